@@ -1,0 +1,108 @@
+"""Array fields whose element type and shape are part of the message's type.
+
+A field is declared as ``Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]``; the usual ones
+have names here (``Vector3``, ``Transform``, ...).  Validation never copies an array that already
+fits: what a subscriber sees is the memory that came from the socket.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
+
+Dimension = int | str
+"""A fixed length, or the name of a free one; equal names within one array must be equal lengths."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArraySpec:
+    """What an array field accepts.
+
+    dtype: numpy type string with byte order, little-endian ("<f8", "|u1").
+    shape: a length per axis; a name stands for any length.
+    finite: refuse NaN and infinity (floating types only).
+    """
+
+    dtype: str
+    shape: tuple[Dimension, ...]
+    finite: bool = True
+
+    def validate(self, value: object) -> NDArray[Any]:
+        """Return `value` as an array of this type; ValueError says what does not fit.
+
+        Arrays must have the exact dtype (a silent float64 -> float32 would lose digits); nested
+        lists, as they come from a scene file, are converted.
+        """
+        wanted = np.dtype(self.dtype)
+        if isinstance(value, np.ndarray):
+            array = value
+            if array.dtype != wanted:
+                raise ValueError(f"array of {array.dtype}, wanted {wanted}")
+        elif isinstance(value, (list, tuple)):
+            try:
+                array = np.asarray(value, dtype=wanted)
+            except (TypeError, ValueError, OverflowError) as error:
+                raise ValueError(f"not an array of {wanted}: {error}") from error
+        else:
+            raise ValueError(f"{type(value).__name__} is not an array of {wanted}")
+        self._check_shape(array.shape)
+        if self.finite and wanted.kind == "f" and not np.isfinite(array).all():
+            raise ValueError("array has NaN or infinite elements")
+        return array if array.flags.c_contiguous else np.ascontiguousarray(array)
+
+    def _check_shape(self, shape: tuple[int, ...]) -> None:
+        if len(shape) == len(self.shape):
+            lengths: dict[str, int] = {}
+            for wanted, length in zip(self.shape, shape, strict=True):
+                if isinstance(wanted, str):
+                    wanted = lengths.setdefault(wanted, length)
+                if wanted != length:
+                    break
+            else:
+                return
+        raise ValueError(f"array of shape {shape}, wanted {self.describe_shape()}")
+
+    def describe_shape(self) -> str:
+        """The shape as a reader would write it: "(3,)", "(height, width)"."""
+        inner = ", ".join(str(length) for length in self.shape)
+        return f"({inner},)" if len(self.shape) == 1 else f"({inner})"
+
+    def __get_pydantic_core_schema__(
+        self, source: object, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            self.validate,
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda array: array.tolist(), when_used="json"
+            ),
+        )
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return {
+            "type": "array",
+            "description": f"{np.dtype(self.dtype).name}, shape {self.describe_shape()}",
+            "dtype": self.dtype,
+            "shape": list(self.shape),
+        }
+
+
+Vector2 = Annotated[NDArray[np.float64], ArraySpec("<f8", (2,))]
+Vector3 = Annotated[NDArray[np.float64], ArraySpec("<f8", (3,))]
+Vector6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6,))]
+Matrix3 = Annotated[NDArray[np.float64], ArraySpec("<f8", (3, 3))]
+Matrix6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
+Transform = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
+"""Homogeneous rigid transform ``a_from_b``: metres, row-major."""
+Points3 = Annotated[NDArray[np.float32], ArraySpec("<f4", ("points", 3))]
+Triangles = Annotated[NDArray[np.int32], ArraySpec("<i4", ("triangles", 3))]
+GrayImage = Annotated[NDArray[np.uint8], ArraySpec("|u1", ("height", "width"))]
+ColorImage = Annotated[NDArray[np.uint8], ArraySpec("|u1", ("height", "width", 3))]
+EyePair = Annotated[NDArray[np.float64], ArraySpec("<f8", (2, 3))]

@@ -1,0 +1,173 @@
+"""The scene: what is shown, with which devices, over which range, and how well.
+
+A scene file (`launch/scenes/*.yaml`) holds exactly these fields.  Lengths are metres, angles
+radians, stresses pascals.  The world frame has its origin at the centre of the imaginary screen,
+x to the right, y up, z towards the user.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from messages.arrays import Transform, Vector3
+from messages.base import Message
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+
+
+class Part(BaseModel):
+    """A named group of a message's fields."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
+class Pose(Part):
+    """Where a frame sits in another: position, then roll, pitch, yaw about the fixed x, y, z axes."""
+
+    position_m: Vector3
+    rpy_rad: Vector3
+
+
+class Material(Part):
+    young_modulus_pa: Positive
+    poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)]
+
+
+class Cylinder(Part):
+    """Solid circular cylinder, axis along the object frame's x, centred on its origin."""
+
+    shape: Literal["cylinder"] = "cylinder"
+    radius_m: Positive
+    length_m: Positive
+
+
+class VirtualObject(Part):
+    """The soft object that is seen and touched."""
+
+    geometry: Cylinder
+    material: Material
+    world_from_object: Pose
+    support_angle_rad: Positive = Field(
+        description="full angle of the strip of skin, opposite the user, that is held fixed"
+    )
+
+
+class SheetSpec(Part):
+    """The rubber sheet, clamped at its left and right edges (x), free at top and bottom (y)."""
+
+    width_m: Positive = Field(description="slack distance between the clamped edges")
+    height_m: Positive = Field(description="length of a clamped edge")
+    thickness_m: Positive
+    young_modulus_pa: Positive
+    max_stretch_ratio: Annotated[float, Field(gt=1)]
+    min_stretch_ratio: Annotated[float, Field(ge=1)] = 1.0
+    max_edge_force_n: Positive
+    usable_half_height_m: Positive = Field(
+        description="how far from the sheet's middle line the finger may come"
+    )
+
+
+class ArmSpec(Part):
+    """One RV-1A: where it stands and how it holds its edge of the sheet.
+
+    Sheet frame: x from the left edge to the right, y along the edges, z towards the user.
+    """
+
+    world_from_base: Pose
+    flange_from_edge: Pose = Field(
+        description="the middle of the clamped edge, axes as the sheet's, seen from the flange"
+    )
+
+
+class Arms(Part):
+    left: ArmSpec
+    right: ArmSpec
+    max_tool_speed_m_per_s: Positive
+    min_distance_m: Positive = Field(description="least distance between the two flanges")
+    workspace_min_m: Vector3 = Field(description="corner of the box the flanges stay in, world")
+    workspace_max_m: Vector3
+
+
+class Lens(Part):
+    """Pinhole with Brown's distortion (k1, k2, p1, p2, k3), OpenCV's convention, in pixels."""
+
+    fx_px: Positive
+    fy_px: Positive
+    cx_px: Finite
+    cy_px: Finite
+    distortion: tuple[Finite, Finite, Finite, Finite, Finite] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class StereoCamera(Part):
+    """A rig of two cameras; camera frames have x right, y down, z along the view (OpenCV)."""
+
+    device: str
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    rate_hz: Positive
+    exposure_s: Positive
+    left: Lens
+    right: Lens
+    right_from_left: Transform
+    world_from_left: Pose
+
+
+class Projector(Part):
+    """A projector as a camera run backwards: same lens model, z along the light."""
+
+    width_px: Annotated[int, Field(gt=0)]
+    height_px: Annotated[int, Field(gt=0)]
+    lens: Lens
+    world_from_projector: Pose
+
+
+class Eyes(Part):
+    """The point of view V; the eyes stand half the interocular distance to either side along x."""
+
+    centre_world_m: Vector3
+    interocular_m: NonNegative
+
+
+class Finger(Part):
+    radius_m: Positive
+    max_speed_m_per_s: Positive
+    volume_min_m: Vector3 = Field(description="corner of the box a fingertip can be in, world")
+    volume_max_m: Vector3
+
+
+class WorkingRange(Part):
+    """What the user may do; limits and charts are taken over it."""
+
+    push_depth_m: Positive
+    tilt_rad: Positive
+    speed_m_per_s: Positive
+
+
+class Tolerances(Part):
+    """How good is good enough; each method family is tuned against one of these."""
+
+    image_m: Positive = Field(description="displacement of the picture as the eye sees it")
+    fingertip_m: Positive
+    skin_m: Positive = Field(description="skin displacement outside 1.5 finger radii")
+    force_ratio: Positive
+    sheet_position_m: Positive
+    latency_s: Positive
+
+
+class Scene(Message):
+    """Everything that the nodes must agree on."""
+
+    name: str
+    object: VirtualObject
+    sheet: SheetSpec
+    arms: Arms
+    camera: StereoCamera
+    projector: Projector
+    eyes: Eyes
+    finger: Finger
+    working_range: WorkingRange
+    tolerances: Tolerances

@@ -1,0 +1,235 @@
+"""The message of every topic but the scene (`messages.scene`).
+
+Positions and directions are in the world frame unless the name says otherwise.  When a quantity is
+not known the message says so by a field; an array never holds NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from messages.arrays import (
+    ArraySpec,
+    ColorImage,
+    EyePair,
+    GrayImage,
+    Matrix6,
+    Points3,
+    Transform,
+    Triangles,
+    Vector2,
+    Vector3,
+    Vector6,
+)
+from messages.base import Message
+from messages.scene import Finite, NonNegative, Part, Positive
+
+Side = Literal["left", "right"]
+Correction = Literal["none", "one_plane", "four_triangles"]
+StereoMode = Literal["mono", "side_by_side", "top_bottom", "anaglyph"]
+
+
+class StereoPair(Message):
+    """Two pictures taken together.  The header's source stamp is the middle of the exposure."""
+
+    device: str
+    exposure_s: NonNegative
+    dropped_frames: int = Field(ge=0, description="frames lost in the device since start")
+    left: GrayImage
+    right: GrayImage
+
+
+FingertipReason = Literal[
+    "ok", "no_mark", "mark_in_one_view", "two_marks", "outside_volume", "too_fast", "inconsistent"
+]
+
+
+class Fingertip(Message):
+    """Where the fingertip is, at the exposure.
+
+    When `valid` is false, `reason` says why and the tracked state is the last good one.
+    `measured_world_m` is this picture's triangulated point, without any filter.
+    """
+
+    valid: bool
+    reason: FingertipReason
+    position_world_m: Vector3
+    velocity_world_m_per_s: Vector3
+    covariance: Matrix6 = Field(description="of (position, velocity), m and m/s")
+    measured_world_m: Vector3
+    reprojection_px: NonNegative
+
+
+Phase = Literal["wait", "approach", "contact", "hold"]
+
+
+class SheetTarget(Message):
+    """Where the sheet shall be at `valid_at_ns`, and how it moves there.
+
+    The sheet frame sits at the sheet's centre: x from the left edge to the right, z towards the
+    user.  A consumer that uses it at another time adds twist times the difference.
+    """
+
+    phase: Phase
+    reason: str = Field(description="why the sheet holds or waits; empty otherwise")
+    valid_at_ns: int = Field(description="on the clock of the header's stamps")
+    world_from_sheet: Transform
+    twist_world: Vector6 = Field(description="linear (m/s) of the centre, then angular (rad/s)")
+    stretch_ratio: Positive = Field(description="distance of the edges over the slack width")
+    contact_world_m: Vector3 = Field(description="point of the undeformed object that is presented")
+    normal_world: Vector3
+    contact_sheet_m: Vector2 = Field(description="the same point on the sheet (x, y)")
+    push_depth_m: NonNegative
+
+
+ArmMode = Literal["disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop"]
+
+
+class ArmState(Message):
+    """One arm as its bridge sees it; the source stamp is when the joints were measured."""
+
+    side: Side
+    mode: ArmMode
+    faults: tuple[str, ...]
+    joints_rad: Vector6
+    joints_commanded_rad: Vector6
+    world_from_flange: Transform
+    world_from_flange_commanded: Transform
+    command_age_s: NonNegative | None = Field(description="of the sheet target in use; None: none")
+    target_source_ns: int = Field(description="exposure of the picture behind that target; 0: none")
+    command_sent_ns: int = Field(description="when the newest command was written; 0: never")
+    edge_distance_m: NonNegative | None = Field(description="between both edges; None: unknown")
+    edge_force_n: NonNegative | None
+    cycle_s: NonNegative = Field(description="duration of the last exchange with the arm")
+
+
+class Skin(Message):
+    """The soft body's skin at rest, once per object; triangles wind outwards."""
+
+    mesh_id: str
+    vertices_world_m: Points3
+    triangles: Triangles
+
+
+class SoftBody(Message):
+    """The skin's answer to the finger."""
+
+    mesh_id: str
+    method: str
+    in_range: bool = Field(description="false: the push exceeds what the method is good for")
+    push_depth_m: NonNegative
+    force_world_n: Vector3 = Field(description="of the object on the finger")
+    stiffness_n_per_m: NonNegative = Field(description="of the object where the finger is")
+    displacement_world_m: Points3
+
+
+class Display(Message):
+    """What the renderer shall show; latched, from console or experiment."""
+
+    correction: Correction
+    stereo: StereoMode
+    swap_eyes: bool = False
+    shading: Literal["soft", "flat"] = "soft"
+    pattern: Literal["object", "grid", "black"] = "object"
+    marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
+    pixels_every: int = Field(
+        default=0, ge=0, description="attach pixels to each nth frame; 0: none"
+    )
+    label: str = Field(default="", description="copied into each frame drawn with these settings")
+
+
+class Frame(Message):
+    """What the projector was given; the source stamp is the exposure behind what it shows."""
+
+    number: int
+    correction: Correction
+    stereo: StereoMode
+    label: str
+    eyes_world_m: EyePair = Field(description="left, right")
+    world_from_sheet: Transform
+    pushed_point_world_m: Vector3
+    predicted_to_ns: int = Field(description="the instant that the picture was drawn for")
+    draw_s: NonNegative
+    late_frames: int = Field(ge=0)
+    pixels: tuple[ColorImage, ...] = Field(
+        description="projector images, top row first: none, one (mono or packed)"
+    )
+
+
+class EStop(Message):
+    """Emergency stop by software.  Bridges latch `engaged`; only `reset` by hand clears it."""
+
+    engaged: bool
+    reason: str
+
+
+class PortStatus(Part):
+    """One input or output of a node over the last second and since its start."""
+
+    topic: str
+    rate_hz: NonNegative
+    age_s: NonNegative | None = Field(description="of the newest message, from its source stamp")
+    messages: int = Field(ge=0)
+    dropped: int = Field(ge=0, description="superseded or overflown before the node saw them")
+    gaps: int = Field(ge=0, description="lost on the way, by sequence numbers")
+    rejected: int = Field(ge=0, description="malformed or of another type")
+
+
+class Status(Message):
+    """How a node is; each node sends one a second."""
+
+    node: str
+    state: Literal["starting", "running", "degraded", "stopping"]
+    pid: int
+    uptime_s: NonNegative
+    cpu_ratio: NonNegative
+    resident_bytes: int = Field(ge=0)
+    inputs: tuple[PortStatus, ...]
+    outputs: tuple[PortStatus, ...]
+    errors: int = Field(ge=0)
+    last_error: str
+    note: str = Field(description="what the node itself wants to say, one line")
+    plan_hash: str
+
+
+class FingerPath(Message):
+    """A path for the twin's finger, from now on: it eases from where it is to the first point."""
+
+    label: str
+    times_s: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points",))]
+    positions_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))]
+    wander_m: NonNegative = Field(description="standard deviation of slow human error")
+    tremor_m: NonNegative = Field(description="amplitude of 8-12 Hz tremor")
+
+
+class TwinFinger(Message):
+    """The true fingertip at the source stamp."""
+
+    path_label: str
+    path_done: bool
+    path_time_s: Finite = Field(description="since the path began; negative while easing to it")
+    position_world_m: Vector3
+    velocity_world_m_per_s: Vector3
+
+
+class TwinArms(Message):
+    """The true joints and flanges at the source stamp."""
+
+    joints_left_rad: Vector6
+    joints_right_rad: Vector6
+    world_from_flange_left: Transform
+    world_from_flange_right: Transform
+
+
+class TwinEye(Message):
+    """What a measuring camera at V sees of the projected image, and what it ought to see."""
+
+    label: str
+    correction: Correction
+    metres_per_px: Positive = Field(description="of the picture, on the imaginary screen")
+    seen: ColorImage
+    proper: ColorImage

@@ -1,0 +1,45 @@
+"""One folder per node: `node.py` wires, the files beside it compute.
+
+`NODES` is the table of nodes that a launch file can name.  Classes are imported when asked for, so
+that a process loads no other node's libraries.
+"""
+
+from __future__ import annotations
+
+from difflib import get_close_matches
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from nodes.node import Node
+
+NODES: dict[str, str] = {
+    "camera": "nodes.camera.node:Camera",
+    "triangulator": "nodes.triangulator.node:Triangulator",
+    "planner": "nodes.planner.node:Planner",
+    "arm_bridge": "nodes.arm_bridge.node:ArmBridge",
+    "fem_solver": "nodes.fem_solver.node:FemSolver",
+    "renderer": "nodes.renderer.node:Renderer",
+    "recorder": "nodes.recorder.node:Recorder",
+    "twin_finger": "nodes.twin.finger_node:TwinFingerNode",
+    "twin_arms": "nodes.twin.arms_node:TwinArmsNode",
+    "twin_eye": "nodes.twin.eye_node:TwinEyeNode",
+}
+
+
+class UnknownNodeError(KeyError):
+    """A node name that is not in the table; the message suggests one that is."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+def node_class(name: str) -> type[Node]:
+    """The class of the node type `name`; a "module:Class" outside the table is imported as it is."""
+    path = NODES.get(name, name)
+    module_name, _, class_name = path.partition(":")
+    if not class_name:
+        near = get_close_matches(name, NODES, n=1)
+        hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(NODES)}"
+        raise UnknownNodeError(f'unknown node "{name}"{hint}')
+    return getattr(import_module(module_name), class_name)  # type: ignore[no-any-return]

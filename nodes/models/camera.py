@@ -1,0 +1,70 @@
+"""Pinhole cameras with Brown's distortion.
+
+A camera frame has x to the right, y down and z along the view.  Points are (..., 3) in metres,
+pixels (..., 2) with the origin at the centre of the top left pixel, as OpenCV has it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Floats:
+    """The 3x3 matrix K of a pinhole."""
+    return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
+
+
+def distort(normalized: Floats, distortion: Floats) -> Floats:
+    """Distorted normalized image coordinates (..., 2) of undistorted ones.
+
+    distortion: k1, k2, p1, p2, k3 (Brown 1966, in OpenCV's order).
+    """
+    k1, k2, p1, p2, k3 = distortion
+    x, y = normalized[..., 0], normalized[..., 1]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return np.stack(
+        [
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def undistort(distorted: Floats, distortion: Floats, *, iterations: int = 20) -> Floats:
+    """Inverse of `distort` by fixed-point iteration; normalized coordinates (..., 2).
+
+    The iteration contracts while the distortion's slope is well below one, which holds inside the
+    picture of any lens that one would measure with.
+    """
+    k1, k2, p1, p2, k3 = distortion
+    point = distorted.copy()
+    for _ in range(iterations):
+        x, y = point[..., 0], point[..., 1]
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        shift = np.stack(
+            [
+                2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+                p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+            ],
+            axis=-1,
+        )
+        point = (distorted - shift) / radial[..., None]
+    return point
+
+
+def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats:
+    """Pixels (..., 2) of points (..., 3) in the camera's frame, in front of it (z > 0)."""
+    normalized = distort(points_camera[..., :2] / points_camera[..., 2:], distortion)
+    return normalized @ matrix[:2, :2].T + matrix[:2, 2]
+
+
+def normalize(pixels: Floats, matrix: Floats, distortion: Floats) -> Floats:
+    """Undistorted normalized coordinates (..., 2) of pixels: the ray is (x, y, 1)."""
+    distorted = (pixels - matrix[:2, 2]) / np.array([matrix[0, 0], matrix[1, 1]])
+    return undistort(distorted, distortion)

@@ -1,0 +1,329 @@
+"""The form of a node: ports declared as annotations, handlers found by name, all else injected.
+
+    class Follower(Node):
+        "Publishes where the sheet shall be, a hand's breadth above the finger."
+
+        parameters: FollowerParameters
+        fingertip: Input[Fingertip]
+        sheet_target: Output[SheetTarget]
+
+        def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
+            self.sheet_target.publish(..., source_ns=header.source_ns)
+
+A node knows no sockets: it is given parameters, a clock and a function that takes what it sends.
+The same class therefore runs live (`nodes.runner`), in replay and in a unit test.  Handlers may be
+plain functions or coroutines; a coroutine handler never runs twice at once, and on a `latest` topic
+it skips what was superseded while it ran.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import random
+import traceback
+from collections import deque
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin, get_type_hints
+
+import structlog
+from pydantic import BaseModel, ConfigDict
+
+from messages.base import Header, Message
+from messages.clock import Clock
+from messages.topics import Delivery, Topic, topic_named
+from messages.types import PortStatus, Status
+
+M = TypeVar("M", bound=Message)
+Send = Callable[[Topic, Message, Header], None]
+Handler = Callable[[Any, Header], Awaitable[None] | None]
+
+RATE_WINDOW_NS = 1_000_000_000
+EVERY_QUEUE_LENGTH = 1000
+
+
+class NodeParameters(BaseModel):
+    """A node's parameters; subclasses declare theirs with units in the names and sane defaults."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+@dataclass(slots=True)
+class PortCounts:
+    """What is counted per port, for the status message."""
+
+    messages: int = 0
+    dropped: int = 0
+    gaps: int = 0
+    rejected: int = 0
+    arrivals_ns: deque[int] = field(default_factory=lambda: deque(maxlen=2048))
+    newest_source_ns: int | None = None
+    newest_clock_id: str = ""
+
+    def count(self, header: Header, now_ns: int) -> None:
+        self.messages += 1
+        self.arrivals_ns.append(now_ns)
+        self.newest_source_ns = header.source_ns
+        self.newest_clock_id = header.clock_id
+
+    def status(self, topic: Topic, clock: Clock) -> PortStatus:
+        now_ns = clock.now_ns()
+        while self.arrivals_ns and self.arrivals_ns[0] < now_ns - RATE_WINDOW_NS:
+            self.arrivals_ns.popleft()
+        age_s = None
+        if self.newest_source_ns is not None and self.newest_clock_id == clock.id:
+            age_s = max(0.0, (now_ns - self.newest_source_ns) * 1e-9)
+        return PortStatus(
+            topic=topic.name,
+            rate_hz=len(self.arrivals_ns) / (RATE_WINDOW_NS * 1e-9),
+            age_s=age_s,
+            messages=self.messages,
+            dropped=self.dropped,
+            gaps=self.gaps,
+            rejected=self.rejected,
+        )
+
+
+class Input(Generic[M]):
+    """A subscribed topic: the newest message with its header, and what was counted."""
+
+    def __init__(self, topic: Topic, clock: Clock) -> None:
+        self.topic = topic
+        self.message: M | None = None
+        self.header: Header | None = None
+        self.received_ns: int = 0
+        self.counts = PortCounts()
+        self._clock = clock
+
+    def age_s(self) -> float:
+        """Seconds since the newest message's source stamp; infinite before the first.
+
+        A stamp of another host's clock cannot be compared with ours: then the time since it was
+        received counts.
+        """
+        if self.header is None:
+            return float("inf")
+        same_clock = self.header.clock_id == self._clock.id
+        since_ns = self.header.source_ns if same_clock else self.received_ns
+        return (self._clock.now_ns() - since_ns) * 1e-9
+
+    def accept(self, message: M, header: Header) -> None:
+        self.message, self.header = message, header
+        self.received_ns = self._clock.now_ns()
+        self.counts.count(header, self.received_ns)
+
+
+class Output(Generic[M]):
+    """A published topic: numbers and stamps each message."""
+
+    def __init__(self, topic: Topic, clock: Clock, send: Send, writer: str, epoch: int) -> None:
+        self.topic = topic
+        self.counts = PortCounts()
+        self._clock, self._send, self._writer, self._epoch = clock, send, writer, epoch
+
+    def publish(self, message: M, *, source_ns: int | None = None) -> Header:
+        """Send `message`; `source_ns` is the stamp of what it derives from (default: now)."""
+        now_ns = self._clock.now_ns()
+        header = Header(
+            sequence=self.counts.messages + 1,
+            source_ns=now_ns if source_ns is None else source_ns,
+            publish_ns=now_ns,
+            clock_id=self._clock.id,
+            writer=self._writer,
+            epoch=self._epoch,
+        )
+        self.counts.count(header, now_ns)
+        self._send(self.topic, message, header)
+        return header
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """A declared input or output, before any node is built."""
+
+    name: str
+    direction: str
+    message: type[Message]
+
+
+@dataclass(frozen=True, slots=True)
+class Timer:
+    """A method to be called periodically; `rate_parameter` names the parameter that holds its Hz."""
+
+    method: str
+    rate_parameter: str
+
+
+def periodic(rate_parameter: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Mark a method to be called at the rate (Hz) that the named parameter holds."""
+
+    def mark(method: Callable[..., Any]) -> Callable[..., Any]:
+        method.__periodic__ = rate_parameter  # type: ignore[attr-defined]  # a function attribute
+        return method
+
+    return mark
+
+
+def ports_of(node_class: type[Node]) -> dict[str, Port]:
+    """The declared ports of a node class, in the order of declaration.
+
+    A port is named as its topic, with "/" written "__" ("twin__finger"); a launch file may connect
+    it to another topic of the same type.
+    """
+    ports = {}
+    for name, annotation in get_type_hints(node_class).items():
+        origin = get_origin(annotation)
+        if origin in (Input, Output):
+            direction = "input" if origin is Input else "output"
+            ports[name] = Port(name, direction, get_args(annotation)[0])
+    return ports
+
+
+def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
+    """The declared type of a node class's `parameters`."""
+    return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
+
+
+def timers_of(node_class: type[Node]) -> list[Timer]:
+    """The methods of a node class that are marked `@periodic`."""
+    return [
+        Timer(name, member.__periodic__)
+        for name, member in inspect.getmembers(node_class, inspect.isfunction)
+        if hasattr(member, "__periodic__")
+    ]
+
+
+class Node:
+    """Base of all nodes; see the module's text."""
+
+    parameters: NodeParameters
+    status: Output[Status]
+
+    handler_errors_shown: ClassVar[int] = 3
+
+    def __init__(
+        self,
+        parameters: NodeParameters,
+        *,
+        name: str,
+        clock: Clock,
+        send: Send,
+        topics: dict[str, str] | None = None,
+        plan_hash: str = "",
+    ) -> None:
+        """`topics` connects ports to topics of other names: {"arm": "arm_left"}."""
+        self.parameters = parameters
+        self.name, self.clock, self.plan_hash = name, clock, plan_hash
+        self.log = structlog.get_logger().bind(node=name)
+        self.inputs: dict[str, Input[Any]] = {}
+        self.outputs: dict[str, Output[Any]] = {}
+        self.errors = 0
+        self.last_error = ""
+        self.note = ""
+        self.started_ns = clock.now_ns()
+        epoch = random.SystemRandom().getrandbits(32)
+        for port in ports_of(type(self)).values():
+            topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
+            if topic.message is not port.message:
+                raise TypeError(
+                    f"{name}.{port.name} carries {port.message.__name__}, "
+                    f'topic "{topic.name}" carries {topic.message.__name__}'
+                )
+            if port.direction == "input":
+                self.inputs[port.name] = Input(topic, clock)
+                setattr(self, port.name, self.inputs[port.name])
+            else:
+                self.outputs[port.name] = Output(topic, clock, send, name, epoch)
+                setattr(self, port.name, self.outputs[port.name])
+        self._mailboxes = {
+            port: Mailbox(self, port)
+            for port in self.inputs
+            if inspect.iscoroutinefunction(self._handler(port))
+        }
+
+    async def setup(self) -> None:
+        """Called once before the first message; open devices here."""
+
+    async def close(self) -> None:
+        """Called once at the end, whatever happened; release devices here."""
+
+    def _handler(self, port: str) -> Handler | None:
+        return getattr(self, f"on_{port}", None)
+
+    def deliver(self, port: str, message: Message, header: Header) -> None:
+        """Hand a message to the input; a plain handler runs now, a coroutine in its own task."""
+        mailbox = self._mailboxes.get(port)
+        if mailbox is not None:
+            mailbox.put(message, header)
+            return
+        self.inputs[port].accept(message, header)
+        handler = self._handler(port)
+        if handler is not None:
+            try:
+                handler(message, header)
+            except Exception as error:
+                self.report_error(f"on_{port}", error)
+
+    async def step(self, port: str, message: Message, header: Header) -> None:
+        """Hand a message to the input and wait until its handler is through: for replay and tests."""
+        self.inputs[port].accept(message, header)
+        handler = self._handler(port)
+        if handler is not None:
+            await self.call(f"on_{port}", handler, message, header)
+
+    async def call(self, what: str, function: Callable[..., Any], *arguments: Any) -> None:
+        """Call a handler or timer; an exception is counted, logged and shown in the status."""
+        try:
+            result = function(*arguments)
+            if inspect.isawaitable(result):
+                await result
+        except Exception as error:
+            self.report_error(what, error)
+
+    def report_error(self, what: str, error: Exception) -> None:
+        """Count an error and keep it for the status; the first few are logged with their trace."""
+        self.errors += 1
+        self.last_error = f"{what}: {type(error).__name__}: {error}"
+        trace = traceback.format_exc() if self.errors <= self.handler_errors_shown else None
+        self.log.error(
+            "handler failed", what=what, error=str(error), count=self.errors, trace=trace
+        )
+
+    def stop_mailboxes(self) -> None:
+        for mailbox in self._mailboxes.values():
+            mailbox.stop()
+
+
+class Mailbox:
+    """What waits for a coroutine handler: the newest message, or a bounded queue of every one."""
+
+    def __init__(self, node: Node, port: str) -> None:
+        self._node, self._port = node, port
+        self._input = node.inputs[port]
+        latest = self._input.topic.delivery is Delivery.LATEST
+        self._capacity = 1 if latest else EVERY_QUEUE_LENGTH
+        self._overflow_is_error = not latest
+        self._waiting: deque[tuple[Message, Header]] = deque()
+        self._task: asyncio.Task[None] | None = None
+
+    def put(self, message: Message, header: Header) -> None:
+        if len(self._waiting) >= self._capacity:
+            self._waiting.popleft()
+            self._input.counts.dropped += 1
+            if self._overflow_is_error:
+                self._node.report_error(
+                    f"on_{self._port}", OverflowError(f"queue of {self._capacity} overflowed")
+                )
+        self._waiting.append((message, header))
+        if self._task is None or self._task.done():
+            self._task = asyncio.get_running_loop().create_task(self._drain())
+
+    async def _drain(self) -> None:
+        while self._waiting:
+            message, header = self._waiting.popleft()
+            await self._node.step(self._port, message, header)
+
+    def stop(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
