@@ -26,7 +26,7 @@ class Part(BaseModel):
 
 
 class Pose(Part):
-    """Where a frame sits in another: position, then roll, pitch, yaw about the fixed x, y, z axes."""
+    """Where a frame sits in another; roll, pitch, yaw turn about the fixed x, y, z axes, in order."""
 
     position_m: Vector3
     rpy_rad: Vector3

@@ -35,7 +35,7 @@ class UnknownNodeError(KeyError):
 
 
 def node_class(name: str) -> type[Node]:
-    """The class of the node type `name`; a "module:Class" outside the table is imported as it is."""
+    """The class of node type `name`; a "module:Class" outside the table is imported as it is."""
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")
     if not class_name:

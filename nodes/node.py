@@ -23,7 +23,7 @@ import inspect
 import random
 import traceback
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin, get_type_hints
 
@@ -149,7 +149,7 @@ class Port:
 
 @dataclass(frozen=True, slots=True)
 class Timer:
-    """A method to be called periodically; `rate_parameter` names the parameter that holds its Hz."""
+    """A method to be called periodically; `rate_parameter` names the parameter with its Hz."""
 
     method: str
     rate_parameter: str
@@ -202,6 +202,12 @@ class Node:
 
     handler_errors_shown: ClassVar[int] = 3
 
+    @classmethod
+    def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
+        """Topics to subscribe to beside the declared ports, for a node whose inputs depend on its
+        parameters and on what the graph writes; the port is then named as its topic."""
+        return ()
+
     def __init__(
         self,
         parameters: NodeParameters,
@@ -211,8 +217,12 @@ class Node:
         send: Send,
         topics: dict[str, str] | None = None,
         plan_hash: str = "",
+        epoch: int | None = None,
     ) -> None:
-        """`topics` connects ports to topics of other names: {"arm": "arm_left"}."""
+        """`topics` connects ports to topics of other names: {"arm": "arm_left"}.
+
+        `epoch` tells one start of the node from another; drawn at random unless a replay gives it.
+        """
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash
         self.log = structlog.get_logger().bind(node=name)
@@ -222,7 +232,8 @@ class Node:
         self.last_error = ""
         self.note = ""
         self.started_ns = clock.now_ns()
-        epoch = random.SystemRandom().getrandbits(32)
+        if epoch is None:
+            epoch = random.SystemRandom().getrandbits(32)
         for port in ports_of(type(self)).values():
             topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
@@ -266,7 +277,7 @@ class Node:
                 self.report_error(f"on_{port}", error)
 
     async def step(self, port: str, message: Message, header: Header) -> None:
-        """Hand a message to the input and wait until its handler is through: for replay and tests."""
+        """Hand a message to the input and wait until its handler is through: replay, tests."""
         self.inputs[port].accept(message, header)
         handler = self._handler(port)
         if handler is not None:

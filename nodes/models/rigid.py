@@ -33,11 +33,8 @@ def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
     cross = skew(vector)
     if angle < 1e-8:
         return np.eye(3) + cross + 0.5 * (cross @ cross)
-    return (
-        np.eye(3)
-        + (np.sin(angle) / angle) * cross
-        + ((1.0 - np.cos(angle)) / angle**2) * (cross @ cross)
-    )
+    turn = np.sin(angle) / angle * cross + (1.0 - np.cos(angle)) / angle**2 * (cross @ cross)
+    return np.asarray(np.eye(3) + turn, dtype=np.float64)
 
 
 def vector_from_rotation(rotation: Floats) -> Floats:
@@ -46,7 +43,8 @@ def vector_from_rotation(rotation: Floats) -> Floats:
     length = float(np.linalg.norm(quaternion[1:]))
     if length < 1e-12:
         return 2.0 * quaternion[1:]
-    return (2.0 * np.arctan2(length, quaternion[0]) / length) * quaternion[1:]
+    scale = 2.0 * float(np.arctan2(length, quaternion[0])) / length
+    return scale * quaternion[1:]
 
 
 def quaternion_from_rotation(rotation: Floats) -> Floats:
@@ -110,7 +108,7 @@ def apply(a_from_b: Floats, points_b: Floats) -> Floats:
 
 
 def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
-    """Whether a 4x4 matrix is finite, its rotation orthonormal and right-handed, last row (0 0 0 1)."""
+    """Whether a matrix is 4x4 and finite, its rotation proper, its last row (0 0 0 1)."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         return False
     rotation = matrix[:3, :3]

@@ -1,0 +1,362 @@
+"""Section V of the paper: stroking the virtual cylinder, and how far off the sheet is (Table I)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from messages.bag import BagReader
+from numpy.typing import NDArray
+from scipy.interpolate import make_smoothing_spline
+
+from messages.scene import ArmSpec, Scene
+from messages.types import ArmState, FingerPath, Fingertip, Frame, Status, TwinArms, TwinFinger
+from nodes.models.rigid import apply, inverse, transform_from_rpy
+
+Floats = NDArray[np.float64]
+
+STROKE_ANGLE_RAD = np.radians(60.0)
+APPROACH_S = 1.5
+DWELL_S = 1.0
+HOVER_M = 0.04
+WANDER_M = 0.0005
+TREMOR_M = 0.00005
+
+PAPER_TABLE_1 = {
+    10.0: {"delta_d_mm": (0.443, 0.0330), "delta_theta_deg": (0.359, 0.267)},
+    30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
+}
+"""Mean and standard deviation by moving time (s)."""
+
+
+def stroke_label(seconds: float) -> str:
+    return f"stroke {seconds:g} s"
+
+
+def stroke_path(scene: Scene, seconds: float) -> FingerPath:
+    """Approach from above, touch, dwell, stroke 60 degrees in `seconds` at constant speed, lift."""
+    radius = scene.object.geometry.radius_m
+    world_from_object = object_pose(scene)
+    stroke_times = np.linspace(0.0, seconds, max(int(seconds * 20), 2))
+    angles = np.concatenate(
+        [[0.0, 0.0, 0.0], STROKE_ANGLE_RAD * stroke_times / seconds, [STROKE_ANGLE_RAD] * 2]
+    )
+    heights = np.concatenate([[HOVER_M, 0.0, 0.0], np.zeros_like(stroke_times), [0.0, HOVER_M]])
+    times = np.concatenate(
+        [
+            [0.0, APPROACH_S, APPROACH_S + DWELL_S - 1e-3],
+            APPROACH_S + DWELL_S + stroke_times,
+            APPROACH_S + DWELL_S + seconds + np.array([0.5, 0.5 + APPROACH_S]),
+        ]
+    )
+    points = np.column_stack(
+        [
+            np.zeros_like(angles),
+            (radius + heights) * np.sin(angles),
+            (radius + heights) * np.cos(angles),
+        ]
+    )
+    return FingerPath(
+        label=stroke_label(seconds),
+        times_s=times,
+        positions_world_m=apply(world_from_object, points),
+        wander_m=WANDER_M,
+        tremor_m=TREMOR_M,
+    )
+
+
+def stroke_window_s(seconds: float) -> tuple[float, float]:
+    """The part of the path's time in which the finger strokes."""
+    begin = APPROACH_S + DWELL_S
+    return begin, begin + seconds
+
+
+def object_pose(scene: Scene) -> Floats:
+    pose = scene.object.world_from_object
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """Samples of a moving thing: times (n,) ns, values (n, k)."""
+
+    times_ns: NDArray[np.int64]
+    values: Floats
+
+    def at(self, times_ns: NDArray[np.int64]) -> Floats:
+        """Values (m, k) at other times, linear between samples.
+
+        Times count from the first sample, so that nanoseconds of a machine that has been up for
+        months keep their digits.
+        """
+        zero = self.times_ns[0]
+        x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
+        return np.column_stack([np.interp(x, xp, column) for column in self.values.T])
+
+    def covers(self, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+        return (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
+
+
+def track(samples: list[tuple[int, Floats]], what: str) -> Track:
+    """A track of (time, value) samples, in the order of time, repeated times dropped."""
+    if len(samples) < 2:
+        raise ValueError(f"the bag has {len(samples)} samples of {what}; the experiment needs more")
+    times = np.array([time for time, _ in samples], dtype=np.int64)
+    values = np.array([value for _, value in samples])
+    times, first = np.unique(times, return_index=True)
+    return Track(times, values[first])
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """What an experiment reads from a bag.
+
+    Edges are (9,) rows: middle of the clamped edge, its y axis, its z axis, in the world.
+    """
+
+    scene: Scene
+    fingertip: Track
+    measured: Track
+    finger: Track
+    windows_ns: dict[str, tuple[int, int]]
+    measured_edges: tuple[Track, Track]
+    true_edges: tuple[Track, Track]
+    exposure_to_arm_s: Floats
+    exposure_to_frame_s: Floats
+    drops: int
+
+
+def edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
+    edge = world_from_flange @ flange_from_edge
+    return np.concatenate([edge[:3, 3], edge[:3, 1], edge[:3, 2]])
+
+
+def read_recording(bag: Path) -> Recording:
+    """Collect from a bag what the stroke's figures are computed from."""
+    scene: Scene | None = None
+    fingertip: list[tuple[int, Floats]] = []
+    measured: list[tuple[int, Floats]] = []
+    finger: list[tuple[int, Floats]] = []
+    times_by_label: dict[str, list[tuple[int, float]]] = {}
+    flanges: dict[str, list[tuple[int, Floats]]] = {
+        key: [] for key in ("left", "right", "true_left", "true_right")
+    }
+    sent: dict[tuple[str, int], float] = {}
+    frame_delays: list[float] = []
+    frame_sources: set[int] = set()
+    losses: dict[tuple[str, str], int] = {}
+    for _, message, header, _ in BagReader(bag):
+        match message:
+            case Scene():
+                scene = message
+            case Fingertip() if message.valid:
+                fingertip.append((header.source_ns, message.position_world_m))
+                measured.append((header.source_ns, message.measured_world_m))
+            case TwinFinger():
+                finger.append((header.source_ns, message.position_world_m))
+                times_by_label.setdefault(message.path_label, []).append(
+                    (header.source_ns, message.path_time_s)
+                )
+            case ArmState():
+                flanges[message.side].append((header.source_ns, message.world_from_flange))
+                key = (message.side, message.target_source_ns)
+                if message.target_source_ns and message.command_sent_ns:
+                    delay_s = (message.command_sent_ns - message.target_source_ns) * 1e-9
+                    sent.setdefault(key, delay_s)
+            case TwinArms():
+                flanges["true_left"].append((header.source_ns, message.world_from_flange_left))
+                flanges["true_right"].append((header.source_ns, message.world_from_flange_right))
+            case Frame() if header.source_ns not in frame_sources:
+                frame_sources.add(header.source_ns)
+                frame_delays.append((header.publish_ns - header.source_ns) * 1e-9)
+            case Status():
+                for port in message.inputs:
+                    losses[message.node, port.topic] = port.gaps + port.rejected
+            case _:
+                pass
+    if scene is None:
+        raise ValueError(f"{bag}: no scene was recorded")
+
+    def edges(key: str, arm: ArmSpec) -> Track:
+        pose = arm.flange_from_edge
+        flange_from_edge = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        rows = [(time, edge_row(flange, flange_from_edge)) for time, flange in flanges[key]]
+        return track(rows, f"arm {key}")
+
+    windows = {}
+    for label, samples in times_by_label.items():
+        zero_ns = samples[-1][0] - round(samples[-1][1] * 1e9)
+        windows[label] = (zero_ns, samples[-1][0])
+    return Recording(
+        scene=scene,
+        fingertip=track(fingertip, "fingertip"),
+        measured=track(measured, "fingertip"),
+        finger=track(finger, "twin/finger"),
+        windows_ns=windows,
+        measured_edges=(edges("left", scene.arms.left), edges("right", scene.arms.right)),
+        true_edges=(edges("true_left", scene.arms.left), edges("true_right", scene.arms.right)),
+        exposure_to_arm_s=np.array(list(sent.values())),
+        exposure_to_frame_s=np.array(frame_delays),
+        drops=sum(losses.values()),
+    )
+
+
+def presented(
+    edges: tuple[Track, Track], world_from_object: Floats, times_ns: NDArray[np.int64], x_m: Floats
+) -> tuple[Floats, Floats]:
+    """What the sheet presents: points D' (n, 3) in the object's frame, and angles (n,).
+
+    The sheet is the plane through both edges.  It presents the cylinder point whose tangent plane
+    it is, so D' is the plane's point nearest to the cylinder's axis (its x there: `x_m` (n,)), and
+    the angle is that of the plane's normal about the axis.
+    """
+    object_from_world = inverse(world_from_object)
+    left, right = (
+        np.concatenate(
+            [
+                apply(object_from_world, row[:, :3]),
+                row[:, 3:6] @ object_from_world[:3, :3].T,
+                row[:, 6:9] @ object_from_world[:3, :3].T,
+            ],
+            axis=1,
+        )
+        for row in (edges[0].at(times_ns), edges[1].at(times_ns))
+    )
+    across = right[:, :3] - left[:, :3]
+    normal = np.cross(across, left[:, 3:6] + right[:, 3:6])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    centre = 0.5 * (left[:, :3] + right[:, :3])
+    axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
+    distance = np.einsum("ij,ij->i", centre - axis_point, normal)
+    return axis_point + distance[:, None] * normal, np.arctan2(normal[:, 1], normal[:, 2])
+
+
+def sheet_errors(
+    scene: Scene, finger: Track, edges: tuple[Track, Track], times_ns: NDArray[np.int64]
+) -> tuple[Floats, Floats]:
+    """Delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`.
+
+    D is the cylinder's point nearest to the finger: the sheet presents the undeformed surface, so
+    how deep the finger pushes is not an error of its.
+    """
+    world_from_object = object_pose(scene)
+    points = apply(inverse(world_from_object), finger.at(times_ns))
+    angles = np.arctan2(points[:, 1], points[:, 2])
+    radius = scene.object.geometry.radius_m
+    on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
+    presented_points, presented_angles = presented(edges, world_from_object, times_ns, points[:, 0])
+    delta_theta = (angles - presented_angles + np.pi) % (2 * np.pi) - np.pi
+    return np.linalg.norm(on_surface - presented_points, axis=1), np.abs(delta_theta)
+
+
+def smoothed(measured: Track, times_ns: NDArray[np.int64]) -> Track:
+    """An offline smoother of the same measurements: what a method that knows the future reaches.
+
+    Cubic smoothing spline per coordinate, its penalty by generalised cross-validation.
+    """
+    inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
+    times, values = measured.times_ns[inside], measured.values[inside]
+    seconds = (times - times[0]) * 1e-9
+    columns = [make_smoothing_spline(seconds, column)(seconds) for column in values.T]
+    return Track(times, np.column_stack(columns))
+
+
+def summary(values: Floats, scale: float) -> dict[str, float]:
+    scaled = values * scale
+    return {
+        "mean": float(scaled.mean()),
+        "std": float(scaled.std()),
+        "max": float(scaled.max()),
+    }
+
+
+def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
+    if len(values_s) == 0:
+        return {"p50": None, "p99": None}
+    return {
+        "p50": float(np.quantile(values_s, 0.5)) * 1e3,
+        "p99": float(np.quantile(values_s, 0.99)) * 1e3,
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class StrokeErrors:
+    """The stroke's errors over time: seconds (n,) since the stroke began, metres, radians."""
+
+    seconds: Floats
+    delta_d_m: Floats
+    true_delta_d_m: Floats
+    delta_theta_rad: Floats
+    true_delta_theta_rad: Floats
+    smoother_m: Floats
+    fingertip_m: Floats
+
+
+def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
+    """Errors at every exposure of the stroke of that duration; ValueError when it is not there."""
+    label = stroke_label(seconds)
+    if label not in recording.windows_ns:
+        have = ", ".join(recording.windows_ns) or "none"
+        raise ValueError(f'the bag has no finger path "{label}"; it has: {have}')
+    zero_ns, end_ns = recording.windows_ns[label]
+    begin_s, finish_s = stroke_window_s(seconds)
+    begin_ns = zero_ns + round(begin_s * 1e9)
+    finish_ns = min(zero_ns + round(finish_s * 1e9), end_ns)
+    times = recording.fingertip.times_ns
+    keep = (times >= begin_ns) & (times <= finish_ns)
+    for edges in (*recording.measured_edges, *recording.true_edges, recording.finger):
+        keep &= edges.covers(times)
+    times = times[keep]
+    if len(times) < 10:
+        raise ValueError(f'only {len(times)} fingertips were recorded during "{label}"')
+    scene = recording.scene
+    delta_d, delta_theta = sheet_errors(scene, recording.fingertip, recording.measured_edges, times)
+    true_d, true_theta = sheet_errors(scene, recording.finger, recording.true_edges, times)
+    smooth = smoothed(recording.measured, times)
+    world_from_object = object_pose(scene)
+    true_points = recording.finger.at(times)
+    return StrokeErrors(
+        seconds=(times - begin_ns) * 1e-9,
+        delta_d_m=delta_d,
+        true_delta_d_m=true_d,
+        delta_theta_rad=delta_theta,
+        true_delta_theta_rad=true_theta,
+        smoother_m=tangential_distance(scene, world_from_object, smooth.at(times), true_points),
+        fingertip_m=np.linalg.norm(recording.fingertip.at(times) - true_points, axis=1),
+    )
+
+
+def tangential_distance(
+    scene: Scene, world_from_object: Floats, points: Floats, others: Floats
+) -> Floats:
+    """Distance (n,) between the cylinder points nearest to `points` and to `others` (n, 3)."""
+    object_from_world = inverse(world_from_object)
+    on_surface = []
+    for array in (points, others):
+        local = apply(object_from_world, array)
+        angle = np.arctan2(local[:, 1], local[:, 2])
+        radius = scene.object.geometry.radius_m
+        on_surface.append(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))
+    return np.linalg.norm(on_surface[0] - on_surface[1], axis=1)
+
+
+def stroke_result(recording: Recording, seconds: float, bag: Path) -> dict[str, Any]:
+    """The figures of `experiment stroke --json`; lengths in mm, angles in degrees, times in ms."""
+    errors = stroke_errors(recording, seconds)
+    return {
+        "seconds": seconds,
+        "delta_d_mm": summary(errors.delta_d_m, 1e3),
+        "delta_theta_deg": summary(errors.delta_theta_rad, np.degrees(1.0)),
+        "true_delta_d_mm": summary(errors.true_delta_d_m, 1e3),
+        "true_delta_theta_deg": summary(errors.true_delta_theta_rad, np.degrees(1.0)),
+        "smoother_mm": summary(errors.smoother_m, 1e3),
+        "fingertip_mm": summary(errors.fingertip_m, 1e3),
+        "latency_ms": {
+            "exposure_to_arm": percentiles_ms(recording.exposure_to_arm_s),
+            "exposure_to_frame": percentiles_ms(recording.exposure_to_frame_s),
+        },
+        "drops": recording.drops,
+        "bag": str(bag),
+    }

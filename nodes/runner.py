@@ -1,0 +1,217 @@
+"""Runs one node live: its inputs and outputs on sockets, its timers on the loop, its status out.
+
+The launcher writes a `NodeConfig` to a file and starts one process per node with it; a test may
+call `run_node` in its own loop.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import psutil
+import structlog
+import uvloop
+from messages.bus import Publisher, Subscriber
+from pydantic import BaseModel, ConfigDict
+
+from messages.base import Header, Message
+from messages.clock import SystemClock
+from messages.topics import Topic, topic_named
+from messages.types import Status
+from nodes import node_class
+from nodes.node import Node, Timer, parameters_of, timers_of
+
+STATUS_PERIOD_S = 1.0
+
+
+class PortConfig(BaseModel):
+    """One port of a node: the topic it is connected to and where (ZeroMQ endpoints)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    port: str
+    topic: str
+    endpoints: tuple[str, ...]
+
+
+class NodeConfig(BaseModel):
+    """All that one node's process needs to know."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    type: str
+    parameters: dict[str, Any]
+    inputs: tuple[PortConfig, ...]
+    outputs: tuple[PortConfig, ...]
+    plan_hash: str
+    run_dir: str
+    ready_fd: int | None = None
+
+
+class Links:
+    """The sockets of one node, by topic (outputs) and by port (inputs)."""
+
+    def __init__(self, config: NodeConfig, log: Any) -> None:
+        self._config, self._log = config, log
+        self._publishers: dict[str, Publisher] = {}
+        self._subscribers: list[Subscriber] = []
+
+    def open_outputs(self) -> None:
+        for output in self._config.outputs:
+            if output.endpoints:
+                topic = topic_named(output.topic)
+                self._publishers[topic.name] = Publisher(topic, output.endpoints)
+
+    def open_inputs(self, node: Node) -> None:
+        def deliver_to(port: str) -> Any:
+            return lambda message, header: node.deliver(port, message, header)
+
+        for config in self._config.inputs:
+            node_input = node.inputs[config.port]
+            subscriber = Subscriber(
+                node_input.topic,
+                config.endpoints,
+                deliver_to(config.port),
+                node_input.counts,
+                on_problem=lambda text: self._log.warning("input", problem=text),
+            )
+            subscriber.start()
+            self._subscribers.append(subscriber)
+
+    def send(self, topic: Topic, message: Message, header: Header) -> None:
+        publisher = self._publishers.get(topic.name)
+        if publisher is not None:
+            publisher.send(message, header)
+
+    def close(self) -> None:
+        for subscriber in self._subscribers:
+            subscriber.close()
+        for publisher in self._publishers.values():
+            publisher.close()
+
+
+async def run_timer(node: Node, timer: Timer) -> None:
+    """Call a node's periodic method on an absolute grid; calls that came due late are skipped."""
+    period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
+    method = getattr(node, timer.method)
+    loop = asyncio.get_running_loop()
+    due_s = loop.time()
+    while True:
+        await node.call(timer.method, method)
+        due_s += period_s
+        now_s = loop.time()
+        if due_s <= now_s:
+            due_s += period_s * int((now_s - due_s) / period_s + 1)
+        await asyncio.sleep(due_s - now_s)
+
+
+async def run_status(node: Node, process: psutil.Process) -> None:
+    """Publish the node's status once a second."""
+    process.cpu_percent()
+    while True:
+        await asyncio.sleep(STATUS_PERIOD_S)
+        node.status.publish(status_of(node, "running", process))
+
+
+def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
+    """The status message: rates, ages, drops and errors of every port come for free."""
+    degraded = state == "running" and any(
+        port.counts.rejected or port.counts.gaps for port in node.inputs.values()
+    )
+    return Status(
+        node=node.name,
+        state="degraded" if degraded else state,
+        pid=process.pid,
+        uptime_s=(node.clock.now_ns() - node.started_ns) * 1e-9,
+        cpu_ratio=process.cpu_percent() / 100.0,
+        resident_bytes=process.memory_info().rss,
+        inputs=tuple(port.counts.status(port.topic, node.clock) for port in node.inputs.values()),
+        outputs=tuple(port.counts.status(port.topic, node.clock) for port in node.outputs.values()),
+        errors=node.errors,
+        last_error=node.last_error,
+        note=node.note,
+        plan_hash=node.plan_hash,
+    )
+
+
+async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
+    """Build the node, connect it, and run it until `stop` is set or a task of it fails."""
+    class_ = node_class(config.type)
+    log = structlog.get_logger().bind(node=config.name)
+    links = Links(config, log)
+    node = class_(
+        parameters_of(class_).model_validate(config.parameters),
+        name=config.name,
+        clock=SystemClock(),
+        send=links.send,
+        topics={port.port: port.topic for port in (*config.inputs, *config.outputs)},
+        plan_hash=config.plan_hash,
+    )
+    process = psutil.Process()
+    tasks: list[asyncio.Task[Any]] = []
+    try:
+        links.open_outputs()
+        await node.setup()
+        links.open_inputs(node)
+        tasks = [asyncio.create_task(run_timer(node, timer)) for timer in timers_of(class_)]
+        tasks.append(asyncio.create_task(run_status(node, process)))
+        tasks.append(asyncio.create_task(stop.wait()))
+        # What setup built lives on; without this the collector walks it in the middle of a cycle.
+        gc.collect()
+        gc.freeze()
+        report_ready(config)
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+        node.status.publish(status_of(node, "stopping", process))
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        node.stop_mailboxes()
+        await node.close()
+        links.close()
+
+
+def report_ready(config: NodeConfig) -> None:
+    """Tell the launcher, through the pipe it gave, that the node is set up."""
+    if config.ready_fd is not None:
+        os.write(config.ready_fd, b"ready\n")
+        os.close(config.ready_fd)
+
+
+async def run_until_signal(config: NodeConfig) -> None:
+    """Run the node until SIGINT or SIGTERM."""
+    stop = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stop.set)
+    await run_node(config, stop)
+
+
+def main(config_path: str) -> int:
+    """Entry of a node's process; returns its exit code."""
+    config = NodeConfig.model_validate_json(Path(config_path).read_text())
+    structlog.configure(
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.TimeStamper(fmt="iso"),
+            structlog.processors.format_exc_info,
+            structlog.processors.JSONRenderer(),
+        ],
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
+    try:
+        uvloop.run(run_until_signal(config))
+    except Exception as error:
+        # The last place that can say why the process ends; the launcher reads the exit code.
+        structlog.get_logger().error("node ends", node=config.name, error=str(error), exc_info=True)
+        return 1
+    return 0
