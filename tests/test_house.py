@@ -1,0 +1,93 @@
+"""The lines of the house hold: imports go down only, nobody looks into a neighbour's room."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+FLOORS = ("messages", "nodes", "launch")
+SHARED_ROOMS = {"nodes.node", "nodes.methods", "nodes.models", "nodes"}
+TWIN_MAY_SHARE = {"nodes.models.rigid", "nodes.models.shapes", "nodes.models"}
+
+
+def modules(floor: str) -> Iterator[Path]:
+    return (ROOT / floor).rglob("*.py")
+
+
+def imports_of(path: Path) -> set[str]:
+    """Dotted names of everything that a file imports, at any depth of it."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module)
+            names.update(f"{node.module}.{alias.name}" for alias in node.names)
+    return names
+
+
+def floor_of(name: str) -> str:
+    return name.split(".", maxsplit=1)[0]
+
+
+@pytest.mark.parametrize("floor", FLOORS)
+def test_imports_go_down_only(floor: str) -> None:
+    above = FLOORS[FLOORS.index(floor) + 1 :]
+    for path in modules(floor):
+        upward = {name for name in imports_of(path) if floor_of(name) in above}
+        assert not upward, f"{path.relative_to(ROOT)} imports {upward}"
+
+
+def test_no_node_imports_another_node() -> None:
+    for path in modules("nodes"):
+        parts = path.relative_to(ROOT).parts
+        if len(parts) < 3 or parts[1] == "models":
+            continue
+        own = f"nodes.{parts[1]}"
+        foreign = {
+            name
+            for name in imports_of(path)
+            if name.startswith("nodes.")
+            and not any(name == room or name.startswith(f"{room}.") for room in [own])
+            and not any(
+                name == room or name.startswith(f"{room}.") for room in SHARED_ROOMS - {"nodes"}
+            )
+        }
+        assert not foreign, f"{path.relative_to(ROOT)} imports {foreign}"
+
+
+def test_models_know_neither_messages_nor_sockets_nor_files() -> None:
+    forbidden = {"messages", "zmq", "asyncio", "time", "pathlib", "os", "structlog"}
+    for path in modules("nodes/models"):
+        found = {floor_of(name) for name in imports_of(path)} & forbidden
+        assert not found, f"{path.relative_to(ROOT)} imports {found}"
+
+
+def test_the_twin_shares_nothing_with_what_it_judges() -> None:
+    for path in modules("nodes/twin"):
+        shared = {
+            name
+            for name in imports_of(path)
+            if name.startswith("nodes.models")
+            and not any(name == room or name.startswith(f"{room}.") for room in TWIN_MAY_SHARE)
+        }
+        assert not shared, f"{path.relative_to(ROOT)} imports {shared}"
+
+
+def test_node_files_wire_and_compute_nothing() -> None:
+    for path in (ROOT / "nodes").glob("*/*node.py"):
+        lines = path.read_text().splitlines()
+        assert len(lines) <= 160, f"{path.relative_to(ROOT)} has {len(lines)} lines"
+
+
+def test_no_unfinished_marks() -> None:
+    marks = ("TO" + "DO", "FIX" + "ME", "XX" + "X", "HA" + "CK")
+    for floor in (*FLOORS, "tests", "benchmarks"):
+        for path in modules(floor):
+            words = path.read_text().replace("(", " ").replace(":", " ").split()
+            found = [mark for mark in marks if mark in words]
+            assert not found, f"{path.relative_to(ROOT)}: {found}"
