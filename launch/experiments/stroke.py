@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
 from messages.scene import ArmSpec, Scene
-from messages.types import ArmState, FingerPath, Fingertip, Frame, Status, TwinArms, TwinFinger
+from messages.types import (
+    ArmState,
+    FingerPath,
+    Fingertip,
+    Frame,
+    SheetTarget,
+    SoftBody,
+    Status,
+    TwinArms,
+    TwinFinger,
+)
 from nodes.models.rigid import apply, inverse, transform_from_rpy
 
 Floats = NDArray[np.float64]
@@ -29,6 +39,9 @@ PAPER_TABLE_1 = {
     30.0: {"delta_d_mm": (0.277, 0.0221), "delta_theta_deg": (0.225, 0.179)},
 }
 """Mean and standard deviation by moving time (s)."""
+
+
+NOTHING: Floats = np.empty(0)
 
 
 def stroke_label(seconds: float) -> str:
@@ -114,6 +127,7 @@ class Recording:
     """What an experiment reads from a bag.
 
     Edges are (9,) rows: middle of the clamped edge, its y axis, its z axis, in the world.
+    delays_s: from the middle of an exposure to each later event that came of it, by event.
     """
 
     scene: Scene
@@ -123,9 +137,21 @@ class Recording:
     windows_ns: dict[str, tuple[int, int]]
     measured_edges: tuple[Track, Track]
     true_edges: tuple[Track, Track]
-    exposure_to_arm_s: Floats
-    exposure_to_frame_s: Floats
+    delays_s: dict[str, Floats]
     drops: int
+
+    def arm_delays_s(self) -> Floats:
+        """From exposure to the command being written, both arms together."""
+        both = [self.delays_s.get(f"{side} arm command", NOTHING) for side in ("left", "right")]
+        return np.concatenate(both)
+
+
+def by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
+    """Delays (n,) of each event, from (event, exposure) to delay."""
+    events: dict[str, list[float]] = {}
+    for (event, _), delay_s in delays.items():
+        events.setdefault(event, []).append(delay_s)
+    return {event: np.array(values) for event, values in events.items()}
 
 
 def edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
@@ -143,15 +169,18 @@ def read_recording(bag: Path) -> Recording:
     flanges: dict[str, list[tuple[int, Floats]]] = {
         key: [] for key in ("left", "right", "true_left", "true_right")
     }
-    sent: dict[tuple[str, int], float] = {}
-    frame_delays: list[float] = []
-    frame_sources: set[int] = set()
+    delays: dict[tuple[str, int], float] = {}
+
+    def delay(event: str, source_ns: int, event_ns: int) -> None:
+        delays.setdefault((event, source_ns), (event_ns - source_ns) * 1e-9)
+
     losses: dict[tuple[str, str], int] = {}
     for _, message, header, _ in BagReader(bag):
         match message:
             case Scene():
                 scene = message
             case Fingertip() if message.valid:
+                delay("fingertip", header.source_ns, header.publish_ns)
                 fingertip.append((header.source_ns, message.position_world_m))
                 measured.append((header.source_ns, message.measured_world_m))
             case TwinFinger():
@@ -161,16 +190,18 @@ def read_recording(bag: Path) -> Recording:
                 )
             case ArmState():
                 flanges[message.side].append((header.source_ns, message.world_from_flange))
-                key = (message.side, message.target_source_ns)
                 if message.target_source_ns and message.command_sent_ns:
-                    delay_s = (message.command_sent_ns - message.target_source_ns) * 1e-9
-                    sent.setdefault(key, delay_s)
+                    event = f"{message.side} arm command"
+                    delay(event, message.target_source_ns, message.command_sent_ns)
             case TwinArms():
                 flanges["true_left"].append((header.source_ns, message.world_from_flange_left))
                 flanges["true_right"].append((header.source_ns, message.world_from_flange_right))
-            case Frame() if header.source_ns not in frame_sources:
-                frame_sources.add(header.source_ns)
-                frame_delays.append((header.publish_ns - header.source_ns) * 1e-9)
+            case SheetTarget():
+                delay("sheet target", header.source_ns, header.publish_ns)
+            case SoftBody():
+                delay("soft body", header.source_ns, header.publish_ns)
+            case Frame():
+                delay("frame drawn", header.source_ns, header.publish_ns)
             case Status():
                 for port in message.inputs:
                     losses[message.node, port.topic] = port.gaps + port.rejected
@@ -197,8 +228,7 @@ def read_recording(bag: Path) -> Recording:
         windows_ns=windows,
         measured_edges=(edges("left", scene.arms.left), edges("right", scene.arms.right)),
         true_edges=(edges("true_left", scene.arms.left), edges("true_right", scene.arms.right)),
-        exposure_to_arm_s=np.array(list(sent.values())),
-        exposure_to_frame_s=np.array(frame_delays),
+        delays_s=by_event(delays),
         drops=sum(losses.values()),
     )
 
@@ -354,8 +384,8 @@ def stroke_result(recording: Recording, seconds: float, bag: Path) -> dict[str, 
         "smoother_mm": summary(errors.smoother_m, 1e3),
         "fingertip_mm": summary(errors.fingertip_m, 1e3),
         "latency_ms": {
-            "exposure_to_arm": percentiles_ms(recording.exposure_to_arm_s),
-            "exposure_to_frame": percentiles_ms(recording.exposure_to_frame_s),
+            "exposure_to_arm": percentiles_ms(recording.arm_delays_s()),
+            "exposure_to_frame": percentiles_ms(recording.delays_s.get("frame drawn", NOTHING)),
         },
         "drops": recording.drops,
         "bag": str(bag),

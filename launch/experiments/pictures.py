@@ -1,0 +1,110 @@
+"""The demo's pictures: what a person should understand at a glance."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from launch.experiments.image import Picture
+from launch.experiments.stroke import PAPER_TABLE_1, Recording, StrokeErrors
+
+EVENTS = (
+    "fingertip",
+    "sheet target",
+    "soft body",
+    "left arm command",
+    "right arm command",
+    "frame drawn",
+)
+
+
+def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) -> None:
+    """One row per case: each picture as the eye sees it, and last as it should be."""
+    columns = max(len(pictures) for _, pictures in rows) + 1
+    figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
+    axes = figure.subplots(len(rows), columns, squeeze=False)
+    for row, (title, pictures) in zip(axes, rows, strict=True):
+        shown = [(picture.correction, picture.seen, picture) for picture in pictures]
+        shown.append(("as it should be", pictures[0].proper, pictures[0]))
+        for axis in row:
+            axis.set_axis_off()
+        for axis, (name, pixels, picture) in zip(row, shown, strict=False):
+            axis.imshow(pixels)
+            outline = outline_box(picture.proper)
+            if outline is not None:
+                left, top, width, height = outline
+                axis.add_patch(
+                    Rectangle((left, top), width, height, fill=False, color="C1", linewidth=0.8)
+                )
+            axis.set_title(f"{title}\n{name.replace('_', ' ')}", fontsize=9)
+    figure.suptitle("What the user's eye sees (orange: the box around the proper image)")
+    figure.savefig(path, dpi=110)
+
+
+def outline_box(picture: np.ndarray) -> tuple[float, float, float, float] | None:
+    """Left, top, width, height of what is brighter than half its maximum; None in a black picture."""
+    gray = picture.max(axis=2)
+    if gray.max() == 0:
+        return None
+    ys, xs = np.nonzero(gray > gray.max() / 2)
+    return (
+        float(xs.min()),
+        float(ys.min()),
+        float(np.ptp(xs)),
+        float(np.ptp(ys)),
+    )
+
+
+def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
+    """Position and angle error over time, one column per stroke, the paper's mean dashed."""
+    figure = Figure(figsize=(5.5 * len(errors), 6), layout="constrained")
+    axes = figure.subplots(2, len(errors), squeeze=False)
+    for column, (seconds, stroke) in enumerate(errors.items()):
+        upper, lower = axes[0][column], axes[1][column]
+        upper.plot(
+            stroke.seconds, stroke.delta_d_m * 1e3, linewidth=0.8, label="to the measured finger"
+        )
+        upper.plot(
+            stroke.seconds, stroke.true_delta_d_m * 1e3, linewidth=0.8, label="to the true finger"
+        )
+        lower.plot(stroke.seconds, np.degrees(stroke.delta_theta_rad), linewidth=0.8)
+        lower.plot(stroke.seconds, np.degrees(stroke.true_delta_theta_rad), linewidth=0.8)
+        paper = PAPER_TABLE_1.get(seconds)
+        if paper is not None:
+            upper.axhline(paper["delta_d_mm"][0], linestyle="--", color="0.3", label="paper, mean")
+            lower.axhline(paper["delta_theta_deg"][0], linestyle="--", color="0.3")
+        upper.set_title(f"60° in {seconds:g} s")
+        upper.set_ylabel("position error Δd, mm")
+        lower.set_ylabel("angle error Δθ, degrees")
+        lower.set_xlabel("time since the stroke began, s")
+        upper.legend(fontsize=8)
+        for axis in (upper, lower):
+            axis.set_ylim(bottom=0)
+            axis.grid(visible=True, alpha=0.2)
+    figure.suptitle("How far the sheet is from the finger while it strokes")
+    figure.savefig(path, dpi=110)
+
+
+def draw_latency(recording: Recording, path: Path) -> None:
+    """Where the milliseconds go: from exposure to each event, median, 1-99 % and all."""
+    events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
+    figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
+    axes = figure.subplots()
+    for row, event in enumerate(events):
+        delays_ms = recording.delays_s[event] * 1e3
+        low, median, high = np.quantile(delays_ms, [0.01, 0.5, 0.99])
+        axes.barh(row, high - low, left=low, height=0.5, color="C0", alpha=0.4)
+        axes.plot([median, median], [row - 0.3, row + 0.3], color="C0", linewidth=2)
+        axes.text(high, row, f"  {median:.1f} / {high:.1f} ms", va="center", fontsize=8)
+    axes.set_yticks(range(len(events)), events)
+    axes.invert_yaxis()
+    axes.set_xlim(left=0)
+    axes.margins(x=0.2)
+    axes.set_xlabel("ms since the middle of the exposure: 1-99 % (bar), median (line)")
+    axes.set_title("Where the milliseconds go")
+    axes.grid(visible=True, axis="x", alpha=0.2)
+    figure.savefig(path, dpi=110)
