@@ -1,0 +1,34 @@
+"""Entry of the `flexsheet` command and of every node's process.
+
+ROS 2 has a Python package named `launch` too.  With foreign packages named `launch`, `nodes` or
+`messages` on PYTHONPATH ours must win; so the first thing is to put our folder first.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+_HERE = os.path.dirname(os.path.abspath(__file__))
+if sys.path[:1] != [_HERE]:
+    sys.path.insert(0, _HERE)
+
+NODE_FLAG = "--node"
+
+
+def main() -> None:
+    """Run the command, or with `--node CONFIG` one node (the launcher starts those)."""
+    if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
+        from launch.child import follow_launcher
+
+        follow_launcher()
+        from nodes.runner import main as run_node
+
+        sys.exit(run_node(sys.argv[2]))
+    from launch.cli import main as run_command
+
+    run_command()
+
+
+if __name__ == "__main__":
+    main()

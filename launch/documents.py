@@ -1,0 +1,221 @@
+"""YAML files whose mistakes can be pointed at: file, line, key, value and remedy.
+
+A file is read with its line numbers, checked against a pydantic model, and everything that is
+wrong with it is reported at once as `Problem`s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
+
+from pydantic import BaseModel, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.constructor import DuplicateKeyError
+from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.scalarbool import ScalarBoolean
+from ruamel.yaml.scalarfloat import ScalarFloat
+from ruamel.yaml.scalarint import ScalarInt
+from ruamel.yaml.scalarstring import ScalarString
+
+M = TypeVar("M", bound=BaseModel)
+Key = tuple[str | int, ...]
+"""Where a value sits in a document: ("nodes", "planner", "parameters", "lead_s")."""
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One thing that is wrong, where, and what to do about it."""
+
+    where: str
+    key: Key
+    what: str
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        key = ".".join(str(part) for part in self.key)
+        parts = [self.where, *([key] if key else []), self.what]
+        return ": ".join(parts) + (f"; {self.remedy}" if self.remedy else "")
+
+
+class BadInputError(ValueError):
+    """Input that cannot be used; `problems` holds all that was found."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        super().__init__("\n".join(str(problem) for problem in problems))
+        self.problems = tuple(problems)
+
+
+@dataclass(slots=True)
+class Document:
+    """A YAML file as plain values, with the line of every key, and what was set over it."""
+
+    path: Path
+    values: dict[str, Any]
+    text: str
+    lines: dict[Key, int]
+    overrides: dict[Key, str] = field(default_factory=dict)
+
+    def where(self, key: Key) -> str:
+        """The file and line of `key` (or of the nearest thing around it), or the override."""
+        for length in range(len(key), 0, -1):
+            part = key[:length]
+            if part in self.overrides:
+                return self.overrides[part]
+            if part in self.lines:
+                return f"{self.path}:{self.lines[part]}"
+        return str(self.path)
+
+    def problem(self, key: Key, what: str, remedy: str = "") -> Problem:
+        return Problem(self.where(key), key, what, remedy)
+
+    def set(self, key: Key, value: Any, origin: str) -> None:
+        """Put `value` at `key`, making the mappings on the way; `origin` names it in errors."""
+        target = self.values
+        for part in key[:-1]:
+            inner = target.get(part) if isinstance(target, dict) else None  # type: ignore[call-overload]
+            if inner is None:
+                inner = target[part] = {}  # type: ignore[index]  # keys of YAML maps are strings
+            if not isinstance(inner, dict):
+                raise BadInputError([Problem(origin, key, f'"{part}" holds no further keys')])
+            target = inner
+        target[key[-1]] = value  # type: ignore[index]
+        self.overrides[key] = origin
+
+
+def parse_value(text: str) -> Any:
+    """A value as YAML reads it: "3" is a number, "[1, 2]" a list, "yes" a string."""
+    return plain(YAML(typ="rt", pure=True).load(text))
+
+
+def read_document(path: Path) -> Document:
+    """Read a YAML file that holds one mapping; raises BadInputError."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise BadInputError(
+            [Problem(str(path), (), f"cannot be read: {reason}", "check the path")]
+        ) from error
+    except UnicodeDecodeError as error:
+        raise BadInputError([Problem(str(path), (), f"is not UTF-8 text: {error}")]) from error
+    try:
+        tree = YAML(typ="rt", pure=True).load(text)
+    except DuplicateKeyError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 0
+        what = (error.problem or "duplicate key").split("\n")[0]
+        raise BadInputError(
+            [Problem(f"{path}:{line}", (), what, "remove or rename one of the two")]
+        ) from error
+    except MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"{path}:{mark.line + 1}" if mark else str(path)
+        raise BadInputError([Problem(where, (), f"not YAML: {error.problem}")]) from error
+    except YAMLError as error:
+        raise BadInputError([Problem(str(path), (), f"not YAML: {error}")]) from error
+    if not isinstance(tree, CommentedMap):
+        kind = "empty" if tree is None else f"a {type(tree).__name__}"
+        raise BadInputError([Problem(str(path), (), f"is {kind}", "it must hold keys and values")])
+    return Document(path, plain(tree), text, dict(_lines(tree, ())))
+
+
+def plain(value: Any) -> Any:
+    """A YAML tree without its comments and quoting, as Python's own types."""
+    if isinstance(value, Mapping):
+        return {plain(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [plain(item) for item in value]
+    if isinstance(value, ScalarBoolean):
+        return bool(value)
+    if isinstance(value, ScalarFloat):
+        return float(value)
+    if isinstance(value, ScalarInt):
+        return int(value)
+    if isinstance(value, ScalarString):
+        return str(value)
+    return value
+
+
+def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:
+    if isinstance(tree, CommentedMap):
+        for name, item in tree.items():
+            inner = (*key, name)
+            position = tree.lc.data.get(name) if tree.lc.data else None
+            if position is not None:
+                yield inner, position[0] + 1
+            yield from _lines(item, inner)
+    elif isinstance(tree, CommentedSeq):
+        for i, item in enumerate(tree):
+            position = tree.lc.data.get(i) if tree.lc.data else None
+            if position is not None:
+                yield (*key, i), position[0] + 1
+            yield from _lines(item, (*key, i))
+
+
+def did_you_mean(name: object, known: Sequence[str]) -> str:
+    """The remedy for a name that does not exist: the nearest one, or all there are."""
+    near = get_close_matches(str(name), known, n=1)
+    if near:
+        return f'did you mean "{near[0]}"?'
+    return f"there are: {', '.join(known)}" if known else "there are none"
+
+
+def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
+    """The values at `at` as a `model`; raises BadInputError with a problem per mistake."""
+    values: Any = document.values
+    for part in at:
+        values = values[part]
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        raise BadInputError(
+            [_problem_of(item, model, document, at) for item in error.errors()]
+        ) from None
+
+
+def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key) -> Problem:
+    location: Key = tuple(error["loc"])
+    key = (*at, *location)
+    if error["type"] == "extra_forbidden":
+        known = _fields_at(model, location[:-1])
+        return document.problem(
+            key, f'unknown key "{location[-1]}"', did_you_mean(location[-1], known)
+        )
+    if error["type"] == "missing":
+        return document.problem(key[:-1], f'"{location[-1]}" is missing', f'add "{location[-1]}"')
+    message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    return document.problem(key, f"{_shown(error['input'])} does not fit", message)
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _fields_at(model: Any, location: Key) -> list[str]:
+    """Names of the fields of the model that sits at `location` inside `model`."""
+    for part in location:
+        model = _inner_type(model, part)
+    return sorted(model.model_fields) if _is_model(model) else []
+
+
+def _is_model(annotation: Any) -> bool:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _inner_type(annotation: Any, part: str | int) -> Any:
+    if _is_model(annotation):
+        field_info = annotation.model_fields.get(part)
+        annotation = field_info.annotation if field_info is not None else None
+    else:
+        arguments = get_args(annotation)
+        annotation = arguments[-1] if arguments else None
+    if get_origin(annotation) in (Union, UnionType):
+        # "X or None" is the only union that launch and scene files have.
+        annotation = next((one for one in get_args(annotation) if one is not type(None)), None)
+    return annotation

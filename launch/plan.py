@@ -1,0 +1,657 @@
+"""A launch file, checked and resolved: which node runs where, with what, and who talks to whom.
+
+The launch file is the graph.  `load_plan` turns it into a `Plan` in which every endpoint is known
+before any process starts; everything that is wrong with the file is reported at once.  Every host
+computes the same plan from the same file, and the plan's hash says so.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import ipaddress
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from launch.documents import (
+    BadInputError,
+    Document,
+    Key,
+    Problem,
+    did_you_mean,
+    parse_value,
+    read_document,
+    validate,
+)
+from messages.scene import Scene
+from messages.topics import TOPICS, Topic
+from nodes import NODES, UnknownNodeError, node_class
+from nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
+
+MAIN = "main"
+"""The host of the launcher's own topics, of the recorder and of the command-line tools."""
+
+LAUNCHER, TOOLS = "launch", "tools"
+"""Writers that are no nodes: the launching process, and command-line tools and experiments."""
+
+RUN_DIRECTORY = "@run"
+"""Stands for the run's directory in endpoints and parameters; known only when the run starts."""
+
+FIRST_PORT, PORTS = 20_000, 10_000
+"""TCP ports lie below the range that Linux gives to outgoing connections (32768 and up)."""
+
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
+
+
+class Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class HostSpec(Strict):
+    """One computer."""
+
+    address: str = Field(description="IP address that its nodes listen on")
+
+
+class RestartSpec(Strict):
+    """What happens when a node's process ends by itself.
+
+    The delay doubles from `delay_s` with each restart inside the window, up to `max_delay_s`; after
+    `max_restarts` in `window_s` the node has failed for good and the whole run ends.
+    """
+
+    policy: Literal["never", "on_failure", "always"] = "on_failure"
+    delay_s: float = Field(default=0.2, ge=0, allow_inf_nan=False)
+    max_delay_s: float = Field(default=5.0, gt=0, allow_inf_nan=False)
+    max_restarts: int = Field(default=5, ge=0)
+    window_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
+
+
+class NodeSpec(Strict):
+    """One node as the launch file has it."""
+
+    type: str = Field(description='a name of the table of nodes, or "module:Class"')
+    host: str = MAIN
+    parameters: dict[str, Any] = {}
+    topics: dict[str, str] = Field(default={}, description="port: topic, where they differ")
+    restart: RestartSpec = RestartSpec()
+    start_deadline_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
+
+
+class LaunchFile(Strict):
+    """A launch file's keys."""
+
+    scene: str | None = Field(default=None, description="scene file, relative to this one")
+    hosts: dict[Name, HostSpec] = {MAIN: HostSpec(address="127.0.0.1")}
+    nodes: dict[Name, NodeSpec]
+    from_tools: list[str] = Field(
+        default=[], description="topics that a tool writes into the graph, as `bag play` does"
+    )
+    record: dict[str, Any] | None = Field(
+        default=None, description="parameters of a recorder on the main host"
+    )
+
+
+class Writer(Strict):
+    """One writer of a topic and what it binds: ipc for its own host, tcp for the others."""
+
+    name: str
+    host: str
+    ipc: str
+    tcp: str | None
+
+    @property
+    def endpoints(self) -> tuple[str, ...]:
+        return (self.ipc,) if self.tcp is None else (self.ipc, self.tcp)
+
+    def endpoint_for(self, host: str) -> str:
+        if host == self.host or self.tcp is None:
+            return self.ipc
+        return self.tcp
+
+
+class PlannedPort(Strict):
+    """A port, its topic, and the endpoints: bound for an output, connected to for an input."""
+
+    port: str
+    topic: str
+    endpoints: tuple[str, ...]
+
+
+class PlannedNode(Strict):
+    """All that is needed to start one node."""
+
+    name: str
+    type: str
+    host: str
+    parameters: dict[str, Any]
+    inputs: tuple[PlannedPort, ...]
+    outputs: tuple[PlannedPort, ...]
+    restart: RestartSpec
+    start_deadline_s: float
+
+
+class Plan(Strict):
+    """A resolved launch file."""
+
+    launch_file: str
+    launch_text: str
+    scene_file: str | None
+    scene_text: str
+    scene: dict[str, Any] | None
+    hosts: dict[str, str] = Field(description="address by name")
+    nodes: dict[str, PlannedNode]
+    writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
+    hash: str
+
+    def writer(self, topic: str, name: str) -> Writer | None:
+        """The writer `name` of `topic`; None when it may not write it."""
+        return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
+
+    def endpoints_to_read(self, topic: str, host: str = MAIN) -> tuple[str, ...]:
+        """Where a subscriber of `topic` on `host` connects to."""
+        return tuple(writer.endpoint_for(host) for writer in self.writers.get(topic, ()))
+
+    def nodes_on(self, host: str | None) -> list[PlannedNode]:
+        """The nodes of one host, or of all."""
+        return [node for node in self.nodes.values() if host is None or node.host == host]
+
+    def scene_message(self) -> Scene | None:
+        return None if self.scene is None else Scene.model_validate(self.scene)
+
+
+class _Member:
+    """A node under check: its spec, class, ports with their topics, and validated parameters."""
+
+    def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
+        self.name, self.spec, self.key = name, spec, key
+        self.type: type[Node] | None = None
+        self.parameters: NodeParameters | None = None
+        self.ports: list[tuple[Port, Topic]] = []
+        self.further_inputs: list[Topic] = []
+
+    def topics(self, direction: str) -> list[tuple[str, Topic]]:
+        found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
+        if direction == "input":
+            found += [(topic.name, topic) for topic in self.further_inputs]
+        return found
+
+
+def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None = None) -> Plan:
+    """Read, check and resolve a launch file.
+
+    settings: "node.parameter=value" each, value in YAML, over what the file says.
+    record: a bag to record to, over what the file says.
+    Raises BadInputError with everything that is wrong.
+    """
+    document = read_document(path)
+    for setting in settings:
+        _apply_setting(document, setting)
+    if record is not None:
+        _apply_record(document, record)
+    spec = validate(LaunchFile, document)
+    problems: list[Problem] = []
+    _check_hosts(spec, document, problems)
+    scene_document, scene = _load_scene(spec, document, problems)
+    members = _members(spec, document, problems)
+    for member in members:
+        _resolve_member(member, document, problems)
+    writers = _writers(spec, members, document, problems, has_scene=scene is not None)
+    _resolve_further_inputs(members, writers, document, problems)
+    _check_inputs(members, writers, document, problems)
+    if problems:
+        raise BadInputError(problems)
+
+    addresses = {name: host.address for name, host in spec.hosts.items()}
+    endpoints = _endpoints(members, writers, addresses)
+    nodes = {
+        member.name: _planned(member, endpoints, document, resolve_paths=True) for member in members
+    }
+    scene_values = None if scene is None else scene.model_dump(mode="json")
+    portable = {
+        "hosts": addresses,
+        "scene": scene_values,
+        "nodes": [
+            _planned(member, endpoints, document, resolve_paths=False).model_dump(mode="json")
+            for member in sorted(members, key=lambda member: member.name)
+        ],
+    }
+    return Plan(
+        launch_file=str(path),
+        launch_text=document.text,
+        scene_file=None if scene_document is None else str(scene_document.path),
+        scene_text="" if scene_document is None else scene_document.text,
+        scene=scene_values,
+        hosts=addresses,
+        nodes=nodes,
+        writers=endpoints,
+        hash=hashlib.sha256(json.dumps(portable, sort_keys=True).encode()).hexdigest()[:16],
+    )
+
+
+def load_scene(path: Path) -> Scene:
+    """Read and check a scene file; raises BadInputError."""
+    return validate(Scene, read_document(path))
+
+
+def is_loopback(address: str) -> bool:
+    return ipaddress.ip_address(address).is_loopback
+
+
+def _apply_setting(document: Document, setting: str) -> None:
+    origin = f"--set {setting}"
+    target, equals, text = setting.partition("=")
+    node, dot, parameter = target.partition(".")
+    if not (equals and dot and node and parameter):
+        raise BadInputError([Problem(origin, (), "is not a setting", "write node.parameter=value")])
+    names = document.values.get("nodes")
+    known = list(names) if isinstance(names, dict) else []
+    inner = tuple(parameter.split("."))
+    if node in known:
+        if not isinstance(document.values["nodes"][node], dict):
+            raise BadInputError([document.problem(("nodes", node), "holds no keys")])
+        document.set(("nodes", node, "parameters", *inner), parse_value(text), origin)
+    elif node == "recorder" and "record" in document.values:
+        document.set(("record", *inner), parse_value(text), origin)
+    else:
+        raise BadInputError(
+            [Problem(origin, (), f'there is no node "{node}"', did_you_mean(node, known))]
+        )
+
+
+def _apply_record(document: Document, bag: Path) -> None:
+    origin = f"--record {bag}"
+    names = document.values.get("nodes")
+    for name, spec in names.items() if isinstance(names, dict) else ():
+        if isinstance(spec, dict) and spec.get("type") == "recorder":
+            document.set(("nodes", name, "parameters", "bag"), str(bag), origin)
+            return
+    document.set(("record", "bag"), str(bag), origin)
+
+
+def _check_hosts(spec: LaunchFile, document: Document, problems: list[Problem]) -> None:
+    if MAIN not in spec.hosts:
+        problems.append(
+            document.problem(
+                ("hosts",), f'no host is named "{MAIN}"', "the launcher and the tools need it"
+            )
+        )
+    seen: dict[str, str] = {}
+    for name, host in spec.hosts.items():
+        key: Key = ("hosts", name, "address")
+        try:
+            address = ipaddress.ip_address(host.address)
+        except ValueError:
+            problems.append(
+                document.problem(key, f'"{host.address}" is no IP address', 'as in "192.0.2.10"')
+            )
+            continue
+        if address.is_unspecified or address.is_multicast:
+            problems.append(
+                document.problem(
+                    key, f'"{host.address}" names no single host', "give the address of its own"
+                )
+            )
+        other = seen.setdefault(host.address, name)
+        if other != name:
+            problems.append(
+                document.problem(
+                    key, f'"{host.address}" is the address of host "{other}" too', "make them one"
+                )
+            )
+
+
+def _load_scene(
+    spec: LaunchFile, document: Document, problems: list[Problem]
+) -> tuple[Document | None, Scene | None]:
+    if spec.scene is None:
+        return None, None
+    path = document.path.parent / spec.scene
+    if not path.is_file():
+        problems.append(
+            document.problem(
+                ("scene",), f'"{spec.scene}" is no file', f"it is looked for at {path}"
+            )
+        )
+        return None, None
+    try:
+        scene_document = read_document(path)
+        return scene_document, validate(Scene, scene_document)
+    except BadInputError as error:
+        problems.extend(error.problems)
+        return None, None
+
+
+def _members(spec: LaunchFile, document: Document, problems: list[Problem]) -> list[_Member]:
+    members = []
+    for name, node_spec in spec.nodes.items():
+        members.append(_Member(name, node_spec, ("nodes", name)))
+        if name in (LAUNCHER, TOOLS):
+            problems.append(
+                document.problem(("nodes", name), f'"{name}" is taken', "give another name")
+            )
+        if node_spec.host not in spec.hosts:
+            problems.append(
+                document.problem(
+                    ("nodes", name, "host"),
+                    f'unknown host "{node_spec.host}"',
+                    did_you_mean(node_spec.host, list(spec.hosts)),
+                )
+            )
+    if not members:
+        problems.append(document.problem(("nodes",), "there is no node", "add one"))
+    if spec.record is not None:
+        if "recorder" in spec.nodes:
+            problems.append(
+                document.problem(
+                    ("record",),
+                    'there is a node "recorder" already',
+                    'keep either "record" or the node',
+                )
+            )
+        else:
+            recorder = NodeSpec(type="recorder", parameters=spec.record)
+            members.append(_Member("recorder", recorder, ("record",)))
+    return members
+
+
+def _resolve_member(member: _Member, document: Document, problems: list[Problem]) -> None:
+    """Find the member's class, connect its ports to topics, check its parameters."""
+    key = member.key
+    type_name = member.spec.type
+    try:
+        class_ = node_class(type_name)
+    except UnknownNodeError:
+        problems.append(
+            document.problem(
+                (*key, "type"),
+                f'unknown node type "{type_name}"',
+                did_you_mean(type_name, list(NODES)),
+            )
+        )
+        return
+    except (ImportError, AttributeError, SyntaxError) as error:
+        problems.append(
+            document.problem(
+                (*key, "type"), f'"{type_name}" cannot be imported: {error}', "see flexsheet doctor"
+            )
+        )
+        return
+    if not (isinstance(class_, type) and issubclass(class_, Node)):
+        problems.append(document.problem((*key, "type"), f'"{type_name}" is no node class'))
+        return
+    member.type = class_
+    _connect_ports(member, class_, document, problems)
+
+    parameters_key = key if key == ("record",) else (*key, "parameters")
+    try:
+        member.parameters = parameters_of(class_).model_validate(member.spec.parameters)
+    except ValidationError:
+        _put(document, parameters_key, member.spec.parameters)
+        try:
+            validate(parameters_of(class_), document, at=parameters_key)
+        except BadInputError as error:
+            problems.extend(error.problems)
+
+
+def _put(document: Document, key: Key, value: dict[str, Any]) -> None:
+    """Make sure that `key` is there to be checked (a node without parameters has no such key)."""
+    target: Any = document.values
+    for part in key[:-1]:
+        target = target[part]
+    target.setdefault(key[-1], value)
+
+
+def _connect_ports(
+    member: _Member, class_: type[Node], document: Document, problems: list[Problem]
+) -> None:
+    ports = ports_of(class_)
+    for name in member.spec.topics:
+        if name not in ports:
+            problems.append(
+                document.problem(
+                    (*member.key, "topics", name),
+                    f'"{member.spec.type}" has no port "{name}"',
+                    did_you_mean(name, list(ports)),
+                )
+            )
+    for port in ports.values():
+        topic_name = member.spec.topics.get(port.name, port.name.replace("__", "/"))
+        key = (*member.key, "topics", port.name)
+        topic = TOPICS.get(topic_name)
+        if topic is None and port.name in member.spec.topics:
+            problems.append(
+                document.problem(
+                    key, f'unknown topic "{topic_name}"', did_you_mean(topic_name, list(TOPICS))
+                )
+            )
+        elif topic is None:
+            fitting = [one.name for one in TOPICS.values() if one.message is port.message]
+            problems.append(
+                document.problem(
+                    key,
+                    f'port "{port.name}" is not connected',
+                    f'say in "topics" which it is: {" or ".join(fitting) or "no topic fits"}',
+                )
+            )
+        elif topic.message is not port.message:
+            problems.append(
+                document.problem(
+                    key,
+                    f'topic "{topic.name}" carries {topic.message.__name__}, '
+                    f'port "{port.name}" takes {port.message.__name__}',
+                    "connect a topic of that type",
+                )
+            )
+        else:
+            member.ports.append((port, topic))
+
+
+def _writers(
+    spec: LaunchFile,
+    members: list[_Member],
+    document: Document,
+    problems: list[Problem],
+    *,
+    has_scene: bool,
+) -> dict[str, list[tuple[str, str]]]:
+    """(writer, host) of every topic, in the order of the file."""
+    writers: dict[str, list[tuple[str, str]]] = {}
+    if has_scene:
+        writers["scene"] = [(LAUNCHER, MAIN)]
+    for member in members:
+        for port_name, topic in member.topics("output"):
+            others = [name for name, _ in writers.get(topic.name, [])]
+            if others and (not topic.many_writers or member.name in others):
+                problems.append(
+                    document.problem(
+                        (*member.key, "topics", port_name),
+                        f'topic "{topic.name}" is written by "{others[0]}" already',
+                        "a topic has one writer",
+                    )
+                )
+            else:
+                writers.setdefault(topic.name, []).append((member.name, member.spec.host))
+    for i, name in enumerate(spec.from_tools):
+        if name not in TOPICS:
+            problems.append(
+                document.problem(
+                    ("from_tools", i), f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
+                )
+            )
+        elif name in writers and not TOPICS[name].many_writers:
+            problems.append(
+                document.problem(
+                    ("from_tools", i),
+                    f'topic "{name}" is written by "{writers[name][0][0]}" already',
+                    "a topic has one writer",
+                )
+            )
+        elif not TOPICS[name].many_writers:
+            writers[name] = [(TOOLS, MAIN)]
+    for topic in TOPICS.values():
+        if topic.many_writers:
+            writers.setdefault(topic.name, []).append((TOOLS, MAIN))
+    return writers
+
+
+def _resolve_further_inputs(
+    members: list[_Member],
+    writers: dict[str, list[tuple[str, str]]],
+    document: Document,
+    problems: list[Problem],
+) -> None:
+    """Ask the members that subscribe by their parameters (the recorder) which topics they want."""
+    written = [topic for topic in TOPICS.values() if topic.name in writers]
+    for member in members:
+        if member.type is None or member.parameters is None:
+            continue
+        for name in member.type.further_inputs(member.parameters, written):
+            if name in TOPICS:
+                member.further_inputs.append(TOPICS[name])
+            else:
+                problems.append(
+                    document.problem(
+                        member.key, f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
+                    )
+                )
+
+
+def _check_inputs(
+    members: list[_Member],
+    writers: dict[str, list[tuple[str, str]]],
+    document: Document,
+    problems: list[Problem],
+) -> None:
+    for member in members:
+        for port_name, topic in member.topics("input"):
+            if topic.name not in writers:
+                remedy = (
+                    'name a scene file in "scene"'
+                    if topic.name == "scene"
+                    else 'add the node that does, or list it in "from_tools"'
+                )
+                problems.append(
+                    document.problem(
+                        (*member.key, "topics", port_name),
+                        f'nobody writes topic "{topic.name}"',
+                        remedy,
+                    )
+                )
+
+
+def _endpoints(
+    members: list[_Member], writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
+) -> dict[str, tuple[Writer, ...]]:
+    """The endpoints of every writer: ipc for its host, tcp when another host reads the topic.
+
+    The main host counts as a reader of everything, for the tools there.
+    """
+    reading_hosts: dict[str, set[str]] = {topic: {MAIN} for topic in writers}
+    for member in members:
+        for _, topic in member.topics("input"):
+            reading_hosts[topic.name].add(member.spec.host)
+    remote = sorted(
+        (host, writer, topic)
+        for topic, entries in writers.items()
+        for writer, host in entries
+        if reading_hosts[topic] - {host}
+    )
+    ports = _ports(remote)
+    return {
+        topic: tuple(
+            Writer(
+                name=writer,
+                host=host,
+                ipc=f"ipc://{RUN_DIRECTORY}/{writer}.{topic.replace('/', '.')}",
+                tcp=_tcp(addresses[host], ports.get((host, writer, topic))),
+            )
+            for writer, host in entries
+        )
+        for topic, entries in writers.items()
+    }
+
+
+def _tcp(address: str, port: int | None) -> str | None:
+    if port is None:
+        return None
+    return f"tcp://[{address}]:{port}" if ":" in address else f"tcp://{address}:{port}"
+
+
+def _ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
+    """A TCP port for each (host, writer, topic), from the hash of its name.
+
+    Two that fall on one port are told apart in the order of their names, so that adding a topic
+    moves no other's port unless they meet.  Ports are unique over all hosts: hosts may share a
+    machine.
+    """
+    taken: dict[int, tuple[str, str, str]] = {}
+    for link in links:
+        digest = hashlib.sha256("/".join(link).encode()).digest()
+        offset = int.from_bytes(digest[:4], "big") % PORTS
+        while FIRST_PORT + offset in taken:
+            offset = (offset + 1) % PORTS
+        taken[FIRST_PORT + offset] = link
+    return {link: port for port, link in taken.items()}
+
+
+def _planned(
+    member: _Member,
+    endpoints: dict[str, tuple[Writer, ...]],
+    document: Document,
+    *,
+    resolve_paths: bool,
+) -> PlannedNode:
+    host = member.spec.host
+    return PlannedNode(
+        name=member.name,
+        type=member.spec.type,
+        host=host,
+        parameters=_parameters(member, document, resolve_paths=resolve_paths),
+        inputs=tuple(
+            PlannedPort(
+                port=port,
+                topic=topic.name,
+                endpoints=tuple(one.endpoint_for(host) for one in endpoints[topic.name]),
+            )
+            for port, topic in member.topics("input")
+        ),
+        outputs=tuple(
+            PlannedPort(
+                port=port,
+                topic=topic.name,
+                endpoints=next(
+                    one.endpoints for one in endpoints[topic.name] if one.name == member.name
+                ),
+            )
+            for port, topic in member.topics("output")
+        ),
+        restart=member.spec.restart,
+        start_deadline_s=member.spec.start_deadline_s,
+    )
+
+
+def _parameters(member: _Member, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
+    """The parameters in full, defaults too; paths that the file gives are relative to the file."""
+    assert member.parameters is not None  # a member without parameters is a problem
+    values = member.parameters.model_dump(mode="json")
+    if not resolve_paths:
+        return values
+    section = member.key if member.key == ("record",) else (*member.key, "parameters")
+    for name in member.parameters.model_fields_set:
+        value = getattr(member.parameters, name)
+        base = Path.cwd() if (*section, name) in document.overrides else document.path.parent
+        if isinstance(value, Path):
+            values[name] = _absolute(value, base)
+        elif isinstance(value, tuple | list) and any(isinstance(one, Path) for one in value):
+            values[name] = [_absolute(Path(one), base) for one in value]
+    return values
+
+
+def _absolute(path: Path, base: Path) -> str:
+    if path.parts and path.parts[0] == RUN_DIRECTORY:
+        return str(path)
+    return str((base / path.expanduser()).resolve())

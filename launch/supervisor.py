@@ -1,0 +1,528 @@
+"""Starts a plan's nodes, keeps them running, and leaves nothing behind.
+
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready()
+        ...
+
+Every node is a process in a session of its own.  It says through a pipe that it is set up; when it
+ends by itself its restart policy decides.  At the end each gets SIGINT, then SIGTERM, then SIGKILL.
+No thread is used: exits come as readable pidfds, logs and readiness through pipes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import random
+import signal
+import socket
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from launch.child import LIFELINE_VARIABLE, PARENT_VARIABLE
+from launch.documents import BadInputError, Problem
+from launch.plan import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort, is_loopback
+from launch.runs import RUN_VARIABLE, Run, create_run, sweep
+from messages.base import Header
+from messages.bus import Publisher
+from messages.clock import SystemClock
+from messages.topics import topic_named
+from nodes.runner import NodeConfig, PortConfig
+
+ENTRY = Path(__file__).resolve().parent.parent / "flexsheet.py"
+STOP_GRACE_S = 3.0
+LOG_READ_BYTES = 65_536
+
+Report = Callable[[str, str], None]
+"""Gets each line of a node's log, and the launcher's own words as those of "launch"."""
+
+
+class NodeFailedError(RuntimeError):
+    """A node failed for good: it ended, or was not ready in time, more often than it may."""
+
+
+class Child:
+    """One start of a node's process."""
+
+    def __init__(
+        self,
+        config: NodeConfig,
+        run: Run,
+        environment: dict[str, str],
+        lifeline: int,
+        report: Report,
+    ) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._node, self._report = config.name, report
+        config_file = run.directory / f"{config.name}.json"
+        self.ready: asyncio.Future[None] = self._loop.create_future()
+        self.exited: asyncio.Future[int] = self._loop.create_future()
+        self._partial = b""
+        self._log = (run.logs / f"{config.name}.log").open("ab", buffering=0)
+        self._output, output_write = os.pipe()
+        self._ready_fd, ready_write = os.pipe()
+        try:
+            with_pipe = config.model_copy(update={"ready_fd": ready_write})
+            config_file.write_text(with_pipe.model_dump_json())
+            self._process = subprocess.Popen(
+                [sys.executable, str(ENTRY), "--node", str(config_file)],
+                stdin=subprocess.DEVNULL,
+                stdout=output_write,
+                stderr=output_write,
+                start_new_session=True,
+                pass_fds=(ready_write, lifeline),
+                env=environment,
+            )
+        except BaseException:
+            os.close(self._output)
+            os.close(self._ready_fd)
+            self._log.close()
+            raise
+        finally:
+            os.close(output_write)
+            os.close(ready_write)
+        self._pidfd = os.pidfd_open(self._process.pid)
+        os.set_blocking(self._output, False)
+        os.set_blocking(self._ready_fd, False)
+        self._loop.add_reader(self._output, self._read_output)
+        self._loop.add_reader(self._ready_fd, self._read_ready)
+        self._loop.add_reader(self._pidfd, self._reap)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def signal(self, number: int) -> None:
+        """Signal the node and all that it started; nothing if it has ended."""
+        if not self.exited.done():
+            # Not reaped yet, so the number still is its own.
+            os.killpg(self.pid, number)
+
+    def kill_now(self) -> None:
+        """Kill and reap without waiting for the loop: for when the loop is being torn down."""
+        self.signal(signal.SIGKILL)
+        if not self.exited.done():
+            self._process.wait()
+            self._reap()
+
+    def _read_ready(self) -> None:
+        if os.read(self._ready_fd, 64) and not self.ready.done():
+            self.ready.set_result(None)
+        self._loop.remove_reader(self._ready_fd)
+
+    def _read_output(self) -> bool:
+        """Copy a piece of output to the log and report its lines; False when none is left."""
+        try:
+            piece = os.read(self._output, LOG_READ_BYTES)
+        except BlockingIOError:
+            return False
+        if not piece:
+            self._loop.remove_reader(self._output)
+            return False
+        self._log.write(piece)
+        *lines, self._partial = (self._partial + piece).split(b"\n")
+        for line in lines:
+            self._report(self._node, line.decode(errors="replace"))
+        return True
+
+    def _reap(self) -> None:
+        """The process has ended: end what it started, read the rest of its words, let go."""
+        if self.exited.done():
+            return
+        if self._process.returncode is None:
+            # A zombie keeps its group's number from being taken by others.
+            os.killpg(self.pid, signal.SIGKILL)
+            self._process.wait()
+        for fd in (self._pidfd, self._output, self._ready_fd):
+            self._loop.remove_reader(fd)
+        while self._read_output():
+            pass
+        if self._partial:
+            self._report(self._node, self._partial.decode(errors="replace"))
+        for fd in (self._pidfd, self._output, self._ready_fd):
+            os.close(fd)
+        self._log.close()
+        self.exited.set_result(self._process.returncode)
+
+
+class RunningGraph:
+    """A plan's nodes as processes.
+
+    host: start only that host's nodes; None: all, which needs all hosts to be this machine.
+    report: called with (node, line) for every line of log; all is in `run.logs` anyway.
+    """
+
+    def __init__(
+        self, plan: Plan, *, host: str | None = None, report: Report | None = None
+    ) -> None:
+        self.plan, self._host, self._report_to = plan, host, report
+        self.nodes = plan.nodes_on(host)
+        self.exit_codes: dict[str, int] = {}
+        self.restarts: dict[str, int] = {node.name: 0 for node in self.nodes}
+        self.failure: NodeFailedError | None = None
+        self._run: Run | None = None
+        self._children: dict[str, Child] = {}
+        self._keepers: dict[str, asyncio.Task[None]] = {}
+        self._ready = {node.name: asyncio.Event() for node in self.nodes}
+        self._publishers: list[Publisher] = []
+        self._lifeline: tuple[int, int] | None = None
+        self._stopping = False
+
+    @property
+    def run(self) -> Run:
+        """The run's directory, logs and identity; there once the graph was started."""
+        if self._run is None:
+            raise RuntimeError("the graph has not been started")
+        return self._run
+
+    @property
+    def pids(self) -> dict[str, int]:
+        """Process ids of the nodes that run now."""
+        return {
+            name: child.pid for name, child in self._children.items() if not child.exited.done()
+        }
+
+    def is_ready(self, node: str) -> bool:
+        """Whether the node's present process has said that it is set up."""
+        return self._ready[node].is_set()
+
+    async def __aenter__(self) -> Self:
+        try:
+            self._start()
+        except BaseException:
+            await self.stop()
+            raise
+        return self
+
+    async def __aexit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        await self.stop()
+
+    async def wait_ready(self, timeout_s: float | None = None) -> None:
+        """Until every node is set up; raises NodeFailedError when one cannot be, TimeoutError."""
+        waiting = [asyncio.ensure_future(event.wait()) for event in self._ready.values()]
+        everyone = asyncio.ensure_future(asyncio.gather(*waiting))
+        end = asyncio.ensure_future(self.wait())
+        try:
+            await asyncio.wait(
+                (everyone, end), timeout=timeout_s, return_when=asyncio.FIRST_COMPLETED
+            )
+            if everyone.done():
+                return
+            if end.done():
+                # Nodes that finished their work before all were ready count as ready.
+                end.result()
+                return
+        finally:
+            end.cancel()
+            everyone.cancel()
+            await asyncio.gather(end, everyone, *waiting, return_exceptions=True)
+        late = [name for name, event in self._ready.items() if not event.is_set()]
+        raise TimeoutError(f"not ready within {timeout_s} s: {', '.join(late)}")
+
+    async def wait_ready_again(self, node: str, restarts: int) -> None:
+        """Until the node was restarted `restarts` times in all and is ready."""
+        while self.restarts[node] < restarts or not self._ready[node].is_set():
+            if self._keepers[node].done():
+                self._keepers[node].result()
+                raise NodeFailedError(f"{node} has ended")
+            await asyncio.sleep(0.02)
+
+    async def wait(self) -> None:
+        """Until every node has ended by itself; raises NodeFailedError when one failed for good."""
+        pending: set[asyncio.Task[None]] = set(self._keepers.values())
+        while pending:
+            done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
+            for keeper in done:
+                if not keeper.cancelled():
+                    keeper.result()
+
+    def kill(self, node: str, number: int = signal.SIGKILL) -> None:
+        """Send a signal to a node's process, as trouble would."""
+        os.kill(self.pids[node], number)
+
+    async def stop(self) -> None:
+        """End all nodes (SIGINT, SIGTERM, SIGKILL) and remove sockets; may be called twice."""
+        self._stopping = True
+        for keeper in self._keepers.values():
+            keeper.cancel()
+        try:
+            await asyncio.gather(*self._keepers.values(), return_exceptions=True)
+            await self._end_children()
+        finally:
+            for child in self._children.values():
+                child.kill_now()
+            for name, child in self._children.items():
+                self.exit_codes[name] = child.exited.result()
+            for publisher in self._publishers:
+                publisher.close()
+            self._publishers.clear()
+            if self._lifeline is not None:
+                for fd in self._lifeline:
+                    os.close(fd)
+                self._lifeline = None
+            if self._run is not None:
+                self._run.end()
+
+    async def _end_children(self) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            alive = [child for child in self._children.values() if not child.exited.done()]
+            if not alive:
+                return
+            for child in alive:
+                child.signal(number)
+            await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
+
+    def _start(self) -> None:
+        _refuse_open_network(self.plan, self._host)
+        swept = sweep()
+        self._run = create_run()
+        if swept:
+            self._report(LAUNCHER, f"ended {len(swept)} processes of launchers that are gone")
+        _check_ports(self.plan, self._host)
+        self._write_run_files()
+        self._lifeline = os.pipe()
+        if self._host in (None, MAIN):
+            self._publish_scene()
+        self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
+        for node in self.nodes:
+            self._keepers[node.name] = asyncio.create_task(self._keep(node), name=node.name)
+
+    def _publish_scene(self) -> None:
+        scene = self.plan.scene_message()
+        writer = self.plan.writer("scene", LAUNCHER)
+        if scene is None or writer is None:
+            return
+        publisher = Publisher(topic_named("scene"), local_endpoints(self.run, writer.endpoints))
+        self._publishers.append(publisher)
+        clock = SystemClock()
+        now_ns = clock.now_ns()
+        publisher.send(
+            scene,
+            Header(
+                sequence=1,
+                source_ns=now_ns,
+                publish_ns=now_ns,
+                clock_id=clock.id,
+                writer=LAUNCHER,
+                epoch=random.SystemRandom().getrandbits(32),
+            ),
+        )
+
+    async def _keep(self, node: PlannedNode) -> None:
+        """Run the node again and again, as its policy says; NodeFailedError when for good."""
+        policy = node.restart
+        recent: deque[float] = deque()
+        loop = asyncio.get_running_loop()
+        while True:
+            problem = await self._run_once(node)
+            if policy.policy == "never" or (policy.policy == "on_failure" and problem is None):
+                if problem is not None:
+                    raise self._fail(f"{node.name} {problem}")
+                self._ready[node.name].set()
+                self._report(LAUNCHER, f"{node.name} finished")
+                return
+            while recent and recent[0] < loop.time() - policy.window_s:
+                recent.popleft()
+            if len(recent) >= policy.max_restarts:
+                raise self._fail(
+                    f"{node.name} {problem or 'ended'}, after {len(recent)} restarts "
+                    f"in {policy.window_s:g} s"
+                )
+            delay_s = min(policy.delay_s * 2 ** len(recent), policy.max_delay_s)
+            recent.append(loop.time())
+            self._report(
+                LAUNCHER, f"{node.name} {problem or 'ended'}; starts again in {delay_s:g} s"
+            )
+            await asyncio.sleep(delay_s)
+            self.restarts[node.name] += 1
+
+    async def _run_once(self, node: PlannedNode) -> str | None:
+        """One life of a node; returns what was wrong with its end, None if nothing was."""
+        child = self._spawn(node)
+        await asyncio.wait(
+            (child.ready, child.exited),
+            timeout=node.start_deadline_s,
+            return_when=asyncio.FIRST_COMPLETED,
+        )
+        late = not child.ready.done() and not child.exited.done()
+        if late:
+            child.signal(signal.SIGKILL)
+        elif child.ready.done():
+            self._ready[node.name].set()
+            self._report(LAUNCHER, f"{node.name} is ready, pid {child.pid}")
+        # The future must outlive this task's cancellation: `stop` waits for it too.
+        code = await asyncio.shield(child.exited)
+        self._ready[node.name].clear()
+        self.exit_codes[node.name] = code
+        if late:
+            return f"was not ready within {node.start_deadline_s:g} s"
+        return describe_exit(code)
+
+    def _spawn(self, node: PlannedNode) -> Child:
+        assert self._lifeline is not None  # made before any keeper
+        environment = {
+            **os.environ,
+            RUN_VARIABLE: self.run.id,
+            PARENT_VARIABLE: str(os.getpid()),
+            LIFELINE_VARIABLE: str(self._lifeline[0]),
+            "PYTHONUNBUFFERED": "1",
+            "PYTHONFAULTHANDLER": "1",
+        }
+        # A process per node already uses the cores; threads of BLAS would spin against them.
+        for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+            environment.setdefault(variable, "1")
+        config = node_config(self.plan, node, self.run)
+        child = Child(config, self.run, environment, self._lifeline[0], self._report)
+        self._children[node.name] = child
+        return child
+
+    def _write_run_files(self) -> None:
+        """What a recorder attaches and what tools find the graph by."""
+        directory = self.run.directory
+        (directory / "launch.yaml").write_text(self.plan.launch_text)
+        (directory / "scene.yaml").write_text(self.plan.scene_text)
+        (directory / "git.json").write_text(git_state(ENTRY.parent))
+        # Last and at once: tools that look for a graph read this file.
+        text = self.plan.model_dump_json(indent=1)
+        temporary = self.run.plan_file.with_suffix(".part")
+        temporary.write_text(text)
+        temporary.rename(self.run.plan_file)
+
+    def _fail(self, text: str) -> NodeFailedError:
+        self.failure = NodeFailedError(f"{text}; its log is {self.run.logs}")
+        self._report(LAUNCHER, text)
+        return self.failure
+
+    def _report(self, node: str, line: str) -> None:
+        if node == LAUNCHER and self._run is not None:
+            with (self._run.logs / f"{LAUNCHER}.log").open("a") as log:
+                log.write(line + "\n")
+        if self._report_to is not None:
+            self._report_to(node, line)
+
+
+def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
+    """What a node's process is told, with the run's directory filled in."""
+
+    def ports(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
+        return tuple(
+            PortConfig(
+                port=port.port, topic=port.topic, endpoints=local_endpoints(run, port.endpoints)
+            )
+            for port in planned
+        )
+
+    return NodeConfig(
+        name=node.name,
+        type=node.type,
+        parameters=_fill_run(node.parameters, run),
+        inputs=ports(node.inputs),
+        outputs=ports(node.outputs),
+        plan_hash=plan.hash,
+        run_dir=str(run.directory),
+    )
+
+
+def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    """Endpoints of a plan with the run's directory filled in."""
+    return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
+
+
+def describe_exit(code: int) -> str | None:
+    """An exit code in words; None for a good one."""
+    if code == 0:
+        return None
+    if code < 0:
+        return f"was ended by {signal.Signals(-code).name}"
+    return f"ended with exit code {code}"
+
+
+def git_state(directory: Path) -> str:
+    """Commit of the code and whether it was changed since, as JSON; nulls outside of git."""
+
+    def git(*arguments: str) -> str | None:
+        try:
+            result = subprocess.run(
+                ["git", "-C", str(directory), *arguments],
+                capture_output=True,
+                text=True,
+                timeout=5,
+                check=True,
+            )
+        except (OSError, subprocess.SubprocessError):
+            return None
+        return result.stdout.strip()
+
+    changes = git("status", "--porcelain")
+    state = {
+        "commit": git("rev-parse", "HEAD"),
+        "changed": None if changes is None else bool(changes),
+    }
+    return json.dumps(state)
+
+
+def _fill_run(value: Any, run: Run) -> Any:
+    if isinstance(value, str) and value.startswith(f"{RUN_DIRECTORY}/"):
+        return str(run.directory / value.removeprefix(f"{RUN_DIRECTORY}/"))
+    if isinstance(value, dict):
+        return {key: _fill_run(item, run) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_fill_run(item, run) for item in value]
+    return value
+
+
+def _refuse_open_network(plan: Plan, host: str | None) -> None:
+    if host is not None and host not in plan.hosts:
+        raise BadInputError(
+            [Problem("--host", (), f'unknown host "{host}"', f"there are: {', '.join(plan.hosts)}")]
+        )
+    for name, address in plan.hosts.items():
+        if not is_loopback(address):
+            raise BadInputError(
+                [
+                    Problem(
+                        plan.launch_file,
+                        ("hosts", name, "address"),
+                        f"{address} is beyond loopback and there are no keys",
+                        "nothing listens there without keys; --dry-run shows the plan",
+                    )
+                ]
+            )
+
+
+def _check_ports(plan: Plan, host: str | None) -> None:
+    """Every TCP port that this launcher's processes will bind must be free."""
+    problems = []
+    for topic, writers in plan.writers.items():
+        for writer in writers:
+            if writer.tcp is None or host not in (None, writer.host):
+                continue
+            address, _, port = writer.tcp.removeprefix("tcp://").rpartition(":")
+            family = socket.AF_INET6 if address.startswith("[") else socket.AF_INET
+            with socket.socket(family, socket.SOCK_STREAM) as probe:
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind((address.strip("[]"), int(port)))
+                except OSError as error:
+                    problems.append(
+                        Problem(
+                            plan.launch_file,
+                            ("hosts", writer.host),
+                            f'{writer.tcp} for topic "{topic}" of "{writer.name}" '
+                            f"cannot be bound: {error.strerror}",
+                            "is the graph running already?",
+                        )
+                    )
+    if problems:
+        raise BadInputError(problems)

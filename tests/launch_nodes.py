@@ -1,0 +1,69 @@
+"""Tiny nodes for the tests of launcher and command line; named "tests.launch_nodes:Class"."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from pathlib import Path
+
+from messages.base import Header
+from messages.types import EStop, TwinFinger
+from nodes.node import Input, Node, NodeParameters, Output, periodic
+
+
+class BeaconParameters(NodeParameters):
+    rate_hz: float = 50.0
+    crash_after: int = 0
+    crash_mark: Path | None = None
+    ready_after_s: float = 0.0
+    deaf: bool = False
+    exit_code: int | None = None
+
+
+class Beacon(Node):
+    """Publishes a finger that counts; told how to misbehave by its parameters."""
+
+    parameters: BeaconParameters
+    twin__finger: Output[TwinFinger]
+
+    async def setup(self) -> None:
+        self.count = 0
+        if self.parameters.deaf:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                asyncio.get_running_loop().remove_signal_handler(number)
+                signal.signal(number, signal.SIG_IGN)
+        if self.parameters.ready_after_s:
+            await asyncio.sleep(self.parameters.ready_after_s)
+
+    @periodic("rate_hz")
+    def beat(self) -> None:
+        self.count += 1
+        if self.parameters.crash_after and self.count >= self.parameters.crash_after:
+            os._exit(3)
+        if self.parameters.exit_code is not None:
+            os._exit(self.parameters.exit_code)
+        self.twin__finger.publish(
+            TwinFinger(
+                path_label="count",
+                path_done=False,
+                path_time_s=float(self.count),
+                position_world_m=[0.001 * self.count, 0.0, 0.0],
+                velocity_world_m_per_s=[0.0, 0.0, 0.0],
+            )
+        )
+        while self.parameters.deaf and self.count > 2:
+            time.sleep(1.0)
+
+
+class Listener(Node):
+    """Stops the graph's world when the finger has come far enough."""
+
+    parameters: NodeParameters
+    twin__finger: Input[TwinFinger]
+    estop: Output[EStop]
+
+    def on_twin__finger(self, finger: TwinFinger, header: Header) -> None:
+        if finger.path_time_s == 10.0:
+            self.estop.publish(EStop(engaged=True, reason="ten"), source_ns=header.source_ns)
