@@ -7,7 +7,9 @@ fits: what a subscriber sees is the memory that came from the socket.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Annotated, Any
 
 import numpy as np
@@ -39,30 +41,29 @@ class ArraySpec:
         Arrays must have the exact dtype (a silent float64 -> float32 would lose digits); nested
         lists, as they come from a scene file, are converted.
         """
-        wanted = np.dtype(self.dtype)
+        wanted = _dtype(self.dtype)
         if isinstance(value, np.ndarray):
             array = value
-            if array.dtype != wanted:
+            if array.dtype is not wanted and array.dtype != wanted:
                 raise ValueError(f"array of {array.dtype}, wanted {wanted}")
         elif isinstance(value, (list, tuple)):
-            try:
-                array = np.asarray(value, dtype=wanted)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise ValueError(f"not an array of {wanted}: {error}") from error
+            array = _from_lists(value, wanted)
         else:
             raise ValueError(f"{type(value).__name__} is not an array of {wanted}")
-        self._check_shape(array.shape)
-        if self.finite and wanted.kind == "f" and not np.isfinite(array).all():
+        if array.shape != self.shape:
+            self._check_shape(array.shape)
+        if not array.flags.c_contiguous:
+            array = np.ascontiguousarray(array)
+        if self.finite and wanted.kind == "f" and not _all_finite(array):
             raise ValueError("array has NaN or infinite elements")
-        return array if array.flags.c_contiguous else np.ascontiguousarray(array)
+        return array
 
     def _check_shape(self, shape: tuple[int, ...]) -> None:
         if len(shape) == len(self.shape):
             lengths: dict[str, int] = {}
             for wanted, length in zip(self.shape, shape, strict=True):
-                if isinstance(wanted, str):
-                    wanted = lengths.setdefault(wanted, length)
-                if wanted != length:
+                expected = lengths.setdefault(wanted, length) if isinstance(wanted, str) else wanted
+                if expected != length:
                     break
             else:
                 return
@@ -92,6 +93,35 @@ class ArraySpec:
             "dtype": self.dtype,
             "shape": list(self.shape),
         }
+
+
+@cache
+def _dtype(name: str) -> np.dtype[Any]:
+    return np.dtype(name)
+
+
+def _from_lists(value: list[Any] | tuple[Any, ...], wanted: np.dtype[Any]) -> NDArray[Any]:
+    try:
+        array = np.asarray(value, dtype=wanted)
+        if wanted.kind in "iu" and not np.array_equal(np.asarray(value), array):
+            raise ValueError("an element is not a whole number")
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"not an array of {wanted}: {error}") from error
+    return array
+
+
+def _all_finite(array: NDArray[Any]) -> bool:
+    """Whether no element is NaN or infinite.
+
+    A scalar product is NaN or infinite if an element is, and four times as fast to get for a few
+    elements; it may overflow for finite ones, hence the second look.
+    """
+    if array.size <= _FEW and math.isfinite(np.vdot(array, array)):
+        return True
+    return bool(np.isfinite(array).all())
+
+
+_FEW = 64
 
 
 Vector2 = Annotated[NDArray[np.float64], ArraySpec("<f8", (2,))]

@@ -1,0 +1,281 @@
+"""How a message looks on a socket and in a bag: a header frame, then large arrays as raw frames.
+
+The header frame is one msgpack array of ten elements:
+
+    protocol     "flexsheet/1"
+    type         name of the message's class
+    fingerprint  8 bytes of its JSON Schema's hash, see `messages.base.schema_fingerprint`
+    sequence, source_ns, publish_ns, clock_id, writer, epoch      see `messages.base.Header`
+    fields       a map; parts are maps, tuples are arrays, numpy arrays are extension types:
+                 type 1  dtype and shape, then the elements (an array of at most 1 KiB)
+                 type 2  dtype and shape only; the elements are the next frame
+
+dtype and shape are: one byte that counts into `DTYPES`, one byte for the number of axes, two zero
+bytes, a little-endian uint32 per axis, and zeros up to a multiple of eight, so that elements stay
+aligned.  Elements are little-endian and in C order.
+
+Large arrays are neither copied by `encode` nor by `decode`: a sender must leave an array alone once
+it is in a message, and a receiver gets read-only views on the memory that came from the socket.
+Small ones are cheaper to copy than to send apart (`benchmarks/messaging.py` measures both).
+Equal messages with equal headers have equal bytes.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from functools import cache, lru_cache
+from math import prod
+from typing import Any, TypeAlias
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ValidationError
+
+from messages.base import Header, Message, schema_fingerprint
+from messages.topics import Topic
+
+Buffer: TypeAlias = bytes | memoryview
+
+PROTOCOL = "flexsheet/1"
+DTYPES = tuple(
+    np.dtype(name)
+    for name in ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
+)
+INLINE_BYTES = 1024
+NAME_LENGTH = 200
+
+_DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
+_INLINE, _FRAME = 1, 2
+_MAX_INTEGER = 2**63 - 1
+
+
+class WireError(ValueError):
+    """Bytes that are not the message that was expected, or a message that has no bytes.
+
+    `cause` is a word for counting: "malformed", "type", "fingerprint", "frames", "size" or "field".
+    """
+
+    def __init__(self, cause: str, text: str) -> None:
+        super().__init__(text)
+        self.cause = cause
+
+
+class Codec:
+    """What encoding and decoding need to know of one message type."""
+
+    __slots__ = ("fingerprint", "name", "prefix", "type", "validator")
+
+    def __init__(self, message_type: type[Message]) -> None:
+        self.type = message_type
+        self.name = message_type.__name__
+        self.fingerprint = schema_fingerprint(message_type)
+        self.prefix = (PROTOCOL, self.name, self.fingerprint)
+        self.validator = message_type.__pydantic_validator__
+
+
+codec_of = cache(Codec)
+
+
+def encode(
+    message: Message,
+    header: Header,
+    *,
+    max_bytes: int | None = None,
+    inline_bytes: int = INLINE_BYTES,
+) -> list[Buffer]:
+    """The frames of a message; raises WireError where it is larger than `max_bytes`.
+
+    `inline_bytes`: arrays up to this size travel in the header frame.  Every reader understands
+    every value; bags and sockets use the one default.
+    """
+    frames: list[Buffer] = [b""]
+
+    def pack(value: object) -> object:
+        if isinstance(value, np.ndarray):
+            array = value if value.flags.c_contiguous else np.ascontiguousarray(value)
+            what = _dtype_and_shape(array.dtype.str, array.shape)
+            if array.nbytes <= inline_bytes or not array.nbytes:
+                return msgpack.ExtType(_INLINE, what + array.tobytes())
+            frames.append(array.data.cast("B"))
+            return msgpack.ExtType(_FRAME, what)
+        if isinstance(value, BaseModel):
+            return value.__dict__
+        raise TypeError(f"{type(value).__name__} has no form on the wire")
+
+    try:
+        frames[0] = msgpack.packb(
+            (
+                *codec_of(type(message)).prefix,
+                header.sequence,
+                header.source_ns,
+                header.publish_ns,
+                header.clock_id,
+                header.writer,
+                header.epoch,
+                message.__dict__,
+            ),
+            default=pack,
+        )
+    except (TypeError, ValueError, OverflowError) as error:
+        raise WireError("field", f"{type(message).__name__} cannot be encoded: {error}") from error
+    if max_bytes is not None:
+        _check_size(frames, max_bytes, type(message).__name__)
+    return frames
+
+
+class Envelope:
+    """A message whose header frame is read and checked, its fields not yet validated."""
+
+    __slots__ = ("codec", "fields", "header")
+
+    def __init__(self, codec: Codec, header: Header, fields: dict[str, object]) -> None:
+        self.codec, self.header, self.fields = codec, header, fields
+
+    def open(self) -> Message:
+        """The validated message; raises WireError with the fields that are wrong."""
+        try:
+            return self.codec.validator.validate_python(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped
+        except ValidationError as error:
+            raise WireError("field", _describe(error, self.codec.name)) from error
+
+
+def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Envelope:
+    """Check everything but the values of the fields; raises WireError.
+
+    frames: buffers (bytes, memoryview, zmq.Frame), header first.
+    expected: the topic, whose size limit then holds, or the type alone.
+    """
+    if isinstance(expected, Topic):
+        codec = codec_of(expected.message)
+        _check_size(frames, expected.max_bytes, f'topic "{expected.name}"')
+    else:
+        codec = codec_of(expected)
+    unpacked = _unpack(frames)
+    if type(unpacked) is not tuple or len(unpacked) != 10:
+        raise WireError("malformed", "not a message of flexsheet: no header of ten elements")
+    protocol, name, fingerprint, sequence, source, publish, clock_id, writer, epoch, fields = (
+        unpacked
+    )
+    if protocol != PROTOCOL:
+        raise WireError(
+            "malformed", f"speaks {_shown(protocol)}, wanted {PROTOCOL}: not a flexsheet node?"
+        )
+    if name != codec.name:
+        raise WireError("type", f"carries {_shown(name)}, wanted {codec.name}")
+    if fingerprint != codec.fingerprint:
+        raise WireError(
+            "fingerprint",
+            f"{codec.name} of another version: fingerprint {_shown(fingerprint)}, "
+            f"here {codec.fingerprint.hex()}; both ends must run the same code",
+        )
+    for number in (sequence, source, publish, epoch):
+        if type(number) is not int or not 0 <= number <= _MAX_INTEGER:
+            raise WireError("malformed", f"a stamp or number in the header is {_shown(number)}")
+    for text in (clock_id, writer):
+        if type(text) is not str or len(text) > NAME_LENGTH:
+            raise WireError("malformed", f"a name in the header is {_shown(text)}")
+    if type(fields) is not dict:
+        raise WireError("malformed", f"the fields of {codec.name} are {_shown(fields)}")
+    return Envelope(codec, Header(sequence, source, publish, clock_id, writer, epoch), fields)
+
+
+def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Message, Header]:
+    """The validated message and its header; whatever is wrong raises WireError and nothing else."""
+    envelope = read_envelope(frames, expected)
+    return envelope.open(), envelope.header
+
+
+def size_of(frames: Sequence[Any]) -> int:
+    """Bytes of all frames together."""
+    return sum(len(frame) for frame in frames)
+
+
+def _unpack(frames: Sequence[Any]) -> Any:
+    """The header frame's value, with its arrays; each further frame must be used exactly once."""
+    used = 0
+
+    def unpack(code: int, data: bytes) -> NDArray[Any]:
+        nonlocal used
+        if code not in (_INLINE, _FRAME):
+            raise WireError("malformed", f"unknown extension type {code} in the header")
+        dtype, shape, offset, size = _read_dtype_and_shape(data[: _head_size(data)])
+        buffer: Any = data
+        if code == _FRAME:
+            used += 1
+            if len(data) != offset or used >= len(frames):
+                raise WireError("frames", f"an array's frame is missing: got {len(frames)} frames")
+            buffer, offset = _read_only(frames[used]), 0
+        if len(buffer) - offset != size:
+            raise WireError(
+                "frames",
+                f"an array of {dtype} and shape {shape} needs {size} bytes, "
+                f"its frame has {len(buffer) - offset}",
+            )
+        return np.ndarray(shape, dtype, buffer=buffer, offset=offset)
+
+    if not frames:
+        raise WireError("frames", "a message without frames")
+    try:
+        # A zmq.Frame is no buffer to msgpack; its bytes are.
+        first = frames[0] if isinstance(frames[0], bytes | memoryview) else frames[0].buffer
+        unpacked = msgpack.unpackb(first, ext_hook=unpack, use_list=False)
+    except WireError:
+        raise
+    # Foreign bytes make msgpack raise ValueError, TypeError, struct.error and more.
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"[:200]
+        raise WireError("malformed", f"not a message of flexsheet: {reason}") from error
+    if used != len(frames) - 1:
+        raise WireError("frames", f"got {len(frames)} frames, the header speaks of {used + 1}")
+    return unpacked
+
+
+def _read_only(frame: Any) -> memoryview:
+    view = memoryview(frame.buffer if hasattr(frame, "buffer") else frame)
+    return view if view.readonly else view.toreadonly()
+
+
+@lru_cache(maxsize=1024)
+def _dtype_and_shape(dtype: str, shape: tuple[int, ...]) -> bytes:
+    if dtype not in _DTYPE_CODES:
+        raise TypeError(f"arrays of {dtype} have no form on the wire")
+    head = struct.pack(f"<BBxx{len(shape)}I", _DTYPE_CODES[dtype], len(shape), *shape)
+    return head + bytes(-len(head) % 8)
+
+
+def _head_size(data: bytes) -> int:
+    """Length of the dtype and shape at the start of an extension's data."""
+    if len(data) < 8:
+        raise WireError("malformed", "an array without dtype and shape")
+    return (4 + 4 * data[1] + 7) & ~7
+
+
+@lru_cache(maxsize=1024)
+def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], int, int]:
+    """dtype, shape, length of `head`, and bytes of the elements."""
+    code, axes = head[0], head[1]
+    if code >= len(DTYPES) or axes > 8 or len(head) != _head_size(head):
+        raise WireError("malformed", f"no dtype and shape: {head[:16].hex()}")
+    shape = struct.unpack_from(f"<{axes}I", head, 4)
+    return DTYPES[code], shape, len(head), DTYPES[code].itemsize * prod(shape)
+
+
+def _check_size(frames: Sequence[Any], max_bytes: int, what: str) -> None:
+    size = size_of(frames)
+    if size > max_bytes:
+        raise WireError("size", f"{what}: message of {size} bytes, at most {max_bytes} are allowed")
+
+
+def _describe(error: ValidationError, name: str) -> str:
+    """The first wrong field, in one sentence; foreign values themselves are not repeated."""
+    details = error.errors(include_url=False, include_input=False, include_context=False)
+    where = ".".join(str(step) for step in details[0]["loc"]) or "message"
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    return f"{name}.{where[:NAME_LENGTH]}: {details[0]['msg'][:NAME_LENGTH]}{more}"
+
+
+def _shown(value: object) -> str:
+    """A foreign value, cut short for a sentence."""
+    return repr(value.hex() if isinstance(value, bytes) else value)[:60]
