@@ -46,7 +46,7 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) ->
 
 
 def outline_box(picture: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Left, top, width, height of what is brighter than half its maximum; None in a black picture."""
+    """Left, top, width, height of what is brighter than half the maximum; None: all black."""
     gray = picture.max(axis=2)
     if gray.max() == 0:
         return None

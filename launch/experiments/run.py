@@ -1,0 +1,143 @@
+"""Runs an experiment: starts the graph with a recorder, drives it, stops it, reads the bag."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from launch.experiments import image, stroke
+from launch.experiments.driver import Driver
+from launch.plan import Plan, load_plan
+from launch.supervisor import RunningGraph
+from messages.scene import Scene
+from messages.types import Correction, FingerPath
+
+DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
+RUNS = Path("runs")
+GRACE_S = 0.3
+
+Progress = Callable[[str], None]
+Procedure = Callable[[Driver, Scene], Awaitable[None]]
+
+
+def new_folder(name: str, parent: Path = RUNS) -> Path:
+    """A new folder for an experiment's bag and pictures: runs/20261121-164500-stroke."""
+    folder = parent / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
+    folder.mkdir(parents=True)
+    return folder
+
+
+async def drive(plan: Plan, procedure: Procedure, progress: Progress) -> None:
+    """Start the plan's graph, run the procedure on it, stop it.
+
+    Raises what the procedure raises, or NodeFailedError as soon as a node has failed for good.
+    """
+    scene = plan.scene_message()
+    if scene is None:
+        raise ValueError(f'{plan.launch_file}: key "scene": an experiment needs a scene; name one')
+    async with RunningGraph(plan) as graph:
+        progress("starting the nodes")
+        await graph.wait_ready()
+        async with Driver(plan, graph.run) as driver:
+            await _unless_it_ends(graph, _drive(driver, scene, procedure, progress))
+
+
+async def _drive(driver: Driver, scene: Scene, procedure: Procedure, progress: Progress) -> None:
+    progress("waiting for the soft body and the arms")
+    await driver.wait_until_up()
+    await procedure(driver, scene)
+    # What the last action caused is on its way through the graph to the recorder.
+    await asyncio.sleep(GRACE_S)
+
+
+async def _unless_it_ends(graph: RunningGraph, work: Coroutine[Any, Any, None]) -> None:
+    """Do `work` while the graph runs; when the graph ends first, raise why."""
+    task = asyncio.create_task(work)
+    end = asyncio.create_task(graph.wait())
+    try:
+        await asyncio.wait((task, end), return_when=asyncio.FIRST_COMPLETED)
+        if not task.done():
+            end.result()
+            raise RuntimeError(f"the nodes ended before the experiment; logs: {graph.run.logs}")
+        task.result()
+    finally:
+        for each in (task, end):
+            each.cancel()
+        await asyncio.gather(task, end, return_exceptions=True)
+
+
+def run_experiment(
+    launch_file: Path,
+    settings: Sequence[str],
+    bag: Path,
+    procedure: Procedure,
+    progress: Progress,
+) -> None:
+    """Run a procedure on a launch file's graph and record it to `bag`."""
+    plan = load_plan(launch_file, settings=settings, record=bag)
+    asyncio.run(drive(plan, procedure, progress))
+
+
+def stroke_procedure(
+    seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
+) -> Procedure:
+    """Stroke once for each duration; or follow `path` instead."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        if path is not None:
+            progress(f"{path.label} ({path.times_s[-1]:.0f} s)")
+            await driver.follow(path)
+            return
+        for duration in seconds:
+            progress(f"stroking 60° in {duration:g} s")
+            await driver.follow(stroke.stroke_path(scene, duration))
+
+    return procedure
+
+
+def tilt_procedure(
+    tilts_deg: Sequence[float], corrections: Sequence[Correction], progress: Progress
+) -> Procedure:
+    """Incline the sheet by each angle and photograph it with each correction."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        for theta_deg in tilts_deg:
+            await driver.follow(image.tilt_path(scene, theta_deg))
+            await driver.wait_settled()
+            for correction in corrections:
+                label = image.tilt_label(theta_deg, correction)
+                progress(label)
+                await driver.take_picture(label, correction)
+
+    return procedure
+
+
+def push_procedure(
+    depths_mm: Sequence[float], corrections: Sequence[Correction], progress: Progress
+) -> Procedure:
+    """Push the middle by each depth and photograph the sheet with each correction."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        await driver.follow(image.tilt_path(scene, 0.0))
+        for depth_mm in depths_mm:
+            await driver.follow(image.push_path(scene, depth_mm))
+            await driver.wait_settled()
+            for correction in corrections:
+                label = image.push_label(depth_mm, correction)
+                progress(label)
+                await driver.take_picture(label, correction)
+
+    return procedure
+
+
+def in_turn(*procedures: Procedure) -> Procedure:
+    """The procedures one after another on the same graph."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        for each in procedures:
+            await each(driver, scene)
+
+    return procedure
