@@ -1,0 +1,147 @@
+"""Follows the fingertip from picture to picture: a Kalman filter of constant velocity, with a gate.
+
+A state is (position, velocity), 6 numbers in the world frame, m and m/s, with a 6x6 covariance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+GATE_SIGMAS = 5.0
+"""Measurement noise that the gate forgives on top of a finger's fastest motion."""
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The estimate at one time: state (6,), covariance (6, 6)."""
+
+    at_ns: int
+    state: Floats
+    covariance: Floats
+
+    @property
+    def position(self) -> Floats:
+        return self.state[:3]
+
+    @property
+    def velocity(self) -> Floats:
+        return self.state[3:]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingSettings:
+    """How a finger moves.
+
+    acceleration_noise: root of the spectral density of a white acceleration, m/s^2 per root hertz.
+    max_speed_m_per_s: faster is no finger.
+    forget_after_s: without a measurement for so long the next one starts a new track.
+    confirm_frames: measurements in a row that must agree with one another, but not with the track,
+        before they replace it.
+    """
+
+    acceleration_noise: float
+    max_speed_m_per_s: float
+    forget_after_s: float
+    confirm_frames: int
+
+
+def started(at_ns: int, measured: Floats, covariance: Floats, max_speed: float) -> Track:
+    """A track from one measurement (3,): at rest, but its velocity as uncertain as a finger's."""
+    full = np.zeros((6, 6))
+    full[:3, :3] = covariance
+    full[3:, 3:] = np.eye(3) * (max_speed / 3.0) ** 2
+    return Track(at_ns, np.concatenate([measured, np.zeros(3)]), full)
+
+
+def predicted(track: Track, at_ns: int, acceleration_noise: float) -> Track:
+    """The track carried on at constant velocity to a later (or equal) time.
+
+    Process noise of a white acceleration, exact over the step (Bar-Shalom, Li, Kirubarajan,
+    Estimation with Applications to Tracking and Navigation, section 6.2.2).
+    """
+    dt = (at_ns - track.at_ns) * 1e-9
+    step = np.eye(6)
+    step[:3, 3:] = np.eye(3) * dt
+    density = acceleration_noise**2
+    noise = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(3)) * density
+    return Track(at_ns, step @ track.state, step @ track.covariance @ step.T + noise)
+
+
+def corrected(track: Track, measured: Floats, covariance: Floats) -> Track:
+    """The track after a measured position (3,) with covariance (3, 3) (Joseph's form)."""
+    gain = np.linalg.solve(track.covariance[:3, :3] + covariance, track.covariance[:3, :]).T
+    state = track.state + gain @ (measured - track.state[:3])
+    keep = np.eye(6)
+    keep[:, :3] -= gain
+    full = keep @ track.covariance @ keep.T + gain @ covariance @ gain.T
+    return Track(track.at_ns, state, 0.5 * (full + full.T))
+
+
+def reachable(
+    before_ns: int, before: Floats, at_ns: int, point: Floats, covariance: Floats, max_speed: float
+) -> bool:
+    """Whether a finger can be at `point` after it was at `before`, but for measurement noise."""
+    slack_m = GATE_SIGMAS * float(np.sqrt(np.trace(covariance)))
+    limit_m = max_speed * (at_ns - before_ns) * 1e-9 + slack_m
+    return float(np.linalg.norm(point - before)) <= limit_m
+
+
+class Tracker:
+    """A track, and the rule by which measurements enter it."""
+
+    def __init__(self, settings: TrackingSettings) -> None:
+        self.settings = settings
+        self.track: Track | None = None
+        self._refused: tuple[int, Floats] | None = None
+        self._agreeing = 0
+
+    def expected(self, at_ns: int) -> Track | None:
+        """Where the finger should be at a time; None without a track that is fresh enough."""
+        if self.track is None or self._forgotten(at_ns):
+            return None
+        return predicted(self.track, at_ns, self.settings.acceleration_noise)
+
+    def _forgotten(self, at_ns: int) -> bool:
+        assert self.track is not None
+        return (at_ns - self.track.at_ns) * 1e-9 > self.settings.forget_after_s
+
+    def take(self, at_ns: int, measured: Floats, covariance: Floats) -> bool:
+        """Let a measurement (3,) with its covariance (3, 3) in; False if no finger moves so fast.
+
+        Times must increase.  A refused jump is not forgotten: when the following measurements
+        agree with it, the finger was there, and the track starts anew.
+        """
+        settings = self.settings
+        if self.track is None or self._forgotten(at_ns):
+            self._start(at_ns, measured, covariance)
+            return True
+        if reachable(
+            self.track.at_ns,
+            self.track.position,
+            at_ns,
+            measured,
+            covariance,
+            settings.max_speed_m_per_s,
+        ):
+            ahead = predicted(self.track, at_ns, settings.acceleration_noise)
+            self.track = corrected(ahead, measured, covariance)
+            self._refused, self._agreeing = None, 0
+            return True
+        agrees = self._refused is not None and reachable(
+            *self._refused, at_ns, measured, covariance, settings.max_speed_m_per_s
+        )
+        self._agreeing = self._agreeing + 1 if agrees else 1
+        self._refused = (at_ns, measured)
+        if self._agreeing < settings.confirm_frames:
+            return False
+        self._start(at_ns, measured, covariance)
+        return True
+
+    def _start(self, at_ns: int, measured: Floats, covariance: Floats) -> None:
+        self.track = started(at_ns, measured, covariance, self.settings.max_speed_m_per_s)
+        self._refused, self._agreeing = None, 0

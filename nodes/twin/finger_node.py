@@ -1,0 +1,140 @@
+"""The twin's finger and the stereo camera that looks at it."""
+
+from __future__ import annotations
+
+import asyncio
+
+import numpy as np
+from pydantic import Field
+
+from messages.base import Header
+from messages.scene import NonNegative, Scene
+from messages.types import FingerPath, StereoPair, TwinFinger
+from nodes.node import Input, Node, NodeParameters, Output
+from nodes.twin.finger import FingerMotion, FingerState
+from nodes.twin.pixels import TwinCamera
+
+
+class TwinFingerParameters(NodeParameters):
+    """seed: of the finger's unsteadiness and the camera's noise."""
+
+    seed: int = 1
+    rest_world_m: tuple[float, float, float] = Field(
+        default=(0.0, 0.0, 0.08), description="where the finger is before the first path"
+    )
+    transfer_s: NonNegative = Field(default=0.004, description="read-out, from end of exposure")
+
+
+class TwinFingerNode(Node):
+    """Moves a true finger along the path it is given and takes its picture at the camera's rate."""
+
+    parameters: TwinFingerParameters
+    scene: Input[Scene]
+    twin__finger_path: Input[FingerPath]
+    twin__finger: Output[TwinFinger]
+    twin__stereo: Output[StereoPair]
+
+    camera: TwinCamera | None = None
+    motion: FingerMotion
+    motion_from_ns = 0
+    path_label = ""
+    missed_frames = 0
+
+    async def setup(self) -> None:
+        self._task = asyncio.create_task(self._film())
+
+    async def close(self) -> None:
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)
+
+    def on_scene(self, scene: Scene, header: Header) -> None:
+        first = self.camera is None
+        if first:
+            rest = np.array(self.parameters.rest_world_m)
+            self.motion = FingerMotion.resting(rest, seed=self.parameters.seed)
+            self.motion_from_ns = self.clock.now_ns()
+        self.camera = TwinCamera(
+            scene.camera, finger_radius_m=scene.finger.radius_m, seed=self.parameters.seed
+        )
+        self.max_speed_m_per_s = scene.finger.max_speed_m_per_s
+        self.period_ns = round(1e9 / scene.camera.rate_hz)
+        self.exposure_ns = round(1e9 * scene.camera.exposure_s)
+        if first and self.twin__finger_path.message is not None:
+            self._follow(self.twin__finger_path.message)
+
+    def on_twin__finger_path(self, path: FingerPath, header: Header) -> None:
+        if self.camera is not None:
+            self._follow(path)
+
+    def _follow(self, path: FingerPath) -> None:
+        """Go over to a path now; a path that cannot be followed raises and changes nothing."""
+        now_ns = self.clock.now_ns()
+        self.motion = self.motion.followed_by(
+            (now_ns - self.motion_from_ns) * 1e-9,
+            times_s=path.times_s,
+            points=path.positions_world_m,
+            wander_m=path.wander_m,
+            tremor_m=path.tremor_m,
+            max_speed_m_per_s=self.max_speed_m_per_s,
+        )
+        self.motion_from_ns, self.path_label = now_ns, path.label
+
+    def truth(self, at_ns: int) -> FingerState:
+        """The fingertip at a time of this node's clock."""
+        return self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
+
+    def expose(self, middle_ns: int) -> StereoPair:
+        """Take the picture whose exposure has its middle at `middle_ns`; publishes the truth.
+
+        Needs a scene.
+        """
+        assert self.camera is not None
+        state = self.truth(middle_ns)
+        self.twin__finger.publish(
+            TwinFinger(
+                path_label=self.path_label,
+                path_done=state.path_done,
+                path_time_s=state.path_time_s,
+                position_world_m=state.position,
+                velocity_world_m_per_s=state.velocity,
+            ),
+            source_ns=middle_ns,
+        )
+        left, right = self.camera.picture(
+            lambda offset_s: self.truth(middle_ns + round(offset_s * 1e9)).position,
+            exposure_s=self.exposure_ns * 1e-9,
+        )
+        return StereoPair(
+            device=self.camera.camera.device,
+            exposure_s=self.exposure_ns * 1e-9,
+            dropped_frames=self.missed_frames,
+            left=left,
+            right=right,
+        )
+
+    async def _film(self) -> None:
+        """Expose on a fixed grid of times; a frame whose time has passed is missed and counted."""
+        while self.camera is None:
+            await asyncio.sleep(0.01)
+        start_ns = self.clock.now_ns()
+        while True:
+            start_ns += self.period_ns
+            late_ns = self.clock.now_ns() - start_ns
+            if late_ns > self.exposure_ns:
+                missed = -(-late_ns // self.period_ns)
+                self.missed_frames += missed
+                start_ns += missed * self.period_ns
+            await self._sleep_until(start_ns)
+            middle_ns = start_ns + self.exposure_ns // 2
+            try:
+                pair = self.expose(middle_ns)
+            except Exception as error:
+                self.report_error("expose", error)
+                continue
+            read_out_ns = start_ns + self.exposure_ns + round(1e9 * self.parameters.transfer_s)
+            await self._sleep_until(read_out_ns)
+            self.twin__stereo.publish(pair, source_ns=middle_ns)
+            self.note = f'path "{self.path_label}", {self.missed_frames} frames missed'
+
+    async def _sleep_until(self, at_ns: int) -> None:
+        await asyncio.sleep(max(0.0, (at_ns - self.clock.now_ns()) * 1e-9))
