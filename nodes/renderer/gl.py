@@ -1,0 +1,238 @@
+"""OpenGL without a window: draws one eye's picture into a multisampled frame and reads it back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.renderer.correction import (
+    GRAZING_SINE,
+    NEAR_M,
+    Screen,
+    sector_normals,
+)
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+FAR_M = 5.0
+SAMPLES = 4
+LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
+OBJECT_COLOUR = (0.95, 0.72, 0.60)
+GRID_PITCH_M = 0.02
+MARK_RADIUS_M = 0.003
+
+
+class NoOpenGLError(RuntimeError):
+    """No OpenGL 3.3 context could be made; the message says what to install."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What one eye's picture is drawn with.
+
+    eye, projector: (3,) world.  screen: None draws without correction.
+    clip_from_screen: (3, 3), see `correction.clip_from_screen`.
+    """
+
+    eye: Floats
+    projector: Floats
+    screen: Screen | None
+    clip_from_screen: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How the object is painted; marks are points of the object at rest, or None."""
+
+    flat: bool
+    pattern: str
+    fingertip_mark: Floats | None = None
+    target_mark: Floats | None = None
+
+
+class Canvas:
+    """A context with the shaders, the meshes and the frame of one projector."""
+
+    def __init__(self, context: moderngl.Context, width_px: int, height_px: int) -> None:
+        self.width_px, self.height_px = width_px, height_px
+        self.context = context
+        vertex, fragment = _shader("object.vert.glsl"), _shader("object.frag.glsl")
+        self._program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
+        samples = min(SAMPLES, self.context.max_samples)
+        size = (width_px, height_px)
+        self._frame = self.context.framebuffer(
+            self.context.renderbuffer(size, 4, samples=samples),
+            self.context.depth_renderbuffer(size, samples=samples),
+        )
+        self._resolved = self.context.framebuffer(self.context.renderbuffer(size, 4))
+        self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        self._object: _Mesh | None = None
+        self._grid = _Mesh(self.context, *_grid_mesh())
+
+    def release(self) -> None:
+        """Free the frame and the meshes; the context stays."""
+        for mesh in (self._object, self._grid):
+            if mesh is not None:
+                mesh.release()
+        for frame in (self._frame, self._resolved):
+            for attachment in (*frame.color_attachments, frame.depth_attachment):
+                if attachment is not None:
+                    attachment.release()
+            frame.release()
+        self._program.release()
+
+    def set_mesh(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
+        """The object's vertices at rest (vertices, 3), world, and its outward triangles."""
+        if self._object is not None:
+            self._object.release()
+        self._object = _Mesh(self.context, rest, triangles)
+
+    def set_shape(self, positions: Floats, normals: Floats) -> None:
+        """Where the vertices are now, and the unit normals there, both (vertices, 3)."""
+        if self._object is None:
+            raise RuntimeError("set_mesh comes before set_shape")
+        self._object.move(positions, normals)
+
+    def draw(self, view: View, look: Look) -> None:
+        """Draw and wait until it is drawn."""
+        self._frame.use()
+        self._frame.clear(0.0, 0.0, 0.0, 1.0)
+        mesh = self._grid if look.pattern == "grid" else self._object
+        if look.pattern != "black" and mesh is not None:
+            # A projector behind the screen draws mirrored: then front faces wind the other way.
+            mirrored = np.linalg.det(view.clip_from_screen) < 0
+            self.context.front_face = "cw" if mirrored else "ccw"
+            set_view(self._program, view)
+            self._set_look(look)
+            mesh.array(self._program).render(moderngl.TRIANGLES)
+        self.context.copy_framebuffer(self._resolved, self._frame)
+        self.context.finish()
+
+    def read(self) -> Image:
+        """The picture drawn last: (height, width, 3), top row first."""
+        data = self._resolved.read(components=3, alignment=1)
+        rows = np.frombuffer(data, np.uint8).reshape(self.height_px, self.width_px, 3)
+        return np.ascontiguousarray(rows[::-1])
+
+    def shifted_points(self, view: View) -> Floats:
+        """(vertices, 4): A' of each vertex as the shader moves it, and 1 where it is valid."""
+        if self._object is None:
+            raise RuntimeError("set_mesh comes before shifted_points")
+        program = self.context.program(
+            vertex_shader=_shader("object.vert.glsl"), varyings=("shifted",)
+        )
+        set_view(program, view)
+        self._frame.use()  # without a window nothing runs, not even this, before a frame is bound
+        captured = self.context.buffer(reserve=self._object.count * 16)
+        self._object.array(program, indexed=False).transform(captured, moderngl.POINTS)
+        return np.frombuffer(captured.read(), np.float32).reshape(-1, 4).astype(np.float64)
+
+    def _set_look(self, look: Look) -> None:
+        program = self._program
+        program["flat_shading"] = look.flat
+        program["grid"] = look.pattern == "grid"
+        program["grid_pitch_m"] = GRID_PITCH_M
+        program["light_direction"] = tuple(LIGHT)
+        program["object_colour"] = OBJECT_COLOUR
+        for name, point in (
+            ("fingertip_mark", look.fingertip_mark),
+            ("target_mark", look.target_mark),
+        ):
+            program[name] = (0.0,) * 4 if point is None else (*point, MARK_RADIUS_M)
+
+
+def set_view(program: moderngl.Program, view: View) -> None:
+    """Hand a view to the vertex shader; uniforms that it does not use are optimised away."""
+    screen = view.screen
+    values: dict[str, object] = {
+        "eye": tuple(view.eye),
+        "projector": tuple(view.projector),
+        "corrected": screen is not None,
+        "grazing_sine": GRAZING_SINE,
+        "near_m": NEAR_M,
+        "far_m": FAR_M,
+        "clip_from_screen": tuple(view.clip_from_screen.T.ravel()),
+    }
+    if screen is not None:
+        values["sheet_point"] = tuple(screen.point)
+        values["sheet_normals"] = [tuple(row) for row in screen.normals]
+        values["sector_normals"] = [tuple(row) for row in sector_normals(screen, view.eye)]
+    for name, value in values.items():
+        if name in program:
+            program[name] = value
+
+
+class _Mesh:
+    """Vertex buffers of one mesh: what is fixed, and what moves each frame."""
+
+    def __init__(
+        self, context: moderngl.Context, rest: Floats, triangles: NDArray[np.int32]
+    ) -> None:
+        self.count = len(rest)
+        self._context = context
+        self._rest = context.buffer(np.ascontiguousarray(rest, np.float32))
+        normals = np.tile([0.0, 0.0, 1.0], (self.count, 1))
+        self._moving = context.buffer(_interleaved(rest, normals))
+        self._triangles = context.buffer(np.ascontiguousarray(triangles, np.int32))
+        self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
+
+    def move(self, positions: Floats, normals: Floats) -> None:
+        self._moving.write(_interleaved(positions, normals))
+
+    def array(self, program: moderngl.Program, *, indexed: bool = True) -> moderngl.VertexArray:
+        key = (program.glo, indexed)
+        if key not in self._arrays:
+            content: list[tuple[object, ...]] = [(self._moving, "3f 3f", "position", "normal")]
+            if "rest_position" in program:
+                content.append((self._rest, "3f", "rest_position"))
+            self._arrays[key] = self._context.vertex_array(
+                program, content, self._triangles if indexed else None, skip_errors=True
+            )
+        return self._arrays[key]
+
+    def release(self) -> None:
+        for array in self._arrays.values():
+            array.release()
+        for buffer in (self._rest, self._moving, self._triangles):
+            buffer.release()
+
+
+def _interleaved(positions: Floats, normals: Floats) -> NDArray[np.float32]:
+    return np.ascontiguousarray(np.concatenate([positions, normals], axis=1), np.float32)
+
+
+def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
+    """A fine sheet of triangles on the imaginary screen, 300 mm square, that carries the grid."""
+    cells = 60
+    axis = np.linspace(-0.15, 0.15, cells + 1)
+    x, y = np.meshgrid(axis, axis)
+    points = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    right, above = corner + 1, corner + cells + 1
+    triangles = np.concatenate(
+        [np.column_stack([corner, right, above + 1]), np.column_stack([corner, above + 1, above])]
+    )
+    return points, triangles.astype(np.int32)
+
+
+def _shader(name: str) -> str:
+    return files("nodes.renderer").joinpath(name).read_text()
+
+
+def headless_context() -> moderngl.Context:
+    """An OpenGL 3.3 context without a window; NoOpenGLError says what to install."""
+    # As a dict, because the stub types every further setting as one.
+    settings: dict[str, Any] = {"backend": "egl"}
+    try:
+        return moderngl.create_context(standalone=True, require=330, **settings)
+    except Exception as error:
+        raise NoOpenGLError(
+            f"no headless OpenGL 3.3 through EGL: {error}; "
+            "on Debian or Ubuntu: apt-get install libegl1 libgl1-mesa-dri"
+        ) from error

@@ -1,0 +1,187 @@
+"""Draws the virtual object for the projector, corrected for where the sheet is."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from messages.base import Header
+from messages.scene import NonNegative, Positive, Scene
+from messages.types import (
+    ArmState,
+    Correction,
+    Display,
+    Fingertip,
+    Frame,
+    SheetTarget,
+    Skin,
+    SoftBody,
+    StereoMode,
+)
+from nodes.node import Input, Node, NodeParameters, Output, periodic
+from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.stage import Sheet, Stage, sheet_between, transform_of
+
+
+class RendererParameters(NodeParameters):
+    rate_hz: Positive = Field(default=30.0, description="most frames a second")
+    lead_s: NonNegative = Field(
+        default=0.016, description="from the start of drawing to the middle of the light"
+    )
+    stale_s: Positive = Field(
+        default=0.1, description="older poses, fingertips and soft bodies are not used"
+    )
+    spacing_m: Positive = Field(default=0.0025, description="between vertices of the drawn surface")
+    correction: Correction = Field(default="four_triangles", description="until a display message")
+    stereo: StereoMode = Field(default="side_by_side", description="until a display message")
+
+
+class Renderer(Node):
+    """Draws as soon as the soft body has answered to a new fingertip, at most at `rate_hz`.
+
+    Without a solver the fingertip itself gives the beat, without a finger the timer.  The sheet is
+    taken from the measured flange poses, moved on by the target's twist to when the light leaves.
+    """
+
+    parameters: RendererParameters
+    scene: Input[Scene]
+    skin: Input[Skin]
+    soft_body: Input[SoftBody]
+    fingertip: Input[Fingertip]
+    sheet_target: Input[SheetTarget]
+    arm_left: Input[ArmState]
+    arm_right: Input[ArmState]
+    display: Input[Display]
+    frame: Output[Frame]
+
+    async def setup(self) -> None:
+        self._context = headless_context()
+        self._stage: Stage | None = None
+        self._sheet: Sheet | None = None
+        self._shown = Display(correction=self.parameters.correction, stereo=self.parameters.stereo)
+        self._due_ns = 0
+        self._number = self._since_pixels = self._late = 0
+        self._period_ns = int(1e9 / self.parameters.rate_hz)
+
+    async def close(self) -> None:
+        if hasattr(self, "_context"):
+            self._context.release()
+
+    def on_scene(self, scene: Scene, header: Header) -> None:
+        if self._stage is not None:
+            self._stage.canvas.release()
+        self._stage, self._sheet = None, None
+        self._stage = Stage(scene, self._context, spacing_m=self.parameters.spacing_m)
+
+    def on_display(self, display: Display, header: Header) -> None:
+        self._shown, self._since_pixels = display, 0
+
+    def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
+        self._draw_if_due()
+
+    def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
+        if self.soft_body.age_s() > self.parameters.stale_s:
+            self._draw_if_due()
+
+    @periodic("rate_hz")
+    def refresh(self) -> None:
+        """Keep the picture alive when nothing new comes."""
+        if self.clock.now_ns() > self._due_ns + self._period_ns:
+            self._draw_if_due()
+
+    def _draw_if_due(self) -> None:
+        # A quarter of a period early is in time: else a 60 Hz camera beats against 30 Hz.
+        now_ns = self.clock.now_ns()
+        if self._stage is None or now_ns < self._due_ns - self._period_ns // 4:
+            return
+        self._due_ns = max(self._due_ns + self._period_ns, now_ns + self._period_ns // 2)
+        self._draw(self._stage, now_ns)
+
+    def _draw(self, stage: Stage, start_ns: int) -> None:
+        shown, predicted_to_ns = self._shown, start_ns + int(self.parameters.lead_s * 1e9)
+        source_ns = self._shape_object(stage, start_ns)
+        sheet = self._believed_sheet(stage)
+        self._since_pixels += 1
+        with_pixels = 0 < shown.pixels_every <= self._since_pixels
+        picture = stage.draw(shown, sheet, self._look(stage), read=with_pixels)
+        if with_pixels:
+            self._since_pixels = 0
+        end_ns = self.clock.now_ns()
+        self._number += 1
+        self._late += end_ns > predicted_to_ns
+        frame = Frame(
+            number=self._number,
+            correction=shown.correction,
+            stereo=shown.stereo,
+            label=shown.label,
+            eyes_world_m=stage.eyes(shown),
+            world_from_sheet=sheet.world_from_sheet,
+            pushed_point_world_m=sheet.plane.point
+            if sheet.pushed_point is None
+            else sheet.pushed_point,
+            predicted_to_ns=predicted_to_ns,
+            draw_s=(end_ns - start_ns) * 1e-9,
+            late_frames=self._late,
+            pixels=() if picture is None else (picture,),
+        )
+        self.frame.publish(frame, source_ns=source_ns)
+
+    def _shape_object(self, stage: Stage, now_ns: int) -> int:
+        """Deform the drawn object; returns the exposure (ns) that the picture goes back to."""
+        skin, body = self.skin.message, self.soft_body.message
+        if skin is not None and stage.mesh_id != skin.mesh_id:
+            stage.follow(skin)
+        fresh = self.soft_body.age_s() <= self.parameters.stale_s
+        if fresh and body is not None and body.mesh_id == stage.mesh_id:
+            stage.deform(body.displacement_world_m)
+        else:
+            stage.rest()
+        used = self.soft_body if fresh else self.fingertip
+        recent = used.header is not None and used.age_s() <= self.parameters.stale_s
+        return used.header.source_ns if recent and used.header is not None else now_ns
+
+    def _believed_sheet(self, stage: Stage) -> Sheet:
+        """The sheet when the light leaves; the last good one when the arms' poses are no good."""
+        left, right, target = self.arm_left, self.arm_right, self.sheet_target.message
+        age_s, stale_s = max(left.age_s(), right.age_s()), self.parameters.stale_s
+        arms = stage.scene.arms
+        sheet = None
+        if left.message is not None and right.message is not None and age_s <= stale_s:
+            moving = target is not None and self.sheet_target.age_s() <= stale_s
+            sheet = sheet_between(
+                left.message.world_from_flange @ transform_of(arms.left.flange_from_edge),
+                right.message.world_from_flange @ transform_of(arms.right.flange_from_edge),
+                height_m=stage.scene.sheet.height_m,
+                twist_world=target.twist_world if moving and target is not None else np.zeros(6),
+                ahead_s=age_s + self.parameters.lead_s,
+                finger_tip=self._finger_tip(),
+            )
+        if sheet is not None and stage.usable(sheet):
+            self.note = ""
+            self._sheet = sheet
+            return sheet
+        why = f"arm poses {age_s:.2f} s old" if sheet is None else "sheet edge-on or turned away"
+        self.note = f"{why}: holding the last good sheet plane"
+        if self._sheet is None:
+            self._sheet = stage.sheet_at_rest()
+        return self._sheet
+
+    def _finger_tip(self) -> np.ndarray | None:
+        """The fingertip when the light leaves, or None when it is not known."""
+        finger, age_s = self.fingertip.message, self.fingertip.age_s()
+        if finger is None or not finger.valid or age_s > self.parameters.stale_s:
+            return None
+        ahead_s = age_s + self.parameters.lead_s
+        return finger.position_world_m + ahead_s * finger.velocity_world_m_per_s
+
+    def _look(self, stage: Stage) -> Look:
+        shown, finger, target = self._shown, self.fingertip.message, self.sheet_target.message
+        marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
+        return Look(
+            flat=shown.shading == "flat",
+            pattern=shown.pattern,
+            fingertip_mark=stage.surface_point(finger.position_world_m)
+            if marks and finger is not None and finger.valid
+            else None,
+            target_mark=target.contact_world_m if marks and target is not None else None,
+        )

@@ -1,0 +1,37 @@
+#version 330
+
+uniform bool flat_shading;
+uniform bool grid;
+uniform float grid_pitch_m;
+uniform vec3 light_direction;
+uniform vec3 object_colour;
+uniform vec4 fingertip_mark;  // point of the object at rest, radius; radius 0: none
+uniform vec4 target_mark;
+
+in vec3 rest_point;
+in vec3 surface_normal;
+in float valid;
+
+out vec4 colour;
+
+void main() {
+    if (valid < 0.9999) discard;  // a triangle with a vertex that could not be corrected
+    if (grid) {
+        vec2 from_line = abs(fract(rest_point.xy / grid_pitch_m + 0.5) - 0.5) * grid_pitch_m;
+        vec2 softness = fwidth(rest_point.xy);
+        vec2 line = 1.0 - smoothstep(vec2(0.0005), vec2(0.0005) + softness, from_line);
+        colour = vec4(vec3(max(line.x, line.y)), 1.0);
+        return;
+    }
+    if (flat_shading) {
+        colour = vec4(1.0);
+    } else {
+        float facing = dot(normalize(surface_normal), light_direction);
+        colour = vec4(object_colour * (0.25 + 0.75 * max(facing, 0.0)), 1.0);
+    }
+    float from_target = distance(rest_point, target_mark.xyz) / max(target_mark.w, 1e-6);
+    float from_finger = distance(rest_point, fingertip_mark.xyz) / max(fingertip_mark.w, 1e-6);
+    if (target_mark.w > 0.0 && from_target < 1.0 && from_target > 0.6)
+        colour = vec4(0.1, 0.35, 0.9, 1.0);
+    if (fingertip_mark.w > 0.0 && from_finger < 1.0) colour = vec4(0.85, 0.1, 0.1, 1.0);
+}

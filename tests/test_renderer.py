@@ -1,0 +1,513 @@
+"""The renderer: shader against numpy, pictures, packing, and the node's timing and holding."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import moderngl
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+
+from messages.base import Header, Message
+from messages.clock import VirtualClock
+from messages.scene import Scene
+from messages.topics import Topic
+from messages.types import ArmState, Display, Fingertip, Frame, SheetTarget, Skin, SoftBody
+from nodes.models.rigid import rotation_from_vector, transform
+from nodes.models.sheet import edge_poses, flange_pose
+from nodes.renderer import gl
+from nodes.renderer.correction import Plane, correct, flat_screen, pushed_screen
+from nodes.renderer.gl import Canvas, Look, NoOpenGLError, View, headless_context
+from nodes.renderer.node import Renderer, RendererParameters
+from nodes.renderer.output import pack
+from nodes.renderer.stage import Stage, sheet_between, transform_of
+from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
+
+ROOT = Path(__file__).parents[1]
+MS = 1_000_000
+
+
+def load_scene() -> Scene:
+    path = ROOT / "launch" / "scenes" / "cylinder.yaml"
+    return Scene.model_validate(YAML(typ="safe").load(path.read_text()))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene()
+
+
+@pytest.fixture(scope="module")
+def context() -> moderngl.Context:
+    return headless_context()
+
+
+@pytest.fixture(scope="module")
+def stage(scene: Scene, context: moderngl.Context) -> Stage:
+    return Stage(scene, context, spacing_m=0.004)
+
+
+def random_screens(scene: Scene) -> list[object]:
+    rng = np.random.default_rng(5)
+    corners = np.array([[-0.12, -0.12, 0], [0.12, -0.12, 0], [0.12, 0.12, 0], [-0.12, 0.12, 0]])
+    screens: list[object] = [None]
+    for _ in range(4):
+        normal = rotation_from_vector(rng.uniform(-1.2, 1.2, 3) * [1, 1, 0])[:, 2]
+        plane = Plane(rng.uniform(-0.03, 0.03, 3), normal)
+        screens += [
+            flat_screen(plane),
+            pushed_screen(rng.uniform(-0.05, 0, 3), corners, plane),
+        ]
+    return screens
+
+
+def test_shader_moves_points_as_the_numpy_equations(scene: Scene, stage: Stage) -> None:
+    rest = stage._surface.rest_world_m
+    projector = scene.projector.world_from_projector.position_m
+    for screen in random_screens(scene):
+        for eye in stage.eyes(Display(correction="none", stereo="side_by_side")):
+            view = View(eye, projector, screen, stage._clip_from_screen)
+            shifted = stage.canvas.shifted_points(view)
+            if screen is None:
+                assert np.allclose(shifted[:, :3], rest, atol=1e-7)
+                continue
+            wanted = correct(rest, eye=eye, projector=projector, screen=screen)
+            same = (shifted[:, 3] > 0.5) == wanted.valid
+            # Points within rounding of a sector's or the grazing limit may fall to either side.
+            assert same.mean() > 0.999
+            close = np.abs(shifted[:, :3] - wanted.points).max(axis=1) < 1e-6
+            assert close[same].mean() > 0.999
+
+
+def test_uncorrected_silhouette_lies_where_the_projector_model_says(
+    scene: Scene, stage: Stage
+) -> None:
+    stage.rest()
+    sheet = stage.sheet_at_rest()
+    shown = Display(correction="none", stereo="mono", shading="flat")
+    picture = stage.draw(shown, sheet, Look(flat=True, pattern="object"), read=True)
+    assert picture is not None
+    rows, columns = np.nonzero(picture[..., 0] > 127)
+    # Front of the cylinder, 60 mm to both sides, 2 px a millimetre around (399.5, 299.5).
+    assert abs(columns.min() - 279.5) <= 1
+    assert abs(columns.max() - 519.5) <= 1
+    radius = scene.object.geometry.radius_m
+    half_angle = np.arcsin(radius / (0.4 + radius))
+    half = 2000.0 * 0.4 * np.tan(half_angle)
+    assert abs(rows.min() - (299.5 - half)) <= 1
+    assert abs(rows.max() - (299.5 + half)) <= 1
+
+
+def test_nearest_surface_hides_what_is_behind(context: moderngl.Context, stage: Stage) -> None:
+    """Two crossing squares: depth decides, whatever the order of the triangles."""
+    canvas = Canvas(context, 80, 60)
+    square = np.array([[-0.05, -0.05, 0.0], [0.05, -0.05, 0], [0.05, 0.05, 0], [-0.05, 0.05, 0]])
+    far = square + np.array([0.0, 0.0, -0.05])
+    near = 0.4 * square + np.array([0.0, 0.0, 0.02])
+    triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    view = View(
+        np.array([0.0, 0.0, 0.4]), np.array([0, -0.25, -1.0]), None, np.diag([10.0, 10.0, 1.0])
+    )
+    lit, dark = np.tile(gl.LIGHT, (4, 1)), np.tile(-gl.LIGHT, (4, 1))
+    for order in (1, -1):
+        positions = np.concatenate([far, near][::order])
+        canvas.set_mesh(positions, np.concatenate([triangles, triangles + 4]).astype(np.int32))
+        canvas.set_shape(positions, np.concatenate([dark, lit][::order]))
+        canvas.draw(view, Look(flat=False, pattern="object"))
+        picture = canvas.read()
+        assert picture[30, 40, 0] > 200
+        assert 30 < picture[30, 50, 0] < 100
+    canvas.release()
+
+
+def test_black_and_grid_patterns(stage: Stage) -> None:
+    sheet = stage.sheet_at_rest()
+    shown = Display(correction="one_plane", stereo="mono")
+    black = stage.draw(shown, sheet, Look(flat=False, pattern="black"), read=True)
+    grid = stage.draw(shown, sheet, Look(flat=False, pattern="grid"), read=True)
+    assert black is not None
+    assert grid is not None
+    assert black.max() == 0
+    # Lines through the centre and 20 mm beside it; black between.
+    assert grid[289, 399, 0] > 200
+    assert grid[289, 439, 0] > 200
+    assert grid[279, 419, 0] == 0
+
+
+def test_marks_are_drawn_on_the_object(stage: Stage) -> None:
+    stage.rest()
+    shown = Display(correction="none", stereo="mono")
+    look = Look(False, "object", np.zeros(3), np.array([0.02, 0.0, 0.0]))
+    picture = stage.draw(shown, stage.sheet_at_rest(), look, read=True)
+    assert picture is not None
+    assert picture[299, 399, 0] > 2 * picture[299, 399, 2]
+    ring = picture[290:310, 350:370]
+    assert (ring[..., 2] > ring[..., 0].astype(int) + 80).any()
+
+
+def test_second_eye_sees_the_front_shifted_the_other_way(stage: Stage) -> None:
+    """The object lies behind the screen: the right eye sees it further right (mirrored: left)."""
+    stage.rest()
+    shown = Display(correction="none", stereo="side_by_side", shading="flat")
+    picture = stage.draw(shown, stage.sheet_at_rest(), Look(True, "object"), read=True)
+    assert picture is not None
+    assert picture.shape == (600, 800, 3)
+    left, right = picture[:, :400, 0], picture[:, 400:, 0]
+    assert left.any()
+    assert np.abs(left.astype(int) - right[:, ::-1]).mean() < 1.0
+    top = np.nonzero(left[:, 200] > 127)[0][0] + 2
+    assert np.nonzero(left[top])[0].mean() > np.nonzero(right[top])[0].mean()
+
+
+def test_missing_egl_names_the_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(**settings: object) -> None:
+        raise RuntimeError("libEGL.so not found")
+
+    monkeypatch.setattr(gl.moderngl, "create_context", fail)
+    with pytest.raises(NoOpenGLError, match="libegl1 libgl1-mesa-dri"):
+        headless_context()
+
+
+def test_packing() -> None:
+    left = np.zeros((4, 6, 3), np.uint8)
+    right = np.full((4, 6, 3), 200, np.uint8)
+    assert pack(left, right, "mono") is left
+    assert pack(left, right, "mono", swap_eyes=True) is right
+    beside = pack(left, right, "side_by_side")
+    assert beside.shape == left.shape
+    assert beside[:, :3].max() == 0
+    assert beside[:, 3:].min() == 200
+    above = pack(left, right, "top_bottom", swap_eyes=True)
+    assert above[:2].min() == 200
+    assert above[2:].max() == 0
+    anaglyph = pack(left, right, "anaglyph")
+    assert anaglyph[..., 0].max() == 0
+    assert anaglyph[..., 1:].min() == 200
+    with pytest.raises(ValueError, match="cannot be packed"):
+        pack(left, right[:2], "anaglyph")
+    with pytest.raises(ValueError, match="cannot be halved"):
+        pack(left[:3], right[:3], "top_bottom")
+
+
+def test_surface_is_closed_round_and_outward() -> None:
+    surface = cylinder_surface(
+        radius_m=0.03, length_m=0.1, world_from_object=np.eye(4), spacing_m=0.005
+    )
+    corners = surface.rest_world_m[surface.triangles]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    volume = np.sum(corners[:, 0] * cross) / 6.0
+    assert np.isclose(volume, np.pi * 0.03**2 * 0.1, rtol=1e-3)
+    assert (np.sum(cross * corners.mean(axis=1), axis=1) > 0).all()
+    normals = normals_of(surface, surface.rest_world_m)
+    side = slice(0, surface.rings * surface.around)
+    outward = surface.rest_world_m[side] * [0, 1, 1] / 0.03
+    assert np.allclose(normals[side], outward, atol=1e-6)
+    assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
+
+
+def test_surface_follows_a_linear_displacement_of_a_coarse_skin() -> None:
+    fine = cylinder_surface(
+        radius_m=0.03, length_m=0.1, world_from_object=np.eye(4), spacing_m=0.002
+    )
+    coarse = cylinder_surface(
+        radius_m=0.03, length_m=0.1, world_from_object=np.eye(4), spacing_m=0.005
+    )
+    follow = follow_matrix(fine.rest_world_m, coarse.rest_world_m, coarse.triangles)
+    gradient = np.random.default_rng(6).normal(size=(3, 3))
+    moved = follow @ (coarse.rest_world_m @ gradient)
+    assert np.allclose(moved, fine.rest_world_m @ gradient, atol=2e-4 * np.abs(gradient).sum())
+    with pytest.raises(ValueError, match="no triangles"):
+        follow_matrix(fine.rest_world_m, coarse.rest_world_m, coarse.triangles[:0])
+
+
+def test_sheet_between_edges_moves_with_its_twist() -> None:
+    pose = transform(rotation_from_vector([0.3, 0.0, 0.0]), [0.0, 0.01, 0.02])
+    left, right = edge_poses(pose, 0.25)
+    twist = np.array([0.0, 0.1, 0.0, 1.0, 0.0, 0.0])
+    still = sheet_between(
+        left, right, height_m=0.24, twist_world=twist, ahead_s=0.0, finger_tip=None
+    )
+    assert still is not None
+    assert np.allclose(still.world_from_sheet, pose)
+    later = sheet_between(
+        left, right, height_m=0.24, twist_world=twist, ahead_s=0.02, finger_tip=pose[:3, 3]
+    )
+    assert later is not None
+    assert np.allclose(later.world_from_sheet[:3, 3], [0.0, 0.012, 0.02])
+    assert np.allclose(later.world_from_sheet[:3, :3], rotation_from_vector([0.32, 0, 0]))
+    assert np.allclose(
+        np.linalg.norm(later.corners - later.plane.point, axis=1), 0.17328, atol=1e-4
+    )
+    assert (
+        sheet_between(left, left, height_m=0.24, twist_world=twist, ahead_s=0.0, finger_tip=None)
+        is None
+    )
+
+
+@pytest.mark.parametrize(
+    ("tip", "pushed"),
+    [
+        ((0.0, 0.0, -0.01), True),
+        ((0.0, 0.0, 0.01), False),
+        ((0.0, 0.2, -0.01), False),
+        ((0.2, 0, -0.01), False),
+    ],
+)
+def test_finger_pushes_only_below_and_over_the_sheet(
+    tip: tuple[float, float, float], pushed: bool
+) -> None:
+    left, right = edge_poses(np.eye(4), 0.25)
+    sheet = sheet_between(
+        left,
+        right,
+        height_m=0.24,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=np.array(tip),
+    )
+    assert sheet is not None
+    assert (sheet.pushed_point is not None) is pushed
+
+
+class Bench:
+    """A renderer with a clock that is moved by hand and a list of what it sent."""
+
+    def __init__(self, **parameters: object) -> None:
+        self.clock = VirtualClock(10_000 * MS)
+        self.sent: list[tuple[Frame, Header]] = []
+        self.node = Renderer(
+            RendererParameters(spacing_m=0.006, **parameters),
+            name="renderer",
+            clock=self.clock,
+            send=self._send,
+        )
+        self.scene = load_scene()
+
+    def _send(self, topic: Topic, message: Message, header: Header) -> None:
+        assert isinstance(message, Frame)
+        self.sent.append((message, header))
+
+    async def step(self, port: str, message: Message, *, age_ms: float = 0.0) -> None:
+        now_ns = self.clock.now_ns()
+        header = Header(1, now_ns - int(age_ms * MS), now_ns, "virtual", "test", 1)
+        await self.node.step(port, message, header)
+        assert self.node.errors == 0, self.node.last_error
+
+    def forward(self, milliseconds: float) -> None:
+        self.clock.move_to(self.clock.now_ns() + int(milliseconds * MS))
+
+    async def arms(self, world_from_sheet: np.ndarray, *, age_ms: float = 0.0) -> None:
+        edges = edge_poses(world_from_sheet, 0.25)
+        for side, edge in zip(("left", "right"), edges, strict=True):
+            spec = getattr(self.scene.arms, side)
+            flange = flange_pose(edge, transform_of(spec.flange_from_edge))
+            await self.step(f"arm_{side}", arm_state(side, flange), age_ms=age_ms)
+
+    async def finger(self, *tip: float, age_ms: float = 4.0, valid: bool = True) -> None:
+        message = Fingertip(
+            valid=valid,
+            reason="ok" if valid else "no_mark",
+            position_world_m=np.array(tip),
+            velocity_world_m_per_s=np.zeros(3),
+            covariance=np.eye(6),
+            measured_world_m=np.array(tip),
+            reprojection_px=0.1,
+        )
+        await self.step("fingertip", message, age_ms=age_ms)
+
+
+def arm_state(side: str, world_from_flange: np.ndarray) -> ArmState:
+    return ArmState(
+        side=side,
+        mode="follow",
+        faults=(),
+        joints_rad=np.zeros(6),
+        joints_commanded_rad=np.zeros(6),
+        world_from_flange=world_from_flange,
+        world_from_flange_commanded=world_from_flange,
+        command_age_s=None,
+        target_source_ns=0,
+        command_sent_ns=0,
+        edge_distance_m=None,
+        edge_force_n=None,
+        cycle_s=0.0,
+    )
+
+
+def skin_and_body(displacement: float) -> tuple[Skin, SoftBody]:
+    surface = cylinder_surface(
+        radius_m=0.0353553,
+        length_m=0.12,
+        world_from_object=transform(np.eye(3), [0, 0, -0.0353553]),
+        spacing_m=0.01,
+    )
+    skin = Skin(
+        mesh_id="m",
+        vertices_world_m=surface.rest_world_m.astype(np.float32),
+        triangles=surface.triangles,
+    )
+    body = SoftBody(
+        mesh_id="m",
+        method="linear",
+        in_range=True,
+        push_depth_m=0.0,
+        force_world_n=np.zeros(3),
+        stiffness_n_per_m=0.0,
+        displacement_world_m=np.full((len(surface.rest_world_m), 3), displacement, np.float32),
+    )
+    return skin, body
+
+
+@pytest.fixture
+async def bench() -> AsyncIterator[Bench]:
+    bench = Bench()
+    await bench.node.setup()
+    yield bench
+    await bench.node.close()
+
+
+async def test_nothing_is_drawn_before_the_scene(bench: Bench) -> None:
+    await bench.finger(0.0, 0.0, 0.1)
+    assert bench.sent == []
+
+
+async def test_frame_follows_the_soft_body_and_carries_its_exposure(bench: Bench) -> None:
+    skin, body = skin_and_body(0.0)
+    await bench.step("scene", bench.scene)
+    await bench.step("skin", skin)
+    pose = transform(rotation_from_vector([0.3, 0.0, 0.0]), [0.0, -0.01, 0.0])
+    await bench.arms(pose)
+    await bench.step("soft_body", body, age_ms=7.0)
+    assert len(bench.sent) == 1
+    frame, header = bench.sent[0]
+    assert header.source_ns == bench.clock.now_ns() - 7 * MS
+    assert np.allclose(frame.world_from_sheet, pose, atol=1e-9)
+    assert frame.pixels == ()
+    assert frame.predicted_to_ns == bench.clock.now_ns() + 16 * MS
+    # A fingertip alone does not draw while the solver answers.
+    bench.forward(40)
+    await bench.step("soft_body", body)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert len(bench.sent) == 2
+
+
+async def test_without_solver_the_fingertip_draws_and_the_rate_is_limited(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4))
+    for _ in range(60):  # one second of a 60 Hz camera, at most 30 frames a second
+        bench.forward(1000 / 60)
+        await bench.finger(0.0, 0.0, 0.1)
+    assert 29 <= len(bench.sent) <= 31
+
+
+async def test_timer_keeps_the_picture_alive_only_when_idle(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    await bench.finger(0.0, 0.0, 0.1)
+    bench.forward(34)
+    bench.node.refresh()
+    assert len(bench.sent) == 1
+    bench.forward(50)
+    bench.node.refresh()
+    assert len(bench.sent) == 2
+
+
+async def test_stale_arms_hold_the_last_plane_and_say_so(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    pose = transform(rotation_from_vector([0.5, 0.0, 0.0]), [0.0, 0.0, 0.0])
+    await bench.arms(pose)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert bench.node.note == ""
+    bench.forward(500)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert np.allclose(bench.sent[-1][0].world_from_sheet, pose, atol=1e-9)
+    assert "arm poses 0.50 s old: holding" in bench.node.note
+
+
+async def test_sheet_turned_away_holds_the_last_plane(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4))
+    await bench.finger(0.0, 0.0, 0.1)
+    bench.forward(100)
+    await bench.arms(transform(rotation_from_vector([1.5, 0.0, 0.0]), [0.0, 0.0, 0.0]))
+    await bench.finger(0.0, 0.0, 0.1)
+    assert np.allclose(bench.sent[-1][0].world_from_sheet, np.eye(4), atol=1e-9)
+    assert "edge-on" in bench.node.note
+
+
+async def test_sheet_is_predicted_to_when_the_light_leaves(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4), age_ms=4.0)
+    target = SheetTarget(
+        phase="contact",
+        reason="",
+        valid_at_ns=bench.clock.now_ns(),
+        world_from_sheet=np.eye(4),
+        twist_world=np.array([0.0, 0.1, 0.0, 0.0, 0.0, 0.0]),
+        stretch_ratio=1.04,
+        contact_world_m=np.zeros(3),
+        normal_world=np.array([0.0, 0.0, 1.0]),
+        contact_sheet_m=np.zeros(2),
+        push_depth_m=0.0,
+    )
+    await bench.step("sheet_target", target)
+    await bench.finger(0.0, 0.0, -0.02)
+    frame = bench.sent[-1][0]
+    assert np.isclose(frame.world_from_sheet[1, 3], 0.1 * 0.020)
+    assert np.allclose(frame.pushed_point_world_m, [0.0, 0.0, -0.02])
+
+
+async def test_invalid_finger_pushes_nothing(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4))
+    await bench.finger(0.0, 0.0, -0.02, valid=False)
+    assert np.allclose(bench.sent[-1][0].pushed_point_world_m, 0.0, atol=1e-9)
+
+
+async def test_pixels_come_with_each_nth_frame_and_the_label(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    display = Display(
+        correction="one_plane", stereo="mono", shading="flat", pixels_every=3, label="tilt 10"
+    )
+    await bench.step("display", display)
+    for _ in range(7):
+        bench.forward(40)
+        await bench.finger(0.0, 0.0, 0.1)
+    with_pixels = [bool(frame.pixels) for frame, _ in bench.sent]
+    assert with_pixels == [False, False, True, False, False, True, False]
+    assert {frame.label for frame, _ in bench.sent} == {"tilt 10"}
+    assert bench.sent[2][0].pixels[0].shape == (600, 800, 3)
+
+
+async def test_object_follows_its_own_skin_only(bench: Bench) -> None:
+    skin, body = skin_and_body(0.01)
+    display = Display(correction="none", stereo="mono", shading="flat", pixels_every=1)
+    await bench.step("scene", bench.scene)
+    await bench.step("display", display)
+    centres = []
+    for message in (body, body.model_copy(update={"mesh_id": "other"})):
+        await bench.step("skin", skin)
+        bench.forward(40)
+        await bench.step("soft_body", message)
+        picture = bench.sent[-1][0].pixels[0][..., 0]
+        centres.append(np.nonzero(picture)[0].mean())
+    assert centres[0] < centres[1] - 15  # 10 mm up is about 20 px
+
+
+async def test_a_new_scene_is_drawn_and_a_bad_one_is_reported(bench: Bench) -> None:
+    await bench.step("scene", bench.scene)
+    lens = bench.scene.projector.lens.model_copy(update={"distortion": (0.1, 0, 0, 0, 0)})
+    projector = bench.scene.projector.model_copy(update={"lens": lens})
+    header = Header(1, 0, 0, "virtual", "test", 1)
+    bad = bench.scene.model_copy(update={"projector": projector})
+    await bench.node.step("scene", bad, header)
+    assert bench.node.errors == 1
+    assert "projector.lens.distortion" in bench.node.last_error
+    bench.node.errors = 0
+    small = bench.scene.projector.model_copy(update={"width_px": 400})
+    await bench.step("scene", bench.scene.model_copy(update={"projector": small}))
+    await bench.step("display", Display(correction="none", stereo="mono", pixels_every=1))
+    bench.forward(100)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert bench.sent[-1][0].pixels[0].shape == (600, 400, 3)
