@@ -1,1 +1,1 @@
-"""What runs where: launch files, scenes, supervisor, experiments, charts, the `flexsheet` command."""
+"""What runs where: launch files, scenes, supervisor, experiments, charts, the command line."""

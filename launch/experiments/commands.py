@@ -155,7 +155,7 @@ def demo(
     ] = None,
     output: Output = None,
 ) -> None:
-    """Run the whole system on this machine: strokes, a tilted sheet, a pushed one; then pictures."""
+    """Run the whole system on this machine: stroke, tilt and push the sheet; then pictures."""
     plan = load_plan(launch_file)
     scene = plan.scene_message()
     path = None

@@ -41,7 +41,7 @@ class DemoResult:
 def run_demo(
     launch_file: Path, folder: Path, progress: Progress, *, path: FingerPath | None = None
 ) -> DemoResult:
-    """Stroke in 10 s and in 30 s (or follow `path`), then photograph the sheet tilted and pushed."""
+    """Stroke in 10 s and in 30 s (or follow `path`), then picture a tilted and a pushed sheet."""
     bag = folder / "demo.mcap"
     procedure = in_turn(
         stroke_procedure(SECONDS, progress, path=path),

@@ -1,0 +1,170 @@
+"""The experiments' own arithmetic: a sheet known to be off is found off by just that."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+
+from launch.charts import UnknownFamilyError, chart_result, family_named, finite, write_chart
+from launch.experiments import image, stroke
+from messages.scene import Scene
+from nodes.methods import Family, Point, Trial, measure, pareto_front
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENE = Scene.model_validate(YAML(typ="safe").load(ROOT / "launch" / "scenes" / "cylinder.yaml"))
+RADIUS = SCENE.object.geometry.radius_m
+AXIS = SCENE.object.world_from_object.position_m
+TIMES = np.arange(0, 10_000_000_000, 10_000_000, dtype=np.int64)
+
+
+def points_at(angles: np.ndarray, distance: float) -> np.ndarray:
+    direction = np.column_stack([np.zeros_like(angles), np.sin(angles), np.cos(angles)])
+    return AXIS + distance * direction
+
+
+def edges_tangent_at(angles: np.ndarray, *, lifted_m: float = 0.0) -> tuple[stroke.Track, ...]:
+    """Edges of a sheet that is tangent to the cylinder at `angles`, moved out along its normal."""
+    contact = points_at(angles, RADIUS + lifted_m)
+    along = np.column_stack([np.zeros_like(angles), np.cos(angles), -np.sin(angles)])
+    normal = np.column_stack([np.zeros_like(angles), np.sin(angles), np.cos(angles)])
+    half_width = np.array([0.125, 0.0, 0.0])
+    return tuple(
+        stroke.Track(TIMES, np.hstack([contact + side * half_width, along, normal]))
+        for side in (-1, 1)
+    )
+
+
+def finger_at(angles: np.ndarray, depth_m: float = 0.0) -> stroke.Track:
+    return stroke.Track(TIMES, points_at(angles, RADIUS - depth_m))
+
+
+@given(
+    lag_rad=st.floats(-0.2, 0.2),
+    lifted_m=st.floats(-0.01, 0.01),
+    depth_m=st.floats(0.0, 0.03),
+)
+def test_a_known_lag_and_lift_come_out(lag_rad: float, lifted_m: float, depth_m: float) -> None:
+    angles = np.linspace(-1.0, 1.0, len(TIMES))
+    left, right = edges_tangent_at(angles - lag_rad, lifted_m=lifted_m)
+    delta_d, delta_theta = stroke.sheet_errors(
+        SCENE, finger_at(angles, depth_m), (left, right), TIMES
+    )
+    expected = np.sqrt(
+        RADIUS**2 + (RADIUS + lifted_m) ** 2 - 2 * RADIUS * (RADIUS + lifted_m) * np.cos(lag_rad)
+    )
+    np.testing.assert_allclose(delta_theta, abs(lag_rad), atol=1e-9)
+    np.testing.assert_allclose(delta_d, expected, atol=1e-9)
+
+
+def test_times_keep_their_digits_on_a_machine_that_is_long_up() -> None:
+    start_ns = 300 * 24 * 3600 * 1_000_000_000
+    samples = stroke.Track(
+        start_ns + np.array([0, 1_000_000], dtype=np.int64), np.array([[0.0], [1.0]])
+    )
+    middle = samples.at(np.array([start_ns + 500_000], dtype=np.int64))
+    assert middle[0, 0] == 0.5
+
+
+def test_the_stroke_path_is_the_papers() -> None:
+    path = stroke.stroke_path(SCENE, 10.0)
+    begin, end = stroke.stroke_window_s(10.0)
+    inside = (path.times_s >= begin) & (path.times_s <= end)
+    local = path.positions_world_m[inside] - AXIS
+    angles = np.degrees(np.arctan2(local[:, 1], local[:, 2]))
+    assert angles[0] == pytest.approx(0.0, abs=1e-9)
+    assert angles[-1] == pytest.approx(60.0)
+    np.testing.assert_allclose(np.hypot(local[:, 1], local[:, 2]), RADIUS)
+    assert np.all(np.diff(path.times_s) > 0)
+
+
+def test_a_track_needs_samples() -> None:
+    with pytest.raises(ValueError, match="1 samples of fingertip"):
+        stroke.track([(0, np.zeros(3))], "fingertip")
+
+
+def test_a_missing_stroke_is_named_with_what_there_is() -> None:
+    empty = stroke.Track(TIMES[:2], np.zeros((2, 3)))
+    recording = stroke.Recording(
+        scene=SCENE,
+        fingertip=empty,
+        measured=empty,
+        finger=empty,
+        windows_ns={"wandering": (0, 1)},
+        measured_edges=(empty, empty),
+        true_edges=(empty, empty),
+        delays_s={},
+        drops=0,
+    )
+    with pytest.raises(ValueError, match=r"no finger path .*it has: wandering"):
+        stroke.stroke_errors(recording, 10.0)
+
+
+def test_size_errors_are_absolute_differences_in_mm() -> None:
+    picture = image.Picture(
+        "case", "none", 0.001, np.full((2, 2, 3), 10, np.uint8), np.full((2, 2, 3), 12, np.uint8)
+    )
+    errors = image.size_errors_mm(picture, lambda pixels, scale: (float(pixels[0, 0, 0]) * scale,))
+    assert errors == [pytest.approx(2.0)]
+
+
+def test_tilt_and_push_paths_go_where_their_label_says() -> None:
+    hover = image.tilt_path(SCENE, -40.0).positions_world_m[-1] - AXIS
+    assert np.degrees(np.arctan2(hover[1], hover[2])) == pytest.approx(-40.0)
+    assert np.linalg.norm(hover) == pytest.approx(RADIUS + image.HOVER_M)
+    pushed = image.push_path(SCENE, 30.0).positions_world_m[-1]
+    np.testing.assert_allclose(pushed, [0.0, 0.0, -0.03], atol=1e-7)
+
+
+def make_family() -> Family:
+    def trials(scene: Scene) -> list[Trial]:
+        return [
+            Trial("good", {"depth_mm": 5}, lambda: 1.0, lambda value: value - 1.0, True),
+            Trial("good", {"depth_mm": 20}, lambda: 3.0, lambda value: value - 1.0, False),
+        ]
+
+    return Family(
+        name="example",
+        unit="mm",
+        reference="the number one",
+        methods=("good",),
+        trials=trials,
+        tolerance=lambda scene: 0.5,
+    )
+
+
+def test_a_chart_is_measured_drawn_and_written(tmp_path: Path) -> None:
+    family = make_family()
+    points = [measure(trial, repeats=3) for trial in family.trials(SCENE)]
+    result = chart_result(family, SCENE, points)
+    assert [point["error"] for point in result["points"]] == [0.0, 2.0]
+    assert result["front"] == ["good"]
+    picture, numbers = write_chart(result, tmp_path / "charts")
+    assert picture.stat().st_size > 1000
+    assert '"depth_mm": 20' in numbers.read_text()
+
+
+def test_an_unknown_family_gets_a_suggestion() -> None:
+    with pytest.raises(UnknownFamilyError, match='did you mean "triangulation"'):
+        family_named("triangulaton")
+
+
+def test_the_front_holds_what_nothing_beats_and_ignores_what_is_out_of_range() -> None:
+    def point(method: str, time_s: float, error: float, in_range: bool = True) -> Point:
+        return Point(method, {}, time_s, time_s, error, in_range)
+
+    points = [
+        point("cheap", 1.0, 9.0),
+        point("dear", 9.0, 1.0),
+        point("bad", 9.0, 9.0),
+        point("cheap", 1.0, 99.0, in_range=False),
+    ]
+    assert pareto_front(points) == ["cheap", "dear"]
+
+
+def test_json_never_holds_nan() -> None:
+    assert finite({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
