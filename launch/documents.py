@@ -76,15 +76,14 @@ class Document:
 
     def set(self, key: Key, value: Any, origin: str) -> None:
         """Put `value` at `key`, making the mappings on the way; `origin` names it in errors."""
-        target = self.values
+        target: dict[Any, Any] = self.values
         for part in key[:-1]:
-            inner = target.get(part) if isinstance(target, dict) else None  # type: ignore[call-overload]
-            if inner is None:
-                inner = target[part] = {}  # type: ignore[index]  # keys of YAML maps are strings
-            if not isinstance(inner, dict):
+            if target.get(part) is None:
+                target[part] = {}
+            if not isinstance(target[part], dict):
                 raise BadInputError([Problem(origin, key, f'"{part}" holds no further keys')])
-            target = inner
-        target[key[-1]] = value  # type: ignore[index]
+            target = target[part]
+        target[key[-1]] = value
         self.overrides[key] = origin
 
 

@@ -36,6 +36,7 @@ QUEUE_BYTES = 1 << 30
 BATCH = 256
 LINGER_MS = 500
 IPC_PATH_BYTES = 107
+REFUSABLE_BYTES = 256 << 20
 
 _log = logging.getLogger("flexsheet.bus")
 
@@ -140,6 +141,8 @@ class Subscriber:
     on_problem: told in a sentence of losses (at the 1st, 2nd, 4th, 8th, ...; not on `latest`
         topics, where losing is meant), of the first refusal for each cause, and of an exception in
         `on_message`, which ends nothing.
+    unopened: call `on_message(frames, header)` with every message that came, whatever the topic's
+        delivery; its fields are not looked at.
     """
 
     def __init__(
@@ -150,10 +153,11 @@ class Subscriber:
         counts: Counts,
         *,
         on_problem: Problem = _log.error,
+        unopened: bool = False,
     ) -> None:
-        self.topic, self._endpoints = topic, tuple(connect)
+        self.topic, self._endpoints, self._unopened = topic, tuple(connect), unopened
         self._on_message, self._on_problem, self._counts = on_message, on_problem, counts
-        self._newest_only = topic.delivery is Delivery.LATEST
+        self._newest_only = topic.delivery is Delivery.LATEST and not unopened
         self._seen: dict[str, tuple[int, int]] = {}
         self._reported_causes: set[str] = set()
         self._report_gaps_from = 1
@@ -169,7 +173,7 @@ class Subscriber:
         try:
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
             for endpoint in self._endpoints:
-                _check_ipc_path(self.topic, endpoint)
+                _check_endpoint(self.topic, endpoint)
                 try:
                     self._socket.connect(endpoint)
                 except zmq.ZMQError as error:
@@ -226,7 +230,9 @@ class Subscriber:
             if frames is None:
                 return True
             envelope = self._accept(frames)
-            if envelope is not None:
+            if envelope is not None and self._unopened:
+                self._call(frames, envelope.header)
+            elif envelope is not None:
                 self._deliver(envelope)
         return False
 
@@ -269,8 +275,11 @@ class Subscriber:
         except WireError as error:
             self._reject(error)
             return
+        self._call(message, envelope.header)
+
+    def _call(self, message: Any, header: Header) -> None:
         try:
-            self._on_message(message, envelope.header)
+            self._on_message(message, header)
         except Exception as error:
             _log.exception("handler of topic %s failed", self.topic.name)
             self._on_problem(
@@ -300,8 +309,9 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.SNDHWM: length,
         zmq.RCVHWM: length,
         zmq.LINGER: LINGER_MS,
-        # Beyond this ZeroMQ cuts the connection without a word, so leave room to refuse with one.
-        zmq.MAXMSGSIZE: 2 * topic.max_bytes,
+        # A larger frame makes ZeroMQ give the endpoint up, for good and without a word.  So what is
+        # merely too large is let in, to be refused and counted; this limit saves the memory.
+        zmq.MAXMSGSIZE: topic.max_bytes + REFUSABLE_BYTES,
         zmq.RECONNECT_IVL: 20,
         zmq.RECONNECT_IVL_MAX: 500,
         zmq.HEARTBEAT_IVL: 1000,
@@ -314,7 +324,7 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
 
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str) -> str:
     """Bind and return the endpoint with its port filled in."""
-    _check_ipc_path(topic, endpoint)
+    _check_endpoint(topic, endpoint)
     if _ipc_is_served(endpoint):
         raise BusError(
             f'topic "{topic.name}": {endpoint} is in use by another process; '
@@ -326,18 +336,26 @@ def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str) -> str:
         if error.errno == errno.EADDRINUSE:
             remedy = "is in use by another process; is the same launch file running already?"
         else:
-            remedy = f"cannot be bound: {error.strerror}; does its folder or address exist here?"
+            remedy = f"cannot be bound: {error.strerror}; is its folder or address on this host?"
         raise BusError(f'topic "{topic.name}": {endpoint} {remedy}') from error
     bound: str = opened.getsockopt_string(zmq.LAST_ENDPOINT)
     return bound
 
 
-def _check_ipc_path(topic: Topic, endpoint: str) -> None:
-    path = endpoint.removeprefix("ipc://")
-    if path != endpoint and len(os.fsencode(path)) > IPC_PATH_BYTES:
+def _check_endpoint(topic: Topic, endpoint: str) -> None:
+    """Refuse what ZeroMQ would take silently (a port of 99999) or explain badly."""
+    transport, _, place = endpoint.partition("://")
+    port = place.rpartition(":")[2]
+    if transport == "tcp" and port != "*" and not (port.isdecimal() and 0 < int(port) < 1 << 16):
+        raise BusError(f'topic "{topic.name}": {endpoint}: a port is a number from 1 to 65535')
+    if transport == "ipc" and len(os.fsencode(place)) > IPC_PATH_BYTES:
         raise BusError(
-            f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(path))} bytes, '
+            f'topic "{topic.name}": the path of {endpoint} has {len(os.fsencode(place))} bytes, '
             f"the system allows {IPC_PATH_BYTES}; choose a shorter folder for sockets"
+        )
+    if transport not in ("tcp", "ipc"):
+        raise BusError(
+            f'topic "{topic.name}": {endpoint} is neither ipc:///path nor tcp://host:port'
         )
 
 

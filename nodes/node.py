@@ -201,6 +201,8 @@ class Node:
     status: Output[Status]
 
     handler_errors_shown: ClassVar[int] = 3
+    takes_frames: ClassVar[bool] = False
+    """Whether `deliver` is given each message as the wire's frames, unopened."""
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:

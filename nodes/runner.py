@@ -81,6 +81,7 @@ class Links:
                 deliver_to(config.port),
                 node_input.counts,
                 on_problem=lambda text: self._log.warning("input", problem=text),
+                unopened=node.takes_frames,
             )
             subscriber.start()
             self._subscribers.append(subscriber)
