@@ -26,7 +26,7 @@ import struct
 from collections.abc import Sequence
 from functools import cache, lru_cache
 from math import prod
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar, overload
 
 import msgpack
 import numpy as np
@@ -37,6 +37,7 @@ from messages.base import Header, Message, schema_fingerprint
 from messages.topics import Topic
 
 Buffer: TypeAlias = bytes | memoryview
+M = TypeVar("M", bound=Message)
 
 PROTOCOL = "flexsheet/1"
 DTYPES = tuple(
@@ -181,6 +182,10 @@ def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Env
     return Envelope(codec, Header(sequence, source, publish, clock_id, writer, epoch), fields)
 
 
+@overload
+def decode(frames: Sequence[Any], expected: type[M]) -> tuple[M, Header]: ...
+@overload
+def decode(frames: Sequence[Any], expected: Topic) -> tuple[Message, Header]: ...
 def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Message, Header]:
     """The validated message and its header; whatever is wrong raises WireError and nothing else."""
     envelope = read_envelope(frames, expected)
@@ -201,19 +206,16 @@ def _unpack(frames: Sequence[Any]) -> Any:
         if code not in (_INLINE, _FRAME):
             raise WireError("malformed", f"unknown extension type {code} in the header")
         dtype, shape, offset, size = _read_dtype_and_shape(data[: _head_size(data)])
-        buffer: Any = data
-        if code == _FRAME:
-            used += 1
-            if len(data) != offset or used >= len(frames):
-                raise WireError("frames", f"an array's frame is missing: got {len(frames)} frames")
-            buffer, offset = _read_only(frames[used]), 0
-        if len(buffer) - offset != size:
-            raise WireError(
-                "frames",
-                f"an array of {dtype} and shape {shape} needs {size} bytes, "
-                f"its frame has {len(buffer) - offset}",
-            )
-        return np.ndarray(shape, dtype, buffer=buffer, offset=offset)
+        if code == _INLINE:
+            _check_elements(len(data) - offset, size, dtype, shape)
+            return np.ndarray(shape, dtype, buffer=data, offset=offset)
+        used += 1
+        if len(data) != offset or used >= len(frames):
+            raise WireError("frames", f"an array's frame is missing: got {len(frames)} frames")
+        view = _read_only(frames[used])
+        _check_elements(len(view), size, dtype, shape)
+        # frombuffer, because an array made from the view by its constructor can be unlocked again.
+        return np.frombuffer(view, dtype).reshape(shape)
 
     if not frames:
         raise WireError("frames", "a message without frames")
@@ -230,6 +232,13 @@ def _unpack(frames: Sequence[Any]) -> Any:
     if used != len(frames) - 1:
         raise WireError("frames", f"got {len(frames)} frames, the header speaks of {used + 1}")
     return unpacked
+
+
+def _check_elements(got: int, wanted: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
+    if got != wanted:
+        raise WireError(
+            "frames", f"an array of {dtype} and shape {shape} needs {wanted} bytes, got {got}"
+        )
 
 
 def _read_only(frame: Any) -> memoryview:

@@ -1,0 +1,444 @@
+"""The bus: deliveries, losses, refusals, restarts; each waits for a condition, never for a time."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import pytest_asyncio
+import zmq
+
+from messages.base import Header, Message
+from messages.bus import BusError, Publisher, Subscriber, queue_length
+from messages.topics import TOPICS, Topic
+from messages.types import EStop, StereoPair, TwinArms, TwinFinger
+from messages.wire import WireError, encode
+
+DEADLINE_S = 20.0
+
+
+@dataclass
+class Counts:
+    dropped: int = 0
+    gaps: int = 0
+    rejected: int = 0
+
+
+def header(sequence: int, writer: str = "writer", epoch: int = 1) -> Header:
+    return Header(sequence, 1000 * sequence, 1000 * sequence + 1, "clock", writer, epoch)
+
+
+def stop(reason: str) -> EStop:
+    return EStop(engaged=True, reason=reason)
+
+
+def finger(x: float) -> TwinFinger:
+    return TwinFinger(
+        path_label="line",
+        path_done=False,
+        path_time_s=x,
+        position_world_m=np.array([x, 0.0, 0.0]),
+        velocity_world_m_per_s=np.zeros(3),
+    )
+
+
+def pictures(value: int) -> StereoPair:
+    image = np.full((48, 64), value, np.uint8)
+    return StereoPair(device="test", exposure_s=0.001, dropped_frames=0, left=image, right=image)
+
+
+async def until(condition: Callable[[], object], what: str = "the condition") -> None:
+    deadline = asyncio.get_running_loop().time() + DEADLINE_S
+    while asyncio.get_running_loop().time() < deadline:
+        if condition():
+            return
+        await asyncio.sleep(0.001)
+    pytest.fail(f"{what} did not come true in {DEADLINE_S} s")
+
+
+class Ear:
+    """A subscriber that writes down what it hears."""
+
+    def __init__(self, topic: Topic, endpoints: list[str]) -> None:
+        self.heard: list[tuple[Any, Header]] = []
+        self.problems: list[str] = []
+        self.counts = Counts()
+        self.extra: Callable[[Message], None] = lambda message: None
+        self.subscriber = Subscriber(
+            topic, endpoints, self.hear, self.counts, on_problem=self.problems.append
+        )
+        self.subscriber.start()
+
+    def hear(self, message: Message, header: Header) -> None:
+        self.heard.append((message, header))
+        self.extra(message)
+
+    @property
+    def sequences(self) -> list[int]:
+        return [header.sequence for _, header in self.heard]
+
+
+class Room:
+    """Makes publishers and ears, and clears them away."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.closers: list[Callable[[], None]] = []
+
+    def endpoint(self, name: str = "a") -> str:
+        return f"ipc://{self.folder}/{name}"
+
+    def mouth(self, topic: Topic, *endpoints: str) -> Publisher:
+        publisher = Publisher(topic, endpoints or (self.endpoint(),))
+        self.closers.append(publisher.close)
+        return publisher
+
+    def ear(self, topic: Topic, *endpoints: str) -> Ear:
+        ear = Ear(topic, list(endpoints or (self.endpoint(),)))
+        self.closers.append(ear.subscriber.close)
+        return ear
+
+    def raw(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+        """A foreign socket that knows nothing of messages."""
+        opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        opened.setsockopt(zmq.LINGER, 0)
+        opened.bind(endpoint)
+        self.closers.append(lambda: opened.close(linger=0))
+        return opened
+
+
+@pytest_asyncio.fixture
+async def room(tmp_path_factory: pytest.TempPathFactory) -> AsyncIterator[Room]:
+    room = Room(tmp_path_factory.mktemp("s"))
+    yield room
+    for close in reversed(room.closers):
+        close()
+
+
+async def connected(publisher: Publisher, ear: Ear, make: Callable[[int], Message]) -> int:
+    """Send numbered messages until the first is heard; the number of the last one sent."""
+    number = 0
+    while not ear.heard:
+        number += 1
+        publisher.send(make(number), header(number))
+        await asyncio.sleep(0.002)
+    await until(lambda: ear.sequences[-1] == number)
+    ear.heard.clear()
+    ear.counts.gaps = ear.counts.dropped = 0
+    return number
+
+
+@pytest.mark.parametrize("transport", ["ipc", "tcp"])
+async def test_every_delivers_all_in_order(room: Room, transport: str) -> None:
+    topic = TOPICS["twin/finger"]
+    where = room.endpoint() if transport == "ipc" else "tcp://127.0.0.1:*"
+    publisher = room.mouth(topic, where)
+    ear = room.ear(topic, *publisher.endpoints)
+    start = await connected(publisher, ear, finger) + 1
+    for number in range(start, start + 700):
+        publisher.send(finger(number), header(number))
+    await until(lambda: len(ear.heard) == 700)
+    assert ear.sequences == list(range(start, start + 700))
+    assert ear.heard[3][0].path_time_s == start + 3
+    assert ear.counts == Counts()
+    assert ear.problems == []
+
+
+async def test_every_counts_and_reports_an_overflow(room: Room) -> None:
+    topic = replace(TOPICS["twin/finger"], max_bytes=1 << 28)  # a queue of 16
+    assert queue_length(topic) == 16
+    publisher = room.mouth(topic)
+    ear = room.ear(topic)
+    start = await connected(publisher, ear, finger) + 1
+    total = 20_000
+    for number in range(start, start + total):  # the loop is not run meanwhile: nobody reads
+        publisher.send(finger(number), header(number))
+    await until(lambda: len(ear.heard) > 0)
+    last = start + total
+    while not ear.heard or ear.sequences[-1] < start + total:  # a last one that gets through
+        publisher.send(finger(0.0), header(last))
+        last += 1
+        await asyncio.sleep(0.002)
+    first_loss = ear.counts.gaps
+    assert first_loss > 0
+    assert len(ear.heard) + ear.counts.gaps == ear.sequences[-1] - start + 1
+    assert ear.sequences == sorted(ear.sequences)
+    assert "messages of writer lost" in ear.problems[0]
+
+
+async def test_latest_hands_over_the_newest_and_counts_the_rest(room: Room) -> None:
+    topic = TOPICS["stereo"]
+    publisher = room.mouth(topic)
+    ear = room.ear(topic)
+    start = await connected(publisher, ear, pictures) + 1
+    for number in range(start, start + 40):
+        publisher.send(pictures(number % 250), header(number))
+    await until(lambda: ear.heard and ear.sequences[-1] == start + 39)
+    assert len(ear.heard) + ear.counts.dropped == 40
+    assert ear.counts.dropped > 0
+    assert ear.counts.gaps == 0
+    message, _ = ear.heard[-1]
+    assert (message.left == (start + 39) % 250).all()
+    assert not message.left.flags.writeable
+
+
+async def test_latest_keeps_the_newest_of_each_writer(room: Room) -> None:
+    topic = replace(TOPICS["estop"], delivery=TOPICS["stereo"].delivery)
+    one, two = room.mouth(topic, room.endpoint("1")), room.mouth(topic, room.endpoint("2"))
+    ear = room.ear(topic, room.endpoint("1"), room.endpoint("2"))
+    number = 0
+    while {h.writer for _, h in ear.heard} != {"one", "two"}:
+        number += 1
+        one.send(stop("1"), header(number, "one"))
+        two.send(stop("2"), header(number, "two"))
+        await asyncio.sleep(0.002)
+    ear.heard.clear()
+    for _ in range(10):
+        number += 1
+        one.send(stop("1"), header(number, "one"))
+        two.send(stop("2"), header(number, "two"))
+    await until(
+        lambda: {(h.writer, h.sequence) for _, h in ear.heard} >= {("one", number), ("two", number)}
+    )
+
+
+async def test_latched_reaches_late_subscribers_once(room: Room) -> None:
+    topic = TOPICS["estop"]
+    publisher = room.mouth(topic)
+    publisher.send(stop("first"), header(1))
+    publisher.send(stop("second"), header(2))
+    early = room.ear(topic)
+    await until(lambda: early.heard)
+    late = room.ear(topic)
+    await until(lambda: late.heard)
+    publisher.send(stop("third"), header(3))
+    await until(lambda: early.sequences[-1] == 3 and late.sequences[-1] == 3)
+    assert early.sequences == late.sequences == [2, 3]
+    assert early.counts == late.counts == Counts()
+    assert early.problems == late.problems == []
+
+
+async def test_latched_over_many_late_subscribers(room: Room) -> None:
+    topic = TOPICS["scene"]
+    topic = replace(topic, message=EStop)
+    publisher = room.mouth(topic)
+    publisher.send(stop("x"), header(1))
+    ears = [room.ear(topic) for _ in range(20)]
+    await until(lambda: all(ear.heard for ear in ears))
+    assert [ear.sequences for ear in ears] == [[1]] * 20
+
+
+async def test_subscriber_before_publisher_and_restart_is_no_gap(room: Room) -> None:
+    topic = TOPICS["estop"]
+    ear = room.ear(topic)
+    first = room.mouth(topic)
+    first.send(stop("a"), header(7, epoch=1))
+    await until(lambda: len(ear.heard) == 1)
+    first.close()
+    second = room.mouth(topic)
+    second.send(stop("b"), header(1, epoch=2))
+    await until(lambda: len(ear.heard) == 2)
+    assert [message.reason for message, _ in ear.heard] == ["a", "b"]
+    assert ear.counts == Counts()
+
+
+async def test_gap_is_counted(room: Room) -> None:
+    topic = TOPICS["estop"]
+    publisher = room.mouth(topic)
+    publisher.send(stop("a"), header(1))
+    ear = room.ear(topic)
+    await until(lambda: ear.heard)
+    publisher.send(stop("b"), header(5))
+    await until(lambda: len(ear.heard) == 2)
+    assert ear.counts.gaps == 3
+    assert len(ear.problems) == 1
+    assert '"estop"' in ear.problems[0]
+
+
+async def test_failing_handler_does_not_stop_the_reader(room: Room) -> None:
+    topic = TOPICS["estop"]
+    publisher = room.mouth(topic)
+    publisher.send(stop("a"), header(1))
+    ear = room.ear(topic)
+
+    def fail(message: Message) -> None:
+        raise ZeroDivisionError("handler's own fault")
+
+    ear.extra = fail
+    await until(lambda: ear.heard)
+    publisher.send(stop("b"), header(2))
+    await until(lambda: len(ear.heard) == 2)
+    assert "handler's own fault" in ear.problems[0]
+
+
+async def test_close_within_the_handler(room: Room) -> None:
+    topic = TOPICS["twin/finger"]
+    publisher = room.mouth(topic)
+    ear = room.ear(topic)
+    start = await connected(publisher, ear, finger) + 1
+    ear.extra = lambda message: ear.subscriber.close()
+    for number in range(start, start + 20):
+        publisher.send(finger(number), header(number))
+    await until(lambda: ear.heard)
+    for _ in range(20):
+        await asyncio.sleep(0)
+    assert len(ear.heard) == 1
+    ear.subscriber.close()
+
+
+async def test_bad_messages_are_refused_and_good_ones_pass(room: Room) -> None:
+    topic = TOPICS["estop"]
+    foreign = room.raw(zmq.PUB, room.endpoint())
+    ear = room.ear(topic)
+    good = encode(stop("fine"), header(1))
+    number = 1
+    while not ear.heard:
+        foreign.send_multipart(encode(stop("fine"), header(number)))
+        number += 1
+        await asyncio.sleep(0.002)
+    bad: list[list[Any]] = [
+        [b"hello"],
+        [b""],
+        [good[0], b"one frame too many"],
+        [good[0][:-3]],
+        [b"\xff" * 1000],
+        encode(finger(1.0), header(2)),
+        [good[0] + b" " * topic.max_bytes],
+    ]
+    for frames in bad:
+        foreign.send_multipart(frames)
+    foreign.send_multipart(encode(stop("still fine"), header(number)))
+    await until(lambda: ear.heard[-1][0].reason == "still fine")
+    assert ear.counts.rejected == len(bad)
+    assert len(ear.problems) == 4  # malformed, frames, type, size: each once
+    assert all('topic "estop": message refused' in problem for problem in ear.problems)
+
+
+async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(room: Room) -> None:
+    topic = TOPICS["estop"]
+    foreign = room.raw(zmq.PUB, room.endpoint())
+    ear = room.ear(topic)
+    number = 0
+    while not ear.heard:
+        number += 1
+        foreign.send_multipart(encode(stop("fine"), header(number)))
+        await asyncio.sleep(0.002)
+    foreign.send(bytes(10 * topic.max_bytes))
+    foreign.send_multipart(encode(stop("after"), header(number + 1)))
+    await until(lambda: ear.heard[-1][0].reason == "after")
+    assert ear.counts.rejected == 1
+    assert "at most" in ear.problems[0]
+
+
+async def test_too_large_a_message_is_refused_at_the_sender(room: Room) -> None:
+    publisher = room.mouth(replace(TOPICS["stereo"], max_bytes=5000))
+    with pytest.raises(WireError, match=r"StereoPair.*at most 5000"):
+        publisher.send(pictures(1), header(1))
+
+
+async def test_endpoint_in_use(room: Room) -> None:
+    topic = TOPICS["twin/arms"]
+    room.mouth(topic)
+    with pytest.raises(BusError, match=r'topic "twin/arms": ipc://.* is in use'):
+        room.mouth(topic)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        with pytest.raises(BusError, match=r'topic "twin/arms": tcp://.* is in use'):
+            room.mouth(topic, f"tcp://127.0.0.1:{taken.getsockname()[1]}")
+
+
+async def test_stale_ipc_file_of_a_killed_writer_is_taken_over(room: Room) -> None:
+    dead = socket.socket(socket.AF_UNIX)
+    dead.bind(room.endpoint().removeprefix("ipc://"))
+    dead.close()
+    room.mouth(TOPICS["estop"])
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "words"),
+    [
+        ("ipc:///" + "x" * 200, "has 201 bytes, the system allows 107"),
+        ("ipc:///no/such/folder/a", "cannot be bound"),
+        ("tcp://127.0.0.1:99999", "a number from 1 to 65535"),
+        ("tcp://192.0.2.1:7777", "cannot be bound"),
+        ("nonsense", "neither ipc"),
+    ],
+)
+async def test_impossible_endpoints(room: Room, endpoint: str, words: str) -> None:
+    with pytest.raises(BusError, match=words) as caught:
+        room.mouth(TOPICS["estop"], endpoint)
+    assert '"estop"' in str(caught.value)
+
+
+async def test_impossible_connections(room: Room) -> None:
+    for endpoint in ("ipc:///" + "x" * 200, "nonsense", "tcp://127.0.0.1:x"):
+        with pytest.raises(BusError, match=r'topic "estop"'):
+            room.ear(TOPICS["estop"], endpoint)
+
+
+async def test_zero_copy_frames_outlive_the_socket(room: Room) -> None:
+    topic = TOPICS["stereo"]
+    publisher = room.mouth(topic)
+    ear = room.ear(topic)
+    number = await connected(publisher, ear, pictures)
+    image = np.random.default_rng(1).integers(0, 255, (480, 640), np.uint8)
+    pair = StereoPair(device="t", exposure_s=0.0, dropped_frames=0, left=image, right=image)
+    publisher.send(pair, header(number + 1))
+    await until(lambda: ear.heard)
+    publisher.close()
+    ear.subscriber.close()
+    message: StereoPair = ear.heard[-1][0]
+    assert np.array_equal(message.left, image)
+    with pytest.raises(ValueError, match="read-only"):
+        message.right[0, 0] = 1
+    with pytest.raises(ValueError, match=r"WRITEABLE|writeable"):
+        message.right.setflags(write=True)
+
+
+def test_queue_lengths_are_bounded_for_every_topic() -> None:
+    for topic in TOPICS.values():
+        assert 16 <= queue_length(topic) <= 1000
+
+
+async def test_twice_started(room: Room) -> None:
+    ear = room.ear(TOPICS["estop"])
+    with pytest.raises(BusError, match="started already"):
+        ear.subscriber.start()
+
+
+def last_heard(ear: Ear, number: int) -> bool:
+    return bool(ear.heard) and ear.sequences[-1] == number
+
+
+def arms() -> TwinArms:
+    return TwinArms(
+        joints_left_rad=np.zeros(6),
+        joints_right_rad=np.zeros(6),
+        world_from_flange_left=np.eye(4),
+        world_from_flange_right=np.eye(4),
+    )
+
+
+async def test_bursts_never_leave_a_message_lying(room: Room) -> None:
+    """Edge-triggered wake-ups: whatever the rhythm, no message waits for the next one."""
+    topic = TOPICS["twin/arms"]
+    publisher = room.mouth(topic)
+    ear = room.ear(topic)
+    number = await connected(publisher, ear, lambda _: arms())
+    random = np.random.default_rng(3)
+    for _ in range(300):
+        for _ in range(int(random.integers(1, 5))):
+            number += 1
+            publisher.send(arms(), header(number))
+            if random.random() < 0.5:
+                await asyncio.sleep(0)
+        await until(partial(last_heard, ear, number), "delivery")
+    assert ear.counts == Counts()
