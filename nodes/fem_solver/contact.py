@@ -1,0 +1,364 @@
+"""Contact of a fingertip sphere with a linear soft body: smooth, and the same from every history.
+
+The finger pushes without friction.  The skin is sampled at fixed contact points, finer than the
+mesh; where a point would lie inside the finger by more than it has yielded, a pressure acts that
+grows with what is left (penetration times a stiff bed).  The nodal forces f then minimise the
+strictly convex energy
+
+    1/2 f.C f + 1/2 sum_q d_q max(0, t_q - (W C f)_q)^2
+
+with C the compliance of the nodes, W the shape functions at the points, t_q how far the rigid
+finger reaches below the skin there, and d_q = bed stiffness times area.  So the answer is unique
+(no path dependence), and Lipschitz continuous in the finger's position (no popping).  A semismooth
+Newton iteration (Qi & Sun 1993) finds it in a few small dense solves.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+BED_RATIO = 40.0
+"""Stiffness of the contact bed (Pa/m) in units of E / finger radius."""
+POINT_SPACING_RATIO = 0.3
+"""Largest spacing of the contact points, in finger radii."""
+FLANK_RATIO = 0.9
+"""Beyond this part of the radius the fingertip goes on as a cone, tangent to the sphere."""
+FULL_STEPS = 8
+MAX_ITERATIONS = 40
+
+
+@dataclass(frozen=True, slots=True)
+class SkinResponse:
+    """What a linear body answers to unit forces on its skin, for a Young's modulus of 1 Pa.
+
+    rest (s, 3): skin nodes, metres, mesh frame.  touch (m,): indices into the skin of the nodes
+    that can be loaded.  normals (m, 3): outward.  faces (f, 6): six-node triangles, indices into
+    `touch`.
+    compliance (m, m): inward displacement of node i under 1 N inward on node j; symmetric.
+    table (m, 3 s) float32: displacement of the whole skin under 1 N inward on node j.
+    """
+
+    rest: Floats
+    touch: Ints
+    normals: Floats
+    faces: Ints
+    compliance: Floats
+    table: Floats32
+
+
+@dataclass(frozen=True, slots=True)
+class Push:
+    """Where a fingertip meets the undeformed object.
+
+    normal: outward, of the surface point that is pushed.  depth_m: of the fingertip below it, along
+    the normal; negative outside.  beyond_m: how far the fingertip is past the end of the surface.
+    """
+
+    surface: Floats
+    normal: Floats
+    depth_m: float
+    beyond_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Response:
+    """A soft body's answer to one finger position, in the mesh frame; see `messages.SoftBody`."""
+
+    displacement: Floats32
+    force_n: Floats
+    stiffness_n_per_m: float
+    push_depth_m: float
+    in_range: bool
+
+
+class SoftBodyMethod(Protocol):
+    """What every method of the family offers, whatever is precomputed behind it."""
+
+    def respond(self, push: Push) -> Response: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """Forces (k,) inward in newtons on touch nodes `nodes`, the sum over all of them (3,) that acts
+    on the finger, and how that sum grows per metre of further push."""
+
+    nodes: Ints
+    forces: Floats
+    force_n: Floats
+    tangent_n_per_m: Floats
+
+
+def approach_normal(point: Floats, radius_m: float, held: Floats | None) -> Floats:
+    """The outward normal that a finger at `point` (3,) pushes against, on a cylinder about x.
+
+    That of the nearest surface point, except deep inside (below half the radius), and on the far
+    side of where the finger went in: there `held`, the normal it came in by, stays; without one,
+    +z, towards the user.  So a finger pushed through the axis does not come out of the other side.
+    """
+    distance = float(np.hypot(point[1], point[2]))
+    if distance > 0.5 * radius_m:
+        radial = np.array([0.0, point[1], point[2]]) / distance
+        if held is None or distance >= radius_m or radial @ held > 0.0:
+            return radial
+    return np.array([0.0, 0.0, 1.0]) if held is None else held
+
+
+def push_on_cylinder(point: Floats, *, radius_m: float, length_m: float, normal: Floats) -> Push:
+    """The push of a fingertip at `point` (3,) against a cylinder about x, along `normal`.
+
+    ValueError for a point that is not finite.
+    """
+    if not np.isfinite(point).all():
+        raise ValueError(f"fingertip {point} is not finite")
+    along = float(point @ normal)
+    across2 = float(point[1] ** 2 + point[2] ** 2) - along**2
+    depth = float(np.sqrt(max(radius_m**2 - across2, 0.0))) - along
+    return Push(
+        surface=point + depth * normal,
+        normal=normal,
+        depth_m=depth,
+        beyond_m=max(0.0, abs(float(point[0])) - 0.5 * length_m),
+    )
+
+
+def saturated(depth_m: float, linear_m: float, largest_m: float) -> float:
+    """A depth that follows `depth_m` to `linear_m` and then bends (C1) towards `largest_m`."""
+    if depth_m <= linear_m:
+        return depth_m
+    span = largest_m - linear_m
+    return linear_m + span * -float(np.expm1(-(depth_m - linear_m) / span))
+
+
+def triangle_points(divisions: int) -> tuple[Floats, Floats]:
+    """Shape functions (p, 6) and local coordinates (p, 2) at the centroids of a six-node triangle
+    cut into divisions^2 equal parts."""
+    upright = [(i + 1 / 3, j + 1 / 3) for i in range(divisions) for j in range(divisions - i)]
+    inverted = [(i + 2 / 3, j + 2 / 3) for i in range(divisions) for j in range(divisions - i - 1)]
+    local = np.array(upright + inverted) / divisions
+    b = np.column_stack([1.0 - local.sum(axis=1), local])
+    middle = 4.0 * np.column_stack([b[:, 0] * b[:, 1], b[:, 1] * b[:, 2], b[:, 2] * b[:, 0]])
+    return np.column_stack([b * (2.0 * b - 1.0), middle]), local
+
+
+class SphereContact:
+    """The contact problem of one body and one fingertip; holds no state between solves."""
+
+    def __init__(
+        self,
+        response: SkinResponse,
+        *,
+        young_modulus_pa: float,
+        finger_radius_m: float,
+        bed_ratio: float = BED_RATIO,
+    ) -> None:
+        self._response = response
+        self._radius = finger_radius_m
+        self._compliance = response.compliance / young_modulus_pa
+        corners = response.rest[response.touch][response.faces]
+        longest = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).max())
+        divisions = max(2, int(np.ceil(longest / (POINT_SPACING_RATIO * finger_radius_m))))
+        self._shape, _ = triangle_points(divisions)
+        self._points = self._shape @ corners
+        normals = self._shape @ response.normals[response.faces]
+        self._normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
+        sides = corners[:, 1:3] - corners[:, :1]
+        areas = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+        bed = bed_ratio * young_modulus_pa / finger_radius_m
+        self._bed = bed * areas / len(self._shape)
+        self._centres = corners.mean(axis=1)
+        self._size = np.linalg.norm(corners - self._centres[:, None], axis=2).max(axis=1)
+
+    def reach(self, points: Floats, normals: Floats, centre: Floats, direction: Floats) -> Floats:
+        """How far the rigid finger reaches below each point, and its growth per push: (2, q).
+
+        points, normals (q, 3); the finger's sphere at `centre`, pushed along -direction.  Beyond
+        `FLANK_RATIO` of the radius the sphere is continued by its tangent cone, so that every point
+        has a finite, C1 answer; it is negative where the finger is clear of the skin.
+        """
+        r = self._radius
+        offset = centre - points
+        along = np.einsum("qi,qi->q", offset, normals)
+        sideways = offset - along[:, None] * normals
+        across = np.sqrt(np.einsum("qi,qi->q", sideways, sideways))
+        flank = FLANK_RATIO * r
+        inner = np.minimum(across, flank)
+        height = np.sqrt(r * r - inner * inner)
+        slope = inner / height
+        below = height - slope * (across - inner) - along
+        drift = sideways @ direction / np.maximum(across, 1e-12)
+        return np.stack([below, normals @ direction + slope * drift])
+
+    def solve(self, push: Push, depth_m: float) -> Contact | None:
+        """The contact at `depth_m` below `push.surface`; None where the finger does not touch."""
+        centre = push.surface + (self._radius - depth_m) * push.normal
+        limit = FLANK_RATIO * self._radius
+        widest = limit + max(depth_m, 0.0)
+        squared = np.square(self._centres - push.surface).sum(axis=1)
+        near = np.flatnonzero(squared < np.square(widest + self._size))
+        if not len(near):
+            return None
+        count = len(self._shape)
+        below, growth = self.reach(
+            self._points[near].reshape(-1, 3),
+            self._normals[near].reshape(-1, 3),
+            centre,
+            push.normal,
+        )
+        reached = np.flatnonzero(below > 0.0)
+        if not len(reached):
+            return None
+        # points that the finger does not reach at rest are left out: the skin sinks around a push
+        face, point = near[reached // count], reached % count
+        nodes, local = np.unique(self._response.faces[face], return_inverse=True)
+        weights = np.zeros((len(reached), len(nodes)))
+        weights[np.arange(len(reached))[:, None], local.reshape(-1, 6)] = self._shape[point]
+        forces, tangent = solve_bed(
+            weights,
+            self._compliance[np.ix_(nodes, nodes)],
+            self._bed[face],
+            below[reached],
+            growth[reached],
+        )
+        normals = self._response.normals[nodes]
+        return Contact(nodes, forces, forces @ normals, tangent @ normals)
+
+
+def solve_bed(
+    weights: Floats, compliance: Floats, bed: Floats, below: Floats, growth: Floats
+) -> tuple[Floats, Floats]:
+    """Nodal forces (k,) of the module's energy, and their growth per unit of `growth`, (k,).
+
+    weights W (q, k), compliance C (k, k), bed d (q,), below t (q,).  Newton from Hertz's guess that
+    half of the overlap is contact; its full steps settle in two to five.  Should they not, further
+    ones are halved until the energy falls.  ArithmeticError if even that does not settle.
+    """
+    yields = weights @ compliance
+    identity = np.eye(len(compliance))
+    active = below > 0.5 * below.max()
+    forces = np.zeros(len(compliance))
+    for iteration in range(MAX_ITERATIONS):
+        loaded = weights[active].T * bed[active]
+        right = loaded @ np.column_stack([below[active], growth[active]])
+        target = np.linalg.solve(identity + loaded @ yields[active], right)
+        share = 1.0
+        if iteration >= FULL_STEPS:
+            share = _decreasing_share(forces, target[:, 0], (compliance, yields, bed, below))
+        forces = forces + share * (target[:, 0] - forces)
+        now = below > yields @ forces
+        if share == 1.0 and np.array_equal(now, active):
+            return forces, target[:, 1]
+        active = now
+    raise ArithmeticError(f"contact of {len(bed)} points did not settle")
+
+
+def _decreasing_share(
+    forces: Floats, target: Floats, problem: tuple[Floats, Floats, Floats, Floats]
+) -> float:
+    """The largest 2^-j of the way from `forces` to `target` along which the energy falls."""
+    compliance, yields, bed, below = problem
+
+    def energy(trial: Floats) -> float:
+        left = np.maximum(below - yields @ trial, 0.0)
+        return 0.5 * float(trial @ compliance @ trial + bed @ (left * left))
+
+    start, share = energy(forces), 1.0
+    while share > 1e-3 and energy(forces + share * (target - forces)) > start * (1.0 + 1e-12):
+        share *= 0.5
+    return share
+
+
+class LinearSoftBody:
+    """The precomputed linear method: one contact solve, one product with the skin's table.
+
+    Good to `linear_depth_m`.  Deeper pushes bend the skin no further than `largest_depth_m`, are
+    flagged, and their force goes on along its tangent.
+    """
+
+    name = "linear"
+
+    def __init__(
+        self,
+        response: SkinResponse,
+        *,
+        young_modulus_pa: float,
+        finger_radius_m: float,
+        linear_depth_m: float,
+        largest_depth_m: float,
+        touch_angle_rad: float,
+    ) -> None:
+        """ValueError unless 0 < linear_depth_m < largest_depth_m."""
+        if not 0.0 < linear_depth_m < largest_depth_m:
+            raise ValueError(
+                f"linear_depth_m: {linear_depth_m:g} must be positive and less than "
+                f"largest_depth_m: {largest_depth_m:g}"
+            )
+        self.contact = SphereContact(
+            response, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
+        )
+        self._response = response
+        self._modulus = young_modulus_pa
+        self._linear, self._largest = linear_depth_m, largest_depth_m
+        self._touch_angle = touch_angle_rad
+        self.at_rest: Floats32 = np.zeros(response.rest.shape, dtype=np.float32)
+        corners = np.unique(response.faces[:, :3])
+        self._places = response.rest[response.touch[corners]]
+        normals = response.normals[corners]
+        self._place_stiffness = np.array(
+            [
+                self._secant(Push(place, normal, linear_depth_m))
+                for place, normal in zip(self._places, normals, strict=True)
+            ]
+        )
+        sides = response.rest[response.touch[response.faces[:, :2]]]
+        longest = np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1).max()
+        self._smoothing2 = max(float(longest), finger_radius_m) ** 2
+
+    def respond(self, push: Push) -> Response:
+        """The body's answer; any finite push has one."""
+        depth = saturated(push.depth_m, self._linear, self._largest)
+        contact = self.contact.solve(push, depth)
+        stiffness = self.stiffness_n_per_m(push.surface)
+        if contact is None:
+            return Response(self.at_rest, np.zeros(3), stiffness, 0.0, True)
+        angle = abs(float(np.arctan2(push.normal[1], push.normal[2])))
+        return Response(
+            displacement=self._displacement(contact),
+            force_n=contact.force_n + (push.depth_m - depth) * contact.tangent_n_per_m,
+            stiffness_n_per_m=stiffness,
+            push_depth_m=max(0.0, push.depth_m - push.beyond_m),
+            in_range=push.depth_m <= self._linear
+            and push.beyond_m == 0.0
+            and angle <= self._touch_angle,
+        )
+
+    def stiffness_n_per_m(self, surface: Floats) -> float:
+        """Force over depth at the end of the linear range, at the touchable place near `surface`.
+
+        It does not depend on the present push, so that it is there before the finger touches; it
+        is a Gaussian mean over the corners of the mesh around, so that it is smooth.
+        """
+        squared = np.square(self._places - surface).sum(axis=1)
+        weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
+        return float(weights @ self._place_stiffness / weights.sum())
+
+    def _secant(self, push: Push) -> float:
+        contact = self.contact.solve(push, push.depth_m)
+        return 0.0 if contact is None else float(contact.force_n @ push.normal) / push.depth_m
+
+    def _displacement(self, contact: Contact) -> Floats32:
+        forces = (contact.forces / self._modulus).astype(np.float32)
+        total = np.zeros(self._response.table.shape[1], dtype=np.float32)
+        # nodes are numbered along the mesh: runs of neighbours are read in place, without a copy
+        breaks = np.flatnonzero(np.diff(contact.nodes) != 1) + 1
+        for start, stop in zip([0, *breaks], [*breaks, len(forces)], strict=True):
+            first = contact.nodes[start]
+            total += forces[start:stop] @ self._response.table[first : first + stop - start]
+        return total.reshape(-1, 3)

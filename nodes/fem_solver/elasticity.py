@@ -1,0 +1,163 @@
+"""Linear isotropic elasticity on 10-node tetrahedra: stiffness, supports, a direct solve.
+
+Small strain, Hooke's law with Lame's constants (Zienkiewicz & Taylor, "The Finite Element Method",
+vol. 1, ch. 4-6).  Degrees of freedom are numbered 3 * node + axis.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.fem_solver.mesh import EDGES
+
+if TYPE_CHECKING:
+    from scipy.sparse import csc_matrix
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CHUNK_ELEMENTS = 2048
+MAX_POISSON_RATIO = 0.4999
+"""Nearer to 0.5 a displacement formulation loses all digits to the bulk modulus."""
+
+
+class MeshError(ValueError):
+    """A mesh that cannot be computed with: inverted elements, or a body that nothing holds."""
+
+
+def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
+    """(lambda, mu) in Pa.  ValueError outside E > 0, -1 < nu <= 0.4999."""
+    if not (np.isfinite(young_modulus_pa) and young_modulus_pa > 0.0):
+        raise ValueError(f"young_modulus_pa: {young_modulus_pa!r} must be a positive number")
+    if not -1.0 < poisson_ratio <= MAX_POISSON_RATIO:
+        raise ValueError(
+            f"poisson_ratio: {poisson_ratio!r} must lie above -1 and at most at "
+            f"{MAX_POISSON_RATIO}; an incompressible body needs a mixed formulation, take 0.499"
+        )
+    mu = 0.5 * young_modulus_pa / (1.0 + poisson_ratio)
+    return 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio), mu
+
+
+def quadrature() -> tuple[Floats, Floats]:
+    """Points (8, 3) and weights (8,) on the unit tetrahedron, exact to degree 3, all positive.
+
+    Conical product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
+    Degree 3 is what the patch test needs on curved elements; straight ones need degree 2.
+    """
+    from scipy.special import roots_jacobi
+
+    rules = [roots_jacobi(2, power, 0.0) for power in (2, 1, 0)]
+    (a, wa), (b, wb), (c, wc) = [
+        (0.5 * (1.0 + x), w / 2.0 ** (power + 1))
+        for (x, w), power in zip(rules, (2, 1, 0), strict=True)
+    ]
+    u, v, w = (grid.ravel() for grid in np.meshgrid(a, b, c, indexing="ij"))
+    points = np.column_stack([u, v * (1.0 - u), w * (1.0 - u) * (1.0 - v)])
+    weights = np.einsum("i,j,k->ijk", wa, wb, wc).ravel()
+    return points, weights
+
+
+def shape_gradients(points: Floats) -> Floats:
+    """Gradients (q, 10, 3) of the shape functions at points (q, 3) of the unit tetrahedron."""
+    barycentric = np.column_stack([1.0 - points.sum(axis=1), points])
+    slopes = np.vstack([-np.ones(3), np.eye(3)])
+    corner = (4.0 * barycentric - 1.0)[:, :, None] * slopes
+    first, second = EDGES.T
+    edge = 4.0 * (
+        barycentric[:, first, None] * slopes[second] + barycentric[:, second, None] * slopes[first]
+    )
+    return np.concatenate([corner, edge], axis=1)
+
+
+def element_stiffness(
+    nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
+) -> Floats:
+    """Stiffness matrices (e, 30, 30) in N/m.
+
+    MeshError where an element is inverted or flat, ValueError as `lame_constants`.
+    """
+    lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
+    points, weights = quadrature()
+    local = shape_gradients(points)
+    jacobian = np.einsum("qak,eai->eqik", local, nodes[elements])
+    determinant = np.linalg.det(jacobian)
+    size = np.ptp(nodes[elements[:, :4]], axis=1).max(axis=1)
+    bad = determinant.min(axis=1) <= 1e-6 * size**3
+    if bad.any():
+        raise MeshError(
+            f"{int(bad.sum())} of {len(elements)} elements are inverted or flat, the first is "
+            f"number {int(np.argmax(bad))} (smallest Jacobian {determinant.min():.3g} m^3)"
+        )
+    # gradients in space: J^-T applied to the local ones, one row per (node, axis)
+    gradient = np.einsum("qak,eqki->eqai", local, np.linalg.inv(jacobian))
+    flat = gradient.reshape(len(elements), len(points), 30)
+    weighted = flat * (determinant * weights)[:, :, None]
+    outer = (weighted.transpose(0, 2, 1) @ flat).reshape(-1, 10, 3, 10, 3)
+    stiffness: Floats = lame * outer + mu * outer.transpose(0, 1, 4, 3, 2)
+    trace = mu * np.einsum("eakbk->eab", outer)
+    for axis in range(3):
+        stiffness[:, :, axis, :, axis] += trace
+    return stiffness.reshape(-1, 30, 30)
+
+
+def stiffness_matrix(
+    nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
+) -> csc_matrix:
+    """The assembled stiffness (3n, 3n) in N/m; errors as `element_stiffness`."""
+    from scipy.sparse import csc_matrix
+
+    size = 3 * len(nodes)
+    total = csc_matrix((size, size))
+    for start in range(0, len(elements), CHUNK_ELEMENTS):
+        part = elements[start : start + CHUNK_ELEMENTS]
+        blocks = element_stiffness(
+            nodes, part, young_modulus_pa=young_modulus_pa, poisson_ratio=poisson_ratio
+        )
+        dofs = (3 * part[:, :, None] + np.arange(3)).reshape(-1, 30)
+        rows, columns = np.repeat(dofs, 30, axis=1).ravel(), np.tile(dofs, (1, 30)).ravel()
+        total = total + csc_matrix((blocks.ravel(), (rows, columns)), shape=(size, size))
+    return total
+
+
+def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
+    """MeshError unless the fixed nodes hold the body: three of them at least, not on one line."""
+    held = nodes[fixed]
+    extent = np.ptp(nodes, axis=0).max()
+    if (
+        len(held) < 3
+        or np.linalg.matrix_rank(held - held.mean(axis=0), tol=1e-6 * extent * len(held) ** 0.5) < 2
+    ):
+        raise MeshError(
+            f"the body is free to move: {len(held)} fixed nodes, at least three not on one line "
+            "are needed (object.support_angle_rad too small for skin_spacing_m?)"
+        )
+
+
+def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
+    """The three degrees of freedom of each node, (3k,)."""
+    return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.arange(3)).ravel()
+
+
+def solve(stiffness: csc_matrix, held: Ints, values: Floats, loads: Floats) -> Floats:
+    """Displacements (3n,) with the degrees of freedom `held` at `values`, nodal `loads` elsewhere.
+
+    One sparse factorisation; MeshError if what is not held can still move freely.
+    """
+    from scipy.sparse.linalg import splu
+
+    free = np.setdiff1d(np.arange(stiffness.shape[0]), held)
+    result = np.zeros(stiffness.shape[0])
+    result[held] = values
+    inner = stiffness[free][:, free].tocsc()
+    try:
+        factor = splu(inner, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    except RuntimeError as error:
+        raise MeshError(f"the body is free to move: {error}") from error
+    pivots = np.abs(factor.U.diagonal())
+    if pivots.min() < 1e-12 * pivots.max():
+        raise MeshError("the body is free to move: the stiffness is singular to rounding")
+    result[free] = factor.solve(loads[free] - stiffness[free][:, held] @ values)
+    return result
