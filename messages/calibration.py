@@ -82,7 +82,8 @@ def load_calibration(path: Path) -> StereoCalibration:
         raise CalibrationFileError(f"{path}: not YAML: {error}") from error
     if not isinstance(content, dict) or "version" not in content:
         raise CalibrationFileError(
-            f'{path}: no key "version": not a calibration; write one with `flexsheet calibrate stereo`'
+            f'{path}: no key "version": not a calibration file; `flexsheet calibrate stereo` '
+            "writes one"
         )
     if content["version"] != CALIBRATION_VERSION:
         raise CalibrationFileError(

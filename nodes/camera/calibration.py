@@ -1,8 +1,8 @@
-"""Calibrates a stereo rig from pictures of a chessboard, and checks a calibration on other pictures.
+"""Calibrates a stereo rig from pictures of a chessboard, and checks a calibration on others.
 
 Zhang's method as OpenCV has it: each camera alone first, then both together with all parameters
-free, which fits held-out pictures better than fixed intrinsics do.  Lens model: pinhole with k1, k2,
-p1, p2; k3 stays 0, since boards that fill less than the picture cannot tell it from k2.
+free, which fits held-out pictures better than fixed intrinsics do.  Lens model: pinhole with k1,
+k2, p1, p2; k3 stays 0, since boards that fill less than the picture cannot tell it from k2.
 """
 
 from __future__ import annotations
@@ -101,9 +101,9 @@ def find_corners(image: NDArray[np.uint8], board: Board) -> Floats | None:
 def same_order(left: Floats, right: Floats, board: Board) -> Floats:
     """The right picture's corners, renumbered to start at the same board corner as the left's.
 
-    A detector may begin at either end of the board (at any corner of a square one).  The two cameras
-    of a rig stand nearly upright to each other, so that the right numbering is the one whose axes
-    point as the left's do.
+    A detector may begin at either end of the board (at any corner of a square one).  The two
+    cameras of a rig stand nearly upright to each other, so that the right numbering is the one
+    whose axes point as the left's do.
     """
     grid = right.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
@@ -112,7 +112,7 @@ def same_order(left: Floats, right: Floats, board: Board) -> Floats:
     def axes(corners: Floats) -> Floats:
         square = corners.reshape(board.rows, board.columns, 2)
         directions = np.stack([square[0, -1] - square[0, 0], square[-1, 0] - square[0, 0]])
-        return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
     wanted = axes(left)
     return max(numberings, key=lambda corners: float(np.sum(axes(corners) * wanted)))
@@ -199,14 +199,18 @@ def _fit(pairs: Sequence[BoardPair], board: Board, size: tuple[int, int]) -> _Ri
         )
     )
     return _Rig(
-        left_matrix=left_k,
-        left_distortion=left_d.ravel()[:5],
-        right_matrix=right_k,
-        right_distortion=right_d.ravel()[:5],
-        right_from_left=rigid.transform(rotation, translation.ravel()),
-        pair_rms_px=errors.reshape(-1, 2),
+        left_matrix=_floats(left_k),
+        left_distortion=_floats(left_d).ravel()[:5],
+        right_matrix=_floats(right_k),
+        right_distortion=_floats(right_d).ravel()[:5],
+        right_from_left=rigid.transform(_floats(rotation), _floats(translation).ravel()),
+        pair_rms_px=_floats(errors).reshape(-1, 2),
         rms_px=float(rms),
     )
+
+
+def _floats(array: object) -> Floats:
+    return np.asarray(array, dtype=np.float64)
 
 
 def _lens(matrix: Floats, distortion: Floats) -> Lens:
@@ -322,7 +326,10 @@ def reprojection_errors(
 
 
 def rigid_fit_residuals(points: Floats, model: Floats) -> Floats:
-    """Distances (n,) left after the best rigid motion of `model` (n, 3) onto `points` (Kabsch 1976)."""
+    """Distances (n,) left after the best rigid motion of `model` (n, 3) onto `points` (n, 3).
+
+    Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
+    """
     centred, reference = points - points.mean(axis=0), model - model.mean(axis=0)
     u, _, vt = np.linalg.svd(reference.T @ centred)
     handed = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

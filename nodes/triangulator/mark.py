@@ -17,9 +17,19 @@ Image = NDArray[np.uint8]
 Window = tuple[slice, slice]
 """Rows and columns of a part of a picture."""
 
-Centroid = Callable[[Image, NDArray[np.bool_], float], tuple[float, float]]
-"""(x, y) in a cut-out, from its levels (h, w), which pixels belong to the mark (h, w), and the
-level that divides mark from surroundings."""
+Centroid = Callable[[Image, float, float], tuple[float, float]]
+"""(x, y) in a cut-out (h, w) around one mark, from its levels, the level of what surrounds the
+mark, and the mark's own peak."""
+
+SURROUND_PX = 3
+"""Width of the border that is kept around a mark's blob; its outermost pixels are surroundings."""
+
+SURROUND_RANK = 0.9
+"""Share of the surrounding pixels that are darker than their stated level: a mark on a finger has
+finger on one side and darkness on the other, and the finger must not count as mark."""
+
+SKIRT_SHARE = 0.1
+"""Light below this share of the mark's height above its surroundings is left out as noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,30 +47,44 @@ class MarkLooks:
     window_half_px: int = 28
 
 
-def moments(levels: Image, member: NDArray[np.bool_], threshold: float) -> tuple[float, float]:
-    """Centre of the mark's area: every pixel of the mark counts alike."""
-    found = cv2.moments(member.view(np.uint8), binaryImage=True)
-    return found["m10"] / found["m00"], found["m01"] / found["m00"]
+def moments(cut: Image, surround: float, peak: float) -> tuple[float, float]:
+    """Centre of the area brighter than half the mark's height: every such pixel counts alike."""
+    bright = cv2.threshold(cut, 0.5 * (surround + peak), 1, cv2.THRESH_BINARY)[1]
+    return _centre(cv2.moments(bright, binaryImage=True))
 
 
-def weighted_centroid(
-    levels: Image, member: NDArray[np.bool_], threshold: float
-) -> tuple[float, float]:
-    """Centre of the mark's light above the threshold.
+def weighted_centroid(cut: Image, surround: float, peak: float) -> tuple[float, float]:
+    """Centre of the mark's light.
 
     A pixel that the mark's edge crosses counts by how much of it is lit, which removes most of the
-    pixel grid's error, and the weight falls to zero at the edge, so that no pixel jumps in or out.
+    pixel grid's error, and the weight falls to zero at the skirt, so that no pixel jumps in or out.
     """
-    weights = np.where(member, levels.astype(np.float32) - np.float32(threshold), np.float32(0.0))
-    found = cv2.moments(weights)
+    skirt = np.float32(surround + SKIRT_SHARE * (peak - surround))
+    return _centre(cv2.moments(np.maximum(cut.astype(np.float32) - skirt, np.float32(0.0))))
+
+
+def _centre(found: dict[str, float]) -> tuple[float, float]:
     return found["m10"] / found["m00"], found["m01"] / found["m00"]
 
 
-MARK_METHODS: dict[str, Centroid] = {"moments": moments, "weighted_centroid": weighted_centroid}
+@dataclass(frozen=True, slots=True)
+class MarkMethod:
+    """A way to find a mark's centre, and the standard deviation (px) that it leaves."""
+
+    centroid: Centroid
+    noise_px: float
+
+
+MARK_METHODS = {
+    "moments": MarkMethod(moments, noise_px=0.1),
+    "weighted_centroid": MarkMethod(weighted_centroid, noise_px=0.025),
+}
+"""The noise is what makes the tracked covariance agree with the twin's true error
+for a mark of 3 mm radius half a metre away."""
 
 
 def window_around(pixel: Floats, shape: tuple[int, int], half_px: int) -> Window | None:
-    """The window of a picture of `shape` (height, width) around a pixel; None if it lies outside."""
+    """The window around a pixel in a picture of `shape` (height, width); None if outside it."""
     if not np.isfinite(pixel).all():
         return None
     x, y = round(float(pixel[0])), round(float(pixel[1]))
@@ -83,24 +107,37 @@ def find_marks(
     mean, (_, peak, _, _) = cv2.mean(part)[0], cv2.minMaxLoc(part)
     if peak - mean < looks.min_contrast:
         return []
-    threshold = 0.5 * (peak + mean)
-    bright = cv2.threshold(part, threshold, 255, cv2.THRESH_BINARY)[1]
+    bright = cv2.threshold(part, 0.5 * (peak + mean), 255, cv2.THRESH_BINARY)[1]
     left, top, width, height = cv2.boundingRect(bright)
     blobs = bright[top : top + height, left : left + width]
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(blobs, connectivity=8)
+    stats = cv2.connectedComponentsWithStats(blobs, connectivity=8)[2][1:]
+    sizes = stats[:, cv2.CC_STAT_AREA]
     centres = []
-    for label in range(1, len(stats)):
-        x, y, blob_width, blob_height, area = (int(number) for number in stats[label])
-        x, y = x + left, y + top
-        if not looks.min_area_px <= area <= looks.max_area_px:
-            continue
-        if x == 0 or y == 0 or x + blob_width == part.shape[1] or y + blob_height == part.shape[0]:
-            continue
-        cut = (slice(y, y + blob_height), slice(x, x + blob_width))
-        member = labels[y - top : y - top + blob_height, x - left : x - left + blob_width] == label
-        centre_x, centre_y = centroid(part[cut], member, threshold)
-        centres.append(np.array([columns.start + x + centre_x, rows.start + y + centre_y]))
+    for x, y, blob_width, blob_height, _ in stats[
+        (sizes >= looks.min_area_px) & (sizes <= looks.max_area_px)
+    ].tolist():
+        box = (x + left, y + top, blob_width, blob_height)
+        centre = _mark_in(part, box, looks, centroid)
+        if centre is not None:
+            centres.append(np.array([columns.start + centre[0], rows.start + centre[1]]))
     return centres
+
+
+def _mark_in(
+    part: Image, box: tuple[int, int, int, int], looks: MarkLooks, centroid: Centroid
+) -> tuple[float, float] | None:
+    """The centre of the blob in a box (x, y, width, height) of a picture; None if it is no mark."""
+    x, y, width, height = box
+    if x == 0 or y == 0 or x + width == part.shape[1] or y + height == part.shape[0]:
+        return None
+    left, top = max(x - SURROUND_PX, 0), max(y - SURROUND_PX, 0)
+    cut = part[top : y + height + SURROUND_PX, left : x + width + SURROUND_PX]
+    border = np.sort(np.concatenate([cut[0], cut[-1], cut[:, 0], cut[:, -1]]))
+    surround, peak = float(border[int(SURROUND_RANK * len(border))]), float(cut.max())
+    if peak - surround < 0.5 * looks.min_contrast:
+        return None
+    centre_x, centre_y = centroid(cut, surround, peak)
+    return left + centre_x, top + centre_y
 
 
 def find_mark_near(

@@ -31,13 +31,15 @@ class TriangulatorParameters(NodeParameters):
     )
     mark: Literal["moments", "weighted_centroid"] = "weighted_centroid"
     triangulation: Literal["midpoint", "dlt", "optimal"] = "dlt"
-    mark_noise_px: Positive = 0.03
+    mark_noise_px: Positive | None = Field(
+        default=None, description="of a mark's centre; null: what the method leaves in the twin"
+    )
     max_reprojection_px: Positive = 1.5
     mark_min_contrast: Positive = 60.0
     mark_min_area_px: Annotated[int, Field(ge=1)] = 6
     mark_max_area_px: Annotated[int, Field(ge=1)] = 1500
     window_half_px: Annotated[int, Field(ge=8)] = 28
-    acceleration_noise: Positive = Field(default=1.0, description="m/s^2 per root hertz")
+    acceleration_noise: Positive = Field(default=0.5, description="m/s^2 per root hertz")
     forget_after_s: Positive = 0.1
     confirm_frames: Annotated[int, Field(ge=1)] = 3
 
@@ -61,6 +63,7 @@ class Triangulator(Node):
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         p = self.parameters
+        method = MARK_METHODS[p.mark]
         self.geometry = None
         self.geometry = StereoGeometry.of(scene.camera, self.calibration)
         self.volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
@@ -72,9 +75,9 @@ class Triangulator(Node):
                 max_area_px=p.mark_max_area_px,
                 window_half_px=p.window_half_px,
             ),
-            centroid=MARK_METHODS[p.mark],
+            centroid=method.centroid,
             triangulate=TRIANGULATION_METHODS[p.triangulation],
-            noise_px=p.mark_noise_px,
+            noise_px=p.mark_noise_px or method.noise_px,
             max_reprojection_px=p.max_reprojection_px,
         )
         self.tracking = TrackingSettings(

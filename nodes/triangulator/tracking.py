@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+POSITION, VELOCITY = np.arange(3), np.arange(3, 6)
+
 GATE_SIGMAS = 5.0
 """Measurement noise that the gate forgives on top of a finger's fastest motion."""
 
@@ -68,8 +70,12 @@ def predicted(track: Track, at_ns: int, acceleration_noise: float) -> Track:
     step = np.eye(6)
     step[:3, 3:] = np.eye(3) * dt
     density = acceleration_noise**2
-    noise = np.kron(np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]]), np.eye(3)) * density
-    return Track(at_ns, step @ track.state, step @ track.covariance @ step.T + noise)
+    full = step @ track.covariance @ step.T
+    full[POSITION, POSITION] += density * dt**3 / 3
+    full[POSITION, VELOCITY] += density * dt**2 / 2
+    full[VELOCITY, POSITION] += density * dt**2 / 2
+    full[VELOCITY, VELOCITY] += density * dt
+    return Track(at_ns, step @ track.state, full)
 
 
 def corrected(track: Track, measured: Floats, covariance: Floats) -> Track:
@@ -82,13 +88,10 @@ def corrected(track: Track, measured: Floats, covariance: Floats) -> Track:
     return Track(track.at_ns, state, 0.5 * (full + full.T))
 
 
-def reachable(
-    before_ns: int, before: Floats, at_ns: int, point: Floats, covariance: Floats, max_speed: float
-) -> bool:
-    """Whether a finger can be at `point` after it was at `before`, but for measurement noise."""
+def reachable(way: Floats, duration_ns: int, covariance: Floats, max_speed: float) -> bool:
+    """Whether a finger can go the way (3,) to a measured point in a time, but for its noise."""
     slack_m = GATE_SIGMAS * float(np.sqrt(np.trace(covariance)))
-    limit_m = max_speed * (at_ns - before_ns) * 1e-9 + slack_m
-    return float(np.linalg.norm(point - before)) <= limit_m
+    return float(np.linalg.norm(way)) <= max_speed * duration_ns * 1e-9 + slack_m
 
 
 class Tracker:
@@ -116,24 +119,18 @@ class Tracker:
         Times must increase.  A refused jump is not forgotten: when the following measurements
         agree with it, the finger was there, and the track starts anew.
         """
-        settings = self.settings
+        settings, speed = self.settings, self.settings.max_speed_m_per_s
         if self.track is None or self._forgotten(at_ns):
             self._start(at_ns, measured, covariance)
             return True
-        if reachable(
-            self.track.at_ns,
-            self.track.position,
-            at_ns,
-            measured,
-            covariance,
-            settings.max_speed_m_per_s,
-        ):
+        since_ns = at_ns - self.track.at_ns
+        if reachable(measured - self.track.position, since_ns, covariance, speed):
             ahead = predicted(self.track, at_ns, settings.acceleration_noise)
             self.track = corrected(ahead, measured, covariance)
             self._refused, self._agreeing = None, 0
             return True
         agrees = self._refused is not None and reachable(
-            *self._refused, at_ns, measured, covariance, settings.max_speed_m_per_s
+            measured - self._refused[1], at_ns - self._refused[0], covariance, speed
         )
         self._agreeing = self._agreeing + 1 if agrees else 1
         self._refused = (at_ns, measured)

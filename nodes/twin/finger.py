@@ -182,8 +182,8 @@ class FingerMotion:
         if (speeds > max_speed_m_per_s).any():
             at = int(np.argmax(speeds))
             raise FingerPathError(
-                f"speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g}, a finger does "
-                f"{max_speed_m_per_s:.3g} m/s (scene finger.max_speed_m_per_s): give it more time"
+                f"speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g}: a finger "
+                f"does {max_speed_m_per_s:.3g} m/s (scene finger.max_speed_m_per_s), give it more time"
             )
         start, start_velocity, amplitudes = self._steady(at_s)
         distance_m = float(np.linalg.norm(points[0] - start))
@@ -243,10 +243,10 @@ def _smoothstep(s: float) -> tuple[float, float]:
 def _reach(
     s: float, duration_s: float, start: Floats, start_velocity: Floats, path: Path3
 ) -> tuple[Floats, Floats]:
-    """Minimum-jerk reach at share `s` of its time: (start, its velocity) to rest at the path's start.
+    """Minimum-jerk reach at share `s` of its time, from `start` to rest at the path's first point.
 
-    The start's velocity dies out by the quintic Hermite function s (1-s)^3 (1+3s), so that position
-    and velocity are continuous.
+    Gives position (m) and velocity (m/s).  The start's velocity dies out by the quintic Hermite
+    function s (1-s)^3 (1+3s), so that both are continuous.
     """
     share, slope = _smoothstep(s)
     carried = s * (1.0 - s) ** 3 * (1.0 + 3.0 * s)
@@ -319,7 +319,7 @@ def _read_recording(csv_path: Path) -> Floats:
     columns = [name.strip() for name in lines[0].split(",")] if lines else []
     if missing := [name for name in wanted if name not in columns]:
         raise FingerPathError(f"{csv_path}: no column {missing[0]}; needed are {', '.join(wanted)}")
-    rows = []
+    rows: list[list[float]] = []
     for number, line in enumerate(lines[1:], start=2):
         cells = line.split(",")
         try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import cached_property
 
 import numpy as np
 from pydantic import Field
@@ -40,6 +41,11 @@ class TwinFingerNode(Node):
     path_label = ""
     missed_frames = 0
 
+    @cached_property
+    def has_scene(self) -> asyncio.Event:
+        """Set by the first scene."""
+        return asyncio.Event()
+
     async def setup(self) -> None:
         self._task = asyncio.create_task(self._film())
 
@@ -59,6 +65,7 @@ class TwinFingerNode(Node):
         self.max_speed_m_per_s = scene.finger.max_speed_m_per_s
         self.period_ns = round(1e9 / scene.camera.rate_hz)
         self.exposure_ns = round(1e9 * scene.camera.exposure_s)
+        self.has_scene.set()
         if first and self.twin__finger_path.message is not None:
             self._follow(self.twin__finger_path.message)
 
@@ -114,8 +121,7 @@ class TwinFingerNode(Node):
 
     async def _film(self) -> None:
         """Expose on a fixed grid of times; a frame whose time has passed is missed and counted."""
-        while self.camera is None:
-            await asyncio.sleep(0.01)
+        await self.has_scene.wait()
         start_ns = self.clock.now_ns()
         while True:
             start_ns += self.period_ns

@@ -50,7 +50,8 @@ class Sensor:
 
     def noise(self, levels: NDArray[np.float32]) -> NDArray[np.float32]:
         """Standard deviation of each level."""
-        return np.sqrt(levels / np.float32(self.photons_per_level) + np.float32(self.read_noise**2))
+        variance = levels / np.float32(self.photons_per_level) + np.float32(self.read_noise**2)
+        return np.asarray(np.sqrt(variance), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ class TwinCamera:
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
             texture += share * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
         level = self.sensor.background_level + self.sensor.texture_level * texture
-        return np.clip(level, 2.0, 0.4 * self.sensor.mark_level).astype(np.float32)
+        return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.mark_level), dtype=np.float32)
 
     def picture(
         self, position: Callable[[float], Floats], *, exposure_s: float, mark: bool = True
@@ -144,16 +145,15 @@ class TwinCamera:
             return image
         rows, columns = window
         levels = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.float32)
-        y, x = np.mgrid[rows, columns].astype(np.float32)
         for tip in tips:
-            levels += self._exposed(eye, tip, x, y, eye.background[window], mark)
+            levels += self._exposed(eye, tip, window, mark)
         levels /= steps
         noise = self._random.standard_normal(levels.shape, dtype=np.float32)
         image[window] = _quantized(levels + self.sensor.noise(levels) * noise)
         return image
 
     def _window(self, eye: Eye, tips: list[Floats]) -> tuple[slice, slice] | None:
-        """Rows and columns that the finger touches during the exposure; None outside the picture."""
+        """Rows and columns that the finger touches during exposure; None: not in the picture."""
         height, width = eye.background.shape
         centres, reach_px = [], 0.0
         for tip in (tips[0], tips[-1]):
@@ -172,19 +172,15 @@ class TwinCamera:
         return None if empty else (rows, columns)
 
     def _exposed(
-        self,
-        eye: Eye,
-        tip: Floats,
-        x: NDArray[np.float32],
-        y: NDArray[np.float32],
-        backdrop: NDArray[np.float32],
-        mark: bool,
+        self, eye: Eye, tip: Floats, window: tuple[slice, slice], mark: bool
     ) -> NDArray[np.float32]:
         """Noise-free levels of a window with the fingertip at `tip`.
 
         An edge seen through pixel area and blur is the normal distribution of the signed distance
-        to it, its variance blur^2 + 1/12; the window's pixels (x, y) are taken at their centres.
+        to it, its variance blur^2 + 1/12; the window's pixels are taken at their centres.
         """
+        y, x = np.mgrid[window].astype(np.float32)
+        backdrop = eye.background[window]
         smear = np.float32(np.hypot(self.sensor.blur_px, np.sqrt(1.0 / 12.0)))
         centre, depth = eye.see(tip)
         knuckle, knuckle_depth = eye.see(tip + FINGER_LENGTH_M * FINGER_DIRECTION)
