@@ -17,11 +17,11 @@ CLAMPED_EDGE_FACTOR = 1.08
 """How much more force the clamps' hold across the width adds to plain uniaxial tension.
 
 Fitted to membrane FE of a square sheet clamped at two edges (24x24, neo-Hookean): 5.1, 12.3, 23.4,
-43.0 N at stretch 1.02, 1.05, 1.10, 1.20 for 1 MPa, 240 x 240 x 1 mm; the rule is within 2 % of each.
+43.0 N at stretch 1.02, 1.05, 1.10, 1.20 for 1 MPa, 240 x 240 x 1 mm; the rule is within 2 %.
 """
 
 PUSH_FACTOR = 0.95
-"""Small-push stiffness over edge force per length: 0.9-1.0 for a fingertip of 10 mm radius (same FE)."""
+"""Small-push stiffness over edge force per length: 0.9-1.0 for a fingertip of radius 10 mm."""
 
 
 def edge_force_n(
@@ -41,7 +41,7 @@ def edge_force_n(
 def stretch_for_edge_force(
     force_n: float, *, young_modulus_pa: float, height_m: float, thickness_m: float
 ) -> float:
-    """Inverse of `edge_force_n` for force >= 0 (Newton on a smooth, increasing, concave-free rule)."""
+    """Inverse of `edge_force_n` for force >= 0 (Newton; the rule is smooth and increasing)."""
     scale = CLAMPED_EDGE_FACTOR * young_modulus_pa / 3.0 * height_m * thickness_m
     wanted = max(force_n, 0.0) / scale
     stretch = 1.0 + wanted / 3.0

@@ -1,0 +1,503 @@
+"""What an arm does in each cycle: follow the sheet's target, hold, stop, relax; decided here.
+
+No sockets and no clock: the node hands in what it knows and how long the cycle is, and sends what
+comes back.  The sheet's motion is bounded in the sheet's own frame first, in both bridges alike, so
+that the two arms stay together on long ways; then each arm's joints go through the limiter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Pose, Scene
+from messages.types import ArmMode, Side
+from nodes.arm_bridge.kinematics import (
+    JOINT_MAX_RAD,
+    JOINT_MIN_RAD,
+    JOINT_SPEED_RAD_PER_S,
+    UnreachableError,
+    forward,
+    inverse_kinematics,
+)
+from nodes.arm_bridge.limiter import (
+    JointLimits,
+    SheetLimits,
+    braked,
+    joint_step,
+    place_trouble,
+    sheet_trouble,
+    with_tool_speed,
+)
+from nodes.models.motion import SheetBounds, SheetMotion, coast_sheet, follow_sheet
+from nodes.models.rigid import (
+    apply,
+    inverse,
+    is_rigid,
+    transform_from_rpy,
+    vector_from_rotation,
+)
+from nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
+
+Floats = NDArray[np.float64]
+
+REST_RAD_PER_S = 1e-6
+RANGE_MARGIN_RAD = np.radians(2.0)
+
+FOLLOW_BOUNDS = SheetBounds(
+    speed_m_per_s=0.22,
+    acceleration_m_per_s2=6.0,
+    turn_rad_per_s=2.5,
+    turn_acceleration_rad_per_s2=80.0,
+    stretch_rate_per_s=0.1,
+    stretch_acceleration_per_s2=1.0,
+)
+START_BOUNDS = SheetBounds(
+    speed_m_per_s=0.06,
+    acceleration_m_per_s2=0.3,
+    turn_rad_per_s=0.5,
+    turn_acceleration_rad_per_s2=2.5,
+    stretch_rate_per_s=0.03,
+    stretch_acceleration_per_s2=0.2,
+)
+RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
+
+SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
+LEAP_M, LEAP_RAD = 0.03, 0.35
+
+
+@dataclass(frozen=True, slots=True)
+class Patience:
+    """How late things may be before the arm holds, and before it stops (seconds)."""
+
+    hold_after_s: float
+    stop_after_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    """The sheet's target at the moment when this command takes effect; age since it arrived."""
+
+    motion: SheetMotion
+    overdue_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class OtherArm:
+    """The other arm as its bridge tells: world poses of its flange, and whether it is well."""
+
+    world_from_flange: Floats
+    world_from_flange_commanded: Floats
+    mode: ArmMode
+    faults: tuple[str, ...]
+    age_s: float
+
+    @property
+    def trouble(self) -> str | None:
+        """Why this arm must not move with it, or None."""
+        if self.faults:
+            return f"other arm: {self.faults[0]}"
+        if self.mode in ("disconnected", "fault", "estop"):
+            return f"other arm: {self.mode}"
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What to tell the arm's controller: mode of the register map, joints (6,) rad."""
+
+    mode: str
+    joints_rad: Floats
+
+
+def _transform(pose: Pose) -> Floats:
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
+
+
+class ArmGeometry:
+    """Where an arm of the scene stands, how it holds its edge, and what limits it."""
+
+    def __init__(self, scene: Scene, side: Side) -> None:
+        self.left = side == "left"
+        arm, other = scene.arms.left, scene.arms.right
+        if not self.left:
+            arm, other = other, arm
+        self.world_from_base = _transform(arm.world_from_base)
+        self.base_from_world = inverse(self.world_from_base)
+        self.flange_from_edge = _transform(arm.flange_from_edge)
+        self.other_flange_from_edge = _transform(other.flange_from_edge)
+        self.max_tool_speed = scene.arms.max_tool_speed_m_per_s
+        sheet = scene.sheet
+        half = 0.5 * sheet.height_m
+        self._tool_points = apply(
+            self.flange_from_edge,
+            np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
+        )
+        self.joint_limits = JointLimits(
+            JOINT_MIN_RAD + RANGE_MARGIN_RAD,
+            JOINT_MAX_RAD - RANGE_MARGIN_RAD,
+            0.95 * JOINT_SPEED_RAD_PER_S,
+            6.0 * JOINT_SPEED_RAD_PER_S,
+        )
+        self.sheet_limits = SheetLimits(
+            width_m=sheet.width_m,
+            height_m=sheet.height_m,
+            thickness_m=sheet.thickness_m,
+            young_modulus_pa=sheet.young_modulus_pa,
+            longest_m=sheet.width_m * (sheet.max_stretch_ratio + 0.005),
+            max_edge_force_n=sheet.max_edge_force_n,
+            max_twist_rad=0.2,
+            min_flange_distance_m=scene.arms.min_distance_m,
+            workspace_min_m=scene.arms.workspace_min_m,
+            workspace_max_m=scene.arms.workspace_max_m,
+        )
+
+    def world_from_flange(self, joints_rad: Floats) -> Floats:
+        return self.world_from_base @ forward(joints_rad)
+
+    def world_from_edge(self, joints_rad: Floats) -> Floats:
+        return self.world_from_flange(joints_rad) @ self.flange_from_edge
+
+    def tool_points(self, joints_rad: Floats) -> Floats:
+        """Middle and both ends of the clamped edge (3, 3), in the base frame."""
+        return apply(forward(joints_rad), self._tool_points)
+
+    def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
+        """Joints that hold this arm's edge of the sheet there; UnreachableError."""
+        edges = edge_poses(
+            motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
+        )
+        flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
+        return inverse_kinematics(self.base_from_world @ flange, present_rad)
+
+    def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
+        """The sheet at rest between this arm's edge and the other's."""
+        left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
+        distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
+        stretch = distance / self.sheet_limits.width_m
+        return SheetMotion(sheet_from_edges(left, right), np.zeros(6), stretch, 0.0)
+
+    def sheet_state(
+        self, joints_rad: Floats, other: OtherArm | None
+    ) -> tuple[float | None, float | None]:
+        """Distance of the edges (m) and force on each (N), as measured; None without the other."""
+        if other is None:
+            return None, None
+        own = self.world_from_edge(joints_rad)
+        across = (other.world_from_flange @ self.other_flange_from_edge)[:3, 3] - own[:3, 3]
+        distance, limits = float(np.linalg.norm(across)), self.sheet_limits
+        force = edge_force_n(
+            distance / limits.width_m,
+            young_modulus_pa=limits.young_modulus_pa,
+            height_m=limits.height_m,
+            thickness_m=limits.thickness_m,
+        )
+        return distance, force
+
+
+class ArmControl:
+    """One arm's state from cycle to cycle.
+
+    mode, faults and reason are for people and for the other arm: faults hold what is wrong with
+    this arm (latched until `reset`, but for a lost connection), reason why it does not follow.
+    """
+
+    def __init__(self, patience: Patience, *, largest_lag_rad: float) -> None:
+        self.mode: ArmMode = "disconnected"
+        self.faults: tuple[str, ...] = ()
+        self.reason = "not connected yet"
+        self.estop_reason: str | None = None
+        self.measured_rad: Floats | None = None
+        self.commanded_rad = np.zeros(6)
+        self._patience = patience
+        self._largest_lag_rad = largest_lag_rad
+        self._velocity = np.zeros(6)
+        self._sheet: SheetMotion | None = None
+        self._settled = False
+        self._clear_arm = False
+        self._has_pulled = False
+        self._goal_rad: Floats | None = None
+        self._relax_from: float | None = None
+
+    @property
+    def all_faults(self) -> tuple[str, ...]:
+        """What the other arm must stop for: own faults, e-stop, a lost connection."""
+        estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
+        lost = (self.reason,) if self.mode == "disconnected" else ()
+        return (*self.faults, *estop, *lost)
+
+    @property
+    def at_rest(self) -> bool:
+        return float(np.abs(self._velocity).max()) <= REST_RAD_PER_S
+
+    def lose_connection(self, text: str) -> None:
+        """The arm cannot be reached: forget all but a latched fault or e-stop."""
+        self.measured_rad = None
+        self.mode, self.reason = "disconnected", text
+        self._forget_motion()
+
+    def take_measurement(self, joints_rad: Floats, arm_faults: tuple[str, ...]) -> None:
+        """What the arm answered; the first answer after a connection starts from there."""
+        if self.measured_rad is None:
+            self._start_at(joints_rad)
+        self.measured_rad = joints_rad
+        if arm_faults and not self.faults:
+            if arm_faults == ("watchdog: no command",):
+                # The cycle came late, the arm has stopped by itself: begin again from where it is.
+                self._start_at(joints_rad)
+                self._clear_arm = True
+            else:
+                self.faults = tuple(f"arm: {text}" for text in arm_faults)
+
+    def engage_estop(self, reason: str) -> None:
+        self.estop_reason = reason
+
+    def reset(self) -> bool:
+        """Clear e-stop and faults; refused (False) while the arm still moves."""
+        if not self.at_rest:
+            return False
+        self.estop_reason, self.faults = None, ()
+        if self.measured_rad is not None:
+            self._start_at(self.measured_rad)
+            self._clear_arm = True
+        return True
+
+    def step(
+        self, geometry: ArmGeometry, goal: Goal | None, other: OtherArm | None, step_s: float
+    ) -> Command:
+        """Decide and compute this cycle's command; `step_s` is the time that it covers."""
+        measured = self.measured_rad
+        if measured is None:
+            return Command("idle", self.commanded_rad)
+        if self._clear_arm:
+            self._clear_arm = False
+            return Command("idle", measured)
+        self._watch(geometry, other, measured)
+        if self.estop_reason is not None:
+            return self._stop("estop", f"e-stop: {self.estop_reason}", geometry, step_s)
+        if self.faults:
+            return self._stop_and_relax("fault", self.faults[0], geometry, other, step_s)
+        return self._serve(geometry, goal, other, measured, step_s)
+
+    def _serve(
+        self,
+        geometry: ArmGeometry,
+        goal: Goal | None,
+        other: OtherArm | None,
+        measured: Floats,
+        step_s: float,
+    ) -> Command:
+        """Nothing is wrong with this arm: go with the target, if there are target and other arm."""
+        if other is None or other.age_s > self._patience.stop_after_s:
+            return self._stop("idle", "the other arm is silent", geometry, step_s)
+        if other.trouble is not None:
+            return self._stop_and_relax("idle", other.trouble, geometry, other, step_s)
+        if goal is None or goal.overdue_s > self._patience.stop_after_s:
+            return self._stop("idle", "no sheet target", geometry, step_s)
+        if self._relax_from is not None:
+            return self._stop("idle", "after relaxing", geometry, step_s)
+        if not _is_sound(goal.motion):
+            return self._fail("sheet target is not a rigid pose", geometry, step_s)
+        if self._sheet is None and not self.at_rest:
+            return self._stop("idle", "comes to rest", geometry, step_s)
+        if self._sheet is None:
+            return self._begin(geometry, other, measured)
+        return self._follow(goal, self._sheet, geometry, other, step_s)
+
+    def _follow(
+        self,
+        goal: Goal,
+        sheet: SheetMotion,
+        geometry: ArmGeometry,
+        other: OtherArm,
+        step_s: float,
+    ) -> Command:
+        """Go with the target; come to rest gently while it, or the other arm, is late."""
+        late = max(goal.overdue_s, other.age_s - self._patience.hold_after_s)
+        if late > self._patience.hold_after_s:
+            self.mode, self.reason = "hold", "sheet target or other arm late"
+            sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
+        else:
+            self.mode, self.reason = "follow", ""
+            sheet = self._towards(goal.motion, sheet, step_s)
+        return self._carry(sheet, geometry, other, step_s)
+
+    def _watch(self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats) -> None:
+        """Latch a fault when the measured poses are not as they must be while moving."""
+        if self.faults or self._sheet is None or self.mode not in ("follow", "hold"):
+            return
+        lag = float(np.abs(self.commanded_rad - measured).max())
+        if lag > self._largest_lag_rad:
+            self.faults = (f"the arm trails its command by {np.degrees(lag):.1f} degrees",)
+        elif other is not None:
+            trouble = sheet_trouble(
+                geometry.world_from_edge(measured),
+                other.world_from_flange @ geometry.other_flange_from_edge,
+                left=geometry.left,
+                limits=geometry.sheet_limits,
+            )
+            if trouble is not None:
+                self.faults = (f"measured: {trouble}",)
+
+    def _begin(self, geometry: ArmGeometry, other: OtherArm, measured: Floats) -> Command:
+        """The first command of a motion is the measured pose."""
+        self._start_at(measured)
+        self._sheet = geometry.sheet_between(
+            geometry.world_from_edge(measured),
+            other.world_from_flange @ geometry.other_flange_from_edge,
+        )
+        self._has_pulled = True
+        self.mode, self.reason = "follow", ""
+        return Command("move", measured)
+
+    def _towards(self, target: SheetMotion, sheet: SheetMotion, step_s: float) -> SheetMotion:
+        """The sheet's next motion: gently until it is on its target, then with it."""
+        distance, angle = _lag(sheet, target)
+        if self._settled and (distance > LEAP_M or angle > LEAP_RAD):
+            self._settled = False
+        elif (
+            distance < SETTLED_M
+            and angle < SETTLED_RAD
+            and abs(target.stretch_ratio - sheet.stretch_ratio) < SETTLED_STRETCH
+        ):
+            self._settled = True
+        bounds = FOLLOW_BOUNDS if self._settled else START_BOUNDS
+        return follow_sheet(sheet, target, bounds=bounds, step_s=step_s)
+
+    def _carry(
+        self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
+    ) -> Command:
+        """Bring this arm's edge to the sheet's motion, through the limiter."""
+        try:
+            goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
+        except UnreachableError as error:
+            return self._fail(str(error), geometry, step_s)
+        before = self.commanded_rad if self._goal_rad is None else self._goal_rad
+        velocity = joint_step(
+            self.commanded_rad,
+            self._velocity,
+            goal_rad,
+            (goal_rad - before) / step_s,
+            limits=geometry.joint_limits,
+            step_s=step_s,
+        )
+        velocity = self._tool_limited(velocity, geometry, step_s)
+        flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
+        trouble = place_trouble(
+            flange, other.world_from_flange_commanded, geometry.sheet_limits
+        ) or sheet_trouble(
+            flange @ geometry.flange_from_edge,
+            other.world_from_flange_commanded @ geometry.other_flange_from_edge,
+            left=geometry.left,
+            limits=geometry.sheet_limits,
+        )
+        if trouble is not None:
+            return self._fail(f"commanded: {trouble}", geometry, step_s)
+        self._sheet, self._goal_rad = sheet, goal_rad
+        return self._move(velocity, step_s)
+
+    def _fail(self, text: str, geometry: ArmGeometry, step_s: float) -> Command:
+        self.faults = (text,)
+        return self._stop("fault", text, geometry, step_s)
+
+    def _stop_and_relax(
+        self,
+        rest_mode: ArmMode,
+        reason: str,
+        geometry: ArmGeometry,
+        other: OtherArm | None,
+        step_s: float,
+    ) -> Command:
+        """Stop; once at rest let the sheet go slack, moving this edge towards the other one."""
+        measured = self.measured_rad
+        braking = not self.at_rest and self._relax_from is None
+        alone = other is None or other.age_s > self._patience.stop_after_s
+        if braking or alone or not self._has_pulled or other is None or measured is None:
+            return self._stop(rest_mode, reason, geometry, step_s)
+        between = geometry.sheet_between(
+            geometry.world_from_edge(measured),
+            other.world_from_flange @ geometry.other_flange_from_edge,
+        )
+        if between.stretch_ratio <= 1.0:
+            self._has_pulled = False
+            return self._stop(rest_mode, reason, geometry, step_s)
+        if self._relax_from is None or self._sheet is None:
+            self._start_at(measured)
+            self._sheet, self._relax_from = between, between.stretch_ratio
+        # Alone, this arm has to give way by the whole of the stretch, twice its share.
+        target = replace(
+            self._sheet,
+            twist_world=np.zeros(6),
+            stretch_ratio=2.0 - self._relax_from,
+            stretch_rate_per_s=0.0,
+        )
+        sheet = follow_sheet(self._sheet, target, bounds=RELAX_BOUNDS, step_s=step_s)
+        try:
+            goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
+        except UnreachableError:
+            return self._stop(rest_mode, reason, geometry, step_s)
+        before = self.commanded_rad if self._goal_rad is None else self._goal_rad
+        velocity = joint_step(
+            self.commanded_rad,
+            self._velocity,
+            goal_rad,
+            (goal_rad - before) / step_s,
+            limits=geometry.joint_limits,
+            step_s=step_s,
+        )
+        self._sheet, self._goal_rad = sheet, goal_rad
+        self.mode, self.reason = "relax", reason
+        return self._move(self._tool_limited(velocity, geometry, step_s), step_s)
+
+    def _stop(
+        self, rest_mode: ArmMode, reason: str, geometry: ArmGeometry, step_s: float
+    ) -> Command:
+        """Brake along the path; at rest stay in `rest_mode`."""
+        self._sheet = self._goal_rad = self._relax_from = None
+        self._settled = False
+        self.reason = reason
+        if self.at_rest:
+            self.mode = rest_mode
+            return Command("idle" if rest_mode == "idle" else "stop", self.commanded_rad)
+        self.mode = "stopping"
+        velocity = braked(self._velocity, limits=geometry.joint_limits, step_s=step_s)
+        return self._move(self._tool_limited(velocity, geometry, step_s), step_s)
+
+    def _tool_limited(self, wanted: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
+        return with_tool_speed(
+            self.commanded_rad,
+            self._velocity,
+            wanted,
+            tool_points=geometry.tool_points,
+            max_tool_speed=geometry.max_tool_speed,
+            limits=geometry.joint_limits,
+            step_s=step_s,
+        )
+
+    def _move(self, velocity: Floats, step_s: float) -> Command:
+        self._velocity = velocity
+        self.commanded_rad = self.commanded_rad + velocity * step_s
+        return Command("move", self.commanded_rad)
+
+    def _start_at(self, joints_rad: Floats) -> None:
+        self._forget_motion()
+        self.commanded_rad = joints_rad.copy()
+
+    def _forget_motion(self) -> None:
+        self._velocity = np.zeros(6)
+        self._sheet = self._goal_rad = self._relax_from = None
+        self._settled = False
+
+
+def _is_sound(motion: SheetMotion) -> bool:
+    rates = (*motion.twist_world, motion.stretch_ratio, motion.stretch_rate_per_s)
+    return is_rigid(motion.world_from_sheet) and bool(np.isfinite(rates).all())
+
+
+def _lag(sheet: SheetMotion, target: SheetMotion) -> tuple[float, float]:
+    """Distance (m) and angle (rad) between two sheet poses."""
+    turn = target.world_from_sheet[:3, :3] @ sheet.world_from_sheet[:3, :3].T
+    shift = target.world_from_sheet[:3, 3] - sheet.world_from_sheet[:3, 3]
+    return float(np.linalg.norm(shift)), float(np.linalg.norm(vector_from_rotation(turn)))

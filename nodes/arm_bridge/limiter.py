@@ -1,0 +1,186 @@
+"""What stands between any command and an arm.
+
+Speed, acceleration and tool speed are clamped, so that the arm merely gets there later; what no
+clamp makes safe (a sheet overstretched or twisted, flanges too near, a place outside the workspace)
+is named, and the caller stops the arm.  Plain functions: joints (6,) rad, poses 4x4, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.models.motion import BRAKE_SHARE, closing_speed
+from nodes.models.rigid import angle_between, vector_from_rotation
+from nodes.models.sheet import edge_force_n
+
+Floats = NDArray[np.float64]
+
+RANGE_BRAKE_SHARE = 2.0 / 3.0
+"""Share of a joint's acceleration kept for stopping short of the end of its range."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointLimits:
+    """Range, speed and acceleration of each joint, (6,)."""
+
+    lowest_rad: Floats
+    highest_rad: Floats
+    speed_rad_per_s: Floats
+    acceleration_rad_per_s2: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class SheetLimits:
+    """What the sheet and the two arms that share it may suffer."""
+
+    width_m: float
+    height_m: float
+    thickness_m: float
+    young_modulus_pa: float
+    longest_m: float
+    max_edge_force_n: float
+    max_twist_rad: float
+    min_flange_distance_m: float
+    workspace_min_m: Floats
+    workspace_max_m: Floats
+
+
+def joint_step(
+    joints_rad: Floats,
+    velocity: Floats,
+    goal_rad: Floats,
+    goal_velocity: Floats,
+    *,
+    limits: JointLimits,
+    step_s: float,
+) -> Floats:
+    """Joint velocities (6,) for the next step towards a goal that moves.
+
+    goal_rad is where the joints should be at the end of the step; a goal that is not finite brakes.
+    A joint within reach lands on its goal, one farther off closes in without overshoot.  Whatever
+    the goal, the result keeps range and speed, and acceleration too unless the range would break.
+    """
+    if not (np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all()):
+        return braked(velocity, limits=limits, step_s=step_s)
+    fastest, sharpest = limits.speed_rad_per_s, limits.acceleration_rad_per_s2
+    goal = np.clip(goal_rad, limits.lowest_rad, limits.highest_rad)
+    along = np.clip(goal_velocity, -fastest, fastest)
+    offset = goal - along * step_s - joints_rad
+    closing = np.sign(offset) * closing_speed(np.abs(offset), BRAKE_SHARE * sharpest, step_s)
+    wanted = np.clip(along + closing, -fastest, fastest)
+    return within_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s)
+
+
+def within_range(
+    joints_rad: Floats, velocity: Floats, wanted: Floats, *, limits: JointLimits, step_s: float
+) -> Floats:
+    """The wanted velocities, clamped to acceleration and so that every joint can stop in range."""
+    sharpest = limits.acceleration_rad_per_s2
+    up = _room(limits.highest_rad - joints_rad, sharpest, step_s)
+    down = _room(joints_rad - limits.lowest_rad, sharpest, step_s)
+    reach = sharpest * step_s
+    result = np.clip(np.clip(wanted, -down, up), velocity - reach, velocity + reach)
+    lowest = (limits.lowest_rad - joints_rad) / step_s
+    highest = (limits.highest_rad - joints_rad) / step_s
+    # Outside the range (as after a start there) the way back is open, the way on is not.
+    return np.clip(result, np.minimum(lowest, 0.0), np.maximum(highest, 0.0))
+
+
+def _room(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
+    return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_SHARE * acceleration, step_s)
+
+
+def braked(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
+    """Velocities (6,) one step nearer to rest: all joints slow in proportion, along their path."""
+    fastest = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
+    return velocity * max(0.0, 1.0 - step_s / fastest) if fastest > 0.0 else velocity
+
+
+def with_tool_speed(
+    joints_rad: Floats,
+    velocity: Floats,
+    wanted: Floats,
+    *,
+    tool_points: Callable[[Floats], Floats],
+    max_tool_speed: float,
+    limits: JointLimits,
+    step_s: float,
+) -> Floats:
+    """The wanted velocities (6,), held back until no tool point moves faster than it may.
+
+    tool_points: joints to points (n, 3) in metres.  First the change of velocity is held back, so
+    that the acceleration stays in bounds; if the present velocity is too fast itself, it is braked;
+    if even that is not enough, it is cut: the speed limit comes before the smooth ride.
+    """
+    here = tool_points(joints_rad)
+
+    def speed(candidate: Floats) -> float:
+        there = tool_points(joints_rad + candidate * step_s)
+        return float(np.linalg.norm(there - here, axis=1).max()) / step_s
+
+    if speed(wanted) <= max_tool_speed:
+        return wanted
+    if speed(velocity) <= max_tool_speed:
+        share, step = 0.0, 0.5
+        for _ in range(5):
+            if speed(velocity + (share + step) * (wanted - velocity)) <= max_tool_speed:
+                share += step
+            step *= 0.5
+        return velocity + share * (wanted - velocity)
+    slower = braked(velocity, limits=limits, step_s=step_s)
+    while (present := speed(slower)) > max_tool_speed:
+        slower = slower * (0.99 * max_tool_speed / present)
+    return slower
+
+
+def sheet_trouble(
+    edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits
+) -> str | None:
+    """What is wrong with the sheet between two edges (world poses), or None.
+
+    edge is this arm's, and `left` says which side that is.
+    """
+    across = other_edge[:3, 3] - edge[:3, 3]
+    distance = float(np.linalg.norm(across))
+    if distance > limits.longest_m:
+        return f"sheet of {distance * 1e3:.1f} mm, at most {limits.longest_m * 1e3:.1f} mm"
+    force = edge_force_n(
+        distance / limits.width_m,
+        young_modulus_pa=limits.young_modulus_pa,
+        height_m=limits.height_m,
+        thickness_m=limits.thickness_m,
+    )
+    if force > limits.max_edge_force_n:
+        return f"edge force {force:.1f} N, at most {limits.max_edge_force_n:.1f} N"
+    twist = float(np.linalg.norm(vector_from_rotation(edge[:3, :3].T @ other_edge[:3, :3])))
+    if twist > limits.max_twist_rad:
+        return (
+            f"edges turned by {np.degrees(twist):.1f} degrees to one another, "
+            f"at most {np.degrees(limits.max_twist_rad):.1f}"
+        )
+    skewed = angle_between(across if left else -across, edge[:3, 0])
+    if skewed > limits.max_twist_rad:
+        return (
+            f"edge skewed by {np.degrees(skewed):.1f} degrees to the line between both, "
+            f"at most {np.degrees(limits.max_twist_rad):.1f}"
+        )
+    return None
+
+
+def place_trouble(flange_world: Floats, other_flange: Floats, limits: SheetLimits) -> str | None:
+    """Whether a flange (world pose) leaves the workspace or comes too near to the other arm's."""
+    place = flange_world[:3, 3]
+    if (place < limits.workspace_min_m).any() or (place > limits.workspace_max_m).any():
+        x, y, z = place * 1e3
+        return f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm is outside the workspace"
+    distance = float(np.linalg.norm(other_flange[:3, 3] - place))
+    if distance < limits.min_flange_distance_m:
+        return (
+            f"flanges {distance * 1e3:.0f} mm apart, "
+            f"at least {limits.min_flange_distance_m * 1e3:.0f} mm"
+        )
+    return None

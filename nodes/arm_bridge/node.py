@@ -1,0 +1,147 @@
+"""Carries one edge of the sheet: from the sheet's target to one arm's joints, cycle by cycle."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from messages.base import Header
+from messages.scene import NonNegative, Positive, Scene
+from messages.types import ArmState, EStop, SheetTarget, Side
+from nodes.arm_bridge.control import ArmControl, ArmGeometry, Goal, OtherArm, Patience
+from nodes.arm_bridge.modbus import ArmLink, ArmLinkError
+from nodes.models.motion import SheetMotion, extrapolated
+from nodes.node import Input, Node, NodeParameters, Output, periodic
+
+
+class ArmBridgeParameters(NodeParameters):
+    side: Side
+    host: str = "127.0.0.1"
+    port: int = Field(default=5020, ge=1, le=65535)
+    rate_hz: Positive = 140.0
+    timeout_s: Positive = 0.03
+    servo_lag_s: NonNegative = Field(
+        default=0.03, description="how far the arm trails a command that moves evenly"
+    )
+    target_period_s: Positive = Field(
+        default=1.0 / 60.0, description="a sheet target this old is not yet late"
+    )
+    hold_after_s: Positive = 0.02
+    stop_after_s: Positive = 0.1
+    furthest_extrapolation_s: Positive = 0.06
+    largest_lag_rad: Positive = 0.12
+
+
+class ArmBridge(Node):
+    """Sends one arm's joints over Modbus TCP and publishes what the arm answers."""
+
+    parameters: ArmBridgeParameters
+    scene: Input[Scene]
+    sheet_target: Input[SheetTarget]
+    other_arm: Input[ArmState]
+    estop: Input[EStop]
+    arm: Output[ArmState]
+
+    async def setup(self) -> None:
+        given = self.parameters
+        self._link = ArmLink(given.host, given.port, timeout_s=given.timeout_s)
+        self._control = ArmControl(
+            Patience(given.hold_after_s, given.stop_after_s), largest_lag_rad=given.largest_lag_rad
+        )
+        self._geometry: ArmGeometry | None = None
+        self._cycle_ns = self._sent_ns = 0
+        self._exchange_s = 0.0
+        self._failures = 0
+
+    async def close(self) -> None:
+        self._link.close()
+
+    def on_scene(self, scene: Scene, header: Header) -> None:
+        self._geometry = ArmGeometry(scene, self.parameters.side)
+
+    def on_estop(self, estop: EStop, header: Header) -> None:
+        if estop.engaged:
+            self._control.engage_estop(estop.reason)
+        elif not self._control.reset():
+            self.log.warning("reset refused: the arm still moves")
+
+    @periodic("rate_hz")
+    async def cycle(self) -> None:
+        now_ns = self.clock.now_ns()
+        if self._geometry is None:
+            self.note = "waits for a scene"
+            return
+        period_s = 1.0 / self.parameters.rate_hz
+        step_s = min(max((now_ns - self._cycle_ns) * 1e-9, 0.5 * period_s), 2.0 * period_s)
+        self._cycle_ns = now_ns
+        if self._link.due(now_ns):
+            await self._exchange(self._geometry, step_s)
+        control = self._control
+        self.note = f"{control.mode} {control.reason}; {self._failures} failed exchanges"
+        self._publish(self._geometry)
+
+    async def _exchange(self, geometry: ArmGeometry, step_s: float) -> None:
+        control = self._control
+        command = control.step(geometry, self._goal(), self._other(), step_s)
+        self._sent_ns = self.clock.now_ns()
+        try:
+            status = await self._link.exchange(
+                mode=command.mode, joints_rad=command.joints_rad, now_ns=self._sent_ns
+            )
+        except ArmLinkError as error:
+            self._failures += 1
+            if control.mode != "disconnected":
+                self.log.warning("arm lost", problem=str(error))
+            control.lose_connection(str(error))
+            return
+        self._exchange_s = (self.clock.now_ns() - self._sent_ns) * 1e-9
+        control.take_measurement(status.joints_rad, status.faults)
+
+    def _goal(self) -> Goal | None:
+        """The newest sheet target, carried on to the moment when this cycle's command acts."""
+        target, header = self.sheet_target.message, self.sheet_target.header
+        if target is None or header is None:
+            return None
+        given, now_ns = self.parameters, self.clock.now_ns()
+        received_ns = self.sheet_target.received_ns
+        same_clock = header.clock_id == self.clock.id
+        # Another host's clock: the target counts as if it had arrived in no time.
+        offset_ns = 0 if same_clock else received_ns - header.publish_ns
+        ahead_s = (now_ns - target.valid_at_ns - offset_ns) * 1e-9 + given.servo_lag_s
+        limit_s = given.furthest_extrapolation_s
+        motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
+        overdue_s = (now_ns - received_ns) * 1e-9 - given.target_period_s
+        return Goal(extrapolated(motion, min(max(ahead_s, -limit_s), limit_s)), overdue_s)
+
+    def _other(self) -> OtherArm | None:
+        state = self.other_arm.message
+        if state is None:
+            return None
+        return OtherArm(
+            state.world_from_flange,
+            state.world_from_flange_commanded,
+            state.mode,
+            state.faults,
+            (self.clock.now_ns() - self.other_arm.received_ns) * 1e-9,
+        )
+
+    def _publish(self, geometry: ArmGeometry) -> None:
+        control, other, header = self._control, self._other(), self.sheet_target.header
+        measured = control.commanded_rad if control.measured_rad is None else control.measured_rad
+        distance, force = geometry.sheet_state(measured, other)
+        age_s = (self.clock.now_ns() - self.sheet_target.received_ns) * 1e-9
+        state = ArmState(
+            side=self.parameters.side,
+            mode=control.mode,
+            faults=control.all_faults,
+            joints_rad=measured,
+            joints_commanded_rad=control.commanded_rad,
+            world_from_flange=geometry.world_from_flange(measured),
+            world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
+            command_age_s=None if header is None else max(age_s, 0.0),
+            target_source_ns=0 if header is None else header.source_ns,
+            command_sent_ns=self._sent_ns,
+            edge_distance_m=distance,
+            edge_force_n=force,
+            cycle_s=self._exchange_s,
+        )
+        self.arm.publish(state)

@@ -1,0 +1,167 @@
+"""Bounded motion: follow a moving target without lag, and without ever jumping.
+
+A follower that is on its target stays on it, since the target's own velocity is fed forward; one
+that is off gets there with bounded speed and acceleration, and without overshoot if the target
+moves evenly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.models.rigid import moved, rotation_from_vector, transform, vector_from_rotation
+
+Floats = NDArray[np.float64]
+
+BRAKE_SHARE = 1.0 / 3.0
+"""Share of the acceleration that braking onto the target may use; the rest follows the target."""
+
+
+def closing_speed(distance: Floats, deceleration: Floats | float, step_s: float) -> Floats:
+    """Largest speeds with which a point at those distances (>= 0) can still stop there.
+
+    Discrete: moving by speed * step_s per step and slowing by deceleration * step_s after each, it
+    arrives exactly, from w^2/(2 a) + w dt/2 = distance; near the end it takes one step.
+    """
+    half = 0.5 * deceleration * step_s
+    speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half
+    return np.minimum(speed, distance / step_s)
+
+
+def follow(
+    error: Floats,
+    velocity: Floats,
+    target_velocity: Floats,
+    *,
+    max_speed: float,
+    max_acceleration: float,
+    step_s: float,
+) -> tuple[Floats, Floats]:
+    """One step of a vector (n,) towards a target that moves with `target_velocity`.
+
+    error: target at the end of the step minus the point now.
+    Returns the displacement over the step and the velocity after it.  Neither the mean speed of the
+    step nor the velocity changes faster than `max_acceleration`.
+    """
+    target_velocity = _shortened(target_velocity, max_speed)
+    offset = error - target_velocity * step_s
+    distance = float(np.linalg.norm(offset))
+    wanted = target_velocity
+    if distance > 0.0:
+        brake = BRAKE_SHARE * max_acceleration
+        speed = float(closing_speed(np.array(distance), brake, step_s))
+        wanted = _shortened(target_velocity + offset * (speed / distance), max_speed)
+    reach = (1.0 - BRAKE_SHARE) * max_acceleration * step_s
+    mean = velocity + _shortened(wanted - velocity, reach)
+    landed = float(np.linalg.norm(error - mean * step_s)) <= 1e-12 + 1e-9 * distance
+    settles = float(np.linalg.norm(target_velocity - mean)) <= BRAKE_SHARE * max_acceleration * (
+        step_s * (1.0 + 1e-9)
+    )
+    return mean * step_s, target_velocity if landed and settles else mean
+
+
+def _shortened(vector: Floats, longest: float) -> Floats:
+    """The vector, or one of that direction and length `longest`, whichever is shorter."""
+    length = float(np.linalg.norm(vector))
+    return vector if length <= longest else vector * (longest / length)
+
+
+@dataclass(frozen=True, slots=True)
+class SheetMotion:
+    """Where the sheet is and how it moves: pose, twist (m/s, rad/s), stretch and its rate (1/s)."""
+
+    world_from_sheet: Floats
+    twist_world: Floats
+    stretch_ratio: float
+    stretch_rate_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SheetBounds:
+    """How fast the sheet's centre, its orientation and its stretch may change."""
+
+    speed_m_per_s: float
+    acceleration_m_per_s2: float
+    turn_rad_per_s: float
+    turn_acceleration_rad_per_s2: float
+    stretch_rate_per_s: float
+    stretch_acceleration_per_s2: float
+
+
+def follow_sheet(
+    now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, step_s: float
+) -> SheetMotion:
+    """The sheet `step_s` (> 0) later, on its way to `target`, which holds at the step's end."""
+    shift, linear = follow(
+        target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3],
+        now.twist_world[:3],
+        target.twist_world[:3],
+        max_speed=bounds.speed_m_per_s,
+        max_acceleration=bounds.acceleration_m_per_s2,
+        step_s=step_s,
+    )
+    turn, angular = follow(
+        vector_from_rotation(target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T),
+        now.twist_world[3:],
+        target.twist_world[3:],
+        max_speed=bounds.turn_rad_per_s,
+        max_acceleration=bounds.turn_acceleration_rad_per_s2,
+        step_s=step_s,
+    )
+    growth, rate = follow(
+        np.array([target.stretch_ratio - now.stretch_ratio]),
+        np.array([now.stretch_rate_per_s]),
+        np.array([target.stretch_rate_per_s]),
+        max_speed=bounds.stretch_rate_per_s,
+        max_acceleration=bounds.stretch_acceleration_per_s2,
+        step_s=step_s,
+    )
+    pose = transform(
+        rotation_from_vector(turn) @ now.world_from_sheet[:3, :3],
+        now.world_from_sheet[:3, 3] + shift,
+    )
+    return SheetMotion(
+        _orthonormal(pose),
+        np.concatenate([linear, angular]),
+        now.stretch_ratio + float(growth[0]),
+        float(rate[0]),
+    )
+
+
+def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> SheetMotion:
+    """The sheet `step_s` later when it shall come to rest, slowing as fast as the bounds allow."""
+    linear = _slowed(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
+    angular = _slowed(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)
+    rate = _slowed(np.array([now.stretch_rate_per_s]), bounds.stretch_acceleration_per_s2 * step_s)
+    twist = np.concatenate([linear, angular])
+    return SheetMotion(
+        _orthonormal(moved(now.world_from_sheet, twist, step_s)),
+        twist,
+        now.stretch_ratio + float(rate[0]) * step_s,
+        float(rate[0]),
+    )
+
+
+def extrapolated(motion: SheetMotion, duration_s: float) -> SheetMotion:
+    """The motion carried on with its twist and rate for `duration_s` (of either sign)."""
+    return replace(
+        motion,
+        world_from_sheet=moved(motion.world_from_sheet, motion.twist_world, duration_s),
+        stretch_ratio=motion.stretch_ratio + motion.stretch_rate_per_s * duration_s,
+    )
+
+
+def _slowed(velocity: Floats, change: float) -> Floats:
+    speed = float(np.linalg.norm(velocity))
+    return np.zeros_like(velocity) if speed <= change else velocity * (1.0 - change / speed)
+
+
+def _orthonormal(pose: Floats) -> Floats:
+    """The pose with its rotation's rounding error taken out (Gram-Schmidt on x, then y)."""
+    x_axis = pose[:3, 0] / np.linalg.norm(pose[:3, 0])
+    y_axis = pose[:3, 1] - x_axis * (x_axis @ pose[:3, 1])
+    y_axis = y_axis / np.linalg.norm(y_axis)
+    return transform(np.column_stack([x_axis, y_axis, np.cross(x_axis, y_axis)]), pose[:3, 3])

@@ -1,0 +1,113 @@
+"""Decides where the sheet shall be: from the fingertip to the sheet's target."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from messages.base import Header
+from messages.scene import NonNegative, Positive, Scene
+from messages.types import Fingertip, SheetTarget, SoftBody
+from nodes.models.motion import SheetBounds
+from nodes.node import Input, Node, NodeParameters, Output
+from nodes.planner.compliance import compliance_for
+from nodes.planner.motion import Plan, Planned
+
+
+class PlannerParameters(NodeParameters):
+    lead_s: NonNegative = Field(
+        default=0.05, description="how far ahead of the exposure the sheet is planned"
+    )
+    touch_m: float = Field(default=0.0005, description="contact begins this near to the object")
+    release_m: Positive = Field(default=0.003, description="contact ends this far from the object")
+    oldest_s: Positive = Field(default=0.1, description="an older fingertip is not followed")
+    tilt_margin_rad: NonNegative = Field(
+        default=0.14, description="how far past the scene's tilt the sheet still follows"
+    )
+    speed_m_per_s: Positive = 0.18
+    acceleration_m_per_s2: Positive = 3.0
+    turn_rad_per_s: Positive = 2.0
+    turn_acceleration_rad_per_s2: Positive = 40.0
+    stretch_rate_per_s: Positive = 0.03
+    stretch_acceleration_per_s2: Positive = 0.3
+
+
+class Planner(Node):
+    """Publishes one sheet target per fingertip; the same inputs give the same bytes."""
+
+    parameters: PlannerParameters
+    scene: Input[Scene]
+    fingertip: Input[Fingertip]
+    soft_body: Input[SoftBody]
+    sheet_target: Output[SheetTarget]
+
+    async def setup(self) -> None:
+        self._plan: Plan | None = None
+        self._stretch_ratio = 1.0
+        self._last_source_ns: int | None = None
+        self._late = 0
+
+    def on_scene(self, scene: Scene, header: Header) -> None:
+        given = self.parameters
+        self._plan = Plan(
+            scene,
+            bounds=SheetBounds(
+                given.speed_m_per_s,
+                given.acceleration_m_per_s2,
+                given.turn_rad_per_s,
+                given.turn_acceleration_rad_per_s2,
+                given.stretch_rate_per_s,
+                given.stretch_acceleration_per_s2,
+            ),
+            touch_m=given.touch_m,
+            release_m=given.release_m,
+            tilt_margin_rad=given.tilt_margin_rad,
+        )
+        self._stretch_ratio = scene.sheet.min_stretch_ratio
+        self._last_source_ns = None
+
+    def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
+        scene = self.scene.message
+        if scene is not None and soft_body.stiffness_n_per_m > 0.0:
+            compliance = compliance_for(soft_body.stiffness_n_per_m, scene.sheet)
+            self._stretch_ratio, self.note = compliance.stretch_ratio, compliance.note
+
+    def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
+        plan = self._plan
+        if plan is None:
+            return
+        last_ns, source_ns = self._last_source_ns, header.source_ns
+        if last_ns is not None and source_ns <= last_ns:
+            self._late += 1
+            self.note = f"{self._late} fingertips came out of order and were left out"
+            return
+        self._last_source_ns = source_ns
+        step_s = 1.0 / 60.0 if last_ns is None else (source_ns - last_ns) * 1e-9
+        age_s = (header.publish_ns - source_ns) * 1e-9
+        if not fingertip.valid:
+            planned = plan.hold(f"fingertip: {fingertip.reason}", step_s)
+        elif age_s > self.parameters.oldest_s:
+            planned = plan.hold(f"fingertip is {age_s * 1e3:.0f} ms old", step_s)
+        else:
+            lead_s = self.parameters.lead_s
+            velocity = fingertip.velocity_world_m_per_s
+            ahead = fingertip.position_world_m + velocity * lead_s
+            planned = plan.follow_finger(ahead, velocity, self._stretch_ratio, step_s)
+        self._publish(planned, source_ns)
+
+    def _publish(self, planned: Planned, source_ns: int) -> None:
+        shown = planned.presentation
+        self.sheet_target.publish(
+            SheetTarget(
+                phase=shown.phase,
+                reason=shown.reason,
+                valid_at_ns=source_ns + round(self.parameters.lead_s * 1e9),
+                world_from_sheet=planned.motion.world_from_sheet,
+                twist_world=planned.motion.twist_world,
+                stretch_ratio=planned.motion.stretch_ratio,
+                contact_world_m=planned.contact_world_m,
+                normal_world=planned.normal_world,
+                contact_sheet_m=planned.contact_sheet_m,
+                push_depth_m=shown.push_depth_m,
+            ),
+            source_ns=source_ns,
+        )

@@ -1,0 +1,303 @@
+"""The twin's arms: RV-1A manipulators with servo lag behind Modbus TCP servers.
+
+Written on its own from `docs/modbus.md` and the arm's dimensions; shares nothing with the bridge
+that it judges.  Forward kinematics is a product of exponentials (Brockett 1984; Lynch and Park,
+Modern Robotics, ch. 4), inverse kinematics Gauss-Newton on it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pymodbus.constants import ExcCodes
+from pymodbus.exceptions import NoSuchIdException
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+Floats = NDArray[np.float64]
+Fault = Literal["none", "silent", "slow", "exception", "bad_crc", "old_version", "frozen"]
+
+CONTROLLER_CYCLE_S = 0.0071
+
+# Screw axes at the zero pose (all frames parallel to the base): direction, and a point on the axis.
+_AXES = np.array(
+    [[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1]], dtype=np.float64
+)
+_POINTS = np.array(
+    [[0, 0, 0], [0, 0, 0.3], [0, 0, 0.55], [-0.09, 0, 0], [-0.09, 0, 0.71], [-0.09, 0, 0]]
+)
+_FLANGE_AT_ZERO = np.array([-0.09, 0.0, 0.782])
+
+RANGE_RAD = np.radians(
+    [[-150, 150], [-60, 120], [60, 155], [-160, 160], [-90, 90], [-200, 200]]
+).astype(np.float64)
+SPEED_RAD_PER_S = np.radians([180.0, 90.0, 135.0, 180.0, 180.0, 210.0])
+ACCELERATION_RAD_PER_S2 = 8.0 * SPEED_RAD_PER_S
+
+_COMMAND = struct.Struct(">HHIIHH6fI")
+_STATUS = struct.Struct(">HHIIIHH6fII")
+_STATUS_AT = 100
+_IDLE, _MOVE, _HOLD, _STOP = range(4)
+STATE_IDLE, STATE_MOVING, STATE_HOLDING, STATE_STOPPED, STATE_FAULT = range(5)
+FAULT_RANGE, FAULT_STEP, FAULT_FINITE, FAULT_WATCHDOG, FAULT_SERVO = 1, 2, 4, 8, 16
+
+
+def forward(joints_rad: Floats) -> Floats:
+    """base_from_flange (4, 4) of joints (6,): exp(S1 q1) ... exp(S6 q6) M."""
+    rotation, position = np.eye(3), np.zeros(3)
+    for axis, point, angle in zip(_AXES, _POINTS, joints_rad, strict=True):
+        turn = _turn(axis, float(angle))
+        position = position + rotation @ (point - turn @ point)
+        rotation = rotation @ turn
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = position + rotation @ _FLANGE_AT_ZERO
+    return pose
+
+
+def _turn(axis: Floats, angle: float) -> Floats:
+    x, y, z = axis.tolist()
+    cross: Floats = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+
+
+def joints_for(base_from_flange: Floats, guess_rad: Floats) -> Floats:
+    """Joints (6,) within the ranges for a flange pose, by damped Gauss-Newton from a guess.
+
+    ValueError when it does not settle within a micrometre and a microradian.
+    """
+    joints = guess_rad.copy()
+    for _ in range(200):
+        error = _pose_error(base_from_flange, forward(joints))
+        if np.abs(error).max() < 1e-10:
+            break
+        slope = np.empty((6, 6))
+        for joint in range(6):
+            nudged = joints.copy()
+            nudged[joint] += 1e-6
+            slope[:, joint] = (error - _pose_error(base_from_flange, forward(nudged))) / 1e-6
+        step = np.linalg.solve(slope.T @ slope + 1e-8 * np.eye(6), slope.T @ error)
+        joints = np.clip(joints + np.clip(step, -0.3, 0.3), RANGE_RAD[:, 0], RANGE_RAD[:, 1])
+    if np.abs(_pose_error(base_from_flange, forward(joints))).max() > 1e-6:
+        raise ValueError(f"the arm cannot reach a flange at {base_from_flange[:3, 3]} m (base)")
+    return joints
+
+
+def _pose_error(wanted: Floats, present: Floats) -> Floats:
+    """Shift (m) and small rotation (rad) from the present pose to the wanted one."""
+    turn = wanted[:3, :3] @ present[:3, :3].T
+    spin = 0.5 * np.array(
+        [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    )
+    return np.concatenate([wanted[:3, 3] - present[:3, 3], spin])
+
+
+@dataclass(slots=True)
+class Servo:
+    """Six joints that follow set-points like critically damped second-order servos.
+
+    lag_s: how far a joint trails a set-point that moves evenly.
+    """
+
+    joints_rad: Floats
+    lag_s: float
+    velocity_rad_per_s: Floats = field(default_factory=lambda: np.zeros(6))
+
+    def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
+        """Move on by `duration_s` in steps of at most a millisecond; braking stops where it can."""
+        steps = max(1, int(np.ceil(duration_s / 1e-3)))
+        step_s = duration_s / steps
+        natural = 2.0 / self.lag_s
+        for _ in range(steps):
+            if braking:
+                pull = -self.velocity_rad_per_s / step_s
+            else:
+                pull = natural * (
+                    natural * (wanted_rad - self.joints_rad) - 2.0 * self.velocity_rad_per_s
+                )
+            pull = np.clip(pull, -ACCELERATION_RAD_PER_S2, ACCELERATION_RAD_PER_S2)
+            speed = self.velocity_rad_per_s + pull * step_s
+            self.velocity_rad_per_s = np.clip(speed, -SPEED_RAD_PER_S, SPEED_RAD_PER_S)
+            self.joints_rad = self.joints_rad + self.velocity_rad_per_s * step_s
+
+
+class Controller:
+    """One arm's controller: takes command blocks, refuses what it must, answers with its status.
+
+    It refuses as a Modbus exception what is not a valid new command (magic, version, CRC, mode,
+    sequence), and falls into its fault state, where it brakes and stays, for joints out of range or
+    not finite, for a set-point that leaps, and when no command came for `watchdog_s` while moving.
+    An `idle` command clears a fault and may start the sequence anew.
+    """
+
+    def __init__(
+        self,
+        joints_rad: Floats,
+        *,
+        servo_lag_s: float,
+        noise_rad: float,
+        watchdog_s: float,
+        largest_step_rad: float = 0.15,
+        seed: int = 0,
+    ) -> None:
+        self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s)
+        self.state = STATE_IDLE
+        self.faults = 0
+        self.refused = 0
+        self.accepted = 0
+        self.commands = 0
+        self.cycles = 0
+        self.wanted_rad = self.servo.joints_rad.copy()
+        self.fault: Fault = "none"
+        self._time_s = 0.0
+        self._command_at_s = 0.0
+        self._watchdog_s = watchdog_s
+        self._largest_step_rad = largest_step_rad
+        self._noise_rad = noise_rad
+        self._random = np.random.default_rng(seed)
+
+    def advance(self, duration_s: float) -> None:
+        """Run the servo for `duration_s` in controller cycles' stead; trips the watchdog."""
+        self._time_s += duration_s
+        self.cycles += max(1, round(duration_s / CONTROLLER_CYCLE_S))
+        if self.state == STATE_MOVING and self._time_s - self._command_at_s > self._watchdog_s:
+            self._fail(FAULT_WATCHDOG)
+        if self.fault == "frozen":
+            return
+        self.servo.advance(self.wanted_rad, duration_s, braking=self.state != STATE_MOVING)
+
+    def take(self, registers: list[int]) -> bool:
+        """Judge a written command block; false refuses it as a Modbus exception."""
+        block = struct.pack(f">{len(registers)}H", *registers)
+        if len(block) != _COMMAND.size:
+            return self._refuse()
+        magic, version, sequence, _, mode, _, *joints, crc = _COMMAND.unpack(block)
+        if magic != 0x4653 or version != 1 or crc != zlib.crc32(block[:-4]) or mode > _STOP:
+            return self._refuse()
+        # Forward by less than half the circle, so that the 32-bit counter may wrap.
+        newer = 0 < (sequence - self.accepted) % 2**32 < 2**31
+        if mode != _IDLE and not newer:
+            return self._refuse()
+        self.accepted = sequence
+        self.commands += 1
+        self._command_at_s = self._time_s
+        if mode == _IDLE:
+            self.faults, self.state = 0, STATE_IDLE
+        elif self.state != STATE_FAULT:
+            self._obey(mode, np.array(joints))
+        return True
+
+    def _obey(self, mode: int, joints: Floats) -> None:
+        if mode != _MOVE:
+            self.state = STATE_HOLDING if mode == _HOLD else STATE_STOPPED
+            return
+        before = self.wanted_rad if self.state == STATE_MOVING else self.servo.joints_rad
+        if not np.isfinite(joints).all():
+            self._fail(FAULT_FINITE)
+        elif (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():
+            self._fail(FAULT_RANGE)
+        elif np.abs(joints - before).max() > self._largest_step_rad:
+            self._fail(FAULT_STEP)
+        else:
+            self.state, self.wanted_rad = STATE_MOVING, joints
+
+    def _fail(self, bit: int) -> None:
+        self.faults |= bit
+        self.state = STATE_FAULT
+
+    def _refuse(self) -> bool:
+        self.refused += 1
+        return False
+
+    def status_registers(self) -> list[int]:
+        """The status block, with the joints as measured now."""
+        measured = self.servo.joints_rad + self._noise_rad * self._random.standard_normal(6)
+        block = _STATUS.pack(
+            0x4653,
+            0 if self.fault == "old_version" else 1,
+            self.accepted,
+            self.cycles & 0xFFFFFFFF,
+            int(self._time_s * 1e6) & 0xFFFFFFFF,
+            self.state,
+            self.faults,
+            *measured,
+            self.refused,
+            0,
+        )
+        crc = zlib.crc32(block[:-4]) ^ (1 if self.fault == "bad_crc" else 0)
+        block = block[:-4] + struct.pack(">I", crc)
+        return list(struct.unpack(f">{len(block) // 2}H", block))
+
+
+class ArmServer:
+    """A Modbus TCP server in front of a controller."""
+
+    def __init__(
+        self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
+    ) -> None:
+        """`before` is called ahead of each command, to bring the arm's motion up to date."""
+        self.controller = controller
+        self._address = (host, port)
+        self._before = before
+        self._server: ModbusTcpServer | None = None
+
+    async def start(self) -> None:
+        """Listen; OSError or RuntimeError when the port is taken."""
+        device = SimDevice(
+            1,
+            simdata=[
+                SimData(0, count=_COMMAND.size // 2, datatype=DataType.REGISTERS),
+                SimData(_STATUS_AT, count=_STATUS.size // 2, datatype=DataType.REGISTERS),
+            ],
+            action=self._act,
+        )
+        # A missing device is not answered at all: that is how this server falls silent.
+        self._server = ModbusTcpServer(device, address=self._address, ignore_missing_devices=True)
+        await self._server.serve_forever(background=True)
+
+    @property
+    def port(self) -> int:
+        """The port listened on (useful when it was given as 0)."""
+        listener: Any = None if self._server is None else self._server.transport
+        if listener is None:
+            raise RuntimeError("the arm's server does not listen")
+        return int(listener.sockets[0].getsockname()[1])
+
+    async def stop(self) -> None:
+        if self._server is not None:
+            await self._server.shutdown()  # type: ignore[no-untyped-call]  # pymodbus
+            self._server = None
+
+    async def _act(  # noqa: PLR0917  # pymodbus calls it so
+        self,
+        function_code: int,
+        first: int,
+        address: int,
+        count: int,
+        registers: list[int],
+        written: list[int] | list[bool] | None,
+    ) -> ExcCodes | None:
+        fault = self.controller.fault
+        if fault == "silent":
+            raise NoSuchIdException
+        if fault == "exception":
+            return ExcCodes.DEVICE_FAILURE
+        if fault == "slow" and written:
+            await asyncio.sleep(0.08)
+        self._before()
+        if written:
+            if address != 0 or not self.controller.take([int(value) for value in written]):
+                return ExcCodes.ILLEGAL_VALUE
+            return None
+        if address == _STATUS_AT:
+            start = _STATUS_AT - first
+            registers[start : start + _STATUS.size // 2] = self.controller.status_registers()
+        return None

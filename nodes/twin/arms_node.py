@@ -1,0 +1,110 @@
+"""The twin's two arms on the network: Modbus TCP servers that move, and the truth about them."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from messages.base import Header
+from messages.scene import ArmSpec, NonNegative, Positive, Scene
+from messages.types import TwinArms
+from nodes.models.rigid import inverse, transform, transform_from_rpy
+from nodes.node import Input, Node, NodeParameters, Output, periodic
+from nodes.twin.arms import ArmServer, Controller, Fault, Floats, forward, joints_for
+
+START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
+
+
+class TwinArmsParameters(NodeParameters):
+    host: str = "127.0.0.1"
+    left_port: int = Field(default=5020, ge=0, le=65535, description="0: any free one")
+    right_port: int = Field(default=5021, ge=0, le=65535)
+    rate_hz: Positive = 140.8
+    servo_lag_s: Positive = 0.025
+    noise_rad: NonNegative = Field(default=5e-6, description="of the measured joints")
+    watchdog_s: Positive = 0.1
+    fault: Fault = Field(default="none", description="what `fault_side` suffers from")
+    fault_side: Literal["left", "right"] = "left"
+    fault_after_s: NonNegative = Field(default=0.0, description="since the arms were switched on")
+
+
+class TwinArmsNode(Node):
+    """Simulates both arms; they are switched on by the first scene, holding the sheet in it."""
+
+    parameters: TwinArmsParameters
+    scene: Input[Scene]
+    twin__arms: Output[TwinArms]
+
+    async def setup(self) -> None:
+        self.servers: dict[str, ArmServer] = {}
+        self._world_from_base: dict[str, Floats] = {}
+        self._moved_ns = self._started_ns = 0
+
+    async def close(self) -> None:
+        for server in self.servers.values():
+            await server.stop()
+
+    async def on_scene(self, scene: Scene, header: Header) -> None:
+        arms = {"left": scene.arms.left, "right": scene.arms.right}
+        for side, spec in arms.items():
+            base = spec.world_from_base
+            self._world_from_base[side] = transform_from_rpy(base.position_m, base.rpy_rad)
+        if self.servers:
+            return
+        self._moved_ns = self._started_ns = self.clock.now_ns()
+        for number, (side, spec) in enumerate(arms.items()):
+            controller = Controller(
+                self._start_joints(side, spec, scene),
+                servo_lag_s=self.parameters.servo_lag_s,
+                noise_rad=self.parameters.noise_rad,
+                watchdog_s=self.parameters.watchdog_s,
+                seed=number,
+            )
+            port = self.parameters.left_port if side == "left" else self.parameters.right_port
+            server = ArmServer(
+                controller, host=self.parameters.host, port=port, before=self._advance
+            )
+            await server.start()
+            self.servers[side] = server
+
+    def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
+        """Joints that hold the sheet in the imaginary screen, just stretched."""
+        half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
+        edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
+        clamp = spec.flange_from_edge
+        flange = edge @ inverse(transform_from_rpy(clamp.position_m, clamp.rpy_rad))
+        return joints_for(inverse(self._world_from_base[side]) @ flange, START_GUESS_RAD)
+
+    def _advance(self) -> None:
+        """Bring both arms to the present instant."""
+        now_ns = self.clock.now_ns()
+        duration_s = (now_ns - self._moved_ns) * 1e-9
+        self._moved_ns = now_ns
+        if duration_s > 0.0:
+            for server in self.servers.values():
+                server.controller.advance(duration_s)
+
+    @periodic("rate_hz")
+    async def cycle(self) -> None:
+        if len(self.servers) < 2:
+            self.note = "waits for a scene"
+            return
+        self._advance()
+        given = self.parameters
+        if given.fault != "none" and self._moved_ns - self._started_ns > given.fault_after_s * 1e9:
+            self.servers[given.fault_side].controller.fault = given.fault
+        joints = {side: server.controller.servo.joints_rad for side, server in self.servers.items()}
+        self.twin__arms.publish(
+            TwinArms(
+                joints_left_rad=joints["left"],
+                joints_right_rad=joints["right"],
+                world_from_flange_left=self._world_from_base["left"] @ forward(joints["left"]),
+                world_from_flange_right=self._world_from_base["right"] @ forward(joints["right"]),
+            )
+        )
+        self.note = ", ".join(
+            f"{side}: {server.controller.commands} commands, {server.controller.refused} refused"
+            for side, server in self.servers.items()
+        )
