@@ -310,7 +310,7 @@ async def test_bad_messages_are_refused_and_good_ones_pass(room: Room) -> None:
         [good[0][:-3]],
         [b"\xff" * 1000],
         encode(finger(1.0), header(2)),
-        [good[0] + b" " * topic.max_bytes],
+        [bytes(good[0]) + b" " * topic.max_bytes],
     ]
     for frames in bad:
         foreign.send_multipart(frames)
