@@ -44,7 +44,6 @@ OUTLIER_RATIO = 3.0
 OUTLIER_FLOOR_PX = 0.5
 REJECTION_ROUNDS = 5
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
-NO_BOARD = "no board of {0.columns}x{0.rows} inner corners found in {1}"
 
 
 class CalibrationError(ValueError):
@@ -151,7 +150,9 @@ def find_pairs(
         left, right = corners
         if left is None or right is None:
             missing = [path.name for path, seen in zip(paths, corners, strict=True) if seen is None]
-            results.append(NO_BOARD.format(board, " and ".join(missing)))
+            results.append(
+                f"no board of {board.columns}x{board.rows} inner corners in {' and '.join(missing)}"
+            )
         else:
             results.append(BoardPair(left, same_order(left, right, board)))
         progress(number, len(left_paths), f"{paths[0].name}, {paths[1].name}")

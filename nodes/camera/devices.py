@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, Protocol
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from messages.scene import NonNegative, Positive, StereoCamera
 
@@ -82,8 +82,15 @@ class ImagesSource(Source):
     loop: bool = False
 
 
+def _kind_alone(source: object) -> object:
+    """Lets a launch file write `source: twin` for a source that needs nothing but its kind."""
+    return {"kind": source} if isinstance(source, str) else source
+
+
 AnySource = Annotated[
-    TwinSource | OpenCvSource | VideoSource | ImagesSource, Field(discriminator="kind")
+    TwinSource | OpenCvSource | VideoSource | ImagesSource,
+    Field(discriminator="kind"),
+    BeforeValidator(_kind_alone),
 ]
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene
+from messages.types import FingerPath
 from nodes.models.rigid import inverse, transform_from_rpy
 
 Floats = NDArray[np.float64]
@@ -183,7 +184,7 @@ class FingerMotion:
             at = int(np.argmax(speeds))
             raise FingerPathError(
                 f"speed {speeds[at]:.3g} m/s after times_s[{at}] = {times_s[at]:.6g}: a finger "
-                f"does {max_speed_m_per_s:.3g} m/s (scene finger.max_speed_m_per_s), give it more time"
+                f"does {max_speed_m_per_s:.3g} m/s (finger.max_speed_m_per_s), give it more time"
             )
         start, start_velocity, amplitudes = self._steady(at_s)
         distance_m = float(np.linalg.norm(points[0] - start))
@@ -257,8 +258,8 @@ def _reach(
     return position, velocity
 
 
-def recorded_path(csv_path: Path, scene: Scene) -> tuple[Floats, Floats]:
-    """A recorded fingertip's path brought into the scene: times (n,) s and points (n, 3) m.
+def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
+    """A recorded fingertip's path brought into the scene, ready to be sent; named as its file.
 
     The file has columns t_s, x_mm, y_mm, z_mm with y upwards, as hand trackers give them.  The
     mapping keeps what a hand does and changes where it does it:
@@ -306,7 +307,14 @@ def recorded_path(csv_path: Path, scene: Scene) -> tuple[Floats, Floats]:
     world = in_object @ (world_from_object[:3, :3] @ towards_user).T + world_from_object[:3, 3]
     inside = np.clip(world, scene.finger.volume_min_m, scene.finger.volume_max_m)
     speed = np.linalg.norm(np.diff(inside, axis=0), axis=1) / np.diff(times_s)
-    return times_s * max(1.0, float(speed.max()) / (0.8 * scene.finger.max_speed_m_per_s)), inside
+    slower = max(1.0, float(speed.max()) / (0.8 * scene.finger.max_speed_m_per_s))
+    return FingerPath(
+        label=csv_path.stem,
+        times_s=times_s * slower,
+        positions_world_m=inside,
+        wander_m=0.0,
+        tremor_m=0.0,
+    )
 
 
 def _read_recording(csv_path: Path) -> Floats:
