@@ -87,13 +87,11 @@ class SoftBodyMethod(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """Forces (k,) inward in newtons on touch nodes `nodes`, the sum over all of them (3,) that acts
-    on the finger, and how that sum grows per metre of further push."""
+    """Inward forces (k,) in N on the touch nodes `nodes` (k,); their sum (3,) on the finger."""
 
     nodes: Ints
     forces: Floats
     force_n: Floats
-    tangent_n_per_m: Floats
 
 
 def approach_normal(point: Floats, radius_m: float, held: Floats | None) -> Floats:
@@ -176,25 +174,21 @@ class SphereContact:
         self._centres = corners.mean(axis=1)
         self._size = np.linalg.norm(corners - self._centres[:, None], axis=2).max(axis=1)
 
-    def reach(self, points: Floats, normals: Floats, centre: Floats, direction: Floats) -> Floats:
-        """How far the rigid finger reaches below each point, and its growth per push: (2, q).
+    def reach(self, points: Floats, normals: Floats, centre: Floats) -> Floats:
+        """How far the rigid finger with its sphere at `centre` reaches below each point, (q,) m.
 
-        points, normals (q, 3); the finger's sphere at `centre`, pushed along -direction.  Beyond
-        `FLANK_RATIO` of the radius the sphere is continued by its tangent cone, so that every point
-        has a finite, C1 answer; it is negative where the finger is clear of the skin.
+        points, normals (q, 3).  Beyond `FLANK_RATIO` of the radius the sphere is continued by its
+        tangent cone, so that every point has a finite, C1 answer; it is negative where the finger
+        is clear of the skin.
         """
-        r = self._radius
         offset = centre - points
         along = np.einsum("qi,qi->q", offset, normals)
-        sideways = offset - along[:, None] * normals
-        across = np.sqrt(np.einsum("qi,qi->q", sideways, sideways))
-        flank = FLANK_RATIO * r
-        inner = np.minimum(across, flank)
-        height = np.sqrt(r * r - inner * inner)
-        slope = inner / height
-        below = height - slope * (across - inner) - along
-        drift = sideways @ direction / np.maximum(across, 1e-12)
-        return np.stack([below, normals @ direction + slope * drift])
+        across2 = np.einsum("qi,qi->q", offset, offset) - along * along
+        across = np.sqrt(np.maximum(across2, 0.0))
+        inner = np.minimum(across, FLANK_RATIO * self._radius)
+        height = np.sqrt(self._radius**2 - inner * inner)
+        result: Floats = height - inner / height * (across - inner) - along
+        return result
 
     def solve(self, push: Push, depth_m: float) -> Contact | None:
         """The contact at `depth_m` below `push.surface`; None where the finger does not touch."""
@@ -206,11 +200,8 @@ class SphereContact:
         if not len(near):
             return None
         count = len(self._shape)
-        below, growth = self.reach(
-            self._points[near].reshape(-1, 3),
-            self._normals[near].reshape(-1, 3),
-            centre,
-            push.normal,
+        below = self.reach(
+            self._points[near].reshape(-1, 3), self._normals[near].reshape(-1, 3), centre
         )
         reached = np.flatnonzero(below > 0.0)
         if not len(reached):
@@ -220,21 +211,17 @@ class SphereContact:
         nodes, local = np.unique(self._response.faces[face], return_inverse=True)
         weights = np.zeros((len(reached), len(nodes)))
         weights[np.arange(len(reached))[:, None], local.reshape(-1, 6)] = self._shape[point]
-        forces, tangent = solve_bed(
+        forces = solve_bed(
             weights,
             self._compliance[np.ix_(nodes, nodes)],
             self._bed[face],
             below[reached],
-            growth[reached],
         )
-        normals = self._response.normals[nodes]
-        return Contact(nodes, forces, forces @ normals, tangent @ normals)
+        return Contact(nodes, forces, forces @ self._response.normals[nodes])
 
 
-def solve_bed(
-    weights: Floats, compliance: Floats, bed: Floats, below: Floats, growth: Floats
-) -> tuple[Floats, Floats]:
-    """Nodal forces (k,) of the module's energy, and their growth per unit of `growth`, (k,).
+def solve_bed(weights: Floats, compliance: Floats, bed: Floats, below: Floats) -> Floats:
+    """Nodal forces (k,) at the minimum of the module's energy.
 
     weights W (q, k), compliance C (k, k), bed d (q,), below t (q,).  Newton from Hertz's guess that
     half of the overlap is contact; its full steps settle in two to five.  Should they not, further
@@ -246,15 +233,14 @@ def solve_bed(
     forces = np.zeros(len(compliance))
     for iteration in range(MAX_ITERATIONS):
         loaded = weights[active].T * bed[active]
-        right = loaded @ np.column_stack([below[active], growth[active]])
-        target = np.linalg.solve(identity + loaded @ yields[active], right)
+        target = np.linalg.solve(identity + loaded @ yields[active], loaded @ below[active])
         share = 1.0
         if iteration >= FULL_STEPS:
-            share = _decreasing_share(forces, target[:, 0], (compliance, yields, bed, below))
-        forces = forces + share * (target[:, 0] - forces)
+            share = _decreasing_share(forces, target, (compliance, yields, bed, below))
+        forces = forces + share * (target - forces)
         now = below > yields @ forces
         if share == 1.0 and np.array_equal(now, active):
-            return forces, target[:, 1]
+            return forces
         active = now
     raise ArithmeticError(f"contact of {len(bed)} points did not settle")
 
@@ -279,7 +265,7 @@ class LinearSoftBody:
     """The precomputed linear method: one contact solve, one product with the skin's table.
 
     Good to `linear_depth_m`.  Deeper pushes bend the skin no further than `largest_depth_m`, are
-    flagged, and their force goes on along its tangent.
+    flagged, and their force goes on growing in proportion to the depth.
     """
 
     name = "linear"
@@ -331,7 +317,7 @@ class LinearSoftBody:
         angle = abs(float(np.arctan2(push.normal[1], push.normal[2])))
         return Response(
             displacement=self._displacement(contact),
-            force_n=contact.force_n + (push.depth_m - depth) * contact.tangent_n_per_m,
+            force_n=contact.force_n * (push.depth_m / depth if push.depth_m > depth else 1.0),
             stiffness_n_per_m=stiffness,
             push_depth_m=max(0.0, push.depth_m - push.beyond_m),
             in_range=push.depth_m <= self._linear

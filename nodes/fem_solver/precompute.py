@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+import structlog
 from numpy.typing import NDArray
 
 from nodes.fem_solver.contact import SkinResponse
@@ -25,6 +26,8 @@ from nodes.fem_solver.mesh import SolidMesh, cylinder_mesh
 VERSION = 1
 """Counts up whenever the same specification gives other numbers."""
 CHUNK_LOADS = 128
+DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
+"""What reading a file that is cut, changed or of another kind may raise."""
 
 Progress = Callable[[int, int, "Budget"], None]
 """Called with (done, total) steps of the work and what it needs, first before it starts; may raise
@@ -170,17 +173,19 @@ def cache_path(spec: SoftBodySpec, cache_dir: Path) -> Path:
 
 
 def load(spec: SoftBodySpec, cache_dir: Path) -> SoftBodyModel | None:
-    """The model kept for this specification; None if there is none, or if it is not whole."""
+    """The model kept for this specification; None if there is none, or (logged) it is damaged."""
     path = cache_path(spec, cache_dir)
     try:
         # reading a member of the archive to its end verifies its CRC-32
-        with np.load(path, allow_pickle=False) as file:
-            content = {name: file[name] for name in file.files}
-        triangles = content.pop("triangles")
-        return SoftBodyModel(SkinResponse(**content), triangles)
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            content = {name: archive[name] for name in archive.files}
+        return SoftBodyModel(triangles=content.pop("triangles"), response=SkinResponse(**content))
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
+    except DAMAGE as error:
+        structlog.get_logger().warning(
+            "damaged cache file is computed anew", path=str(path), error=repr(error)
+        )
         return None
 
 

@@ -1,0 +1,265 @@
+"""The soft body node, driven as the runner drives it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from messages.base import Header, Message
+from messages.clock import VirtualClock
+from messages.scene import Scene
+from messages.topics import Topic
+from messages.types import Fingertip, Skin, SoftBody
+from nodes.fem_solver import precompute
+from nodes.fem_solver.node import FemSolver, FemSolverParameters
+
+SCENES = Path(__file__).parents[1] / "launch" / "scenes"
+
+
+def scene(**changes: Any) -> Scene:
+    """The cylinder scene; `changes` go into its object."""
+    content = YAML(typ="safe").load((SCENES / "cylinder.yaml").read_text())
+    content["object"].update(changes)
+    return Scene.model_validate(content)
+
+
+def header(source_ns: int = 0) -> Header:
+    return Header(1, source_ns, source_ns, "virtual", "test", 0)
+
+
+def fingertip(
+    position: tuple[float, float, float],
+    *,
+    valid: bool = True,
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Fingertip:
+    return Fingertip(
+        valid=valid,
+        reason="ok" if valid else "no_mark",
+        position_world_m=np.array(position, dtype=np.float64),
+        velocity_world_m_per_s=np.array(velocity, dtype=np.float64),
+        covariance=np.eye(6),
+        measured_world_m=np.array(position, dtype=np.float64),
+        reprojection_px=0.1,
+    )
+
+
+class Bench:
+    """A node and what it sent."""
+
+    def __init__(self, **parameters: Any) -> None:
+        self.sent: list[tuple[str, Message, Header]] = []
+        self.node = FemSolver(
+            FemSolverParameters(skin_spacing_m=0.007, **parameters),
+            name="fem_solver",
+            clock=VirtualClock(),
+            send=self._keep,
+        )
+
+    def _keep(self, topic: Topic, message: Message, header: Header) -> None:
+        self.sent.append((topic.name, message, header))
+
+    async def push(self, tip: Fingertip, source_ns: int = 0) -> SoftBody:
+        await self.node.step("fingertip", tip, header(source_ns))
+        name, message, head = self.sent[-1]
+        assert name == "soft_body"
+        assert head.source_ns == source_ns
+        assert isinstance(message, SoftBody)
+        return message
+
+    def skin(self) -> Skin:
+        skins = [m for name, m, _ in self.sent if name == "skin"]
+        assert isinstance(skins[-1], Skin)
+        return skins[-1]
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture
+async def bench(cache: str) -> AsyncIterator[Bench]:
+    bench = Bench(cache_dir=cache)
+    await bench.node.setup()
+    await bench.node.step("scene", scene(), header(5))
+    yield bench
+    await bench.node.close()
+    assert bench.node.errors == 0, bench.node.last_error
+
+
+async def test_nothing_is_said_before_a_scene(cache: str) -> None:
+    bench = Bench(cache_dir=cache)
+    await bench.node.setup()
+    await bench.node.step("fingertip", fingertip((0, 0, 0)), header())
+    assert bench.sent == []
+    assert "scene" in bench.node.note
+
+
+async def test_the_skin_stands_where_the_scene_puts_it(bench: Bench) -> None:
+    skin = bench.skin()
+    assert bench.sent[0][2].source_ns == 5
+    low, high = skin.vertices_world_m.min(axis=0), skin.vertices_world_m.max(axis=0)
+    assert low == pytest.approx([-0.06, -0.0353553, -0.0707106], abs=2e-3)
+    assert high == pytest.approx([0.06, 0.0353553, 0.0], abs=2e-3)
+    assert "ready" in bench.node.note
+
+
+async def test_a_push_dents_the_skin_towards_the_back(bench: Bench) -> None:
+    answer = await bench.push(fingertip((0.0, 0.0, -0.004)), 17)
+    assert answer.mesh_id == bench.skin().mesh_id
+    assert answer.in_range
+    assert answer.push_depth_m == pytest.approx(0.004, abs=1e-6)
+    assert answer.displacement_world_m.shape == bench.skin().vertices_world_m.shape
+    assert -0.0045 < answer.displacement_world_m[:, 2].min() < -0.0033
+    assert answer.force_world_n[2] > 0.05  # the object pushes the finger back to the user
+    assert np.abs(answer.force_world_n[:2]).max() < 0.05 * answer.force_world_n[2]
+
+
+async def test_a_finger_in_the_air_sees_the_body_at_rest_and_its_stiffness(bench: Bench) -> None:
+    answer = await bench.push(fingertip((0.01, 0.0, 0.03)))
+    assert not answer.displacement_world_m.any()
+    assert not answer.force_world_n.any()
+    assert answer.in_range
+    assert 20.0 < answer.stiffness_n_per_m < 80.0
+
+
+async def test_fifty_millimetres_are_flagged_and_bounded(bench: Bench) -> None:
+    for depth in np.linspace(0.0, 0.05, 26):
+        answer = await bench.push(fingertip((0.0, 0.001, -float(depth))))
+    assert not answer.in_range
+    assert answer.push_depth_m == pytest.approx(0.05, abs=0.001)
+    assert np.linalg.norm(answer.displacement_world_m, axis=1).max() < 0.0102
+    assert 1.0 < answer.force_world_n[2] < 10.0
+
+
+async def test_a_lost_finger_is_held_and_then_the_body_springs_back(bench: Bench) -> None:
+    lost = fingertip((0.0, 0.0, -0.004), valid=False)
+    untouched = await bench.push(lost)
+    assert not untouched.displacement_world_m.any()
+    assert untouched.stiffness_n_per_m > 0.0
+    good = await bench.push(fingertip((0.0, 0.0, -0.004)), 1_000_000_000)
+    held = await bench.push(lost, 1_090_000_000)
+    assert np.array_equal(held.displacement_world_m, good.displacement_world_m)
+    dents = []
+    for ms in range(100, 1500, 10):
+        answer = await bench.push(lost, 1_000_000_000 + ms * 1_000_000)
+        dents.append(-float(answer.displacement_world_m[:, 2].min()))
+    steps = -np.diff(dents)
+    assert (steps >= 0).all()
+    assert steps.max() < 0.08 * dents[0]
+    assert dents[-1] < 1e-3 * dents[0]
+    again = await bench.push(fingertip((0.0, 0.0, -0.004)), 3_000_000_000)
+    assert np.array_equal(again.displacement_world_m, good.displacement_world_m)
+
+
+async def test_lead_moves_the_finger_along_its_velocity(cache: str, bench: Bench) -> None:
+    ahead = Bench(cache_dir=cache, lead_s=0.1)
+    await ahead.node.setup()
+    await ahead.node.step("scene", scene(), header())
+    moving = await ahead.push(fingertip((0.0, 0.0, -0.002), velocity=(0.0, 0.0, -0.02)))
+    there = await bench.push(fingertip((0.0, 0.0, -0.004)))
+    assert moving.push_depth_m == pytest.approx(there.push_depth_m)
+
+
+@pytest.mark.parametrize(
+    "rpy", [(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2), (2.0, 0.0, 0.0), (0.3, 0.0, 1.0)]
+)
+async def test_the_body_may_lie_any_way_across(cache: str, rpy: tuple[float, ...]) -> None:
+    bench = Bench(cache_dir=cache)
+    await bench.node.setup()
+    pose = {"position_m": [0.01, 0.02, -0.0353553], "rpy_rad": list(rpy)}
+    await bench.node.step("scene", scene(world_from_object=pose), header())
+    answer = await bench.push(fingertip((0.01, 0.02, -0.004)))
+    assert answer.force_world_n[2] > 0.05
+    skin = bench.skin().vertices_world_m
+    deepest = int(answer.displacement_world_m[:, 2].argmin())
+    assert skin[deepest] == pytest.approx([0.01, 0.02, 0.0], abs=0.008)
+
+
+async def test_a_new_material_needs_no_new_precomputation(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = await bench.push(fingertip((0.0, 0.0, -0.004)))
+
+    def refuse(*_: Any) -> None:
+        raise AssertionError("nothing is to be computed")
+
+    monkeypatch.setattr(precompute, "load_or_compute", refuse)
+    twice = scene(material={"young_modulus_pa": 8000.0, "poisson_ratio": 0.45})
+    await bench.node.step("scene", twice, header())
+    after = await bench.push(fingertip((0.0, 0.0, -0.004)))
+    assert after.force_world_n == pytest.approx(2 * before.force_world_n, rel=1e-5)
+    assert after.mesh_id == before.mesh_id
+    assert [name for name, _, _ in bench.sent].count("skin") == 2
+
+
+async def test_another_object_replaces_the_first(bench: Bench) -> None:
+    before = await bench.push(fingertip((0.0, 0.0, -0.004)))
+    thin = {"shape": "cylinder", "radius_m": 0.03, "length_m": 0.1}
+    await bench.node.step("scene", scene(geometry=thin), header())
+    after = await bench.push(fingertip((0.0, 0.0, -0.01)))
+    assert after.mesh_id == bench.skin().mesh_id != before.mesh_id
+    assert len(after.displacement_world_m) == len(bench.skin().vertices_world_m)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            {"world_from_object": {"position_m": [0, 0, 0], "rpy_rad": [0, np.pi / 2, 0]}},
+            "towards the user",
+        ),
+        ({"support_angle_rad": 6.5}, "support_angle_rad"),
+        ({"material": {"young_modulus_pa": 4000.0, "poisson_ratio": 0.49995}}, "poisson_ratio"),
+        ({"geometry": {"shape": "cylinder", "radius_m": 0.01, "length_m": 0.1}}, "skin_spacing_m"),
+    ],
+)
+async def test_an_impossible_object_is_an_error_with_its_reason(
+    cache: str, change: dict[str, Any], words: str
+) -> None:
+    bench = Bench(cache_dir=cache)
+    await bench.node.setup()
+    await bench.node.step("scene", scene(**change), header())
+    assert bench.node.errors == 1
+    assert words in bench.node.last_error
+    assert words in bench.node.note
+    await bench.node.step("fingertip", fingertip((0, 0, 0)), header())
+    assert bench.sent == []
+
+
+async def test_closing_interrupts_the_precomputation(tmp_path: Path) -> None:
+    bench = Bench(cache_dir=str(tmp_path))
+    await bench.node.setup()
+    building = asyncio.create_task(bench.node.step("scene", scene(), header()))
+    while "precomputing" not in bench.node.note:
+        assert not building.done()
+        await asyncio.sleep(0)
+    await bench.node.close()
+    await building
+    assert "interrupted" in bench.node.note
+    assert bench.node.errors == 0
+    assert bench.sent == []
+    assert os.listdir(tmp_path) == []
+
+
+async def test_the_same_messages_give_the_same_bytes(cache: str) -> None:
+    def wiggle(i: int) -> NDArray[np.float64]:
+        return np.array([1e-3 * i, 5e-4 * i, -0.006 * np.sin(0.3 * i)])
+
+    runs = []
+    for _ in range(2):
+        bench = Bench(cache_dir=cache)
+        await bench.node.setup()
+        await bench.node.step("scene", scene(), header())
+        answers = [await bench.push(fingertip(tuple(wiggle(i))), i) for i in range(20)]
+        runs.append(b"".join(a.displacement_world_m.tobytes() for a in answers))
+    assert runs[0] == runs[1]
