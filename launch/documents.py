@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
@@ -179,14 +179,16 @@ def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
 
 def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key) -> Problem:
     location: Key = tuple(error["loc"])
-    key = (*at, *location)
-    if error["type"] == "extra_forbidden":
-        known = _fields_at(model, location[:-1])
+    if error["type"] in ("extra_forbidden", "missing"):
+        name = location[-1]
+        inside, holder = _walk(model, location[:-1])
+        if error["type"] == "missing":
+            return document.problem((*at, *inside), f'"{name}" is missing', f'add "{name}"')
+        known = sorted(holder.model_fields) if _is_model(holder) else []
         return document.problem(
-            key, f'unknown key "{location[-1]}"', did_you_mean(location[-1], known)
+            (*at, *inside, name), f'unknown key "{name}"', did_you_mean(name, known)
         )
-    if error["type"] == "missing":
-        return document.problem(key[:-1], f'"{location[-1]}" is missing', f'add "{location[-1]}"')
+    key = (*at, *_walk(model, location)[0])
     message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
     return document.problem(key, f"{_shown(error['input'])} does not fit", message)
 
@@ -196,15 +198,39 @@ def _shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _fields_at(model: Any, location: Key) -> list[str]:
-    """Names of the fields of the model that sits at `location` inside `model`."""
+def _walk(model: Any, location: Key) -> tuple[Key, Any]:
+    """The key in the file that pydantic's `location` stands for, and the type that sits there.
+
+    Inside a union of models pydantic's location also names the member that the tag chose.
+    """
+    key: list[str | int] = []
     for part in location:
-        model = _inner_type(model, part)
-    return sorted(model.model_fields) if _is_model(model) else []
+        members = [one for one in get_args(model) if _is_model(one)] if _is_union(model) else []
+        chosen = next((one for one in members if _has_tag(one, part)), None)
+        if chosen is not None:
+            model = chosen
+            continue
+        key.append(part)
+        model = _inner_type(members[0] if len(members) == 1 else model, part)
+    if _is_union(model):
+        members = [one for one in get_args(model) if _is_model(one)]
+        model = members[0] if len(members) == 1 else None
+    return tuple(key), model
 
 
 def _is_model(annotation: Any) -> bool:
     return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
+def _is_union(annotation: Any) -> bool:
+    return get_origin(annotation) in (Union, UnionType)
+
+
+def _has_tag(model: type[BaseModel], tag: str | int) -> bool:
+    fields = model.model_fields.values()
+    return any(
+        get_origin(one.annotation) is Literal and tag in get_args(one.annotation) for one in fields
+    )
 
 
 def _inner_type(annotation: Any, part: str | int) -> Any:
@@ -214,7 +240,6 @@ def _inner_type(annotation: Any, part: str | int) -> Any:
     else:
         arguments = get_args(annotation)
         annotation = arguments[-1] if arguments else None
-    if get_origin(annotation) in (Union, UnionType):
-        # "X or None" is the only union that launch and scene files have.
-        annotation = next((one for one in get_args(annotation) if one is not type(None)), None)
+    while get_origin(annotation) is Annotated:
+        annotation = get_args(annotation)[0]
     return annotation

@@ -76,7 +76,9 @@ class NodeSpec(Strict):
     type: str = Field(description='a name of the table of nodes, or "module:Class"')
     host: str = MAIN
     parameters: dict[str, Any] = {}
-    topics: dict[str, str] = Field(default={}, description="port: topic, where they differ")
+    topics: dict[str, str | None] = Field(
+        default={}, description="port: topic, where they differ; null leaves a port unconnected"
+    )
     restart: RestartSpec = RestartSpec()
     start_deadline_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
 
@@ -171,6 +173,7 @@ class _Member:
         self.type: type[Node] | None = None
         self.parameters: NodeParameters | None = None
         self.ports: list[tuple[Port, Topic]] = []
+        self.unconnected: list[tuple[Port, Topic]] = []
         self.further_inputs: list[Topic] = []
 
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
@@ -178,6 +181,13 @@ class _Member:
         if direction == "input":
             found += [(topic.name, topic) for topic in self.further_inputs]
         return found
+
+    def unconnected_ports(self, direction: str) -> tuple[PlannedPort, ...]:
+        return tuple(
+            PlannedPort(port=port.name, topic=topic.name, endpoints=())
+            for port, topic in self.unconnected
+            if port.direction == direction
+        )
 
 
 def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None = None) -> Plan:
@@ -188,10 +198,10 @@ def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None =
     Raises BadInputError with everything that is wrong.
     """
     document = read_document(path)
-    for setting in settings:
-        _apply_setting(document, setting)
     if record is not None:
         _apply_record(document, record)
+    for setting in settings:
+        _apply_setting(document, setting)
     spec = validate(LaunchFile, document)
     problems: list[Problem] = []
     _check_hosts(spec, document, problems)
@@ -420,6 +430,11 @@ def _connect_ports(
             )
     for port in ports.values():
         topic_name = member.spec.topics.get(port.name, port.name.replace("__", "/"))
+        fitting = [one for one in TOPICS.values() if one.message is port.message]
+        if topic_name is None and fitting:
+            member.unconnected.append((port, fitting[0]))
+            continue
+        topic_name = str(topic_name)
         key = (*member.key, "topics", port.name)
         topic = TOPICS.get(topic_name)
         if topic is None and port.name in member.spec.topics:
@@ -429,12 +444,12 @@ def _connect_ports(
                 )
             )
         elif topic is None:
-            fitting = [one.name for one in TOPICS.values() if one.message is port.message]
+            names = " or ".join(one.name for one in fitting)
             problems.append(
                 document.problem(
                     key,
                     f'port "{port.name}" is not connected',
-                    f'say in "topics" which it is: {" or ".join(fitting) or "no topic fits"}',
+                    f'say in "topics" which it is: {names or "no topic fits"}',
                 )
             )
         elif topic.message is not port.message:
@@ -532,7 +547,8 @@ def _check_inputs(
                 remedy = (
                     'name a scene file in "scene"'
                     if topic.name == "scene"
-                    else 'add the node that does, or list it in "from_tools"'
+                    else 'add the node that does, list it in "from_tools" for a tool to write, '
+                    f"or leave the port out with topics: {{{port_name}: null}}"
                 )
                 problems.append(
                     document.problem(
@@ -618,7 +634,8 @@ def _planned(
                 endpoints=tuple(one.endpoint_for(host) for one in endpoints[topic.name]),
             )
             for port, topic in member.topics("input")
-        ),
+        )
+        + member.unconnected_ports("input"),
         outputs=tuple(
             PlannedPort(
                 port=port,
@@ -628,7 +645,8 @@ def _planned(
                 ),
             )
             for port, topic in member.topics("output")
-        ),
+        )
+        + member.unconnected_ports("output"),
         restart=member.spec.restart,
         start_deadline_s=member.spec.start_deadline_s,
     )
@@ -642,13 +660,26 @@ def _parameters(member: _Member, document: Document, *, resolve_paths: bool) -> 
         return values
     section = member.key if member.key == ("record",) else (*member.key, "parameters")
     for name in member.parameters.model_fields_set:
-        value = getattr(member.parameters, name)
         base = Path.cwd() if (*section, name) in document.overrides else document.path.parent
-        if isinstance(value, Path):
-            values[name] = _absolute(value, base)
-        elif isinstance(value, tuple | list) and any(isinstance(one, Path) for one in value):
-            values[name] = [_absolute(Path(one), base) for one in value]
+        values[name] = _with_absolute_paths(getattr(member.parameters, name), values[name], base)
     return values
+
+
+def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
+    """`dumped`, the plain form of `value`, with each path in it made absolute from `base`."""
+    if isinstance(value, Path):
+        return _absolute(value, base)
+    if isinstance(value, BaseModel):
+        given = {
+            name: _with_absolute_paths(getattr(value, name), dumped[name], base)
+            for name in value.model_fields_set
+        }
+        return {**dumped, **given}
+    if isinstance(value, tuple | list):
+        return [
+            _with_absolute_paths(one, plain, base) for one, plain in zip(value, dumped, strict=True)
+        ]
+    return dumped
 
 
 def _absolute(path: Path, base: Path) -> str:

@@ -26,7 +26,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from launch.child import LIFELINE_VARIABLE, PARENT_VARIABLE
-from launch.documents import BadInputError, Problem
+from launch.documents import BadInputError, Problem, read_document
 from launch.plan import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort, is_loopback
 from launch.runs import RUN_VARIABLE, Run, create_run, sweep
 from messages.base import Header
@@ -250,6 +250,11 @@ class RunningGraph:
     def kill(self, node: str, number: int = signal.SIGKILL) -> None:
         """Send a signal to a node's process, as trouble would."""
         os.kill(self.pids[node], number)
+
+    def hurry(self) -> None:
+        """Kill all nodes at once, for somebody who will not wait for `stop`."""
+        for child in self._children.values():
+            child.signal(signal.SIGKILL)
 
     async def stop(self) -> None:
         """End all nodes (SIGINT, SIGTERM, SIGKILL) and remove sockets; may be called twice."""
@@ -491,8 +496,7 @@ def _refuse_open_network(plan: Plan, host: str | None) -> None:
         if not is_loopback(address):
             raise BadInputError(
                 [
-                    Problem(
-                        plan.launch_file,
+                    read_document(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
                         f"{address} is beyond loopback and there are no keys",
                         "nothing listens there without keys; --dry-run shows the plan",

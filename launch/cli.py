@@ -1,0 +1,53 @@
+"""The `flexsheet` command.  Subcommands live in `launch.commands`; this file only gathers them."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from launch.commands import bag, calibrate, doctor, launching, node, topic
+from launch.commands.output import BAD_INPUT, FAILED, CommandError, words
+
+app = typer.Typer(
+    name="flexsheet",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="An encountered-type visual haptic display with a flexible sheet.",
+)
+app.command()(launching.launch)
+app.add_typer(node.app, name="node")
+app.add_typer(topic.app, name="topic")
+app.add_typer(bag.app, name="bag")
+app.add_typer(calibrate.app, name="calibrate")
+app.command()(doctor.doctor)
+
+
+def main() -> None:
+    """Run the command line; what people can put right is said in a sentence, without a trace."""
+    try:
+        app()
+    except Exception as error:
+        code = _exit_code(error)
+        if code is None:
+            raise
+        words.print(f"flexsheet: {error}", markup=False)
+        sys.exit(code)
+
+
+def _exit_code(error: Exception) -> int | None:
+    """The exit code of an error that is the user's to put right; None for an error of ours."""
+    # Imported only now: a command that goes well should not wait for these.
+    from launch.documents import BadInputError
+    from launch.runs import RunDirectoryError
+    from messages.bag import BagError
+    from messages.bus import BusError
+
+    if isinstance(error, CommandError):
+        return error.code
+    if isinstance(error, BadInputError):
+        return BAD_INPUT
+    if isinstance(error, BusError | RunDirectoryError | BagError):
+        return FAILED
+    return None

@@ -1,0 +1,288 @@
+"""`flexsheet bag`: record, play, look into, save and verify bags."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
+from launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    print_fields,
+    print_json,
+    print_table,
+    words,
+)
+
+if TYPE_CHECKING:
+    from launch.plan import Plan
+    from launch.replay import Verification
+    from launch.runs import Run
+
+app = typer.Typer(no_args_is_help=True, help="Bags: recordings of topics (MCAP files).")
+
+BagArgument = Annotated[Path, typer.Argument(metavar="BAG", help="Bag file.")]
+TopicsOption = Annotated[
+    list[str] | None, typer.Option("--topic", help="Only this topic; may be given again.")
+]
+
+
+@app.command()
+def record(
+    bag: BagArgument,
+    topics: TopicsOption = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Stop by itself.")
+    ] = None,
+    run: RunOption = None,
+) -> None:
+    """Record the graph that runs, until Ctrl-C; without --topic all that is logged by default."""
+    plan, found = running_graph(run)
+    if bag.exists():
+        raise CommandError(f"{bag}: exists already; a bag is never written over", BAD_INPUT)
+    run_interruptible(_record(bag, topics or [], plan, found, duration))
+    words.print(f"recorded {bag}", markup=False)
+
+
+@app.command()
+def play(
+    *,
+    bag: BagArgument,
+    rate: Annotated[float, typer.Option(help="So many times as fast.", min=0.01)] = 1.0,
+    start: Annotated[float, typer.Option(metavar="SECONDS", help="Begin here.", min=0.0)] = 0.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Again and again, until Ctrl-C.")] = False,
+    topics: TopicsOption = None,
+    into: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Start this launch file for the time of playing."),
+    ] = None,
+    run: RunOption = None,
+) -> None:
+    """Play a bag into a graph: the topics that its launch file leaves to tools (from_tools)."""
+    how = Playing(bag, tuple(topics or ()), rate, start, loop)
+    raise typer.Exit(run_interruptible(_play(how, into, run)))
+
+
+@app.command()
+def info(bag: BagArgument, as_json: JsonOption = False) -> None:
+    """What a bag holds; a bag that was cut off by a crash is read as far as it goes."""
+    from messages.bag import info as bag_info
+
+    summary = bag_info(bag)
+    if as_json:
+        print_json({**asdict(summary), "path": str(summary.path)})
+        return
+    print_fields(
+        [
+            ("bag", summary.path),
+            ("size", f"{summary.size_bytes / 1e6:.2f} MB"),
+            ("complete", "yes" if summary.complete else f"no: {summary.problem}"),
+            ("duration", f"{summary.duration_s:.3f} s"),
+            ("messages", summary.count),
+            *(pair for table in summary.metadata.values() for pair in table.items()),
+            ("attachments", ", ".join(one.name for one in summary.attachments) or "none"),
+        ]
+    )
+    print()
+    print_table(
+        ("topic", "message", "count", "rate_hz", "readable"),
+        [
+            (one.name, one.type, one.count, f"{one.rate_hz:.2f}", "" if one.readable else "no")
+            for one in summary.topics
+        ],
+    )
+
+
+@app.command()
+def recover(
+    bag: BagArgument,
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Bag to write.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Write a whole bag from what can be read of a cut or damaged one; the original stays."""
+    from messages.bag import recover as recover_bag
+
+    with words.status(f"reading {bag}"):
+        report = recover_bag(bag, output)
+    if as_json:
+        print_json({**asdict(report), "output": str(output)})
+    else:
+        print_fields([*asdict(report).items(), ("output", output)])
+
+
+@app.command()
+def verify(
+    node: Annotated[str, typer.Argument(help="Name of the node in the bag's launch file.")],
+    bag: BagArgument,
+    tolerance: Annotated[
+        float, typer.Option(help="Between replayed and recorded numbers.", min=0.0)
+    ] = 1e-6,
+    as_json: JsonOption = False,
+) -> None:
+    """Step one node through its recorded inputs, twice; exit code 1 when anything differs.
+
+    The two passes must give the same bytes.  Against what the node published when it was recorded,
+    numbers may differ by the tolerance.
+    """
+    from launch.replay import verify as verify_node
+
+    with words.status(f"stepping {node} through {bag}"):
+        result = verify_node(bag, node, tolerance=tolerance)
+    if as_json:
+        print_json({**asdict(result), "ok": result.ok})
+    else:
+        _print_verification(result)
+    if not result.ok:
+        raise typer.Exit(FAILED)
+
+
+def _print_verification(result: Verification) -> None:
+    print_fields(
+        [
+            ("node", result.node),
+            ("messages in", result.messages_in),
+            ("messages out", result.messages_out),
+            ("same bytes twice", "yes" if result.same_bytes else "NO"),
+            ("sha256 of them", result.digest),
+            ("errors", f"{result.errors} {result.last_error}"),
+        ]
+    )
+    print()
+    print_table(
+        ("topic", "recorded", "replayed", "paired", f"beyond {result.tolerance:g}", "worst field"),
+        [
+            (
+                topic,
+                one.recorded,
+                one.replayed,
+                one.compared,
+                one.beyond_tolerance,
+                _worst(one.worst),
+            )
+            for topic, one in result.topics.items()
+        ],
+    )
+
+
+def _worst(fields: dict[str, float]) -> str:
+    if not fields:
+        return "all equal"
+    name = max(fields, key=lambda field: fields[field])
+    return f"{name} {fields[name]:.3g}"
+
+
+async def _record(
+    bag: Path, topics: list[str], plan: Plan, run: Run, duration_s: float | None
+) -> int:
+    """Run a recorder node in this process, connected to the running graph."""
+    from launch.plan import RUN_DIRECTORY
+    from launch.supervisor import local_endpoints
+    from messages.topics import TOPICS
+    from nodes.recorder.node import RUN_FILES, Recorder, RecorderParameters
+    from nodes.runner import NodeConfig, PortConfig, run_node
+
+    parameters = RecorderParameters(
+        bag=bag,
+        topics=tuple(topics),
+        attach=tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES),
+    )
+    written = [topic for topic in TOPICS.values() if topic.name in plan.writers]
+    wanted = Recorder.further_inputs(parameters, written)
+    for name in wanted:
+        if name not in plan.writers:
+            raise CommandError(f"--topic {name}: nobody writes it in the running graph", BAD_INPUT)
+    config = NodeConfig(
+        name="bag_record",
+        type="recorder",
+        parameters=parameters.model_dump(mode="json"),
+        inputs=tuple(
+            PortConfig(
+                port=name,
+                topic=name,
+                endpoints=local_endpoints(run, plan.endpoints_to_read(name)),
+            )
+            for name in wanted
+        ),
+        outputs=(),
+        plan_hash=plan.hash,
+        run_dir=str(run.directory),
+    )
+    stop = asyncio.Event()
+    work = asyncio.create_task(run_node(config, stop))
+    try:
+        await asyncio.wait((work,), timeout=duration_s)
+    finally:
+        # Also when interrupted: the bag is closed in order.
+        stop.set()
+        await work
+    return 0
+
+
+@dataclass(frozen=True, slots=True)
+class Playing:
+    """What is to be played, and how."""
+
+    bag: Path
+    topics: tuple[str, ...]
+    rate: float
+    start_s: float
+    loop: bool
+
+
+async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> int:
+    from launch.plan import load_plan
+    from launch.supervisor import RunningGraph
+
+    if into is None:
+        plan, run = running_graph(run_directory)
+        return await _play_into(how, plan, run)
+    plan = load_plan(into)
+    async with RunningGraph(plan) as graph:
+        with words.status(f"starting {into}"):
+            await graph.wait_ready()
+        return await _play_into(how, plan, graph.run)
+
+
+async def _play_into(how: Playing, plan: Plan, run: Run) -> int:
+    from launch.player import play as play_bag
+    from launch.player import select_topics
+    from messages.bag import BagReader
+
+    selection = select_topics(BagReader(how.bag).topics, plan, how.topics)
+    for name, why in selection.left_out.items():
+        words.print(f"not played: {name} ({why})", markup=False)
+    if not selection.topics:
+        raise CommandError(f"{how.bag}: nothing in it can be played into {plan.launch_file}")
+    sent = 0
+    while True:
+        with _progress(f"playing {how.bag.name}") as progress:
+            sent += await play_bag(
+                how.bag,
+                plan,
+                run,
+                topics=selection.topics,
+                rate=how.rate,
+                start_s=how.start_s,
+                progress=progress,
+            )
+        if not how.loop:
+            break
+    words.print(f"played {sent} messages on {', '.join(selection.topics)}", markup=False)
+    return 0
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[float, float], None]]:
+    from rich.progress import Progress
+
+    with Progress(console=words, transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda played, total: bar.update(task, completed=played, total=total)

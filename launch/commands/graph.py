@@ -1,0 +1,56 @@
+"""Finding the graph that runs, and running a command's loop until it is interrupted."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from collections.abc import Coroutine
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch.commands.output import BAD_INPUT, CommandError
+
+if TYPE_CHECKING:
+    from launch.plan import Plan
+    from launch.runs import Run
+
+RunOption = Annotated[
+    Path | None,
+    typer.Option("--run", help="Directory of the run; without it the newest that is alive."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+
+
+def running_graph(directory: Path | None) -> tuple[Plan, Run]:
+    """The Plan and the Run of the graph in `directory`, or of the newest that is alive."""
+    from launch.plan import Plan
+    from launch.runs import Run, live_runs
+
+    if directory is not None:
+        run = Run(directory.resolve().name, directory.resolve())
+        if not run.plan_file.is_file():
+            raise CommandError(f"--run {directory}: no plan.json there", BAD_INPUT)
+    else:
+        ready = [run for run in live_runs() if run.plan_file.is_file()]
+        if not ready:
+            raise CommandError("no graph is running; start one with: flexsheet launch FILE")
+        run = ready[0]
+    return Plan.model_validate_json(run.plan_file.read_text()), run
+
+
+def run_interruptible(work: Coroutine[Any, Any, int]) -> int:
+    """Run `work` in a loop; SIGINT and SIGTERM end it in order, and that is no failure."""
+
+    async def guarded() -> int:
+        task = asyncio.ensure_future(work)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, task.cancel)
+        try:
+            return await task
+        except asyncio.CancelledError:
+            return 0
+
+    return asyncio.run(guarded())

@@ -1,0 +1,153 @@
+"""`flexsheet launch`: start a graph, keep it running, end it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import FAILED, print_json, print_table, words
+
+if TYPE_CHECKING:
+    from launch.plan import Plan
+
+LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
+
+
+def launch(
+    *,
+    file: Annotated[Path, typer.Argument(help="Launch file.")],
+    host: Annotated[
+        str | None, typer.Option(help="Start only this host's nodes; all of them without it.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Check the file, print the plan, start nothing.")
+    ] = False,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NODE.PARAM=VALUE", help="Over what the file says."),
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(metavar="BAG", help="Record the logged topics to this bag.")
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Stop by itself, counted from ready.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Start the nodes of a launch file and keep them running until Ctrl-C.
+
+    Exit codes: 0 stopped as asked, 1 a node failed for good, 2 the input is wrong.
+    """
+    from launch.plan import load_plan
+
+    plan = load_plan(file, settings=settings or (), record=record)
+    if dry_run:
+        if as_json:
+            print_json(plan.model_dump(mode="json"))
+        else:
+            _print_plan(plan, host)
+        return
+    raise typer.Exit(asyncio.run(_run(plan, host, duration)))
+
+
+async def _run(plan: Plan, host: str | None, duration_s: float | None) -> int:
+    from launch.supervisor import NodeFailedError, RunningGraph
+
+    asked_to_stop = asyncio.Event()
+    graph = RunningGraph(plan, host=host, report=_say)
+    loop = asyncio.get_running_loop()
+
+    def on_signal() -> None:
+        if asked_to_stop.is_set():
+            graph.hurry()
+        asked_to_stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        loop.add_signal_handler(number, on_signal)
+    stop = asyncio.create_task(asked_to_stop.wait())
+    try:
+        async with graph:
+            ready = asyncio.create_task(graph.wait_ready())
+            end = asyncio.create_task(graph.wait())
+            try:
+                await asyncio.wait((ready, end, stop), return_when=asyncio.FIRST_COMPLETED)
+                if ready.done():
+                    ready.result()
+                    words.print(f"[green]all {len(graph.nodes)} nodes are ready[/]; Ctrl-C ends")
+                    await asyncio.wait(
+                        (end, stop), timeout=duration_s, return_when=asyncio.FIRST_COMPLETED
+                    )
+                if end.done():
+                    end.result()
+            finally:
+                ready.cancel()
+                end.cancel()
+                await asyncio.gather(ready, end, return_exceptions=True)
+    except NodeFailedError as error:
+        words.print(f"[red]failed:[/] {error}", markup=True)
+        return FAILED
+    finally:
+        stop.cancel()
+    words.print("stopped")
+    return 0
+
+
+def _say(node: str, line: str) -> None:
+    """One line of a node's log for people: JSON from structlog is put into words."""
+    style, text = "", line
+    if line.startswith("{"):
+        try:
+            record = json.loads(line)
+        except ValueError:
+            record = None
+        if isinstance(record, dict) and "event" in record:
+            style = LEVEL_STYLES.get(str(record.pop("level", "")), "")
+            record.pop("timestamp", None)
+            record.pop("node", None)
+            event = record.pop("event")
+            trace = record.pop("trace", None) or record.pop("exception", None)
+            text = " ".join([str(event), *(f"{key}={value}" for key, value in record.items())])
+            if trace:
+                text += f"\n{trace}"
+    words.print(f"{node:>16} | {text}", style=style, markup=False)
+
+
+def _print_plan(plan: Plan, host: str | None) -> None:
+    words.print(f"plan {plan.hash} of {plan.launch_file}, scene {plan.scene_file or 'none'}")
+    print_table(
+        ("node", "type", "host", "restart", "parameters"),
+        [
+            (
+                node.name,
+                node.type,
+                f"{node.host} ({plan.hosts[node.host]})",
+                node.restart.policy,
+                " ".join(f"{key}={value}" for key, value in node.parameters.items()),
+            )
+            for node in plan.nodes_on(host)
+        ],
+    )
+    print()
+    print_table(
+        ("topic", "from", "endpoints", "to"),
+        [
+            (
+                topic,
+                writer.name,
+                " ".join(writer.endpoints),
+                " ".join(
+                    node.name
+                    for node in plan.nodes.values()
+                    if any(port.topic == topic for port in node.inputs)
+                ),
+            )
+            for topic, writers in plan.writers.items()
+            for writer in writers
+        ],
+    )

@@ -1,0 +1,73 @@
+"""`flexsheet node`: which nodes there are, and what one takes and gives."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, print_table
+
+app = typer.Typer(no_args_is_help=True, help="Nodes: which there are, what they take and give.")
+
+
+@app.command("list")
+def list_nodes(as_json: JsonOption = False) -> None:
+    """The node types that a launch file can name."""
+    from nodes import NODES
+
+    if as_json:
+        print_json([{"type": name, "class": path} for name, path in NODES.items()])
+    else:
+        print_table(("type", "class"), NODES.items())
+
+
+@app.command()
+def describe(
+    node: Annotated[str, typer.Argument(help='Type of node, or "module:Class".')],
+    as_json: JsonOption = False,
+) -> None:
+    """Ports, timers and parameters of a type of node."""
+    from nodes import UnknownNodeError, node_class
+    from nodes.node import parameters_of, ports_of, timers_of
+
+    try:
+        class_ = node_class(node)
+    except (UnknownNodeError, ImportError, AttributeError) as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    description = {
+        "type": node,
+        "about": (class_.__doc__ or "").strip(),
+        "ports": [
+            {"port": port.name, "direction": port.direction, "message": port.message.__name__}
+            for port in ports_of(class_).values()
+        ],
+        "timers": [
+            {"method": timer.method, "rate_parameter": timer.rate_parameter}
+            for timer in timers_of(class_)
+        ],
+        "parameters": [
+            _parameter(name, field) for name, field in parameters_of(class_).model_fields.items()
+        ],
+    }
+    if as_json:
+        print_json(description)
+        return
+    print_fields([("type", node), ("about", str(description["about"]).split("\n")[0])])
+    for title in ("ports", "timers", "parameters"):
+        rows: Any = description[title]
+        if rows:
+            print()
+            print_table(tuple(rows[0]), [tuple(row.values()) for row in rows])
+
+
+def _parameter(name: str, field: Any) -> dict[str, Any]:
+    annotation = field.annotation
+    plain = isinstance(annotation, type) and not hasattr(annotation, "__args__")
+    return {
+        "parameter": name,
+        "type": annotation.__name__ if plain else str(annotation).replace("typing.", ""),
+        "default": "required" if field.is_required() else str(field.get_default()),
+        "about": field.description or "",
+    }

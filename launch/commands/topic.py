@@ -1,0 +1,410 @@
+"""`flexsheet topic`: the table of topics, and a look at (or a word into) the graph that runs."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch.commands.graph import (
+    JsonOption,
+    RunOption,
+    run_interruptible,
+    running_graph,
+)
+from launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    print_fields,
+    print_json,
+    print_json_line,
+    print_table,
+    words,
+)
+
+if TYPE_CHECKING:
+    from messages.base import Header, Message
+    from messages.topics import Topic
+
+app = typer.Typer(no_args_is_help=True, help="Topics: the table, and what is on them now.")
+
+TopicArgument = Annotated[str, typer.Argument(help="Name of the topic, as twin/finger.")]
+SHORT_ARRAY = 36
+"""Arrays of more elements than a 6x6 matrix are abbreviated."""
+
+
+@app.command("list")
+def list_topics(as_json: JsonOption = False) -> None:
+    """The one table of topics."""
+    from messages.topics import TOPICS
+
+    rows = [_describe(topic) for topic in TOPICS.values()]
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(
+            ("topic", "message", "delivery", "rate_hz", "logged", "about"),
+            [
+                (
+                    row["topic"],
+                    row["message"],
+                    row["delivery"],
+                    "on change" if row["rate_hz"] is None else "{:g}-{:g}".format(*row["rate_hz"]),
+                    "yes" if row["logged"] else "",
+                    row["about"],
+                )
+                for row in rows
+            ],
+        )
+
+
+@app.command()
+def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = False) -> None:
+    """Type and fields of a topic, and who writes and reads it in the graph that runs."""
+    found = _topic(topic)
+    description = _describe(found)
+    schema = found.message.model_json_schema()
+    description["fields"] = {
+        name: field.get("description") or field.get("type") or field.get("$ref", "").split("/")[-1]
+        for name, field in schema["properties"].items()
+    }
+    try:
+        plan, _ = running_graph(run)
+    except CommandError:
+        if run is not None:
+            raise
+    else:
+        description["writers"] = [writer.name for writer in plan.writers.get(topic, ())]
+        description["readers"] = [
+            node.name
+            for node in plan.nodes.values()
+            if any(port.topic == topic for port in node.inputs)
+        ]
+    if as_json:
+        print_json(description)
+        return
+    fields = description.pop("fields")
+    print_fields(
+        (name, " ".join(map(str, value)) if isinstance(value, list | tuple) else value)
+        for name, value in description.items()
+    )
+    print()
+    print_table(("field", "what"), fields.items())
+
+
+@app.command()
+def echo(
+    *,
+    topic: TopicArgument,
+    once: Annotated[bool, typer.Option("--once", help="Stop after one message.")] = False,
+    count: Annotated[int | None, typer.Option(help="Stop after so many messages.", min=1)] = None,
+    timeout: Annotated[
+        float | None, typer.Option(help="Fail when nothing came for so many seconds.")
+    ] = None,
+    field: Annotated[str | None, typer.Option(help="Only this field, as left.fx_px.")] = None,
+    full: Annotated[bool, typer.Option("--full", help="Do not abbreviate arrays.")] = False,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print the messages of a topic as they come; --json prints one document a line."""
+    found = _topic(topic)
+    wanted = 1 if once else count
+
+    def show(message: Message, header: Header) -> None:
+        value = _field(message, field, topic)
+        if as_json:
+            print_json_line({"header": _header(header), "message": to_plain(value, full=full)})
+            return
+        seconds = f"{header.source_ns * 1e-9:.6f}"
+        print(f"--- {header.writer} #{header.sequence}, source {seconds} s")
+        print("\n".join(_lines(to_plain(value, full=full))), flush=True)
+
+    raise typer.Exit(run_interruptible(_read(found, run, show, wanted, timeout)))
+
+
+@app.command()
+def hz(
+    topic: TopicArgument,
+    duration: Annotated[float, typer.Option(help="Measure for so many seconds.", min=0.1)] = 5.0,
+    run: RunOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Rate of each writer of a topic, by the writers' own stamps and sequence numbers."""
+    found = _topic(topic)
+    headers: list[Header] = []
+    run_interruptible(_collect_headers(found, run, headers, duration))
+    rows = rates(headers)
+    if as_json:
+        print_json(rows)
+    else:
+        print_table(
+            ("writer", "rate_hz", "received", "lost", "interval p50 ms", "p99 ms"),
+            [
+                (
+                    row["writer"],
+                    "-" if row["rate_hz"] is None else f"{row['rate_hz']:.2f}",
+                    row["received"],
+                    row["lost"],
+                    "-" if row["interval_ms"] is None else f"{row['interval_ms']['p50']:.2f}",
+                    "-" if row["interval_ms"] is None else f"{row['interval_ms']['p99']:.2f}",
+                )
+                for row in rows
+            ],
+        )
+    if not rows:
+        words.print(f'nothing came on "{topic}" in {duration:g} s')
+        raise typer.Exit(FAILED)
+
+
+@app.command()
+def pub(
+    topic: TopicArgument,
+    message: Annotated[str, typer.Argument(help="The message in YAML or JSON, or @FILE.")],
+    rate: Annotated[float | None, typer.Option(help="Send again at this rate, Hz.")] = None,
+    count: Annotated[int | None, typer.Option(help="Send so many times.", min=1)] = None,
+    run: RunOption = None,
+) -> None:
+    """Publish into the graph that runs: to topics that many may write, and those of from_tools.
+
+    A latched message is kept for late subscribers only while this command runs.
+    """
+    found = _topic(topic)
+    built = _parse_message(found, message)
+    times = count if count is not None else (None if rate else 1)
+    code = run_interruptible(_publish(found, built, run, rate or 1.0, times))
+    raise typer.Exit(code)
+
+
+def rates(headers: list[Header]) -> list[dict[str, Any]]:
+    """Per writer: rate by its stamps, received and lost messages, intervals between stamps."""
+    import numpy as np
+
+    rows = []
+    for key in dict.fromkeys((header.writer, header.epoch) for header in headers):
+        own = [header for header in headers if (header.writer, header.epoch) == key]
+        sequences = np.array([header.sequence for header in own])
+        stamps_s = np.array([header.publish_ns for header in own]) * 1e-9
+        span_s = float(stamps_s[-1] - stamps_s[0])
+        sent = int(sequences[-1] - sequences[0])
+        steps = np.diff(sequences)
+        intervals_ms = np.diff(stamps_s)[steps == 1] * 1e3
+        rows.append(
+            {
+                "writer": key[0],
+                "rate_hz": sent / span_s if span_s > 0 else None,
+                "received": len(own),
+                "lost": int(sent + 1 - len(own)),
+                "interval_ms": None
+                if intervals_ms.size == 0
+                else {
+                    "p50": float(np.quantile(intervals_ms, 0.5)),
+                    "p99": float(np.quantile(intervals_ms, 0.99)),
+                    "max": float(intervals_ms.max()),
+                },
+            }
+        )
+    return rows
+
+
+def to_plain(value: Any, *, full: bool) -> Any:
+    """A message or field as JSON's types; long arrays as their type, shape and range."""
+    import numpy as np
+    from pydantic import BaseModel
+
+    if isinstance(value, BaseModel):
+        return {
+            name: to_plain(getattr(value, name), full=full) for name in type(value).model_fields
+        }
+    if isinstance(value, np.ndarray):
+        if full or value.size <= SHORT_ARRAY:
+            return value.tolist()
+        return {
+            "dtype": str(value.dtype),
+            "shape": list(value.shape),
+            "min": value.min().item(),
+            "max": value.max().item(),
+        }
+    if isinstance(value, tuple | list):
+        return [to_plain(item, full=full) for item in value]
+    return value
+
+
+def _lines(value: Any, indent: str = "") -> list[str]:
+    if not isinstance(value, dict):
+        return [f"{indent}{_word(value)}"]
+    lines = []
+    for name, item in value.items():
+        if isinstance(item, dict):
+            lines += [f"{indent}{name}:", *_lines(item, indent + "  ")]
+        else:
+            lines.append(f"{indent}{name}: {_word(item)}")
+    return lines
+
+
+def _word(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return f"[{', '.join(_word(item) for item in value)}]"
+    return str(value)
+
+
+def _topic(name: str) -> Topic:
+    from messages.topics import UnknownTopicError, topic_named
+
+    try:
+        return topic_named(name)
+    except UnknownTopicError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+
+
+def _describe(topic: Topic) -> dict[str, Any]:
+    return {
+        "topic": topic.name,
+        "message": topic.message.__name__,
+        "delivery": str(topic.delivery),
+        "rate_hz": topic.rate_hz,
+        "logged": topic.logged,
+        "many_writers": topic.many_writers,
+        "max_bytes": topic.max_bytes,
+        "about": topic.about,
+    }
+
+
+def _header(header: Header) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    return asdict(header)
+
+
+def _field(message: Message, path: str | None, topic: str) -> Any:
+    value: Any = message
+    for name in path.split(".") if path else ():
+        fields = getattr(type(value), "model_fields", {})
+        if name not in fields:
+            from launch.documents import did_you_mean
+
+            raise CommandError(
+                f'--field {path}: topic "{topic}" has no field "{name}" there; '
+                f"{did_you_mean(name, list(fields))}",
+                BAD_INPUT,
+            )
+        value = getattr(value, name)
+    return value
+
+
+async def _read(
+    topic: Topic, run: Path | None, show: Any, wanted: int | None, timeout_s: float | None
+) -> int:
+    from messages.bus import Subscriber
+    from nodes.node import PortCounts
+
+    endpoints = endpoints_of(topic, run)
+    arrived: asyncio.Queue[tuple[Any, Any]] = asyncio.Queue()
+    subscriber = Subscriber(
+        topic,
+        endpoints,
+        lambda message, header: arrived.put_nowait((message, header)),
+        PortCounts(),
+        on_problem=lambda text: words.print(text, markup=False),
+    )
+    subscriber.start()
+    try:
+        shown = 0
+        while wanted is None or shown < wanted:
+            async with asyncio.timeout(timeout_s):
+                message, header = await arrived.get()
+            show(message, header)
+            shown += 1
+    except TimeoutError:
+        words.print(f'nothing came on "{topic.name}" in {timeout_s:g} s')
+        return FAILED
+    finally:
+        subscriber.close()
+    return 0
+
+
+async def _collect_headers(
+    topic: Topic, run: Path | None, headers: list[Header], duration_s: float
+) -> int:
+    from messages.bus import Subscriber
+    from nodes.node import PortCounts
+
+    subscriber = Subscriber(
+        topic,
+        endpoints_of(topic, run),
+        lambda _, header: headers.append(header),
+        PortCounts(),
+        on_problem=lambda text: words.print(text, markup=False),
+        unopened=True,
+    )
+    subscriber.start()
+    try:
+        await asyncio.sleep(duration_s)
+    finally:
+        subscriber.close()
+    return 0
+
+
+def endpoints_of(topic: Topic, run_directory: Path | None) -> tuple[str, ...]:
+    """Where the graph that runs writes the topic; CommandError when nothing does."""
+    from launch.supervisor import local_endpoints
+
+    plan, run = running_graph(run_directory)
+    endpoints = plan.endpoints_to_read(topic.name)
+    if not endpoints:
+        raise CommandError(f'nobody writes "{topic.name}" in the graph that runs ({run.directory})')
+    return local_endpoints(run, endpoints)
+
+
+def _parse_message(topic: Topic, text: str) -> Message:
+    from pydantic import ValidationError
+    from ruamel.yaml.error import YAMLError
+
+    from launch.documents import parse_value
+
+    source = "MESSAGE"
+    if text.startswith("@"):
+        source = text[1:]
+        try:
+            text = Path(source).read_text()
+        except OSError as error:
+            raise CommandError(f"{source}: cannot be read: {error.strerror}", BAD_INPUT) from error
+    try:
+        return topic.message.model_validate(parse_value(text))
+    except YAMLError as error:
+        raise CommandError(f"{source}: neither YAML nor JSON: {error}", BAD_INPUT) from error
+    except ValidationError as error:
+        problems = "; ".join(
+            f"{'.'.join(str(part) for part in item['loc'])}: {item['msg']}"
+            for item in error.errors()
+        )
+        raise CommandError(
+            f"{source} is no {topic.message.__name__}: {problems}", BAD_INPUT
+        ) from error
+
+
+async def _publish(
+    topic: Topic, message: Message, run: Path | None, rate_hz: float, times: int | None
+) -> int:
+    from launch.tools import READER_RECONNECT_S, ToolsWriter
+
+    plan, found = running_graph(run)
+    writer = ToolsWriter(plan, found, [topic.name])
+    try:
+        await asyncio.sleep(READER_RECONNECT_S)
+        sent = 0
+        while times is None or sent < times:
+            if sent:
+                await asyncio.sleep(1.0 / rate_hz)
+            writer.publish(topic.name, message)
+            sent += 1
+        # Latched messages reach readers that are only now connecting.
+        await asyncio.sleep(READER_RECONNECT_S / 2)
+    finally:
+        writer.close()
+    words.print(f'sent {sent} on "{topic.name}"')
+    return 0

@@ -1,0 +1,78 @@
+"""Writing into a graph from outside of it, as the writer "tools" that every plan foresees."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterable
+
+from launch.documents import BadInputError, Problem
+from launch.plan import TOOLS, Plan
+from launch.runs import Run
+from launch.supervisor import local_endpoints
+from messages.base import Header, Message
+from messages.bus import Publisher
+from messages.clock import SystemClock
+from messages.topics import topic_named
+
+READER_RECONNECT_S = 1.0
+"""Readers look for a writer that was not there at most every half second."""
+
+
+def topics_for_tools(plan: Plan) -> list[str]:
+    """Topics that a tool may write in this plan."""
+    return [topic for topic in plan.writers if plan.writer(topic, TOOLS) is not None]
+
+
+class ToolsWriter:
+    """Publishers for some topics of a running graph; needs a running loop.
+
+    Raises BadInputError for a topic that is a node's, BusError when another tool writes it now.
+    """
+
+    def __init__(self, plan: Plan, run: Run, topics: Iterable[str]) -> None:
+        self._clock = SystemClock()
+        self._epoch = random.SystemRandom().getrandbits(32)
+        self._sequences: dict[str, int] = {}
+        self._publishers: dict[str, Publisher] = {}
+        try:
+            for name in topics:
+                writer = plan.writer(name, TOOLS)
+                if writer is None:
+                    owners = ", ".join(one.name for one in plan.writers.get(name, ()))
+                    what = f"is written by {owners}" if owners else "is not part of the graph"
+                    raise BadInputError(
+                        [
+                            Problem(
+                                plan.launch_file,
+                                ("from_tools",),
+                                f'topic "{name}" {what}',
+                                f'list it in "from_tools"; open are: '
+                                f"{', '.join(topics_for_tools(plan))}",
+                            )
+                        ]
+                    )
+                endpoints = local_endpoints(run, writer.endpoints)
+                self._publishers[name] = Publisher(topic_named(name), endpoints)
+        except BaseException:
+            self.close()
+            raise
+
+    def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
+        """Send a message with the next sequence number, stamped now (or as `source_ns` says)."""
+        self._sequences[topic] = self._sequences.get(topic, 0) + 1
+        now_ns = self._clock.now_ns()
+        self._publishers[topic].send(
+            message,
+            Header(
+                sequence=self._sequences[topic],
+                source_ns=now_ns if source_ns is None else source_ns,
+                publish_ns=now_ns,
+                clock_id=self._clock.id,
+                writer=TOOLS,
+                epoch=self._epoch,
+            ),
+        )
+
+    def close(self) -> None:
+        for publisher in self._publishers.values():
+            publisher.close()
