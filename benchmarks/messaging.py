@@ -1,0 +1,467 @@
+"""How long a message takes from one process to another, by the way that it is received.
+
+    python -m benchmarks.messaging [--quick] [--transport ipc|tcp] [--rounds N] [--json FILE]
+
+One process publishes at a steady rate, one process per design receives; the latency is the true one
+way on the clock that both share.  It begins before a typed message is constructed and ends in the
+handler that is given the validated message; raw designs carry as many bytes in as many frames and
+look at none of them.  The designs take turns in random order in every round, and what counts is the
+ratio to blocking ZeroMQ within the round: microseconds of a shared machine move by a factor of two
+while one looks on.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import os
+import platform
+import random
+import statistics
+import sys
+import tempfile
+import time
+import timeit
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import uvloop
+import zmq
+import zmq.asyncio
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from messages.base import Header, Message
+from messages.bus import Publisher, Subscriber
+from messages.topics import TOPICS, Topic
+from messages.types import Fingertip, StereoPair
+from messages.wire import decode, encode, size_of
+
+FLOOR = "blocking"
+EPOCH = 1
+
+
+@dataclass(frozen=True)
+class Design:
+    """A way to receive.  `typed` ones hand over validated messages, the others bytes."""
+
+    name: str
+    about: str
+    typed: bool
+    receive: Callable[[Topic, str, Callable[[int, int], bool]], None]
+    inline_bytes: int | None = None
+
+
+@dataclass(frozen=True)
+class Payload:
+    name: str
+    topic: Topic
+    rate_hz: float
+    make: Callable[[int], Message]
+
+
+class Counts:
+    dropped = gaps = rejected = 0
+
+
+def subscriber_socket(context: Any, endpoint: str) -> Any:
+    opened = context.socket(zmq.SUB)
+    opened.setsockopt(zmq.SUBSCRIBE, b"")
+    opened.setsockopt(zmq.RCVHWM, 1000)
+    opened.connect(endpoint)
+    return opened
+
+
+def raw_stamp(frames: Sequence[Any]) -> tuple[int, int]:
+    """Sequence and stamp, which a raw message begins with."""
+    head = bytes(memoryview(frames[0])[:16])
+    return int.from_bytes(head[:8], "little"), int.from_bytes(head[8:], "little")
+
+
+def blocking(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    opened = subscriber_socket(zmq.Context.instance(), endpoint)
+    while arrived(*raw_stamp(opened.recv_multipart(copy=False))):
+        pass
+    opened.close(linger=0)
+
+
+def zmq_asyncio(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    async def run() -> None:
+        opened = subscriber_socket(zmq.asyncio.Context.instance(), endpoint)
+        while arrived(*raw_stamp(await opened.recv_multipart(copy=False))):
+            pass
+        opened.close(linger=0)
+
+    asyncio.run(run())
+
+
+def zmq_asyncio_typed(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    async def run() -> None:
+        opened = subscriber_socket(zmq.asyncio.Context.instance(), endpoint)
+        going = True
+        while going:
+            _, header = decode(await opened.recv_multipart(copy=False), topic)
+            going = arrived(header.sequence, header.publish_ns)
+        opened.close(linger=0)
+
+    asyncio.run(run())
+
+
+async def read_descriptor(endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    loop = asyncio.get_running_loop()
+    opened = subscriber_socket(zmq.Context.instance(), endpoint)
+    ended = loop.create_future()
+
+    def drain() -> None:
+        while not ended.done():
+            try:
+                frames = opened.recv_multipart(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            if not arrived(*raw_stamp(frames)):
+                ended.set_result(None)
+
+    loop.add_reader(opened.fileno(), drain)
+    loop.call_soon(drain)
+    await ended
+    loop.remove_reader(opened.fileno())
+    opened.close(linger=0)
+
+
+def descriptor(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    asyncio.run(read_descriptor(endpoint, arrived))
+
+
+def descriptor_uvloop(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    uvloop.run(read_descriptor(endpoint, arrived))
+
+
+async def subscribe(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    ended = asyncio.get_running_loop().create_future()
+
+    def on_message(message: Message, header: Header) -> None:
+        if not arrived(header.sequence, header.publish_ns) and not ended.done():
+            ended.set_result(None)
+
+    subscriber = Subscriber(topic, [endpoint], on_message, Counts())
+    subscriber.start()
+    await ended
+    subscriber.close()
+
+
+def flexsheet_asyncio(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    asyncio.run(subscribe(topic, endpoint, arrived))
+
+
+def flexsheet_uvloop(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    uvloop.run(subscribe(topic, endpoint, arrived))
+
+
+DESIGNS = (
+    Design(FLOOR, "raw, blocking recv in a thread of its own: the floor", False, blocking),
+    Design("zmq.asyncio", "raw, await recv_multipart()", False, zmq_asyncio),
+    Design("descriptor", "raw, add_reader on the socket's descriptor", False, descriptor),
+    Design("descriptor uvloop", "the same on uvloop", False, descriptor_uvloop),
+    Design(
+        "zmq.asyncio typed", "await recv_multipart(), decoded, validated", True, zmq_asyncio_typed
+    ),
+    Design("flexsheet asyncio", "messages.bus, decoded, validated", True, flexsheet_asyncio),
+    Design("flexsheet uvloop", "the same on uvloop: what nodes use", True, flexsheet_uvloop),
+    Design(
+        "flexsheet, all frames", "the same, each array its own frame", True, flexsheet_uvloop, 0
+    ),
+)
+
+
+def fingertip(number: int) -> Fingertip:
+    return Fingertip(
+        valid=True,
+        reason="ok",
+        position_world_m=np.array([0.01, 0.02, 0.03]),
+        velocity_world_m_per_s=np.array([0.1, 0.0, -0.1]),
+        covariance=np.eye(6),
+        measured_world_m=np.array([0.01, 0.02, 0.03]),
+        reprojection_px=0.1,
+    )
+
+
+IMAGES = np.random.default_rng(0).integers(0, 255, (2, 480, 640), np.uint8)
+
+
+def stereo(number: int) -> StereoPair:
+    return StereoPair(
+        device="bench", exposure_s=0.001, dropped_frames=0, left=IMAGES[0], right=IMAGES[1]
+    )
+
+
+PAYLOADS = (
+    Payload("fingertip", TOPICS["fingertip"], 250.0, fingertip),
+    Payload("stereo pair 640x480", TOPICS["stereo"], 60.0, stereo),
+)
+
+
+def receive_rounds(design: Design, topic: Topic, endpoint: str, results: Connection) -> None:
+    """A child's work: per round the latencies; sequence 0 warms up, -1 ends a round, -2 all."""
+    latencies: list[int] = []
+
+    def arrived(sequence: int, stamp_ns: int) -> bool:
+        now_ns = time.monotonic_ns()
+        kind = stamp_ns & 3
+        if kind == 0:
+            latencies.append(now_ns - stamp_ns)
+        elif kind == 1:
+            results.send("here")
+        elif kind == 2:
+            results.send(latencies.copy())
+            latencies.clear()
+        return kind != 3
+
+    design.receive(topic, endpoint, arrived)
+
+
+# A stamp's two lowest bits say what the message is for; four nanoseconds do not matter.
+MEASURE, WARM_UP, END_ROUND, END = range(4)
+
+
+class Sender:
+    """The parent's end of one design: a publisher and the child that listens to it."""
+
+    def __init__(self, design: Design, payload: Payload, endpoint: str) -> None:
+        self.design, self.payload = design, payload
+        self.sequence = 0
+        topic = payload.topic
+        frames = encode(payload.make(0), self.header(0), inline_bytes=design.inline_bytes or 1024)
+        self._raw = [bytearray(frame) for frame in frames]
+        self._publisher = Publisher(topic, [endpoint])
+        spawn = multiprocessing.get_context("spawn")
+        self.results, childs_end = spawn.Pipe()
+        self._child = spawn.Process(
+            target=receive_rounds,
+            args=(design, topic, self._publisher.endpoints[0], childs_end),
+            daemon=True,
+        )
+        self._child.start()
+        while not self.results.poll(0.01):
+            self.send(WARM_UP)
+        time.sleep(0.05)
+        while self.results.poll(0):
+            self.results.recv()
+
+    def header(self, stamp_ns: int) -> Header:
+        return Header(self.sequence, stamp_ns, stamp_ns, "bench", "bench", EPOCH)
+
+    def send(self, kind: int) -> None:
+        self.sequence += 1
+        stamp_ns = (time.monotonic_ns() & ~3) | kind
+        if not self.design.typed:
+            raw = self._raw[0]
+            raw[:16] = self.sequence.to_bytes(8, "little") + stamp_ns.to_bytes(8, "little")
+            frames = [bytes(raw), *self._raw[1:]]
+            self._publisher._send(frames)
+        elif self.design.inline_bytes is None:
+            self._publisher.send(self.payload.make(self.sequence), self.header(stamp_ns))
+        else:
+            message = self.payload.make(self.sequence)
+            self._publisher._send(
+                encode(message, self.header(stamp_ns), inline_bytes=self.design.inline_bytes)
+            )
+
+    def round(self, count: int) -> list[int]:
+        """Latencies in ns of `count` messages at the payload's rate."""
+        period_s = 1.0 / self.payload.rate_hz
+        next_s = time.monotonic()
+        for _ in range(count):
+            next_s += period_s
+            time.sleep(max(0.0, next_s - time.monotonic()))
+            self.send(MEASURE)
+        time.sleep(0.05)
+        self.send(END_ROUND)
+        if not self.results.poll(20.0):
+            raise RuntimeError(f"{self.design.name}: the receiver fell silent")
+        return list(self.results.recv())
+
+    def close(self) -> None:
+        self.send(END)
+        self._child.join(5.0)
+        self._publisher.close()
+
+
+def percentile_us(latencies_ns: Sequence[int], percent: float) -> float:
+    return float(np.percentile(np.asarray(latencies_ns), percent)) * 1e-3
+
+
+def measure(
+    payload: Payload, *, rounds: int, seconds: float, transport: str, folder: Path, step: Any
+) -> list[dict[str, Any]]:
+    """One row per design: p50 and p99 and their ratios to the floor's, medians over the rounds."""
+    count = round(seconds * payload.rate_hz)
+    senders = []
+    by_design: dict[str, list[tuple[float, float]]] = {design.name: [] for design in DESIGNS}
+    lost = dict.fromkeys(by_design, 0)
+    try:
+        for number, design in enumerate(DESIGNS):
+            endpoint = f"ipc://{folder}/{number}" if transport == "ipc" else "tcp://127.0.0.1:*"
+            senders.append(Sender(design, payload, endpoint))
+        for _ in range(rounds):
+            for sender in random.sample(senders, len(senders)):
+                latencies = sender.round(count)
+                name = sender.design.name
+                lost[name] += count - len(latencies)
+                by_design[name].append((percentile_us(latencies, 50), percentile_us(latencies, 99)))
+                step()
+    finally:
+        for sender in senders:
+            sender.close()
+    floor = by_design[FLOOR]
+    return [
+        {
+            "payload": payload.name,
+            "design": design.name,
+            "about": design.about,
+            "typed": design.typed,
+            "messages": count * rounds,
+            "lost": lost[design.name],
+            "p50_us": statistics.median(p50 for p50, _ in by_design[design.name]),
+            "p99_us": statistics.median(p99 for _, p99 in by_design[design.name]),
+            "p50_ratio": statistics.median(
+                own[0] / base[0] for own, base in zip(by_design[design.name], floor, strict=True)
+            ),
+            "p99_ratio": statistics.median(
+                own[1] / base[1] for own, base in zip(by_design[design.name], floor, strict=True)
+            ),
+            "p50_ratio_range": [
+                pick(
+                    own[0] / base[0]
+                    for own, base in zip(by_design[design.name], floor, strict=True)
+                )
+                for pick in (min, max)
+            ],
+        }
+        for design in DESIGNS
+    ]
+
+
+def codec_costs() -> list[dict[str, Any]]:
+    """Microseconds within one process, the best of several repetitions."""
+    rows = []
+    header = Header(1, 2, 3, "bench", "bench", EPOCH)
+    for payload in PAYLOADS:
+        for inline_bytes in (1024, 0):
+            message = payload.make(0)
+            frames = encode(message, header, inline_bytes=inline_bytes)
+            actions: dict[str, Callable[[], object]] = {
+                "construct_us": lambda payload=payload: payload.make(0),
+                "encode_us": lambda message=message, inline_bytes=inline_bytes: encode(
+                    message, header, inline_bytes=inline_bytes
+                ),
+                "decode_us": lambda frames=frames, payload=payload: decode(frames, payload.topic),
+            }
+            rows.append(
+                {
+                    "payload": payload.name,
+                    "inline_bytes": inline_bytes,
+                    "frames": len(frames),
+                    "bytes": size_of(frames),
+                }
+                | {
+                    name: min(timeit.repeat(action, number=2000, repeat=7)) / 2000 * 1e6
+                    for name, action in actions.items()
+                }
+            )
+    return rows
+
+
+def machine() -> str:
+    name = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        lines = [line for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        name = lines[0].partition(":")[2].strip() if lines else name
+    return f"{os.cpu_count()} cores {name}, Python {platform.python_version()}"
+
+
+def print_tables(report: dict[str, Any], console: Console) -> None:
+    for payload in PAYLOADS:
+        table = Table(title=f"{payload.name}, one way, {report['transport']}", title_justify="left")
+        for heading in (
+            "design",
+            "p50 µs",
+            "p99 µs",
+            "p50 ratio",
+            "(min-max)",
+            "p99 ratio",
+            "lost",
+        ):
+            table.add_column(heading, justify="left" if heading == "design" else "right")
+        for row in report["latency"]:
+            if row["payload"] == payload.name:
+                low, high = row["p50_ratio_range"]
+                table.add_row(
+                    row["design"],
+                    f"{row['p50_us']:.0f}",
+                    f"{row['p99_us']:.0f}",
+                    f"{row['p50_ratio']:.2f}",
+                    f"{low:.2f}-{high:.2f}",
+                    f"{row['p99_ratio']:.2f}",
+                    f"{row['lost']}",
+                )
+        console.print(table)
+    table = Table(title="in one process", title_justify="left")
+    for heading in ("message", "frames", "bytes", "construct µs", "encode µs", "decode µs"):
+        table.add_column(heading, justify="left" if heading == "message" else "right")
+    for row in report["codec"]:
+        table.add_row(
+            row["payload"],
+            f"{row['frames']}",
+            f"{row['bytes']}",
+            *(f"{row[key]:.1f}" for key in ("construct_us", "encode_us", "decode_us")),
+        )
+    console.print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="2 rounds of 1 s: under a minute")
+    parser.add_argument("--rounds", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=2.0, help="per design and round")
+    parser.add_argument("--transport", choices=["ipc", "tcp"], default="ipc")
+    parser.add_argument("--json", type=Path, help="also write the figures there")
+    options = parser.parse_args()
+    rounds, seconds = (2, 1.0) if options.quick else (options.rounds, options.seconds)
+    words = Console(stderr=True)
+    with Progress(console=words) as progress, tempfile.TemporaryDirectory() as folder:
+        task = progress.add_task("measuring", total=rounds * len(DESIGNS) * len(PAYLOADS))
+        latency = []
+        for payload in PAYLOADS:
+            inner = Path(folder) / payload.topic.name
+            inner.mkdir()
+            latency += measure(
+                payload,
+                rounds=rounds,
+                seconds=seconds,
+                transport=options.transport,
+                folder=inner,
+                step=lambda: progress.advance(task),
+            )
+    report = {
+        "machine": machine(),
+        "zmq": zmq.zmq_version(),
+        "transport": options.transport,
+        "rounds": rounds,
+        "latency": latency,
+        "codec": codec_costs(),
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+    print_tables(report, Console(file=sys.stdout))
+
+
+if __name__ == "__main__":
+    main()
