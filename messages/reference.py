@@ -1,0 +1,201 @@
+"""Writes docs/messages.md from the topic table and the message types.
+
+python -m messages.reference > docs/messages.md
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Sequence
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from messages.arrays import ArraySpec
+from messages.base import Header
+from messages.topics import TOPICS, Topic
+
+INTRODUCTION = """\
+# Messages
+
+<!-- Written by `python -m messages.reference > docs/messages.md`; a test compares. -->
+
+What nodes say to one another.  Numbers are SI and radians; positions and directions are in the
+world frame (origin at the centre of the imaginary screen, x right, y up, z towards the user) unless
+a name says otherwise; `a_from_b` is a 4x4 transform.  The form on sockets and in bags is described
+in `messages/wire.py` and `messages/bag.py`; how long a message takes is in
+[messaging.md](messaging.md).
+
+## Topics
+
+`latest`: a subscriber gets the newest, older ones are dropped and counted.  `every`: all of them,
+in order; an overflow is counted and reported.  `latched`: as `every`, and a late subscriber first
+gets the last one sent.  Writers is "many" where any number of nodes may publish.
+"""
+
+HEADER_INTRODUCTION = """\
+## The header
+
+Travels with every message.
+"""
+
+TYPES_INTRODUCTION = """\
+## Types
+
+An array is written as element type and shape; equal names of lengths within one array are equal.
+Arrays never hold NaN or infinity.
+"""
+
+
+def reference() -> str:
+    """The whole page."""
+    types = list(dict.fromkeys(topic.message for topic in TOPICS.values()))
+    parts = list(dict.fromkeys(part for kind in types for part in _parts_of(kind)))
+    sections = [INTRODUCTION + "\n" + _topic_table(), HEADER_INTRODUCTION + "\n" + _header_table()]
+    sections.append(TYPES_INTRODUCTION)
+    sections += [_type_section(kind) for kind in types]
+    sections.append("## Parts\n\nGroups of fields within the types above.\n")
+    sections += [_type_section(kind) for kind in parts]
+    return "\n".join(sections)
+
+
+def _topic_table() -> str:
+    rows = [
+        (
+            f"`{topic.name}`",
+            f"[{topic.message.__name__}](#{topic.message.__name__.lower()})",
+            topic.delivery.value,
+            _rate(topic),
+            "many" if topic.many_writers else "one",
+            "yes" if topic.logged else "no",
+            f"{topic.max_bytes >> 20} MiB",
+            topic.about,
+        )
+        for topic in TOPICS.values()
+    ]
+    heads = ("topic", "type", "delivery", "rate", "writers", "recorded", "at most", "what")
+    return _table(heads, rows)
+
+
+def _rate(topic: Topic) -> str:
+    if topic.rate_hz is None:
+        return "on change"
+    return f"{topic.rate_hz[0]:g}-{topic.rate_hz[1]:g} Hz"
+
+
+def _header_table() -> str:
+    """The fields of the header with the words of its docstring."""
+    described: dict[str, str] = {}
+    for line in inspect.cleandoc(Header.__doc__ or "").splitlines():
+        name, colon, words = line.partition(": ")
+        if colon and name in Header.__slots__:
+            described[name] = words
+        elif described and line.strip():
+            described[next(reversed(described))] += " " + line.strip()
+    types = inspect.get_annotations(Header, eval_str=True)
+    rows = [
+        (f"`{name}`", types[name].__name__, described.get(name, "")) for name in Header.__slots__
+    ]
+    return _table(("field", "type", "what"), rows)
+
+
+def _type_section(kind: type[BaseModel]) -> str:
+    rows = [
+        (f"`{name}`", _field_type(field), _field_notes(field))
+        for name, field in kind.model_fields.items()
+    ]
+    text = inspect.cleandoc(kind.__doc__ or "")
+    return f"### {kind.__name__}\n\n{text}\n\n{_table(('field', 'type', 'notes'), rows)}"
+
+
+def _field_type(field: FieldInfo) -> str:
+    for extra in field.metadata:
+        if isinstance(extra, ArraySpec):
+            return _array(extra)
+    return _type(field.annotation)
+
+
+def _type(annotation: Any) -> str:
+    """A type as a reader of the page would say it."""
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        spec = next((extra for extra in arguments[1:] if isinstance(extra, ArraySpec)), None)
+        return _array(spec) if spec else _type(arguments[0])
+    if origin is Literal:
+        return " \\| ".join(f"`{value}`" for value in arguments)
+    if origin in (Union, UnionType):
+        return " or ".join(_type(argument) for argument in arguments)
+    if origin is tuple and arguments[-1] is Ellipsis:
+        return f"any number of {_type(arguments[0])}"
+    if origin is tuple:
+        return f"{len(arguments)} of {_type(arguments[0])}"
+    if annotation is NoneType:
+        return "none"
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+    return getattr(annotation, "__name__", str(annotation))
+
+
+def _array(spec: ArraySpec) -> str:
+    return f"{np.dtype(spec.dtype).name} {spec.describe_shape()}"
+
+
+def _field_notes(field: FieldInfo) -> str:
+    """Bounds, default and description."""
+    notes = [note for extra in _constraints(field) if (note := _constraint(extra))]
+    if not field.is_required():
+        notes.append(f"default {field.default!r}")
+    if field.description:
+        notes.append(field.description)
+    return "; ".join(notes)
+
+
+def _constraints(field: FieldInfo) -> Iterator[Any]:
+    yield from field.metadata
+    for argument in get_args(field.annotation):
+        if get_origin(argument) is Annotated:
+            for extra in get_args(argument)[1:]:
+                yield from getattr(extra, "metadata", ())
+
+
+def _constraint(extra: Any) -> str:
+    match extra:
+        case Gt(gt=bound):
+            return f"> {bound}"
+        case Ge(ge=bound):
+            return f"≥ {bound}"
+        case Lt(lt=bound):
+            return f"< {bound}"
+        case Le(le=bound):
+            return f"≤ {bound}"
+        case _:
+            return ""
+
+
+def _parts_of(annotation: Any) -> Iterator[type[BaseModel]]:
+    """All models within a type, outer ones first, without the type itself."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        for field in annotation.model_fields.values():
+            for inner in _models_in(field.annotation):
+                yield inner
+                yield from _parts_of(inner)
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _models_in(argument)
+
+
+def _table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    lines = [heads, tuple("---" for _ in heads), *rows]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(reference(), end="")

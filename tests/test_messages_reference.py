@@ -1,0 +1,27 @@
+"""The message reference is what the types say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from messages.base import Header
+from messages.reference import reference
+from messages.topics import TOPICS
+
+PAGE = Path(__file__).parent.parent / "docs" / "messages.md"
+
+
+def test_page_is_up_to_date() -> None:
+    assert PAGE.read_text() == reference(), "run: python -m messages.reference > docs/messages.md"
+
+
+def test_page_names_every_topic_type_and_field() -> None:
+    page = reference()
+    for topic in TOPICS.values():
+        assert f"| `{topic.name}` | [{topic.message.__name__}]" in page
+        assert f"### {topic.message.__name__}\n" in page
+        for name in topic.message.model_fields:
+            assert f"| `{name}` |" in page
+    for name in Header.__slots__:
+        line = next(line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
+        assert not line.endswith("|  |"), f"the header's {name} is not described"
