@@ -255,7 +255,7 @@ def light_centre(image: NDArray[np.uint8], near: Floats) -> Floats:
 def test_the_marks_light_is_centred_on_the_fingertip(
     camera: TwinCamera, speed_m_per_s: float, bias_px: float
 ) -> None:
-    """A fast mark smears over 6 px, one flank over the lit finger: that much bias is in the light."""
+    """A fast mark smears over 6 px, one flank over the lit finger: the light itself is biased."""
     generator = np.random.default_rng(5)
     errors = []
     for _ in range(30):

@@ -96,6 +96,7 @@ class Triangulator(Node):
             self.tracker = Tracker(self.tracking)
         elif header.source_ns <= self.newest[1]:
             self.out_of_order += 1
+            self._note()
             return
         self.newest = (header.epoch, header.source_ns)
         reason, measured = locate(
@@ -112,7 +113,11 @@ class Triangulator(Node):
             reason = "ok" if taken else "too_fast"
         self.reasons[reason] += 1
         self.fingertip.publish(self._message(reason, measured), source_ns=header.source_ns)
-        self.note = f"{dict(self.reasons)}, {self.out_of_order} out of order"
+        self._note()
+
+    def _note(self) -> None:
+        counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
+        self.note = f"{counts}; {self.out_of_order} out of order"
 
     def _message(self, reason: FingertipReason, measured: Measured | None) -> Fingertip:
         track = self.tracker.track

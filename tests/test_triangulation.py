@@ -1,0 +1,192 @@
+"""From two pixels to a point: the methods against each other, an optimiser, and their breaking."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+from scipy.optimize import least_squares
+
+from messages.calibration import Board, StereoCalibration
+from messages.scene import Scene
+from nodes.methods import measure as measure_trial
+from nodes.models import rigid
+from nodes.triangulator.families import TRIANGULATION
+from nodes.triangulator.triangulation import (
+    TRIANGULATION_METHODS,
+    CalibrationMismatchError,
+    StereoGeometry,
+    measure,
+    optimal,
+)
+
+Floats = NDArray[np.float64]
+SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+METHODS = sorted(TRIANGULATION_METHODS)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+
+
+@pytest.fixture(scope="module")
+def geometry(scene: Scene) -> StereoGeometry:
+    return StereoGeometry.of(scene.camera)
+
+
+def turned_rig() -> Floats:
+    """right_from_left of cameras that converge and are a little rolled, as real ones are."""
+    return rigid.transform(rigid.rotation_from_rpy([0.02, -0.15, 0.03]), [-0.12, 0.004, 0.01])
+
+
+def seen(points: Floats, right_from_left: Floats) -> tuple[Floats, Floats]:
+    right = rigid.apply(right_from_left, points)
+    return points[:, :2] / points[:, 2:], right[:, :2] / right[:, 2:]
+
+
+@pytest.mark.parametrize("name", METHODS)
+@given(point=st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(0.2, 3.0)))
+@settings(max_examples=60, deadline=None)
+def test_exact_pixels_give_the_exact_point(name: str, point: tuple[float, float, float]) -> None:
+    truth = np.array([point])
+    for rig in (rigid.transform(np.eye(3), [-0.12, 0.0, 0.0]), turned_rig()):
+        found = TRIANGULATION_METHODS[name](*seen(truth, rig), rig)
+        assert np.allclose(found, truth, rtol=1e-8, atol=1e-9)
+
+
+def test_optimal_is_the_least_image_error() -> None:
+    rig, generator = turned_rig(), np.random.default_rng(2)
+    truth = generator.uniform([-0.2, -0.2, 0.4], [0.2, 0.2, 1.0], (20, 3))
+    left, right = (view + 2e-3 * generator.standard_normal(view.shape) for view in seen(truth, rig))
+
+    def image_error(point: Floats, i: int) -> Floats:
+        views = seen(point[None], rig)
+        return np.concatenate([views[0][0] - left[i], views[1][0] - right[i]])
+
+    found = optimal(left, right, rig)
+    for i, start in enumerate(truth):
+        best = least_squares(image_error, start, args=(i,), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+        own = float(np.sum(image_error(found[i], i) ** 2))
+        assert own <= 2.0 * best.cost * (1 + 1e-6)
+        for other in ("midpoint", "dlt"):
+            point = TRIANGULATION_METHODS[other](left[i : i + 1], right[i : i + 1], rig)[0]
+            assert own <= float(np.sum(image_error(point, i) ** 2)) * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_parallel_rays_give_no_finite_point(name: str) -> None:
+    rig = rigid.transform(np.eye(3), [-0.12, 0.0, 0.0])
+    pixel = np.array([[0.1, 0.05]])
+    point = TRIANGULATION_METHODS[name](pixel, pixel, rig)[0]
+    assert not np.isfinite(point).all() or np.linalg.norm(point) > 1e6
+
+
+@given(
+    point=st.tuples(st.floats(-0.12, 0.12), st.floats(-0.12, 0.12), st.floats(-0.1, 0.15)),
+    name=st.sampled_from(METHODS),
+)
+@settings(max_examples=60, deadline=None)
+def test_pixels_through_the_lenses_and_back(
+    geometry: StereoGeometry, point: tuple[float, float, float], name: str
+) -> None:
+    truth = np.array(point)
+    left, right = geometry.project(truth)
+    found = measure(geometry, left, right, method=TRIANGULATION_METHODS[name], noise_px=0.1)
+    assert found is not None
+    assert np.allclose(found.point_world, truth, atol=1e-8)
+    assert found.reprojection_px < 1e-6
+
+
+def test_the_covariance_is_that_of_noisy_pixels(geometry: StereoGeometry) -> None:
+    truth, noise_px, generator = np.array([0.03, -0.02, 0.01]), 0.2, np.random.default_rng(1)
+    left, right = geometry.project(truth)
+    points, stated, squares = [], None, []
+    for _ in range(1500):
+        noise = noise_px * generator.standard_normal((2, 2))
+        found = measure(
+            geometry, left + noise[0], right + noise[1], method=optimal, noise_px=noise_px
+        )
+        assert found is not None
+        points.append(found.point_world)
+        stated = found.covariance
+        squares.append(found.reprojection_px**2)
+    assert stated is not None
+    actual = np.cov(np.array(points).T)
+    assert np.allclose(np.linalg.eigvalsh(actual), np.linalg.eigvalsh(stated), rtol=0.2)
+    # Four pixel coordinates less three of the point leave one to be misfit.
+    assert np.mean(squares) == pytest.approx(noise_px**2 / 2, rel=0.2)
+    depth_m, baseline_m, focal_px = 0.49, 0.1205, 540.0
+    along_view = np.sqrt(np.linalg.eigvalsh(stated)[-1])
+    rule = depth_m**2 / (focal_px * baseline_m) * np.sqrt(2) * noise_px
+    assert along_view == pytest.approx(rule, rel=0.15)
+
+
+def test_marks_that_do_not_belong_together_show_in_the_reprojection(
+    geometry: StereoGeometry,
+) -> None:
+    left, right = geometry.project(np.array([0.0, 0.0, 0.0]))
+    found = measure(geometry, left, right + np.array([0.0, 8.0]), method=optimal, noise_px=0.1)
+    assert found is not None
+    assert found.reprojection_px == pytest.approx(4.0, rel=0.05)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_a_point_behind_the_cameras_is_none(geometry: StereoGeometry, name: str) -> None:
+    left, right = geometry.project(np.array([0.0, 0.0, 0.0]))
+    far_apart = measure(
+        geometry,
+        left,
+        right + np.array([200.0, 0.0]),
+        method=TRIANGULATION_METHODS[name],
+        noise_px=0.1,
+    )
+    assert far_apart is None
+
+
+def calibration_of(scene: Scene, **changes: object) -> StereoCalibration:
+    camera = scene.camera
+    calibration = StereoCalibration(
+        device=camera.device,
+        date="2026-01-01T00:00:00+00:00",
+        code_version="0",
+        width_px=camera.width_px,
+        height_px=camera.height_px,
+        left=camera.left.model_copy(update={"fx_px": 600.0}),
+        right=camera.right,
+        right_from_left=camera.right_from_left,
+        board=Board(columns=9, rows=6, square_m=0.02),
+        reprojection_rms_px=0.1,
+        pairs=(),
+    )
+    return calibration.model_copy(update=changes)
+
+
+def test_a_calibration_replaces_the_optics_but_not_the_place(scene: Scene) -> None:
+    geometry = StereoGeometry.of(scene.camera, calibration_of(scene))
+    assert geometry.matrices[0][0, 0] == 600.0
+    assert np.allclose(geometry.world_from_left[:3, 3], scene.camera.world_from_left.position_m)
+
+
+def test_a_calibration_of_another_camera_is_refused(scene: Scene) -> None:
+    with pytest.raises(CalibrationMismatchError, match=r'device "other".*"twin-bumblebee"'):
+        StereoGeometry.of(scene.camera, calibration_of(scene, device="other"))
+    with pytest.raises(CalibrationMismatchError, match=r"1024x480 px.*640x480 px"):
+        StereoGeometry.of(scene.camera, calibration_of(scene, width_px=1024))
+
+
+def test_the_family_meets_the_scenes_tolerance_in_its_range(scene: Scene) -> None:
+    trials = list(TRIANGULATION.trials(scene))
+    assert {trial.method for trial in trials} == set(TRIANGULATION.methods)
+    points = [measure_trial(trial, repeats=1) for trial in trials]
+    worst = max(point.error for point in points if point.in_range)
+    assert worst < 3 * TRIANGULATION.tolerance(scene)
+    outside = [point.error for point in points if not point.in_range]
+    assert max(outside) > worst
+    fine = [point for point in points if point.in_range and point.params["noise_px"] == 0.02]
+    assert max(point.error for point in fine) < TRIANGULATION.tolerance(scene)
