@@ -179,7 +179,7 @@ class _Member:
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
         found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
         if direction == "input":
-            found += [(topic.name, topic) for topic in self.further_inputs]
+            found += [(f"in/{topic.name}", topic) for topic in self.further_inputs]
         return found
 
     def unconnected_ports(self, direction: str) -> tuple[PlannedPort, ...]:

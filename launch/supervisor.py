@@ -280,13 +280,15 @@ class RunningGraph:
                 self._run.end()
 
     async def _end_children(self) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            alive = [child for child in self._children.values() if not child.exited.done()]
-            if not alive:
-                return
-            for child in alive:
-                child.signal(number)
-            await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
+        """End the nodes; those that only listen come last, to hear the others' last words."""
+        listeners = {
+            node.name
+            for node in self.nodes
+            if all(port.topic == "status" for port in node.outputs) and node.inputs
+        }
+        speakers = self._children.keys() - listeners
+        for names in (speakers, listeners):
+            await _end([self._children[name] for name in names if name in self._children])
 
     def _start(self) -> None:
         _refuse_open_network(self.plan, self._host)
@@ -415,6 +417,16 @@ class RunningGraph:
                 log.write(line + "\n")
         if self._report_to is not None:
             self._report_to(node, line)
+
+
+async def _end(children: list[Child]) -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        alive = [child for child in children if not child.exited.done()]
+        if not alive:
+            return
+        for child in alive:
+            child.signal(number)
+        await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
 
 
 def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:

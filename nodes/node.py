@@ -207,7 +207,7 @@ class Node:
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
         """Topics to subscribe to beside the declared ports, for a node whose inputs depend on its
-        parameters and on what the graph writes; the port is then named as its topic."""
+        parameters and on what the graph writes; such a port is named "in/" and the topic."""
         return ()
 
     def __init__(

@@ -205,7 +205,7 @@ async def _record(
         parameters=parameters.model_dump(mode="json"),
         inputs=tuple(
             PortConfig(
-                port=name,
+                port=f"in/{name}",
                 topic=name,
                 endpoints=local_endpoints(run, plan.endpoints_to_read(name)),
             )

@@ -57,7 +57,7 @@ class Recorder(Node):
     ) -> None:
         super().__init__(parameters, **rest)
         for port, topic in (topics or {}).items():
-            if port not in self.outputs:
+            if port.startswith("in/"):
                 self.inputs[port] = Input(topic_named(topic), self.clock)
         self._bag: BagWriter | None = None
         self._failed = False
@@ -83,7 +83,10 @@ class Recorder(Node):
             media_type = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             self._bag.add_attachment(file.name, file.read_bytes(), media_type)
         self._bag.flush()
-        self.log.info("recording", bag=str(self._bag.path), topics=list(self.inputs))
+        self.log.info("recording", bag=str(self._bag.path), topics=self._topics())
+
+    def _topics(self) -> list[str]:
+        return [source.topic.name for source in self.inputs.values()]
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
         """Write a message's frames; called instead of handlers, since frames are taken unopened."""
