@@ -77,8 +77,23 @@ class ArraySpec:
     def __get_pydantic_core_schema__(
         self, source: object, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
+        wanted, shape = np.dtype(self.dtype), self.shape
+        check_finite = self.finite and wanted.kind == "f"
+
+        def validate(value: object) -> NDArray[Any]:
+            """The common case without detours: an array that fits."""
+            if (
+                type(value) is np.ndarray
+                and value.dtype is wanted
+                and value.shape == shape
+                and value.flags.c_contiguous
+                and (not check_finite or _all_finite(value))
+            ):
+                return value
+            return self.validate(value)
+
         return core_schema.no_info_plain_validator_function(
-            self.validate,
+            validate,
             serialization=core_schema.plain_serializer_function_ser_schema(
                 lambda array: array.tolist(), when_used="json"
             ),
@@ -113,15 +128,18 @@ def _from_lists(value: list[Any] | tuple[Any, ...], wanted: np.dtype[Any]) -> ND
 def _all_finite(array: NDArray[Any]) -> bool:
     """Whether no element is NaN or infinite.
 
-    A scalar product is NaN or infinite if an element is, and four times as fast to get for a few
-    elements; it may overflow for finite ones, hence the second look.
+    A sum or a scalar product is NaN or infinite if an element is, and several times as fast to get
+    for a few elements; it may overflow for finite ones, hence the second look.
     """
-    if array.size <= _FEW and math.isfinite(np.vdot(array, array)):
-        return True
+    if array.size <= _FEW:
+        small = array.ndim == 1 and array.size <= _VERY_FEW
+        if math.isfinite(sum(array.tolist()) if small else np.vdot(array, array)):
+            return True
     return bool(np.isfinite(array).all())
 
 
 _FEW = 64
+_VERY_FEW = 8
 
 
 Vector2 = Annotated[NDArray[np.float64], ArraySpec("<f8", (2,))]

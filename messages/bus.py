@@ -211,6 +211,11 @@ class Subscriber:
         newest: dict[str, Envelope] = {}
         drained = False
         for _ in range(BATCH):
+            # Asking for events costs less than the exception of a recv in vain, and here the
+            # message at hand waits for the answer.
+            if newest and not self._has_more():
+                drained = True
+                break
             frames = self._receive()
             if frames is None:
                 drained = True
@@ -235,6 +240,12 @@ class Subscriber:
             elif envelope is not None:
                 self._deliver(envelope)
         return False
+
+    def _has_more(self) -> bool:
+        if self._socket is None or self._socket.closed:
+            return False
+        events: Any = self._socket.getsockopt(zmq.EVENTS)
+        return bool(events & zmq.POLLIN)
 
     def _receive(self) -> list[Any] | None:
         """The frames of one message, or None where there is none; large ones are not copied."""

@@ -15,9 +15,10 @@ import pytest
 import pytest_asyncio
 import zmq
 
+from messages.bag import BagReader, BagWriter
 from messages.base import Header, Message
 from messages.bus import BusError, Publisher, Subscriber, queue_length
-from messages.topics import TOPICS, Topic
+from messages.topics import TOPICS, Delivery, Topic
 from messages.types import EStop, StereoPair, TwinArms, TwinFinger
 from messages.wire import WireError, encode
 
@@ -190,7 +191,7 @@ async def test_latest_hands_over_the_newest_and_counts_the_rest(room: Room) -> N
 
 
 async def test_latest_keeps_the_newest_of_each_writer(room: Room) -> None:
-    topic = replace(TOPICS["estop"], delivery=TOPICS["stereo"].delivery)
+    topic = replace(TOPICS["estop"], delivery=Delivery.LATEST)
     one, two = room.mouth(topic, room.endpoint("1")), room.mouth(topic, room.endpoint("2"))
     ear = room.ear(topic, room.endpoint("1"), room.endpoint("2"))
     number = 0
@@ -427,12 +428,14 @@ def arms() -> TwinArms:
     )
 
 
-async def test_bursts_never_leave_a_message_lying(room: Room) -> None:
+@pytest.mark.parametrize("delivery", [Delivery.EVERY, Delivery.LATEST, Delivery.LATCHED])
+async def test_bursts_never_leave_a_message_lying(room: Room, delivery: Delivery) -> None:
     """Edge-triggered wake-ups: whatever the rhythm, no message waits for the next one."""
-    topic = TOPICS["twin/arms"]
+    topic = replace(TOPICS["twin/arms"], delivery=delivery)
     publisher = room.mouth(topic)
     ear = room.ear(topic)
     number = await connected(publisher, ear, lambda _: arms())
+    first = number + 1
     random = np.random.default_rng(3)
     for _ in range(300):
         for _ in range(int(random.integers(1, 5))):
@@ -441,4 +444,42 @@ async def test_bursts_never_leave_a_message_lying(room: Room) -> None:
             if random.random() < 0.5:
                 await asyncio.sleep(0)
         await until(partial(last_heard, ear, number), "delivery")
-    assert ear.counts == Counts()
+    assert ear.counts.gaps == ear.counts.rejected == 0
+    assert len(ear.heard) + ear.counts.dropped == number - first + 1
+    assert ear.counts.dropped == 0 or delivery is Delivery.LATEST
+
+
+async def test_unopened_frames_of_every_message_for_the_recorder(
+    room: Room, tmp_path: Path
+) -> None:
+    topic = TOPICS["stereo"]
+    publisher = room.mouth(topic)
+    bag = BagWriter(tmp_path / "a.mcap")
+    room.closers.append(bag.close)
+    heard: list[int] = []
+
+    def record(frames: list[Any], header: Header) -> None:
+        bag.write_frames(topic, frames, header, header.publish_ns)
+        heard.append(header.sequence)
+
+    problems: list[str] = []
+    ear = Subscriber(
+        topic, [room.endpoint()], record, Counts(), on_problem=problems.append, unopened=True
+    )
+    ear.start()
+    room.closers.append(ear.close)
+    number = 0
+    while not heard:
+        number += 1
+        publisher.send(pictures(number), header(number))
+        await asyncio.sleep(0.002)
+    for _ in range(40):  # on a latest topic, and yet none is left out
+        number += 1
+        publisher.send(pictures(number), header(number))
+    await until(lambda: heard[-1] == number)
+    assert heard == list(range(heard[0], number + 1))
+    assert problems == []
+    bag.close()
+    for _, message, head, _ in BagReader(tmp_path / "a.mcap"):
+        assert isinstance(message, StereoPair)
+        assert (message.left == head.sequence).all()
