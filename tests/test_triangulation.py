@@ -149,6 +149,14 @@ def test_a_point_behind_the_cameras_is_none(geometry: StereoGeometry, name: str)
     assert far_apart is None
 
 
+@pytest.mark.parametrize("name", METHODS)
+def test_a_pixel_that_is_no_number_is_none(geometry: StereoGeometry, name: str) -> None:
+    right = np.array([300.0, 200.0])
+    for bad in (np.array([np.nan, 200.0]), np.array([np.inf, 200.0])):
+        method = TRIANGULATION_METHODS[name]
+        assert measure(geometry, bad, right, method=method, noise_px=0.1) is None
+
+
 def calibration_of(scene: Scene, **changes: object) -> StereoCalibration:
     camera = scene.camera
     calibration = StereoCalibration(

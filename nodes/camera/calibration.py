@@ -42,7 +42,9 @@ Progress = Callable[[int, int, str], None]
 MIN_PAIRS = 5
 OUTLIER_RATIO = 3.0
 OUTLIER_FLOOR_PX = 0.5
-REJECTION_ROUNDS = 5
+MISFIT_RATIO = 5.0
+MISFIT_FLOOR_PX = 5.0
+MISFIT = "does not go with the other pairs:"
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
 
@@ -162,7 +164,7 @@ def find_pairs(
 
 @dataclass(frozen=True, slots=True)
 class _Rig:
-    """What OpenCV estimates: matrices 3x3, distortions (5,), rotation, translation, residuals."""
+    """What is estimated: matrices 3x3, distortions (5,), a transform, residuals (pairs, 2) px."""
 
     left_matrix: Floats
     left_distortion: Floats
@@ -173,29 +175,80 @@ class _Rig:
     rms_px: float
 
 
-def _fit(pairs: Sequence[BoardPair], board: Board, size: tuple[int, int]) -> _Rig:
-    """Both cameras from all pairs; `pair_rms_px` is (pairs, 2), left and right."""
+Optics = tuple[Floats, Floats]
+"""One camera's matrix 3x3 and distortion (5,)."""
+
+
+def _single(views: Sequence[Floats], board: Board, size: tuple[int, int]) -> Optics:
+    """One camera from its own views of the board."""
+    points = [board_points(board).astype(np.float32)] * len(views)
+    corners = [view.astype(np.float32) for view in views]
+    _, matrix, distortion, *_ = cv2.calibrateCamera(
+        points, corners, size, None, None, flags=cv2.CALIB_FIX_K3, criteria=REFINEMENT
+    )
+    return _floats(matrix), _floats(distortion).ravel()[:5]
+
+
+def _board_poses(views: Sequence[Floats], board: Board, optics: Optics) -> list[Floats]:
+    """camera_from_board (4, 4) of each view, from that view alone."""
+    poses = []
+    for corners in views:
+        _, rotation, translation = cv2.solvePnP(board_points(board), corners, *optics)
+        poses.append(rigid.transform(_floats(cv2.Rodrigues(rotation)[0]), translation.ravel()))
+    return poses
+
+
+def misfits(pairs: Sequence[BoardPair], board: Board, left: Optics, right: Optics) -> Floats:
+    """How far each pair (n,) is from what most pairs say of the rig, px rms in the right view.
+
+    Each pair alone determines how the cameras stand to each other.  The pair whose answer suits the
+    others best by their median (least median of squares, Rousseeuw 1984) judges them all.  A pair
+    of pictures that do not belong together thus stands out; in a common fit it would bend the rig
+    until all pairs looked equally bad.
+    """
+    left_poses = _board_poses([pair.left for pair in pairs], board, left)
+    right_poses = _board_poses([pair.right for pair in pairs], board, right)
+    rigs = [b @ rigid.inverse(a) for a, b in zip(left_poses, right_poses, strict=True)]
+    errors = np.empty((len(rigs), len(pairs)))
+    for i, right_from_left in enumerate(rigs):
+        for j, pair in enumerate(pairs):
+            drawn = _projected(board_points(board), right_from_left @ left_poses[j], right)
+            errors[i, j] = _rms(np.linalg.norm(drawn - pair.right, axis=1))
+    return np.asarray(errors[np.argmin(np.median(errors, axis=1))])
+
+
+def _singles(
+    pairs: Sequence[BoardPair], board: Board, size: tuple[int, int]
+) -> tuple[Optics, Optics]:
+    return (
+        _single([pair.left for pair in pairs], board, size),
+        _single([pair.right for pair in pairs], board, size),
+    )
+
+
+def _projected(points: Floats, camera_from_points: Floats, optics: Optics) -> Floats:
+    """Pixels (n, 2) of points (n, 3)."""
+    rotation, _ = cv2.Rodrigues(camera_from_points[:3, :3])
+    drawn, _ = cv2.projectPoints(points, rotation, camera_from_points[:3, 3], *optics)
+    return _floats(drawn)[:, 0]
+
+
+def _fit(
+    pairs: Sequence[BoardPair], board: Board, size: tuple[int, int], left: Optics, right: Optics
+) -> _Rig:
+    """Both cameras together from all pairs, beginning at what each camera alone gave."""
     points = [board_points(board).astype(np.float32)] * len(pairs)
-    views = [
-        [pair.left.astype(np.float32) for pair in pairs],
-        [pair.right.astype(np.float32) for pair in pairs],
-    ]
-    flags = cv2.CALIB_FIX_K3
-    single = [
-        cv2.calibrateCamera(points, view, size, None, None, flags=flags, criteria=REFINEMENT)[1:3]
-        for view in views
-    ]
     (rms, left_k, left_d, right_k, right_d, rotation, translation, *_, errors) = (
         cv2.stereoCalibrateExtended(
             points,
-            views[0],
-            views[1],
-            *single[0],
-            *single[1],
+            [pair.left.astype(np.float32) for pair in pairs],
+            [pair.right.astype(np.float32) for pair in pairs],
+            *left,
+            *right,
             size,
             np.eye(3),
             np.zeros(3),
-            flags=flags | cv2.CALIB_USE_INTRINSIC_GUESS,
+            flags=cv2.CALIB_FIX_K3 | cv2.CALIB_USE_INTRINSIC_GUESS,
             criteria=REFINEMENT,
         )
     )
@@ -236,38 +289,50 @@ def calibrate_stereo(
 ) -> StereoCalibration:
     """Calibrate a rig from pairs of pictures of a chessboard of `board` (columns, rows) corners.
 
-    A pair whose residual exceeds three times the median (and half a pixel) is left out, with the
-    reason kept in the result, and the rest is fitted again.  Raises CalibrationError when the
-    pictures cannot be used or fewer than MIN_PAIRS pairs remain.
+    Left out, with the reason kept in the result: pairs without the board; pairs that contradict the
+    others grossly (`misfits`); pairs whose residual then exceeds three times the median and half a
+    pixel.  Raises CalibrationError when the pictures cannot be used or fewer than MIN_PAIRS pairs
+    remain.
     """
     chessboard = Board(columns=board[0], rows=board[1], square_m=square_m)
     found, size = find_pairs(left_paths, right_paths, chessboard, progress)
     reasons = {index: pair for index, pair in enumerate(found) if isinstance(pair, str)}
     good = {index: pair for index, pair in enumerate(found) if isinstance(pair, BoardPair)}
-    residuals: dict[int, Floats] = {}
-    for _ in range(REJECTION_ROUNDS):
+
+    def enough() -> list[BoardPair]:
         if len(good) < MIN_PAIRS:
             listed = "".join(f"\n  {left_paths[i].name}: {text}" for i, text in reasons.items())
             raise CalibrationError(
                 f"{len(good)} usable pairs of {len(found)}, at least {MIN_PAIRS} are needed; take "
                 f"more pictures with the whole board in both views{listed}"
             )
-        try:
-            rig = _fit(list(good.values()), chessboard, size)
-        except cv2.error as error:
-            raise CalibrationError(
-                f"the {len(good)} pairs do not determine the rig ({error.err}); tilt the board "
-                "differently from picture to picture"
-            ) from error
-        residuals.update(zip(good, rig.pair_rms_px, strict=True))
-        worst = rig.pair_rms_px.max(axis=1)
-        limit = max(OUTLIER_RATIO * float(np.median(worst)), OUTLIER_FLOOR_PX)
-        outliers = [i for i, rms in zip(good, worst, strict=True) if rms > limit]
-        if not outliers:
-            break
-        for i in outliers:
-            reasons[i] = f"residual {residuals[i].max():.2f} px, limit {limit:.2f} px"
+        return list(good.values())
+
+    def leave_out(errors_px: Floats, ratio: float, floor_px: float, what: str) -> bool:
+        """Move pairs with large errors from `good` to `reasons`; whether there were any."""
+        limit_px = max(ratio * float(np.median(errors_px)), floor_px)
+        bad = [(i, error) for i, error in zip(good, errors_px, strict=True) if error > limit_px]
+        for i, error in bad:
+            reasons[i] = f"{what} {error:.2f} px, limit {limit_px:.2f} px"
             del good[i]
+        return bool(bad)
+
+    residuals: dict[int, Floats] = {}
+    try:
+        left, right = _singles(enough(), chessboard, size)
+        leave_out(misfits(enough(), chessboard, left, right), MISFIT_RATIO, MISFIT_FLOOR_PX, MISFIT)
+        left, right = _singles(enough(), chessboard, size)
+        while True:
+            rig = _fit(enough(), chessboard, size, left, right)
+            residuals.update(zip(good, rig.pair_rms_px, strict=True))
+            worst = rig.pair_rms_px.max(axis=1)
+            if not leave_out(worst, OUTLIER_RATIO, OUTLIER_FLOOR_PX, "residual"):
+                break
+    except cv2.error as error:
+        raise CalibrationError(
+            f"the {len(good)} pairs do not determine the rig ({error.err}); tilt the board "
+            "differently from picture to picture"
+        ) from error
     return StereoCalibration(
         device=device,
         date=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -293,7 +358,7 @@ def calibrate_stereo(
     )
 
 
-def _opencv_lens(lens: Lens) -> tuple[Floats, Floats]:
+def _opencv_lens(lens: Lens) -> Optics:
     matrix = np.array([[lens.fx_px, 0, lens.cx_px], [0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
     return matrix, np.array(lens.distortion)
 
@@ -318,11 +383,8 @@ def reprojection_errors(
     )
     errors = []
     for seen, lens, camera_from_left in views:
-        rotation, _ = cv2.Rodrigues(camera_from_left[:3, :3])
-        drawn, _ = cv2.projectPoints(
-            points_left, rotation, camera_from_left[:3, 3], *_opencv_lens(lens)
-        )
-        errors.append(np.linalg.norm(drawn[:, 0] - seen, axis=1))
+        drawn = _projected(points_left, camera_from_left, _opencv_lens(lens))
+        errors.append(np.linalg.norm(drawn - seen, axis=1))
     return np.stack(errors)
 
 

@@ -204,7 +204,12 @@ def measure(
     method: Triangulate,
     noise_px: float,
 ) -> Measured | None:
-    """The point behind a mark's two pixels (2,); None if it is not in front of both cameras."""
+    """The point behind a mark's two pixels (2,); None if it is not in front of both cameras.
+
+    A pixel that is no finite number has no point either.
+    """
+    if not (np.isfinite(left_px).all() and np.isfinite(right_px).all()):
+        return None
     left, right = geometry.normalize(left_px[None], right_px[None])
     point = method(left, right, geometry.right_from_left)[0]
     if not np.isfinite(point).all():

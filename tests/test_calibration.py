@@ -1,0 +1,288 @@
+"""Stereo calibration: on boards rendered here, on real pairs, and on pictures that will not do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from messages.calibration import (
+    Board,
+    CalibrationFileError,
+    StereoCalibration,
+    load_calibration,
+    save_calibration,
+)
+from messages.scene import Lens
+from nodes.camera.calibration import (
+    CalibrationError,
+    board_points,
+    calibrate_stereo,
+    check_stereo,
+    rigid_fit_residuals,
+    same_order,
+)
+from nodes.models import camera, rigid
+
+Floats = NDArray[np.float64]
+REAL = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "stereo"
+BOARD = Board(columns=7, rows=5, square_m=0.03)
+SIZE = (480, 360)
+DISTORTION = np.array([-0.08, 0.03, 0.0005, -0.0004, 0.0])
+LEFT_MATRIX = camera.camera_matrix(400.0, 401.0, 238.0, 181.0)
+RIGHT_MATRIX = camera.camera_matrix(403.0, 402.0, 243.0, 177.0)
+RIGHT_FROM_LEFT = rigid.transform(
+    rigid.rotation_from_rpy([0.01, -0.06, 0.02]), [-0.1, 0.002, 0.003]
+)
+
+
+def rays_of(matrix: Floats) -> Floats:
+    """Where a distorted camera's pixels look."""
+    y, x = np.mgrid[: SIZE[1], : SIZE[0]].astype(np.float64)
+    seen = camera.normalize(np.stack([x, y], axis=-1), matrix, DISTORTION)
+    return np.concatenate([seen, np.ones((*seen.shape[:2], 1))], axis=-1)
+
+
+def wave(squares: Floats, square_px: Floats) -> Floats:
+    """Alternates between -1 and 1 from square to square, with ramps of a pixel in between."""
+    line = np.rint(squares)
+    flipped = np.where(line % 2 == 0, 1.0, -1.0)
+    return np.asarray(flipped * np.clip(2.0 * square_px * (squares - line), -1.0, 1.0))
+
+
+def render(left_from_board: Floats, rays: Floats, camera_from_left: Floats) -> NDArray[np.uint8]:
+    """A chessboard with a white rim on grey, as a camera sees it."""
+    board_from_camera = rigid.inverse(camera_from_left @ left_from_board)
+    directions = rays @ board_from_camera[:3, :3].T
+    origin = board_from_camera[:3, 3]
+    depth = -origin[2] / directions[..., 2]
+    on_board = (origin + directions * depth[..., None]) / BOARD.square_m
+    column, row = on_board[..., 0], on_board[..., 1]
+    out = np.maximum(
+        np.abs(column - 0.5 * (BOARD.columns - 1)) - 0.5 * (BOARD.columns + 1),
+        np.abs(row - 0.5 * (BOARD.rows - 1)) - 0.5 * (BOARD.rows + 1),
+    )
+    square_px = LEFT_MATRIX[0, 0] * BOARD.square_m / depth
+    squares = 125.0 - 100.0 * wave(column, square_px) * wave(row, square_px)
+    level = np.where(out < 0.0, squares, np.where(out < 0.5, 225.0, 110.0))
+    noise = np.random.default_rng(7).normal(0.0, 1.5, level.shape)
+    return np.clip(np.rint(cv2.GaussianBlur(level, (0, 0), 0.6) + noise), 0, 255).astype(np.uint8)
+
+
+def pose(number: int) -> Floats:
+    """left_from_board number so-and-so: the board's middle in view, tilted in all directions."""
+    generator = np.random.default_rng(number)
+    tilt = generator.uniform(-0.5, 0.5, 3) * [1.0, 1.0, 0.4]
+    rotation = rigid.rotation_from_rpy(tilt)
+    middle = board_points(BOARD).mean(axis=0)
+    place = generator.uniform([0.0, -0.02, 0.4], [0.08, 0.02, 0.5])
+    return rigid.transform(rotation, place - rotation @ middle)
+
+
+@dataclass(frozen=True)
+class Pictures:
+    left: list[Path]
+    right: list[Path]
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
+    """Twelve pairs of a board that was never made."""
+    folder = tmp_path_factory.mktemp("boards")
+    pictures = Pictures([], [])
+    left_rays, right_rays = rays_of(LEFT_MATRIX), rays_of(RIGHT_MATRIX)
+    for number in range(12):
+        for paths, side, rays, camera_from_left in (
+            (pictures.left, "left", left_rays, np.eye(4)),
+            (pictures.right, "right", right_rays, RIGHT_FROM_LEFT),
+        ):
+            paths.append(folder / f"{side}{number:02}.png")
+            cv2.imwrite(str(paths[-1]), render(pose(number), rays, camera_from_left))
+    return pictures
+
+
+def calibrate(left: list[Path], right: list[Path]) -> StereoCalibration:
+    board = (BOARD.columns, BOARD.rows)
+    return calibrate_stereo(left, right, board=board, square_m=BOARD.square_m, device="made")
+
+
+@pytest.fixture(scope="module")
+def calibration(rendered: Pictures) -> StereoCalibration:
+    return calibrate(rendered.left[:9], rendered.right[:9])
+
+
+def test_the_rig_that_drew_the_pictures_is_found(calibration: StereoCalibration) -> None:
+    assert all(pair.used for pair in calibration.pairs)
+    assert (calibration.width_px, calibration.height_px) == SIZE
+    assert calibration.reprojection_rms_px < 0.1
+    for lens, matrix in ((calibration.left, LEFT_MATRIX), (calibration.right, RIGHT_MATRIX)):
+        assert lens.fx_px == pytest.approx(matrix[0, 0], rel=5e-3)
+        assert lens.fy_px == pytest.approx(matrix[1, 1], rel=5e-3)
+        assert lens.cx_px == pytest.approx(matrix[0, 2], abs=2.0)
+        assert lens.cy_px == pytest.approx(matrix[1, 2], abs=2.0)
+        assert lens.distortion[0] == pytest.approx(DISTORTION[0], abs=0.03)
+    baseline_m = np.linalg.norm(calibration.right_from_left[:3, 3])
+    assert baseline_m == pytest.approx(np.linalg.norm(RIGHT_FROM_LEFT[:3, 3]), rel=3e-3)
+    turn = calibration.right_from_left[:3, :3] @ RIGHT_FROM_LEFT[:3, :3].T
+    assert np.linalg.norm(rigid.vector_from_rotation(turn)) < 5e-3
+
+
+def test_held_out_pairs_are_measured_as_well_as_corners_are_found(
+    rendered: Pictures, calibration: StereoCalibration
+) -> None:
+    told: list[tuple[int, int, str]] = []
+    result = check_stereo(
+        calibration,
+        rendered.left[9:],
+        rendered.right[9:],
+        board=(BOARD.columns, BOARD.rows),
+        square_m=BOARD.square_m,
+        progress=lambda *step: told.append(step),
+    )
+    assert result["pairs"] == 3
+    assert result["rigid_fit_rms_mm"] < 0.3  # 0.05 px in each view, 5 mm of depth a pixel
+    assert result["square_rms_mm"] < 0.1
+    assert result["diagonal_rms_mm"] < 0.3
+    assert result["reprojection_rms_px"] < 0.1
+    assert [step[:2] for step in told] == [(1, 3), (2, 3), (3, 3)]
+    smaller = check_stereo(
+        calibration,
+        rendered.left[9:],
+        rendered.right[9:],
+        board=(BOARD.columns, BOARD.rows),
+        square_m=BOARD.square_m * 0.99,
+    )
+    assert smaller["square_rms_mm"] == pytest.approx(0.01 * 1e3 * BOARD.square_m, rel=0.2)
+
+
+def test_a_wrong_pair_is_left_out_with_its_reason(rendered: Pictures) -> None:
+    right = [*rendered.right[:8], rendered.right[3]]
+    calibration = calibrate(rendered.left[:9], right)
+    assert [pair.used for pair in calibration.pairs] == [True] * 8 + [False]
+    assert "does not go with the other pairs" in calibration.pairs[8].reason
+    assert calibration.reprojection_rms_px < 0.1
+
+
+def test_a_pair_without_a_board_is_left_out(rendered: Pictures, tmp_path: Path) -> None:
+    blank = tmp_path / "blank.png"
+    cv2.imwrite(str(blank), np.full((SIZE[1], SIZE[0]), 90, np.uint8))
+    calibration = calibrate([*rendered.left[:6], blank], rendered.right[:7])
+    assert calibration.pairs[6].reason == "no board of 7x5 inner corners in blank.png"
+    assert calibration.pairs[6].left_rms_px is None
+    with pytest.raises(CalibrationError, match=r"4 usable pairs of 5.*\n  blank\.png: no board"):
+        calibrate([*rendered.left[:4], blank], rendered.right[:5])
+    with pytest.raises(CalibrationError, match="no usable pair of 1: no board"):
+        check_stereo(calibration, [blank], [blank], board=(7, 5), square_m=0.03)
+
+
+def test_pictures_that_will_not_do_are_named(
+    rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
+) -> None:
+    text, small = tmp_path / "text.png", tmp_path / "small.png"
+    text.write_text("no picture")
+    cv2.imwrite(str(small), np.zeros((90, 120), np.uint8))
+    left, right = rendered.left, rendered.right
+    for bad_left, bad_right, said in (
+        (left[:3], right[:2], "3 left and 2 right pictures"),
+        ([], [], "no pictures"),
+        ([text], right[:1], r"text\.png: not a picture"),
+        ([tmp_path / "absent.png"], right[:1], r"absent\.png: not a picture"),
+        ([left[0], small], right[:2], r"small\.png: 120x90 px, the others 480x360"),
+    ):
+        with pytest.raises(CalibrationError, match=said):
+            calibrate(bad_left, bad_right)
+    other = calibration.model_copy(update={"width_px": 640})
+    with pytest.raises(CalibrationError, match="480x360 px, calibration of made for 640x360"):
+        check_stereo(other, left[:1], right[:1], board=(7, 5), square_m=0.03)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(9, 6), (7, 7), (6, 9)])
+def test_corners_numbered_from_another_end_are_brought_into_order(columns: int, rows: int) -> None:
+    board = Board(columns=columns, rows=rows, square_m=10.0)
+    left = board_points(board)[:, :2] + 100
+    turn = np.array([[np.cos(0.3), -np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+    right = left @ turn.T + [-30.0, 4.0]
+    grid = right.reshape(rows, columns, 2)
+    for quarter in (0, 1, 2, 3) if rows == columns else (0, 2):
+        numbered = np.rot90(grid, quarter).reshape(-1, 2)
+        assert np.array_equal(same_order(left, numbered, board), right)
+
+
+@given(turn=st.tuples(*[st.floats(-3, 3)] * 3), move=st.tuples(*[st.floats(-5, 5)] * 3))
+@settings(max_examples=50, deadline=None)
+def test_a_moved_board_fits_itself(
+    turn: tuple[float, float, float], move: tuple[float, float, float]
+) -> None:
+    model = board_points(BOARD)
+    moved = model @ rigid.rotation_from_vector(turn).T + move
+    assert rigid_fit_residuals(moved, model).max() < 1e-12
+    bumped = moved.copy()
+    bumped[0] += 1e-3
+    assert 5e-4 < rigid_fit_residuals(bumped, model).max() < 2e-3
+
+
+def test_a_file_gives_back_every_digit(tmp_path: Path, calibration: StereoCalibration) -> None:
+    save_calibration(calibration, tmp_path / "rig.yaml")
+    loaded = load_calibration(tmp_path / "rig.yaml")
+    assert loaded.model_dump(mode="json") == calibration.model_dump(mode="json")
+    assert [path.name for path in tmp_path.iterdir()] == ["rig.yaml"]
+
+
+def without(key: str) -> Callable[[str], str]:
+    return lambda text: "\n".join(line for line in text.split("\n") if not line.startswith(key))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (
+            lambda text: text.replace("version: 1", "version: 2", 1),
+            "version: 2, this program reads 1",
+        ),
+        (without("version"), 'no key "version"'),
+        (without("device"), "device: Field required"),
+        (lambda text: text + "\nflavour: salt\n", "flavour: Extra inputs"),
+        (lambda text: text.replace("width_px: 480", "width_px: wide"), "width_px: .*valid integer"),
+        (lambda text: text[: len(text) // 3] + "\n{", "not YAML"),
+        (lambda text: "", 'no key "version"'),
+    ],
+    ids=["version", "no version", "missing", "foreign", "type", "cut", "empty"],
+)
+def test_a_spoilt_file_is_refused(
+    tmp_path: Path, calibration: StereoCalibration, spoil: Callable[[str], str], said: str
+) -> None:
+    path = tmp_path / "rig.yaml"
+    save_calibration(calibration, path)
+    path.write_text(spoil(path.read_text()))
+    with pytest.raises(CalibrationFileError, match=said) as raised:
+        load_calibration(path)
+    assert str(path) in str(raised.value)
+
+
+def test_a_lens_file_needs_finite_numbers(tmp_path: Path, calibration: StereoCalibration) -> None:
+    path = tmp_path / "rig.yaml"
+    save_calibration(calibration, path)
+    path.write_text(path.read_text().replace("fx_px: ", "fx_px: .nan #", 1))
+    with pytest.raises(CalibrationFileError, match=r"left\.fx_px"):
+        load_calibration(path)
+    assert isinstance(calibration.left, Lens)
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data is not here")
+def test_real_pairs_beat_plain_opencv_on_held_out_pairs() -> None:
+    """OpenCV's plain calibration of these pairs leaves 0.56 mm on pairs it has not seen."""
+    left, right = sorted(REAL.glob("left*.jpg")), sorted(REAL.glob("right*.jpg"))
+    calibration = calibrate_stereo(
+        left[::2], right[::2], board=(9, 6), square_m=0.02423, device="real"
+    )
+    result = check_stereo(calibration, left[1::2], right[1::2], board=(9, 6), square_m=0.02423)
+    assert result["pairs"] == 10
+    assert np.linalg.norm(calibration.right_from_left[:3, 3]) == pytest.approx(0.094, abs=0.001)
+    assert result["rigid_fit_rms_mm"] <= 0.56

@@ -1,0 +1,342 @@
+"""The camera node and its readers: real decoders, files that end, devices that fail."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+from ruamel.yaml import YAML
+
+from messages.base import Header, Message
+from messages.clock import SystemClock
+from messages.scene import Scene
+from messages.topics import Topic
+from messages.types import StereoPair
+from nodes.camera.devices import (
+    DeviceError,
+    ImagesSource,
+    OpenCvSource,
+    Pictures,
+    ReaderThread,
+    VideoSource,
+    halves,
+    open_reader,
+)
+from nodes.camera.node import Camera, CameraParameters
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+WIDTH, HEIGHT, FRAMES = 160, 120, 6
+Image = NDArray[np.uint8]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """The paper's scene with a small camera."""
+    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+    size = {"width_px": WIDTH, "height_px": HEIGHT}
+    return scene.model_copy(update={"camera": scene.camera.model_copy(update=size)})
+
+
+def picture(number: int, side: int, width: int = WIDTH) -> Image:
+    """An even picture whose level tells its number and side, as compression leaves it."""
+    return np.full((HEIGHT, width), 20 + 20 * number + 100 * side, np.uint8)
+
+
+def told(image: Image) -> int:
+    return round((float(image.mean()) - 20) / 20)
+
+
+def write_video(path: Path, frames: list[Image], rate_hz: float = 50.0) -> Path:
+    height, width = frames[0].shape
+    codec = cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), codec, rate_hz, (width, height), True)
+    assert writer.isOpened()
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def videos(tmp_path: Path) -> tuple[Path, Path]:
+    left, right = ([picture(n, side) for n in range(FRAMES)] for side in (0, 1))
+    return write_video(tmp_path / "l.avi", left), write_video(tmp_path / "r.avi", right)
+
+
+@pytest.fixture
+def side_by_side(tmp_path: Path) -> Path:
+    frames = [np.hstack([picture(n, 0), picture(n, 1)]) for n in range(FRAMES)]
+    return write_video(tmp_path / "both.avi", frames)
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> dict[str, str]:
+    for number in range(FRAMES):
+        cv2.imwrite(str(tmp_path / f"left{number:02}.png"), picture(number, 0))
+        colour = cv2.cvtColor(picture(number, 1), cv2.COLOR_GRAY2BGR)
+        cv2.imwrite(str(tmp_path / f"right{number:02}.png"), colour)
+    return {"left": str(tmp_path / "left*.png"), "right": str(tmp_path / "right*.png")}
+
+
+class Bench:
+    """A camera node that runs, and what it publishes."""
+
+    def __init__(self, **parameters: Any) -> None:
+        self.sent: list[tuple[StereoPair, Header]] = []
+        self.changed = asyncio.Event()
+        self.node = Camera(
+            CameraParameters.model_validate(parameters),
+            name="camera",
+            clock=SystemClock(),
+            send=self.keep,
+        )
+
+    def keep(self, topic: Topic, message: Message, header: Header) -> None:
+        assert isinstance(message, StereoPair)
+        self.sent.append((message, header))
+        self.changed.set()
+
+    async def until(self, true: Callable[[], bool]) -> None:
+        async with asyncio.timeout(20):
+            while not true():  # noqa: ASYNC110  # notes and errors come without an event
+                await asyncio.sleep(0.005)
+
+    def numbers(self) -> list[tuple[int, int]]:
+        return [(told(pair.left), told(pair.right) - 5) for pair, _ in self.sent]
+
+
+@asynccontextmanager
+async def running(scene: Scene, **parameters: Any) -> AsyncIterator[Bench]:
+    bench = Bench(**parameters)
+    await bench.node.setup()
+    await bench.node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
+    try:
+        yield bench
+    finally:
+        await bench.node.close()
+
+
+IN_ORDER = [(number, number) for number in range(FRAMES)]
+
+
+async def test_two_video_files_are_played_to_their_end(
+    scene: Scene, videos: tuple[Path, Path]
+) -> None:
+    source = {"kind": "video", "left": videos[0], "right": videos[1]}
+    async with running(scene, source=source) as bench:
+        await bench.until(lambda: "ended" in bench.node.note)
+        assert bench.node.note == f"ended after {FRAMES} pairs"
+        assert bench.numbers() == IN_ORDER
+        stamps = [header.source_ns for _, header in bench.sent]
+        assert stamps == sorted(set(stamps))
+        assert {pair.device for pair, _ in bench.sent} == {scene.camera.device}
+        assert bench.node.errors == 0
+
+
+async def test_a_side_by_side_video_is_cut_in_the_middle(scene: Scene, side_by_side: Path) -> None:
+    source = {"kind": "video", "left": side_by_side, "rate_hz": 200.0}
+    async with running(scene, source=source) as bench:
+        await bench.until(lambda: "ended" in bench.node.note)
+        assert all(left == right for left, right in bench.numbers())
+        assert bench.sent[0][0].left.shape == (HEIGHT, WIDTH)
+
+
+async def test_a_video_starts_again_when_it_loops(scene: Scene, videos: tuple[Path, Path]) -> None:
+    source = {"kind": "video", "left": videos[0], "right": videos[1], "rate_hz": 100, "loop": True}
+    async with running(scene, source=source) as bench:
+        await bench.until(lambda: bench.numbers().count((0, 0)) >= 3)
+        assert "ended" not in bench.node.note
+
+
+async def test_images_come_in_the_order_of_their_names(
+    scene: Scene, images: dict[str, str]
+) -> None:
+    async with running(scene, source={"kind": "images", **images, "rate_hz": 50}) as bench:
+        await bench.until(lambda: "ended" in bench.node.note)
+        assert bench.numbers() == IN_ORDER
+
+
+async def test_looping_images_and_a_new_scene(scene: Scene, images: dict[str, str]) -> None:
+    source = {"kind": "images", **images, "rate_hz": 200, "loop": True}
+    async with running(scene, source=source) as bench:
+        await bench.until(lambda: len(bench.sent) > 2 * FRAMES)
+        first = bench.node.reader
+        other = scene.camera.model_copy(update={"device": "renamed"})
+        again = scene.model_copy(update={"camera": other})
+        await bench.node.step("scene", again, Header(2, 0, 0, "virtual", "test", 1))
+        assert first is not None
+        assert not first.is_alive()
+        await bench.until(lambda: bench.sent[-1][0].device == "renamed")
+
+
+async def test_a_live_camera_is_reopened_when_it_ends(scene: Scene, side_by_side: Path) -> None:
+    """OpenCV opens a file as it opens a camera; at its end it is a camera that was unplugged."""
+    source = {"kind": "opencv", "left": str(side_by_side)}
+    async with running(scene, source=source, retry_s=0.01) as bench:
+        await bench.until(lambda: bench.node.errors >= 2 and len(bench.sent) > 2)
+        assert "gives no more pictures" in bench.node.last_error
+        assert all(left == right for left, right in bench.numbers())
+
+
+async def test_a_camera_that_is_not_there_is_tried_again(scene: Scene, tmp_path: Path) -> None:
+    path = tmp_path / "camera.avi"
+    source = {"kind": "opencv", "left": str(path)}
+    async with running(scene, source=source, retry_s=0.01) as bench:
+        await bench.until(lambda: bench.node.errors >= 2)
+        assert f"{str(path)!r}: cannot be opened" in bench.node.note
+        assert bench.sent == []
+        frames = [np.hstack([picture(n, 0), picture(n, 1)]) for n in range(FRAMES)]
+        write_video(tmp_path / "ready.avi", frames).rename(path)
+        await bench.until(lambda: len(bench.sent) > 0)
+
+
+async def test_pictures_of_another_size_are_an_error(scene: Scene, tmp_path: Path) -> None:
+    wide = write_video(tmp_path / "w.avi", [picture(n, 0, 2 * WIDTH) for n in range(3)])
+    source = {"kind": "video", "left": wide, "right": wide}
+    async with running(scene, source=source, retry_s=0.01) as bench:
+        await bench.until(lambda: bench.node.errors >= 1)
+        assert "left view of 320x120 px" in bench.node.last_error
+        assert "160x120" in bench.node.last_error
+        assert bench.sent == []
+
+
+async def test_the_twins_pictures_pass_with_their_time(scene: Scene) -> None:
+    async with running(scene, source="twin") as bench:
+        pair = StereoPair(
+            device="twin-bumblebee",
+            exposure_s=0.004,
+            dropped_frames=3,
+            left=picture(1, 0),
+            right=picture(1, 1),
+        )
+        header = Header(1, 123_456, 130_000, "virtual", "twin", 1)
+        await bench.node.step("twin__stereo", pair, header)
+        passed, passed_header = bench.sent[0]
+        assert passed is pair
+        assert passed_header.source_ns == 123_456
+        wrong = pair.model_copy(update={"right": picture(1, 1, 80)})
+        await bench.node.step("twin__stereo", wrong, header)
+        assert "right view of 80x120 px" in bench.node.last_error
+        assert len(bench.sent) == 1
+        assert bench.node.reader is None
+
+
+async def test_the_twins_pictures_are_left_alone_by_a_real_camera(
+    scene: Scene, images: dict[str, str]
+) -> None:
+    pair = StereoPair(
+        device="t", exposure_s=0, dropped_frames=0, left=picture(0, 0), right=picture(0, 1)
+    )
+    bench = Bench(source={"kind": "images", **images})
+    await bench.node.step("twin__stereo", pair, Header(1, 1, 1, "virtual", "twin", 1))
+    assert bench.sent == []
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [
+        (lambda p: VideoSource(kind="video", left=p / "absent.avi"), "absent.avi: no such file"),
+        (lambda p: VideoSource(kind="video", left=p / "text.avi"), "cannot be opened"),
+        (lambda p: OpenCvSource(kind="opencv", left=str(p / "absent")), "cannot be opened"),
+        (
+            lambda p: ImagesSource(kind="images", left=str(p / "x*.png"), right=str(p / "a*.png")),
+            "matches no file",
+        ),
+        (
+            lambda p: ImagesSource(kind="images", left=str(p / "a*.png"), right=str(p / "b*.png")),
+            "matches 2 files, .* 1",
+        ),
+    ],
+    ids=["absent video", "no video", "absent camera", "no images", "unequal images"],
+)
+def test_what_cannot_be_opened_is_named(
+    scene: Scene, tmp_path: Path, source: Callable[[Path], Any], said: str
+) -> None:
+    (tmp_path / "text.avi").write_text("no video")
+    for name in ("a1.png", "a2.png", "b1.png"):
+        cv2.imwrite(str(tmp_path / name), picture(0, 0))
+    with pytest.raises(DeviceError, match=said):
+        open_reader(source(tmp_path), scene.camera, lambda: 0)
+
+
+def test_an_unreadable_image_is_named(scene: Scene, tmp_path: Path) -> None:
+    for name in ("l.png", "r.png"):
+        (tmp_path / name).write_text("no picture")
+    source = ImagesSource(kind="images", left=str(tmp_path / "l*"), right=str(tmp_path / "r*"))
+    with pytest.raises(DeviceError, match=r"l\.png: not a picture"):
+        open_reader(source, scene.camera, lambda: 0).read()
+
+
+def test_a_side_by_side_picture_of_odd_width_is_refused() -> None:
+    with pytest.raises(DeviceError, match="camera: side-by-side picture of odd width 161"):
+        halves(picture(0, 0, 161), "camera")
+
+
+def test_the_exposure_is_stamped_before_the_grab(scene: Scene, side_by_side: Path) -> None:
+    clock = iter(range(10**9, 2 * 10**9, 1_000_000))
+    late = OpenCvSource(kind="opencv", left=str(side_by_side), exposure_to_grab_s=0.02)
+    reader = open_reader(late, scene.camera, lambda: next(clock))
+    pictures = reader.read()
+    reader.close()
+    assert pictures is not None
+    assert pictures.exposure_ns == 10**9 - 20_000_000
+
+
+class StutteringReader:
+    """Frames at 60 Hz, but for three that never came."""
+
+    rate_hz: float | None = None
+
+    def __init__(self) -> None:
+        self.frames = iter([1, 2, 3, 7, 8])
+
+    def read(self) -> Pictures | None:
+        frame = next(self.frames, None)
+        if frame is None:
+            return None
+        return Pictures(picture(0, 0), picture(0, 1), round(frame * 1e9 / 60))
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
+    lost: list[int] = []
+    ended = threading.Event()
+    thread = ReaderThread(
+        StutteringReader,
+        camera=scene.camera,
+        name="stutter",
+        now=lambda: 0,
+        retry_s=1.0,
+        deliver=lambda pictures, count: lost.append(count),
+        fail=lambda error: pytest.fail(str(error)),
+        finish=lambda pairs: ended.set(),
+    )
+    thread.start()
+    thread.join(10)
+    assert ended.is_set()
+    assert lost == [0, 0, 0, 3, 3]
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "twim",
+        {"kind": "opencv"},
+        {"kind": "video", "left": "a", "lop": True},
+        {"kind": "twin", "x": 1},
+    ],
+)
+def test_a_wrong_source_is_refused(source: object) -> None:
+    with pytest.raises(ValidationError):
+        CameraParameters.model_validate({"source": source})
