@@ -26,7 +26,7 @@ from nodes.arm_bridge.limiter import (
     JointLimits,
     SheetLimits,
     braked,
-    joint_step,
+    limited,
     place_trouble,
     sheet_trouble,
     with_tool_speed,
@@ -66,6 +66,7 @@ RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
 LEAP_M, LEAP_RAD = 0.03, 0.35
+SLACK_STRETCH = 1.0005
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,16 +375,7 @@ class ArmControl:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
             return self._fail(str(error), geometry, step_s)
-        before = self.commanded_rad if self._goal_rad is None else self._goal_rad
-        velocity = joint_step(
-            self.commanded_rad,
-            self._velocity,
-            goal_rad,
-            (goal_rad - before) / step_s,
-            limits=geometry.joint_limits,
-            step_s=step_s,
-        )
-        velocity = self._tool_limited(velocity, geometry, step_s)
+        velocity = self._limited(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         trouble = place_trouble(
             flange, other.world_from_flange_commanded, geometry.sheet_limits
@@ -420,7 +412,7 @@ class ArmControl:
             geometry.world_from_edge(measured),
             other.world_from_flange @ geometry.other_flange_from_edge,
         )
-        if between.stretch_ratio <= 1.0:
+        if between.stretch_ratio <= SLACK_STRETCH:
             self._has_pulled = False
             return self._stop(rest_mode, reason, geometry, step_s)
         if self._relax_from is None or self._sheet is None:
@@ -438,18 +430,10 @@ class ArmControl:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError:
             return self._stop(rest_mode, reason, geometry, step_s)
-        before = self.commanded_rad if self._goal_rad is None else self._goal_rad
-        velocity = joint_step(
-            self.commanded_rad,
-            self._velocity,
-            goal_rad,
-            (goal_rad - before) / step_s,
-            limits=geometry.joint_limits,
-            step_s=step_s,
-        )
+        velocity = self._limited(goal_rad, geometry, step_s)
         self._sheet, self._goal_rad = sheet, goal_rad
         self.mode, self.reason = "relax", reason
-        return self._move(self._tool_limited(velocity, geometry, step_s), step_s)
+        return self._move(velocity, step_s)
 
     def _stop(
         self, rest_mode: ArmMode, reason: str, geometry: ArmGeometry, step_s: float
@@ -462,14 +446,25 @@ class ArmControl:
             self.mode = rest_mode
             return Command("idle" if rest_mode == "idle" else "stop", self.commanded_rad)
         self.mode = "stopping"
-        velocity = braked(self._velocity, limits=geometry.joint_limits, step_s=step_s)
-        return self._move(self._tool_limited(velocity, geometry, step_s), step_s)
-
-    def _tool_limited(self, wanted: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
-        return with_tool_speed(
+        velocity = with_tool_speed(
             self.commanded_rad,
             self._velocity,
-            wanted,
+            braked(self._velocity, limits=geometry.joint_limits, step_s=step_s),
+            tool_points=geometry.tool_points,
+            max_tool_speed=geometry.max_tool_speed,
+            limits=geometry.joint_limits,
+            step_s=step_s,
+        )
+        return self._move(velocity, step_s)
+
+    def _limited(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
+        """Joint velocities towards a goal that moves as it did since the last cycle."""
+        before = self.commanded_rad if self._goal_rad is None else self._goal_rad
+        return limited(
+            self.commanded_rad,
+            self._velocity,
+            goal_rad,
+            (goal_rad - before) / step_s,
             tool_points=geometry.tool_points,
             max_tool_speed=geometry.max_tool_speed,
             limits=geometry.joint_limits,

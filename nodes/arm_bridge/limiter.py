@@ -49,30 +49,57 @@ class SheetLimits:
     workspace_max_m: Floats
 
 
-def joint_step(
+def limited(
     joints_rad: Floats,
     velocity: Floats,
+    goal_rad: Floats,
+    goal_velocity: Floats,
+    *,
+    tool_points: Callable[[Floats], Floats],
+    max_tool_speed: float,
+    limits: JointLimits,
+    step_s: float,
+) -> Floats:
+    """Joint velocities (6,) for the next step towards a goal that moves: the whole limiter.
+
+    goal_rad is where the joints should be at the end of the step; a goal that is not finite brakes.
+    velocity is what the last call returned.  tool_points: joints to points (n, 3) in metres, none
+    of which may exceed `max_tool_speed`.  Whatever the goal, joints_rad + result * step_s is in
+    range, and speed and tool speed are kept.  So is the acceleration, unless range or tool speed
+    could not be kept otherwise.
+    """
+    if np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all():
+        wanted = towards(joints_rad, goal_rad, goal_velocity, limits=limits, step_s=step_s)
+        wanted = within_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s)
+    else:
+        wanted = braked(velocity, limits=limits, step_s=step_s)
+    return with_tool_speed(
+        joints_rad,
+        velocity,
+        wanted,
+        tool_points=tool_points,
+        max_tool_speed=max_tool_speed,
+        limits=limits,
+        step_s=step_s,
+    )
+
+
+def towards(
+    joints_rad: Floats,
     goal_rad: Floats,
     goal_velocity: Floats,
     *,
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Joint velocities (6,) for the next step towards a goal that moves.
-
-    goal_rad is where the joints should be at the end of the step; a goal that is not finite brakes.
-    A joint within reach lands on its goal, one farther off closes in without overshoot.  Whatever
-    the goal, the result keeps range and speed, and acceleration too unless the range would break.
-    """
-    if not (np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all()):
-        return braked(velocity, limits=limits, step_s=step_s)
-    fastest, sharpest = limits.speed_rad_per_s, limits.acceleration_rad_per_s2
+    """The velocities (6,) one would like: onto the goal at once, or closing in to stop there."""
+    fastest = limits.speed_rad_per_s
     goal = np.clip(goal_rad, limits.lowest_rad, limits.highest_rad)
     along = np.clip(goal_velocity, -fastest, fastest)
     offset = goal - along * step_s - joints_rad
-    closing = np.sign(offset) * closing_speed(np.abs(offset), BRAKE_SHARE * sharpest, step_s)
-    wanted = np.clip(along + closing, -fastest, fastest)
-    return within_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s)
+    brake = BRAKE_SHARE * limits.acceleration_rad_per_s2
+    closing = np.sign(offset) * closing_speed(np.abs(offset), brake, step_s)
+    return np.clip(along + closing, -fastest, fastest)
 
 
 def within_range(
@@ -96,8 +123,8 @@ def _room(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
 
 def braked(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
     """Velocities (6,) one step nearer to rest: all joints slow in proportion, along their path."""
-    fastest = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
-    return velocity * max(0.0, 1.0 - step_s / fastest) if fastest > 0.0 else velocity
+    stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
+    return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
 
 
 def with_tool_speed(
@@ -112,9 +139,9 @@ def with_tool_speed(
 ) -> Floats:
     """The wanted velocities (6,), held back until no tool point moves faster than it may.
 
-    tool_points: joints to points (n, 3) in metres.  First the change of velocity is held back, so
-    that the acceleration stays in bounds; if the present velocity is too fast itself, it is braked;
-    if even that is not enough, it is cut: the speed limit comes before the smooth ride.
+    First the change of velocity is held back, so that the acceleration stays in bounds; if the
+    present velocity is too fast itself, it is braked; if even that is not enough, it is cut: the
+    speed limit comes before the smooth ride.
     """
     here = tool_points(joints_rad)
 
@@ -130,8 +157,10 @@ def with_tool_speed(
             if speed(velocity + (share + step) * (wanted - velocity)) <= max_tool_speed:
                 share += step
             step *= 0.5
-        return velocity + share * (wanted - velocity)
-    slower = braked(velocity, limits=limits, step_s=step_s)
+        slower = velocity + share * (wanted - velocity)
+    else:
+        slower = braked(velocity, limits=limits, step_s=step_s)
+    slower = within_range(joints_rad, velocity, slower, limits=limits, step_s=step_s)
     while (present := speed(slower)) > max_tool_speed:
         slower = slower * (0.99 * max_tool_speed / present)
     return slower

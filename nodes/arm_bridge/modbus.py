@@ -7,6 +7,7 @@ its block, high byte first.
 
 from __future__ import annotations
 
+import logging
 import math
 import struct
 import zlib
@@ -84,6 +85,9 @@ def struct_format(block: Sequence[Field]) -> str:
 def register_count(block: Sequence[Field]) -> int:
     return struct.calcsize(struct_format(block)) // 2
 
+
+# Every failure is raised as ArmLinkError; the library's own log would say it again, with hex dumps.
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 _COMMAND_FORMAT, _STATUS_FORMAT = struct_format(COMMAND), struct_format(STATUS)
 _STATUS_REGISTERS = register_count(STATUS)

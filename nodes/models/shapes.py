@@ -62,7 +62,7 @@ class CylinderShape:
         distance = radius - self.radius_m
         if beyond > 0:
             distance = float(np.hypot(max(distance, 0.0), beyond))
-        return SurfacePoint(surface, normal, distance, undecided or beyond > 0)
+        return SurfacePoint(surface, normal, distance, undecided or bool(beyond > 0))
 
     def angle_rad(self, point: Floats) -> float:
         """Angle of a point about the axis, 0 on +z, growing towards +y."""

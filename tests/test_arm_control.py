@@ -1,0 +1,377 @@
+"""The bridge's decisions, cycle by cycle, without sockets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from messages.clock import VirtualClock
+from messages.scene import Scene
+from messages.types import ArmState, Side
+from nodes.arm_bridge.control import ArmControl, ArmGeometry, Command, Goal, OtherArm, Patience
+from nodes.arm_bridge.kinematics import KINEMATICS
+from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from nodes.methods import measure
+from nodes.models.motion import SheetMotion
+from nodes.models.rigid import transform_from_rpy, twist_between
+from nodes.models.sheet import edge_poses
+
+Floats = NDArray[np.float64]
+SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+STEP_S = 1.0 / 140.0
+GUESS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
+HOME = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
+PATIENCE = Patience(hold_after_s=0.02, stop_after_s=0.1)
+
+
+def sheet_at(
+    y: float = 0.0, *, z: float = 0.0, tilt: float = 0.0, stretch: float = 1.02
+) -> SheetMotion:
+    return replace(
+        HOME, world_from_sheet=transform_from_rpy([0.0, y, z], [tilt, 0, 0]), stretch_ratio=stretch
+    )
+
+
+@dataclass
+class Arm:
+    """One controlled arm that does at once what it is told."""
+
+    geometry: ArmGeometry
+    control: ArmControl
+    joints: Floats
+    command: Command
+
+    @classmethod
+    def holding(cls, side: Side, motion: SheetMotion = HOME) -> Arm:
+        geometry = ArmGeometry(SCENE, side)
+        control = ArmControl(PATIENCE, largest_lag_rad=0.12)
+        joints = geometry.joints_for_sheet(motion, GUESS)
+        arm = cls(geometry, control, joints, Command("idle", joints))
+        control.take_measurement(joints, ())
+        return arm
+
+    def cycle(self, goal: Goal | None, other: OtherArm | None, step_s: float = STEP_S) -> None:
+        self.command = self.control.step(self.geometry, goal, other, step_s)
+        if self.command.mode == "move":
+            self.joints = self.command.joints_rad
+        self.control.take_measurement(self.joints, ())
+
+    def as_other(self, age_s: float = 0.005) -> OtherArm:
+        return OtherArm(
+            self.geometry.world_from_flange(self.joints),
+            self.geometry.world_from_flange(self.control.commanded_rad),
+            self.control.mode,
+            self.control.all_faults,
+            age_s,
+        )
+
+    @property
+    def edge(self) -> Floats:
+        return self.geometry.world_from_edge(self.joints)
+
+
+def pair(motion: SheetMotion = HOME) -> tuple[Arm, Arm]:
+    arms = Arm.holding("left", motion), Arm.holding("right", motion)
+    for arm in arms:
+        arm.control.mode = "idle"
+    return arms
+
+
+def run(arms: tuple[Arm, Arm], goal: Goal | None, cycles: int) -> None:
+    for _ in range(cycles):
+        for arm, other in (arms, arms[::-1]):
+            arm.cycle(goal, other.as_other())
+
+
+def distance(arms: tuple[Arm, Arm]) -> float:
+    return float(np.linalg.norm(arms[0].edge[:3, 3] - arms[1].edge[:3, 3]))
+
+
+def on_time(motion: SheetMotion) -> Goal:
+    return Goal(motion, overdue_s=-0.005)
+
+
+def test_the_first_command_is_the_measured_pose() -> None:
+    arms = pair()
+    arms[0].control.step(arms[0].geometry, None, arms[1].as_other(), STEP_S)
+    command = arms[0].control.step(
+        arms[0].geometry, on_time(sheet_at(0.05)), arms[1].as_other(), STEP_S
+    )
+    assert command.mode == "move"
+    assert (command.joints_rad == arms[0].joints).all()
+
+
+def test_before_the_arm_answers_it_is_told_to_be_idle() -> None:
+    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+    geometry = ArmGeometry(SCENE, "left")
+    command = control.step(geometry, on_time(HOME), None, STEP_S)
+    assert command.mode == "idle"
+    assert control.mode == "disconnected"
+
+
+def test_a_far_target_is_reached_slowly_and_together() -> None:
+    arms = pair()
+    goal = on_time(sheet_at(0.06, z=0.05, tilt=0.6, stretch=1.06))
+    longest, speeds = 0.0, []
+    for _ in range(600):
+        before = arms[0].edge
+        run(arms, goal, 1)
+        longest = max(longest, distance(arms))
+        speeds.append(np.linalg.norm(arms[0].edge[:3, 3] - before[:3, 3]) / STEP_S)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+    assert max(speeds) < 0.1
+    assert longest <= 0.24 * 1.06 + 1e-6
+    for edge, arm in zip(edge_poses(goal.motion.world_from_sheet, 0.24 * 1.06), arms, strict=True):
+        assert arm.edge == pytest.approx(edge, abs=1e-7)
+
+
+def test_a_moving_target_is_followed_without_lag() -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 50)
+    rate, at_s = 0.15, 0.0
+    for _ in range(200):
+        at_s += STEP_S
+        motion = replace(sheet_at(tilt=rate * at_s), twist_world=np.array([0, 0, 0, rate, 0, 0]))
+        run(arms, on_time(motion), 1)
+    left, _ = edge_poses(motion.world_from_sheet, 0.24 * 1.02)
+    assert arms[0].edge == pytest.approx(left, abs=1e-8)
+
+
+def test_a_late_target_is_held_and_a_lost_one_stops() -> None:
+    arms = pair()
+    moving = replace(sheet_at(), twist_world=np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0]))
+    run(arms, on_time(HOME), 50)
+    for number in range(40):
+        shifted = transform_from_rpy([0.0, 0.05 * number * STEP_S, 0.0], [0, 0, 0])
+        run(arms, on_time(replace(moving, world_from_sheet=shifted)), 1)
+    run(arms, Goal(moving, overdue_s=0.03), 30)
+    assert {arm.control.mode for arm in arms} == {"hold"}
+    assert all(arm.control.at_rest for arm in arms)
+    run(arms, Goal(moving, overdue_s=0.11), 30)
+    assert {arm.control.mode for arm in arms} == {"idle"}
+    assert all(arm.control.faults == () for arm in arms)
+
+
+@pytest.mark.parametrize("age_s", [None, 0.2])
+def test_without_the_other_arm_nothing_moves(age_s: float | None) -> None:
+    arms = pair()
+    other = None if age_s is None else arms[1].as_other(age_s)
+    for _ in range(20):
+        arms[0].cycle(on_time(sheet_at(0.05)), other)
+    assert arms[0].control.mode == "idle"
+    assert arms[0].command.mode == "idle"
+    assert arms[0].control.reason == "the other arm is silent"
+
+
+def test_the_other_arms_fault_stops_this_one_in_the_same_cycle_and_slackens_the_sheet() -> None:
+    arms = pair(sheet_at(stretch=1.06))
+    goal = on_time(sheet_at(stretch=1.06))
+    run(arms, goal, 30)
+    for number in range(60):
+        motion = replace(
+            sheet_at(0.05 * number * STEP_S, stretch=1.06),
+            twist_world=np.array([0.0, 0.05, 0.0, 0.0, 0.0, 0.0]),
+        )
+        run(arms, on_time(motion), 1)
+    arms[0].control.faults = ("drill",)
+    arms[0].cycle(goal, arms[1].as_other())
+    arms[1].cycle(goal, arms[0].as_other())
+    assert [arm.control.mode for arm in arms] == ["stopping", "stopping"]
+    run(arms, goal, 2)
+    stretched = distance(arms)
+    run(arms, goal, 400)
+    assert [arm.control.mode for arm in arms] == ["fault", "idle"]
+    assert stretched > 0.25
+    assert distance(arms) == pytest.approx(0.24, abs=0.0005)
+    assert arms[1].control.faults == ()
+    assert arms[0].control.reset()
+    arms[0].cycle(goal, arms[1].as_other())
+    assert arms[0].command.mode == "idle"
+    run(arms, goal, 400)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+    assert distance(arms) == pytest.approx(0.24 * 1.06, abs=1e-6)
+
+
+def test_the_arm_that_can_still_move_slackens_the_sheet_alone() -> None:
+    arms = pair(sheet_at(stretch=1.06))
+    run(arms, on_time(sheet_at(stretch=1.06)), 30)
+    arms[0].control.lose_connection("cable")
+    for _ in range(600):
+        arms[1].cycle(on_time(HOME), arms[0].as_other())
+    assert distance(arms) == pytest.approx(0.24, abs=0.0005)
+    assert arms[1].control.mode == "idle"
+
+
+def test_the_estop_latches_until_reset_at_rest() -> None:
+    arms = pair()
+    goal = on_time(sheet_at(0.05))
+    run(arms, goal, 60)
+    for arm in arms:
+        arm.control.engage_estop("button")
+    run(arms, goal, 1)
+    assert arms[0].control.mode == "stopping"
+    assert not arms[0].control.reset()
+    run(arms, goal, 60)
+    assert {arm.control.mode for arm in arms} == {"estop"}
+    assert arms[0].control.all_faults == ("e-stop: button",)
+    place = arms[0].joints
+    run(arms, goal, 60)
+    assert (arms[0].joints == place).all()
+    assert all(arm.control.reset() for arm in arms)
+    run(arms, goal, 10)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        (replace(HOME, world_from_sheet=np.diag([1.0, 1.0, -1.0, 1.0])), "not a rigid pose"),
+        (replace(HOME, twist_world=np.full(6, np.nan)), "not a rigid pose"),
+        (replace(HOME, stretch_ratio=float("inf")), "not a rigid pose"),
+    ],
+)
+def test_a_target_that_makes_no_sense_is_a_fault(motion: SheetMotion, words: str) -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 10)
+    arms[0].cycle(on_time(motion), arms[1].as_other())
+    assert words in arms[0].control.faults[0]
+
+
+@pytest.mark.parametrize(
+    ("motion", "words"),
+    [
+        (sheet_at(z=0.29), "outside the workspace|reach|joint ranges"),
+        (sheet_at(stretch=1.2), "sheet of|edge force"),
+    ],
+)
+def test_a_target_past_the_limits_stops_both_within_them(motion: SheetMotion, words: str) -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 10)
+    longest = 0.0
+    for _ in range(900):
+        run(arms, on_time(motion), 1)
+        longest = max(longest, distance(arms))
+        for arm in arms:
+            place = arm.geometry.world_from_flange(arm.joints)[:3, 3]
+            assert (np.abs(place) <= [0.4, 0.3, 0.3]).all()
+    assert longest <= 0.24 * 1.09
+    assert not {arm.control.mode for arm in arms} & {"follow", "hold"}
+    faults = [text for arm in arms for text in arm.control.faults]
+    assert any(word in faults[0] for word in words.split("|"))
+
+
+def test_an_arm_that_does_not_follow_is_a_fault() -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 10)
+    stuck = arms[0].joints
+    for _ in range(300):
+        command = arms[0].control.step(
+            arms[0].geometry, on_time(sheet_at(0.08)), arms[1].as_other(), STEP_S
+        )
+        arms[0].control.take_measurement(stuck, ())
+        if arms[0].control.faults:
+            break
+    assert "trails its command" in arms[0].control.faults[0]
+    assert np.abs(command.joints_rad - stuck).max() < 0.14
+
+
+def test_faults_of_the_arm_are_latched_but_its_watchdog_starts_anew() -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 10)
+    arms[0].control.take_measurement(arms[0].joints, ("watchdog: no command",))
+    assert not arms[0].control.faults
+    arms[0].cycle(on_time(HOME), arms[1].as_other())
+    assert arms[0].command.mode == "idle"
+    arms[0].control.take_measurement(arms[0].joints, ("servo",))
+    assert list(arms[0].control.faults) == ["arm: servo"]
+
+
+poses = st.tuples(*[st.floats(-0.15, 0.15)] * 3, *[st.floats(-0.8, 0.8)] * 3)
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    targets=st.lists(
+        st.tuples(poses, st.floats(0.8, 1.3), st.integers(1, 40), st.floats(-0.02, 0.12)),
+        min_size=1,
+        max_size=6,
+    ),
+    jitter=st.lists(st.floats(0.5, 2.0), min_size=1, max_size=5),
+)
+def test_no_target_leads_to_a_command_out_of_bounds(
+    targets: list[tuple[tuple[float, ...], float, int, float]], jitter: list[float]
+) -> None:
+    arms = pair()
+    number = 0
+    for pose, stretch, cycles, overdue_s in targets:
+        world_from_sheet = transform_from_rpy(pose[:3], pose[3:])
+        twist = twist_between(np.eye(4), world_from_sheet, 0.3)
+        goal = Goal(SheetMotion(world_from_sheet, twist, stretch, 0.0), overdue_s)
+        for _ in range(cycles):
+            number += 1
+            step_s = STEP_S * jitter[number % len(jitter)]
+            for arm, other in (arms, arms[::-1]):
+                before = arm.joints
+                tool = arm.geometry.tool_points(before)
+                arm.cycle(goal, other.as_other(), step_s)
+                limits = arm.geometry.joint_limits
+                assert np.isfinite(arm.joints).all()
+                assert (arm.joints >= limits.lowest_rad - 1e-9).all()
+                assert (arm.joints <= limits.highest_rad + 1e-9).all()
+                speed = np.abs(arm.joints - before) / step_s
+                assert (speed <= limits.speed_rad_per_s * (1 + 1e-6)).all()
+                moved = np.linalg.norm(arm.geometry.tool_points(arm.joints) - tool, axis=1)
+                assert moved.max() / step_s <= 0.25 * (1 + 1e-6)
+            assert distance(arms) <= 0.24 * 1.09
+
+
+def test_the_scene_is_reachable_over_its_strokes() -> None:
+    radius = SCENE.object.geometry.radius_m
+    for side in ("left", "right"):
+        geometry = ArmGeometry(SCENE, side)
+        joints = GUESS
+        for begin_deg in (-60, 0, 60):
+            for angle_deg in range(-60, 61, 5):
+                angle = np.radians(angle_deg)
+                y = radius * np.radians(angle_deg - begin_deg)
+                if abs(y) > SCENE.sheet.usable_half_height_m:
+                    continue
+                pose = transform_from_rpy([0.0, 0.0, -radius], [-angle, 0.0, 0.0])
+                pose[:3, 3] += radius * pose[:3, 2] - y * pose[:3, 1]
+                for stretch in (1.0, 1.08):
+                    motion = replace(HOME, world_from_sheet=pose, stretch_ratio=stretch)
+                    joints = geometry.joints_for_sheet(motion, joints)
+                    assert abs(joints[4]) > np.radians(30.0)
+                    assert (joints > geometry.joint_limits.lowest_rad).all()
+                    assert (joints < geometry.joint_limits.highest_rad).all()
+
+
+async def test_without_a_scene_the_node_waits() -> None:
+    sent: list[object] = []
+    node = ArmBridge(
+        ArmBridgeParameters(side="left"),
+        name="arm_left_bridge",
+        clock=VirtualClock(),
+        send=lambda topic, message, header: sent.append(message),
+        topics={"arm": "arm_left", "other_arm": "arm_right"},
+    )
+    await node.setup()
+    await node.cycle()
+    assert node.note == "waits for a scene"
+    assert not any(isinstance(message, ArmState) for message in sent)
+    await node.close()
+
+
+def test_every_method_of_the_family_is_within_tolerance_in_its_range() -> None:
+    points = [measure(trial, repeats=1) for trial in KINEMATICS.trials(SCENE)]
+    assert {point.method for point in points} == set(KINEMATICS.methods)
+    for point in points:
+        assert not point.in_range or point.error <= KINEMATICS.tolerance(SCENE)

@@ -1,0 +1,442 @@
+"""The planner: approach, rolling, holding, bounds, compliance, and the same bytes every time."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from messages.base import Header, Message
+from messages.clock import VirtualClock
+from messages.scene import Scene
+from messages.topics import Topic
+from messages.types import Fingertip, FingertipReason, SheetTarget, SoftBody
+from nodes.models.rigid import inverse, moved, transform_from_rpy, twist_between
+from nodes.models.shapes import CylinderShape
+from nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
+from nodes.planner.compliance import compliance_for, stretch_range
+from nodes.planner.node import Planner, PlannerParameters
+from nodes.planner.rolling import Encounter, Reach, sheet_on_cylinder, sheet_twist
+
+Floats = NDArray[np.float64]
+SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+RADIUS = SCENE.object.geometry.radius_m
+SHAPE = CylinderShape(RADIUS, SCENE.object.geometry.length_m)
+FRAME_NS = 16_666_667
+
+
+def on_cylinder(angle_deg: float, height: float = 0.0, x: float = 0.0) -> Floats:
+    """A point at a height over the cylinder's skin, in the object's frame."""
+    angle, reach = math.radians(angle_deg), RADIUS + height
+    return np.array([x, reach * math.sin(angle), reach * math.cos(angle)])
+
+
+def in_world(point: Floats) -> Floats:
+    shift: Floats = np.array([0.0, 0.0, RADIUS])
+    return point - shift
+
+
+class Table:
+    """A planner, fed by hand at 60 Hz."""
+
+    def __init__(self, scene: Scene, **parameters: float) -> None:
+        self.sent: list[SheetTarget] = []
+        self.planner = Planner(
+            PlannerParameters(**parameters),
+            name="planner",
+            clock=VirtualClock(),
+            send=self._take,
+        )
+        self.scene = scene
+        self.now_ns = 0
+
+    def _take(self, topic: Topic, message: Message, header: Header) -> None:
+        assert isinstance(message, SheetTarget)
+        assert header.source_ns == self.now_ns
+        self.sent.append(message)
+
+    async def start(self) -> None:
+        await self.planner.setup()
+        await self.planner.step("scene", self.scene, self.header())
+
+    def header(self, age_ns: int = 5_000_000) -> Header:
+        return Header(1, self.now_ns, self.now_ns + age_ns, "virtual", "test", 1)
+
+    async def see(
+        self,
+        position: Floats,
+        velocity: Floats | None = None,
+        *,
+        reason: FingertipReason = "ok",
+        after_ns: int = FRAME_NS,
+        age_ns: int = 5_000_000,
+    ) -> SheetTarget:
+        self.now_ns += after_ns
+        message = Fingertip(
+            valid=reason == "ok",
+            reason=reason,
+            position_world_m=position,
+            velocity_world_m_per_s=np.zeros(3) if velocity is None else velocity,
+            covariance=np.eye(6),
+            measured_world_m=position,
+            reprojection_px=0.0,
+        )
+        await self.planner.step("fingertip", message, self.header(age_ns))
+        assert self.planner.errors == 0, self.planner.last_error
+        return self.sent[-1]
+
+    async def rest_at(self, position: Floats, frames: int = 240) -> SheetTarget:
+        for _ in range(frames):
+            target = await self.see(position)
+        return target
+
+
+async def table(**parameters: float) -> Table:
+    result = Table(SCENE, **parameters)
+    await result.start()
+    return result
+
+
+async def test_nothing_is_sent_before_the_scene() -> None:
+    desk = Table(SCENE)
+    await desk.planner.setup()
+    await desk.planner.step(
+        "fingertip",
+        Fingertip(
+            valid=True, reason="ok", position_world_m=np.zeros(3),
+            velocity_world_m_per_s=np.zeros(3), covariance=np.eye(6),
+            measured_world_m=np.zeros(3), reprojection_px=0.0,
+        ),
+        desk.header(),
+    )  # fmt: skip
+    assert desk.sent == []
+
+
+async def test_without_a_finger_the_sheet_waits_in_the_imaginary_screen() -> None:
+    desk = await table()
+    target = await desk.see(np.zeros(3), reason="no_mark")
+    assert target.phase == "wait"
+    assert target.reason == "fingertip: no_mark"
+    assert target.world_from_sheet == pytest.approx(np.eye(4), abs=1e-12)
+    assert target.stretch_ratio == SCENE.sheet.min_stretch_ratio
+
+
+@pytest.mark.parametrize("angle_deg", [-60.0, -20.0, 0.0, 45.0])
+async def test_the_sheet_approaches_the_tangent_plane_under_the_finger(angle_deg: float) -> None:
+    desk = await table()
+    target = await desk.rest_at(in_world(on_cylinder(angle_deg, 0.03, 0.02)))
+    assert target.phase == "approach"
+    wanted = transform_from_rpy([0, 0, -RADIUS], [0, 0, 0]) @ sheet_on_cylinder(
+        SHAPE, math.radians(angle_deg), 0.0
+    )
+    assert target.world_from_sheet == pytest.approx(wanted, abs=1e-9)
+    assert target.contact_world_m == pytest.approx(
+        in_world(on_cylinder(angle_deg, 0.0, 0.02)), abs=1e-9
+    )
+    assert target.contact_sheet_m == pytest.approx([0.02, 0.0], abs=1e-9)
+    assert target.push_depth_m == 0.0
+
+
+@given(st.floats(-1.2, 1.2), st.floats(-0.09, 0.09), st.booleans())
+def test_the_twist_is_the_poses_derivative(angle: float, y: float, rolling: bool) -> None:
+    rate, step_s = 0.7, 1e-5
+
+    def pose(at_s: float) -> Floats:
+        way = RADIUS * rate * at_s if rolling else 0.0
+        return sheet_on_cylinder(SHAPE, angle + rate * at_s, y + way)
+
+    expected = twist_between(pose(-step_s), pose(step_s), 2.0 * step_s)
+    assert sheet_twist(SHAPE, angle, y, rate, rolling=rolling) == pytest.approx(expected, abs=1e-8)
+
+
+async def stroke(
+    desk: Table, from_deg: float, to_deg: float, frames: int, height: float = -0.002
+) -> list[SheetTarget]:
+    """A finger that goes evenly from one angle to another; its velocity is known exactly."""
+    rate = math.radians(to_deg - from_deg) / (frames * FRAME_NS * 1e-9)
+    reach, sent = RADIUS + height, []
+    for number in range(1, frames + 1):
+        angle = from_deg + (to_deg - from_deg) * number / frames
+        a = math.radians(angle)
+        velocity = rate * reach * np.array([0.0, math.cos(a), -math.sin(a)])
+        sent.append(await desk.see(in_world(on_cylinder(angle, height)), velocity))
+    return sent
+
+
+async def test_in_touch_the_sheet_rolls_without_slipping() -> None:
+    desk = await table(lead_s=0.0)
+    await desk.rest_at(in_world(on_cylinder(0.0, 0.02)))
+    first = await desk.rest_at(in_world(on_cylinder(0.0, -0.002)))
+    assert first.phase == "contact"
+    assert first.push_depth_m == pytest.approx(0.002, abs=1e-9)
+    for frames, end_deg in ((600, 60.0), (1200, -60.0), (600, 0.0)):
+        begin_deg = {60.0: 0.0, -60.0: 60.0, 0.0: -60.0}[end_deg]
+        sent = await stroke(desk, begin_deg, end_deg, frames)
+        for number, target in enumerate(sent[30:], start=31):
+            angle = math.radians(begin_deg + (end_deg - begin_deg) * number / frames)
+            assert target.phase == "contact"
+            # Arc AB = A'B; the sheet is tangent at B to the undeformed object.
+            assert target.contact_sheet_m[1] == pytest.approx(RADIUS * angle, abs=1e-6)
+            assert target.world_from_sheet[:3, 2] == pytest.approx(
+                [0.0, math.sin(angle), math.cos(angle)], abs=1e-6
+            )
+    assert desk.sent[-1].world_from_sheet == pytest.approx(first.world_from_sheet, abs=1e-5)
+
+
+async def test_the_published_twist_leads_to_the_next_pose() -> None:
+    desk = await table(lead_s=0.04)
+    await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
+    sent = await stroke(desk, 0.0, 50.0, 500)
+    for before, after in itertools.pairwise(sent[50:]):
+        duration_s = (after.valid_at_ns - before.valid_at_ns) * 1e-9
+        ahead = moved(before.world_from_sheet, before.twist_world, duration_s)
+        assert ahead == pytest.approx(after.world_from_sheet, abs=2e-5)
+
+
+async def test_the_prediction_is_for_the_moment_that_it_names() -> None:
+    desk = await table(lead_s=0.05)
+    await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
+    sent = await stroke(desk, 0.0, 40.0, 600)
+    assert sent[-1].valid_at_ns == desk.now_ns + 50_000_000
+    ahead_deg = 40.0 + 40.0 / 10.0 * 0.05
+    normal = sent[-1].world_from_sheet[:3, 2]
+    assert math.degrees(math.atan2(normal[1], normal[2])) == pytest.approx(ahead_deg, abs=0.01)
+
+
+async def test_contact_has_hysteresis() -> None:
+    desk = await table(lead_s=0.0)
+    phases = []
+    for height_mm in (5.0, 1.0, 0.4, 1.0, 2.9, 3.1, 1.0, 0.6, 0.4):
+        target = await desk.rest_at(in_world(on_cylinder(10.0, height_mm * 1e-3)), 2)
+        phases.append(target.phase)
+    assert phases == ["approach"] * 2 + ["contact"] * 3 + ["approach"] * 3 + ["contact"]
+
+
+async def test_after_a_lift_the_sheet_is_met_at_its_middle_again() -> None:
+    desk = await table(lead_s=0.0)
+    await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
+    sent = await stroke(desk, 0.0, 50.0, 500)
+    assert sent[-1].contact_sheet_m[1] > 0.03
+    lifted = await desk.rest_at(in_world(on_cylinder(50.0, 0.02)))
+    assert lifted.contact_sheet_m == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+async def test_a_contact_begun_on_the_way_takes_the_sheet_as_it_is() -> None:
+    desk = await table(lead_s=0.0)
+    await desk.rest_at(in_world(on_cylinder(40.0, 0.02)))
+    for _ in range(3):
+        before = await desk.see(in_world(on_cylinder(10.0, 0.02)))
+    target = await desk.see(in_world(on_cylinder(10.0, 0.0)))
+    shift = target.world_from_sheet[:3, 3] - before.world_from_sheet[:3, 3]
+    assert target.phase == "contact"
+    assert np.linalg.norm(shift) < 0.18 / 60 + 1e-9
+    assert abs(target.contact_sheet_m[1]) > 0.001
+
+
+REACH = Reach(
+    front_rad=0.0, tilt_rad=1.2, half_height_m=0.03, touch_m=0.0005, release_m=0.003, axis_m=0.005
+)
+
+
+def touched(angle_deg: float = 0.0) -> Encounter:
+    encounter = Encounter(SHAPE, REACH)
+    assert encounter.step(on_cylinder(angle_deg, -0.001), np.zeros(3), 0.0).phase == "contact"
+    return encounter
+
+
+@pytest.mark.parametrize(
+    ("finger", "words", "depth"),
+    [
+        (np.array([0.0, 0.0, 0.0]), "axis", RADIUS),
+        (np.array([0.0, 0.0, 0.004]), "axis", RADIUS - 0.004),
+        (np.array([0.0, 0.001, -0.0146]), "axis", RADIUS + 0.0146),
+        (on_cylinder(180.0, -0.001), "axis", 2 * RADIUS - 0.001),
+        (on_cylinder(0.0, -0.001, 0.061), "past the object's end", 0.001),
+        (on_cylinder(0.0, -0.001, -0.08), "past the object's end", 0.001),
+        (on_cylinder(60.0, -0.001), "usable height", 0.001),
+    ],
+)
+def test_the_sheet_holds_where_it_cannot_follow(finger: Floats, words: str, depth: float) -> None:
+    encounter = touched()
+    shown = encounter.step(finger, np.array([0.1, 0.2, 0.3]), 0.0)
+    assert shown.phase == "hold"
+    assert words in shown.reason
+    assert shown.angle_rate == 0.0
+    assert shown.push_depth_m == pytest.approx(depth, abs=1e-12)
+    assert abs(shown.y_m) <= REACH.half_height_m + 1e-12
+    back = encounter.step(on_cylinder(0.0, -0.001), np.zeros(3), 0.0)
+    assert (back.phase, back.angle_rad) == ("contact", 0.0)
+
+
+def test_a_finger_on_the_axis_from_the_first_is_held_and_not_met() -> None:
+    shown = Encounter(SHAPE, REACH).step(np.zeros(3), np.zeros(3), 0.0)
+    assert (shown.phase, shown.angle_rad, shown.angle_rate) == ("hold", 0.0, 0.0)
+
+
+def test_behind_the_object_the_side_is_kept() -> None:
+    encounter = Encounter(SHAPE, REACH)
+    angles = [
+        encounter.step(on_cylinder(angle_deg, 0.02), np.zeros(3), 0.0).angle_rad
+        for angle_deg in (40.0, 100.0, 170.0, 185.0, 200.0, 175.0)
+    ]
+    assert angles == pytest.approx([math.radians(40.0)] + [REACH.tilt_rad] * 5)
+
+
+@settings(max_examples=200)
+@given(
+    st.lists(
+        st.tuples(st.floats(-0.08, 0.08), st.floats(-0.06, 0.06), st.floats(-0.06, 0.06)),
+        min_size=1,
+        max_size=20,
+    )
+)
+def test_wherever_the_finger_goes_the_presentation_is_within_reach(
+    path: list[tuple[float, float, float]],
+) -> None:
+    encounter = Encounter(SHAPE, REACH)
+    for x, y, z in path:
+        shown = encounter.step(np.array([x, y, z]), np.array([0.1, -0.1, 0.1]), 0.001)
+        assert abs(shown.angle_rad) <= REACH.tilt_rad + 1e-9
+        assert abs(shown.y_m) <= REACH.half_height_m + 1e-9
+        assert math.isfinite(shown.angle_rate)
+        assert shown.push_depth_m >= 0.0
+
+
+async def test_a_lost_finger_brings_the_sheet_to_rest_smoothly() -> None:
+    desk = await table(lead_s=0.0)
+    await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
+    await stroke(desk, 0.0, 40.0, 120)
+    lost = [await desk.see(np.zeros(3), reason="two_marks") for _ in range(30)]
+    assert {target.phase for target in lost} == {"hold"}
+    assert lost[0].reason == "fingertip: two_marks"
+    assert lost[-1].twist_world == pytest.approx(np.zeros(6), abs=0.0)
+    assert lost[-1].world_from_sheet == pytest.approx(lost[-2].world_from_sheet, abs=1e-15)
+    found = await desk.rest_at(in_world(on_cylinder(40.0, -0.001)), 60)
+    assert found.phase == "contact"
+    assert found.contact_sheet_m[1] == pytest.approx(RADIUS * math.radians(40.0), abs=1e-5)
+
+
+async def test_an_old_fingertip_is_held_and_one_out_of_order_left_out() -> None:
+    desk = await table()
+    await desk.rest_at(in_world(on_cylinder(0.0, 0.02)), 5)
+    target = await desk.see(in_world(on_cylinder(30.0, 0.02)), age_ns=150_000_000)
+    assert target.phase == "hold"
+    assert target.reason == "fingertip is 150 ms old"
+    count = len(desk.sent)
+    await desk.see(in_world(on_cylinder(30.0, 0.02)), after_ns=-FRAME_NS)
+    assert len(desk.sent) == count
+    assert "1 fingertips came out of order" in desk.planner.note
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    desk = await table()
+    given = desk.planner.parameters
+    sent = []
+    for _ in range(40):
+        spot = random.uniform([-0.1, -0.1, -0.1], [0.1, 0.1, 0.1])
+        reason: FingertipReason = "no_mark" if random.random() < 0.2 else "ok"
+        velocity = random.uniform(-1.0, 1.0, 3)
+        for _ in range(random.integers(1, 8)):
+            sent.append(await desk.see(spot, velocity, reason=reason))
+    step_s = FRAME_NS * 1e-9
+    poses = [target.world_from_sheet for target in sent]
+    steps = np.array([twist_between(a, b, step_s) for a, b in itertools.pairwise(poses)])
+    speed, turn = np.linalg.norm(steps[:, :3], axis=1), np.linalg.norm(steps[:, 3:], axis=1)
+    assert speed.max() <= given.speed_m_per_s * (1 + 1e-6)
+    assert turn.max() <= given.turn_rad_per_s * (1 + 1e-6)
+    changes = np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1) / step_s
+    assert changes.max() <= given.acceleration_m_per_s2 * (1 + 1e-6)
+    rates = np.diff([target.stretch_ratio for target in sent]) / step_s
+    assert np.abs(rates).max() <= given.stretch_rate_per_s * (1 + 1e-6)
+
+
+def soft(stiffness: float) -> SoftBody:
+    return SoftBody(
+        mesh_id="m",
+        method="test",
+        in_range=True,
+        push_depth_m=0.001,
+        force_world_n=np.zeros(3),
+        stiffness_n_per_m=stiffness,
+        displacement_world_m=np.zeros((4, 3), dtype=np.float32),
+    )
+
+
+async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> None:
+    desk = await table()
+    position = in_world(on_cylinder(0.0, -0.001))
+    await desk.rest_at(position, 10)
+    await desk.planner.step("soft_body", soft(45.0), desk.header())
+    target = await desk.rest_at(position, 300)
+    sheet = SCENE.sheet
+    force = edge_force_n(
+        target.stretch_ratio,
+        young_modulus_pa=sheet.young_modulus_pa,
+        height_m=sheet.height_m,
+        thickness_m=sheet.thickness_m,
+    )
+    assert push_stiffness_n_per_m(force, width_m=sheet.width_m) == pytest.approx(45.0, rel=1e-6)
+    assert desk.planner.note == ""
+
+
+@pytest.mark.parametrize(("stiffness", "words"), [(2.0, "softer"), (5000.0, "stiffer")])
+async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: str) -> None:
+    desk = await table()
+    await desk.planner.step("soft_body", soft(stiffness), desk.header())
+    assert words in desk.planner.note
+    least, largest = stretch_range(SCENE.sheet)
+    target = await desk.rest_at(in_world(on_cylinder(0.0, -0.001)), 300)
+    assert target.stretch_ratio == pytest.approx(least if words == "softer" else largest)
+
+
+def test_the_arms_pull_limits_the_stretch() -> None:
+    weak = SCENE.sheet.model_copy(update={"max_edge_force_n": 8.0})
+    _, largest = stretch_range(weak)
+    force = edge_force_n(
+        compliance_for(1e4, weak).stretch_ratio,
+        young_modulus_pa=weak.young_modulus_pa,
+        height_m=weak.height_m,
+        thickness_m=weak.thickness_m,
+    )
+    assert largest < weak.max_stretch_ratio
+    assert force == pytest.approx(8.0, rel=1e-9)
+
+
+async def test_the_same_inputs_give_the_same_bytes() -> None:
+    async def once() -> list[bytes]:
+        random = np.random.default_rng(3)
+        desk = await table()
+        for _ in range(100):
+            position = in_world(on_cylinder(random.uniform(-60, 60), random.uniform(-0.01, 0.01)))
+            await desk.see(position, random.uniform(-0.1, 0.1, 3))
+            await desk.planner.step("soft_body", soft(random.uniform(1, 200)), desk.header())
+        return [target.model_dump_json().encode() for target in desk.sent]
+
+    assert await once() == await once()
+
+
+async def test_an_object_turned_in_the_world_is_met_from_the_users_side() -> None:
+    data = YAML(typ="safe").load(SCENE_FILE)
+    data["object"]["world_from_object"] = {
+        "position_m": [0.01, 0.02, -0.05],
+        "rpy_rad": [math.radians(130.0), 0.0, 0.0],
+    }
+    desk = Table(Scene.model_validate(data))
+    await desk.start()
+    world_from_object = transform_from_rpy([0.01, 0.02, -0.05], [math.radians(130.0), 0.0, 0.0])
+    finger = np.array([0.0, 0.02, 0.02])
+    target = await desk.rest_at(finger)
+    assert target.normal_world == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
+    on_object = (inverse(world_from_object) @ np.append(target.contact_world_m, 1.0))[:3]
+    assert np.hypot(on_object[1], on_object[2]) == pytest.approx(RADIUS)

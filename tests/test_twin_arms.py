@@ -1,0 +1,202 @@
+"""The twin's arms: their kinematics, servo and refusals."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from messages.base import Header, Message
+from messages.clock import VirtualClock
+from messages.scene import Scene
+from messages.topics import Topic
+from messages.types import TwinArms
+from nodes.models.rigid import transform_from_rpy
+from nodes.twin.arms import (
+    ACCELERATION_RAD_PER_S2,
+    FAULT_FINITE,
+    FAULT_RANGE,
+    FAULT_STEP,
+    FAULT_WATCHDOG,
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+    STATE_FAULT,
+    STATE_HOLDING,
+    STATE_IDLE,
+    STATE_MOVING,
+    Controller,
+    Servo,
+    forward,
+    joints_for,
+)
+from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
+
+Floats = NDArray[np.float64]
+JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
+SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
+
+
+def test_home_pose_by_hand() -> None:
+    home = forward(np.radians([0.0, 0.0, 90.0, 0.0, 0.0, 0.0]))
+    assert home[:3, 3] == pytest.approx([0.232, 0.0, 0.64], abs=1e-12)
+
+
+@settings(max_examples=30, deadline=None)
+@given(arrays(np.float64, 6, elements=st.floats(-0.2, 0.2)))
+def test_inverse_finds_the_pose(change: Floats) -> None:
+    pose = forward(JOINTS + change)
+    assert forward(joints_for(pose, JOINTS)) == pytest.approx(pose, abs=1e-6)
+
+
+def test_a_pose_out_of_reach_is_an_error() -> None:
+    pose = forward(JOINTS)
+    pose[0, 3] += 1.0
+    with pytest.raises(ValueError, match="cannot reach"):
+        joints_for(pose, JOINTS)
+
+
+def test_the_servo_trails_an_even_command_by_its_lag() -> None:
+    servo, rate = Servo(JOINTS.copy(), 0.025), np.full(6, 0.2)
+    time_s = 0.0
+    for _ in range(400):
+        time_s += 0.001
+        servo.advance(JOINTS + rate * time_s, 0.001)
+    assert (JOINTS + rate * time_s - servo.joints_rad) / rate == pytest.approx(0.025, abs=0.0015)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(arrays(np.float64, 6, elements=st.floats(-3.0, 3.0)), min_size=1, max_size=10))
+def test_the_servo_keeps_its_limits(wanted: list[Floats]) -> None:
+    servo = Servo(JOINTS.copy(), 0.025)
+    for target in wanted:
+        for _ in range(20):
+            before = servo.velocity_rad_per_s
+            servo.advance(target, 0.001)
+            change = np.abs(servo.velocity_rad_per_s - before)
+            assert (change <= ACCELERATION_RAD_PER_S2 * 0.001 * (1 + 1e-9)).all()
+            assert (np.abs(servo.velocity_rad_per_s) <= SPEED_RAD_PER_S * (1 + 1e-9)).all()
+
+
+def command(
+    sequence: int,
+    joints: Floats = JOINTS,
+    *,
+    mode: int = 1,
+    magic: int = 0x4653,
+    version: int = 1,
+    crc: int | None = None,
+) -> list[int]:
+    body = struct.pack(">HHIIHH6f", magic, version, sequence, 0, mode, 0, *joints)
+    body += struct.pack(">I", zlib.crc32(body) if crc is None else crc)
+    return list(struct.unpack(f">{len(body) // 2}H", body))
+
+
+def controller() -> Controller:
+    result = Controller(JOINTS, servo_lag_s=0.025, noise_rad=0.0, watchdog_s=0.1)
+    assert result.take(command(1, mode=0))
+    return result
+
+
+@pytest.mark.parametrize(
+    "registers",
+    [
+        command(2, magic=1),
+        command(2, version=2),
+        command(2, crc=5),
+        command(2, mode=4),
+        command(1),
+        command(2**31 + 1),
+        command(2)[:-1],
+        [],
+    ],
+)
+def test_what_is_not_a_new_command_is_refused(registers: list[int]) -> None:
+    arm = controller()
+    assert not arm.take(registers)
+    assert arm.refused == 1
+    assert (arm.state, arm.accepted) == (STATE_IDLE, 1)
+
+
+@pytest.mark.parametrize(
+    ("joints", "bit"),
+    [
+        (np.where(np.arange(6) == 2, np.nan, JOINTS), FAULT_FINITE),
+        (np.where(np.arange(6) == 4, RANGE_RAD[4, 0] - 0.01, JOINTS), FAULT_RANGE),
+        (JOINTS + 0.2, FAULT_STEP),
+    ],
+)
+def test_what_an_arm_must_not_do_is_a_fault_that_idle_clears(joints: Floats, bit: int) -> None:
+    arm = controller()
+    assert arm.take(command(2, joints))
+    assert (arm.state, arm.faults) == (STATE_FAULT, bit)
+    assert arm.take(command(3))
+    arm.advance(0.1)
+    assert arm.state == STATE_FAULT
+    assert arm.servo.joints_rad == pytest.approx(JOINTS, abs=1e-12)
+    assert arm.take(command(1, mode=0))
+    assert (arm.state, arm.faults) == (STATE_IDLE, 0)
+    assert arm.take(command(2))
+    assert arm.state == STATE_MOVING
+
+
+def test_the_watchdog_stops_an_arm_that_is_no_longer_commanded() -> None:
+    arm = controller()
+    arm.take(command(2, JOINTS + 0.1))
+    arm.advance(0.09)
+    assert arm.state == STATE_MOVING
+    arm.advance(0.02)
+    assert (arm.state, arm.faults) == (STATE_FAULT, FAULT_WATCHDOG)
+    arm.advance(0.3)
+    assert arm.servo.velocity_rad_per_s == pytest.approx(np.zeros(6), abs=1e-12)
+
+
+def test_hold_brakes_and_a_counter_may_wrap() -> None:
+    arm = controller()
+    arm.accepted = 2**32 - 2
+    assert arm.take(command(2**32 - 1, JOINTS + 0.05))
+    arm.advance(0.01)
+    assert arm.take(command(0, mode=2))
+    assert arm.state == STATE_HOLDING
+    arm.advance(0.3)
+    assert arm.servo.velocity_rad_per_s == pytest.approx(np.zeros(6), abs=1e-12)
+
+
+async def test_the_node_switches_its_arms_on_with_the_first_scene() -> None:
+    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+    clock, sent = VirtualClock(), []
+
+    def send(topic: Topic, message: Message, header: Header) -> None:
+        assert isinstance(message, TwinArms)
+        sent.append(message)
+
+    node = TwinArmsNode(
+        TwinArmsParameters(left_port=0, right_port=0), name="twin", clock=clock, send=send
+    )
+    await node.setup()
+    await node.cycle()
+    assert sent == []
+    try:
+        await node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
+        assert node.errors == 0, node.last_error
+        clock.move_to(7_100_000)
+        await node.cycle()
+        clamp = transform_from_rpy(
+            scene.arms.left.flange_from_edge.position_m, scene.arms.left.flange_from_edge.rpy_rad
+        )
+        edge = sent[-1].world_from_flange_left @ clamp
+        half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
+        assert edge[:3, 3] == pytest.approx([-half, 0.0, 0.0], abs=1e-6)
+        assert edge[:3, :3] == pytest.approx(np.eye(3), abs=1e-6)
+        ports = {server.port for server in node.servers.values()}
+        await node.step("scene", scene, Header(2, 0, 0, "virtual", "test", 1))
+        assert {server.port for server in node.servers.values()} == ports
+    finally:
+        await node.close()
