@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from pydantic import Field
 
 from messages.base import Header
@@ -19,8 +18,9 @@ from messages.types import (
     StereoMode,
 )
 from nodes.node import Input, Node, NodeParameters, Output, periodic
+from nodes.renderer.belief import SheetBelief
 from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.stage import Sheet, Stage, sheet_between, transform_of
+from nodes.renderer.stage import Stage
 
 
 class RendererParameters(NodeParameters):
@@ -57,7 +57,7 @@ class Renderer(Node):
     async def setup(self) -> None:
         self._context = headless_context()
         self._stage: Stage | None = None
-        self._sheet: Sheet | None = None
+        self._belief = self._new_belief()
         self._shown = Display(correction=self.parameters.correction, stereo=self.parameters.stereo)
         self._due_ns = 0
         self._number = self._since_pixels = self._late = 0
@@ -70,7 +70,7 @@ class Renderer(Node):
     def on_scene(self, scene: Scene, header: Header) -> None:
         if self._stage is not None:
             self._stage.canvas.release()
-        self._stage, self._sheet = None, None
+        self._stage, self._belief = None, self._new_belief()
         self._stage = Stage(scene, self._context, spacing_m=self.parameters.spacing_m)
 
     def on_display(self, display: Display, header: Header) -> None:
@@ -100,7 +100,10 @@ class Renderer(Node):
     def _draw(self, stage: Stage, start_ns: int) -> None:
         shown, predicted_to_ns = self._shown, start_ns + int(self.parameters.lead_s * 1e9)
         source_ns = self._shape_object(stage, start_ns)
-        sheet = self._believed_sheet(stage)
+        sheet = self._belief.update(
+            stage, self.arm_left, self.arm_right, self.sheet_target, self.fingertip
+        )
+        self.note = self._belief.note
         self._since_pixels += 1
         with_pixels = 0 < shown.pixels_every <= self._since_pixels
         picture = stage.draw(shown, sheet, self._look(stage), read=with_pixels)
@@ -140,39 +143,8 @@ class Renderer(Node):
         recent = used.header is not None and used.age_s() <= self.parameters.stale_s
         return used.header.source_ns if recent and used.header is not None else now_ns
 
-    def _believed_sheet(self, stage: Stage) -> Sheet:
-        """The sheet when the light leaves; the last good one when the arms' poses are no good."""
-        left, right, target = self.arm_left, self.arm_right, self.sheet_target.message
-        age_s, stale_s = max(left.age_s(), right.age_s()), self.parameters.stale_s
-        arms = stage.scene.arms
-        sheet = None
-        if left.message is not None and right.message is not None and age_s <= stale_s:
-            moving = target is not None and self.sheet_target.age_s() <= stale_s
-            sheet = sheet_between(
-                left.message.world_from_flange @ transform_of(arms.left.flange_from_edge),
-                right.message.world_from_flange @ transform_of(arms.right.flange_from_edge),
-                height_m=stage.scene.sheet.height_m,
-                twist_world=target.twist_world if moving and target is not None else np.zeros(6),
-                ahead_s=age_s + self.parameters.lead_s,
-                finger_tip=self._finger_tip(),
-            )
-        if sheet is not None and stage.usable(sheet):
-            self.note = ""
-            self._sheet = sheet
-            return sheet
-        why = f"arm poses {age_s:.2f} s old" if sheet is None else "sheet edge-on or turned away"
-        self.note = f"{why}: holding the last good sheet plane"
-        if self._sheet is None:
-            self._sheet = stage.sheet_at_rest()
-        return self._sheet
-
-    def _finger_tip(self) -> np.ndarray | None:
-        """The fingertip when the light leaves, or None when it is not known."""
-        finger, age_s = self.fingertip.message, self.fingertip.age_s()
-        if finger is None or not finger.valid or age_s > self.parameters.stale_s:
-            return None
-        ahead_s = age_s + self.parameters.lead_s
-        return finger.position_world_m + ahead_s * finger.velocity_world_m_per_s
+    def _new_belief(self) -> SheetBelief:
+        return SheetBelief(stale_s=self.parameters.stale_s, lead_s=self.parameters.lead_s)
 
     def _look(self, stage: Stage) -> Look:
         shown, finger, target = self._shown, self.fingertip.message, self.sheet_target.message

@@ -1,0 +1,544 @@
+"""The judge of the picture: what an eye sees on the true sheet, by tracing rays.
+
+A measuring camera stands at the eye; its picture plane is the imaginary screen (z = 0), a square
+window about the origin.  Each ray is followed to the sheet's triangles, from there to the
+projector, and takes the colour that the projector sends there.  The object itself is traced in the
+same way, as it ought to be seen.  Sizes are then measured in the pictures, as the paper did.
+
+It shares no code with the renderer: own rays, own projector, own object.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+from messages.scene import Projector, Scene
+from nodes.models.rigid import apply, inverse, transform_from_rpy
+from nodes.twin.membrane import DeformedSheet, Rubber, solve
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Bools = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+METRES_PER_PX = 0.00035
+"""Half of the paper's 0.7 mm."""
+
+HALF_WINDOW_M = 0.12
+SEEN_SAMPLES = 2
+PROPER_SAMPLES = 8
+SHADOW_TOLERANCE = 0.002
+"""Relative depth behind the lit surface from which a point lies in its shadow."""
+
+LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
+OBJECT_COLOUR = np.array([0.95, 0.72, 0.60])
+AMBIENT = 0.25
+
+
+class NotMeasurableError(ValueError):
+    """The picture does not show what is to be measured; the message says what is missing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """A fan of rays: from `origin` (3,) along first + column * right + row * down, each (3,)."""
+
+    origin: Floats
+    first: Floats
+    right: Floats
+    down: Floats
+    width: int
+    height: int
+
+    def directions(self) -> Floats:
+        """(height, width, 3)."""
+        columns, rows = np.arange(self.width), np.arange(self.height)
+        return self.first + columns[None, :, None] * self.right + rows[:, None, None] * self.down
+
+
+@dataclass(frozen=True, slots=True)
+class Hits:
+    """First hits of a fan of rays.
+
+    triangle: (height, width), -1 where nothing is hit.  inverse_range: (height, width), one over
+    the ray parameter of the hit, 0 where there is none.  weights: (triangles, 3, 3), which take
+    (1, column, row) to unscaled barycentric weights.
+    """
+
+    triangle: NDArray[np.int32]
+    inverse_range: Floats
+    weights: Floats
+
+
+def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
+    """Intersect a fan of rays with triangles (triangles, 3) of vertices (vertices, 3).
+
+    A direction d = sum of w_i (vertex_i - origin) meets the triangle where all w_i >= 0, at the
+    parameter 1 / sum(w); the weights are linear in column and row.  Triangles that reach behind the
+    origin, or are seen edge-on, are not hit.
+    """
+    corners = (vertices - rays.origin)[triangles]
+    basis = np.column_stack([rays.first, rays.right, rays.down])
+    volume = np.einsum("ti,ti->t", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    size = np.linalg.norm(corners, axis=2).prod(axis=1)
+    # Vertices as the fan's own pixels: their (1, column, row) up to the depth.
+    pixels = corners @ np.linalg.inv(basis).T
+    ahead = (pixels[..., 0] > 1e-9).all(axis=1) & (np.abs(volume) > 1e-12 * size)
+    weights = np.zeros((len(triangles), 3, 3))
+    weights[ahead] = np.linalg.inv(corners[ahead].transpose(0, 2, 1)) @ basis
+    at = pixels[..., 1:] / np.where(ahead, 1.0, np.nan)[:, None, None] / pixels[..., :1]
+    limit = np.array([rays.width - 1, rays.height - 1])
+    low, high = np.ceil(at.min(axis=1) - 1e-6), np.floor(at.max(axis=1) + 1e-6)
+    ahead &= (high >= 0).all(axis=1) & (low <= limit).all(axis=1) & (high >= low).all(axis=1)
+    chosen = np.nonzero(ahead)[0]
+    low = np.clip(low[chosen], 0, limit).astype(int)
+    high = np.clip(high[chosen], 0, limit).astype(int) + 1
+
+    nearest = np.zeros((rays.height, rays.width))
+    triangle = np.full((rays.height, rays.width), -1, np.int32)
+    columns, rows = np.arange(rays.width, dtype=float), np.arange(rays.height, dtype=float)[:, None]
+    for index, (c0, r0), (c1, r1) in zip(chosen, low, high, strict=True):
+        (a, b, c), x, y = weights[index].T, columns[c0:c1], rows[r0:r1]
+        w0 = (a[0] + b[0] * x) + c[0] * y
+        w1 = (a[1] + b[1] * x) + c[1] * y
+        w2 = (a[2] + b[2] * x) + c[2] * y
+        total = w0 + w1 + w2
+        here = nearest[r0:r1, c0:c1]
+        hit = (np.minimum(np.minimum(w0, w1), w2) >= -1e-9 * total) & (total > here)
+        here[hit] = total[hit]
+        triangle[r0:r1, c0:c1][hit] = index
+    return Hits(triangle, nearest, weights)
+
+
+class TrueProjector:
+    """The projector on the true sheet: which pixel lights a point, and where a pixel lands."""
+
+    def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
+        """vertices: (vertices, 3) of the sheet, world.  triangles: (triangles, 3)."""
+        pose, lens = projector.world_from_projector, projector.lens
+        self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._lens = lens
+        rotation = self._world_from_projector[:3, :3]
+        corner = np.array([-lens.cx_px / lens.fx_px, -lens.cy_px / lens.fy_px, 1.0])
+        self._rays = Rays(
+            origin=self._world_from_projector[:3, 3],
+            first=rotation @ corner,
+            right=rotation[:, 0] / lens.fx_px,
+            down=rotation[:, 1] / lens.fy_px,
+            width=projector.width_px,
+            height=projector.height_px,
+        )
+        if any(lens.distortion):
+            raise ValueError(
+                f"projector.lens.distortion: {lens.distortion}: the twin's projector is a pinhole; "
+                "give zeros"
+            )
+        self._vertices, self._triangles = vertices, triangles
+
+    @cached_property
+    def _hits(self) -> Hits:
+        return first_hits(self._rays, self._vertices, self._triangles)
+
+    def pixels_of(self, points: Floats) -> tuple[Floats, Bools]:
+        """Projector pixels (..., 2) that send light towards points (..., 3), and which are lit.
+
+        Not lit: outside the picture, or behind another part of the sheet.
+        """
+        local = apply(inverse(self._world_from_projector), points)
+        depth = local[..., 2]
+        ahead = depth > 1e-6
+        share = 1.0 / np.where(ahead, depth, 1.0)
+        column = self._lens.fx_px * local[..., 0] * share + self._lens.cx_px
+        row = self._lens.fy_px * local[..., 1] * share + self._lens.cy_px
+        nearest = np.rint(np.stack([column, row], axis=-1))
+        size = np.array([self._rays.width, self._rays.height])
+        inside = ahead & ((nearest >= 0) & (nearest < size)).all(axis=-1)
+        at = np.where(inside[..., None], nearest, 0).astype(int)
+        first = self._hits.inverse_range[at[..., 1], at[..., 0]]
+        lit = inside & (share >= first * (1.0 - SHADOW_TOLERANCE))
+        return np.stack([column, row], axis=-1), lit
+
+    def lands_at(self, pixels: Floats) -> tuple[Floats, Bools]:
+        """World points (n, 3) of the sheet that pixels (n, 2) light first, and which do."""
+        limit = np.array([self._rays.width - 1, self._rays.height - 1])
+        inside: Bools = np.all((pixels >= -0.5) & (pixels <= limit + 0.5), axis=1)
+        at = np.clip(np.rint(np.where(inside[:, None], pixels, 0)), 0, limit).astype(int)
+        triangle = self._hits.triangle[at[:, 1], at[:, 0]]
+        inside &= triangle >= 0
+        ones = np.column_stack([np.ones(len(pixels)), pixels])
+        total = np.einsum("nij,nj->n", self._hits.weights[triangle], ones)
+        inside &= total > 0.0
+        rays = self._rays
+        directions = rays.first + pixels[:, :1] * rays.right + pixels[:, 1:] * rays.down
+        return rays.origin + directions / np.where(inside, total, 1.0)[:, None], inside
+
+
+def eye_rays(eye: Floats, *, metres_per_px: float, half_window_m: float, samples: int) -> Rays:
+    """Rays of the measuring camera, `samples` x `samples` to a pixel, top left first."""
+    pixels = round(2.0 * half_window_m / metres_per_px)
+    pitch = metres_per_px / samples
+    count = pixels * samples
+    edge = 0.5 * (count - 1) * pitch
+    return Rays(
+        origin=eye,
+        first=np.array([-edge, edge, 0.0]) - eye,
+        right=np.array([pitch, 0.0, 0.0]),
+        down=np.array([0.0, -pitch, 0.0]),
+        width=count,
+        height=count,
+    )
+
+
+def seen(
+    projected: Image,
+    sheet: DeformedSheet,
+    scene: Scene,
+    *,
+    eye: Floats,
+    metres_per_px: float = METRES_PER_PX,
+    half_window_m: float = HALF_WINDOW_M,
+) -> Image:
+    """The picture (rows, columns, 3) that the measuring camera takes of the sheet.
+
+    projected: the projector's picture (height, width, 3), top row first.  Black where there is no
+    sheet, and where a fold keeps the light away.
+    """
+    vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
+    rays = eye_rays(
+        eye, metres_per_px=metres_per_px, half_window_m=half_window_m, samples=SEEN_SAMPLES
+    )
+    hits = first_hits(rays, vertices, triangles)
+    hit = hits.triangle >= 0
+    points = rays.origin + rays.directions()[hit] / hits.inverse_range[hit][:, None]
+    pixels, lit = TrueProjector(scene.projector, vertices, triangles).pixels_of(points)
+    where = np.full((rays.height, rays.width, 2), -10.0, np.float32)
+    where[hit] = np.where(lit[:, None], pixels, -10.0)
+    sampled = cv2.remap(
+        projected, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
+    )
+    return _averaged(sampled.astype(np.float32), SEEN_SAMPLES)
+
+
+def _averaged(image: NDArray[np.float32], samples: int) -> Image:
+    height, width = image.shape[0] // samples, image.shape[1] // samples
+    mean = image.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))
+    rounded: Image = np.rint(mean).astype(np.uint8)
+    return rounded
+
+
+@dataclass(frozen=True, slots=True)
+class TrueObject:
+    """The object as it is: vertices (vertices, 3) world, outward triangles, unit normals."""
+
+    vertices: Floats
+    triangles: Indices
+    normals: Floats
+
+
+class TrueCylinder:
+    """The scene's cylinder, at rest or moved as a skin is, on a mesh of its own."""
+
+    def __init__(self, scene: Scene, *, around: int = 180, along: int = 48) -> None:
+        cylinder, pose = scene.object.geometry, scene.object.world_from_object
+        self._around, self._along = around, along
+        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._length, self._radius = cylinder.length_m, cylinder.radius_m
+        angle = 2.0 * np.pi * np.arange(around) / around
+        station = np.linspace(-0.5, 0.5, along + 1) * cylinder.length_m
+        self._station, self._angle = (
+            values.ravel() for values in np.meshgrid(station, angle, indexing="ij")
+        )
+        side = np.column_stack(
+            [self._station, self._radius * np.sin(self._angle), self._radius * np.cos(self._angle)]
+        )
+        self._rest = apply(self._world_from_object, side)
+        i, j = (v.ravel() for v in np.meshgrid(np.arange(along), np.arange(around), indexing="ij"))
+        here, beside = i * around + j, i * around + (j + 1) % around
+        self._triangles = np.concatenate(
+            [
+                np.column_stack([here, here + around, beside + around]),
+                np.column_stack([here, beside + around, beside]),
+            ]
+        )
+
+    def at_rest(self) -> TrueObject:
+        return self._object(self._rest)
+
+    def displaced(self, skin_vertices: Floats, displacement: Floats) -> TrueObject:
+        """Moved by a skin's displacement (skin vertices, 3), linear between its vertices.
+
+        Skin vertices off the cylinder's side (inside its end caps) are left out.  ValueError if too
+        few lie on it.
+        """
+        local = apply(inverse(self._world_from_object), skin_vertices)
+        radius = np.hypot(local[:, 1], local[:, 2])
+        side = np.abs(radius - self._radius) < 0.02 * self._radius
+        if side.sum() < 8:
+            raise ValueError(f"{side.sum()} of {len(side)} skin vertices lie on the cylinder")
+        angle = np.arctan2(local[side, 1], local[side, 2]) * self._radius
+        turn = 2.0 * np.pi * self._radius
+        # Unrolled three times over, so that the seam lies inside; stretched a little at the ends.
+        places = np.concatenate(
+            [np.column_stack([local[side, 0], angle + k * turn]) for k in (-1, 0, 1)]
+        )
+        values = np.tile(displacement[side], (3, 1))
+        at = np.column_stack([self._station, self._angle * self._radius])
+        moved = LinearNDInterpolator(places, values)(at)
+        outside = np.isnan(moved).any(axis=1)
+        if outside.any():
+            moved[outside] = NearestNDInterpolator(places, values)(at[outside])
+        return self._object(self._rest + moved)
+
+    def _object(self, vertices: Floats) -> TrueObject:
+        """Close the ends by a fan about each rim's mean, and find the normals."""
+        around, rim = self._around, np.arange(self._around)
+        last = self._along * around
+        count = len(vertices)
+        centres = np.stack([vertices[:around].mean(axis=0), vertices[last:].mean(axis=0)])
+        after = (rim + 1) % around
+        caps = [
+            np.column_stack([np.full(around, count), rim, after]),
+            np.column_stack([np.full(around, count + 1), last + after, last + rim]),
+        ]
+        grid = vertices.reshape(self._along + 1, around, 3)
+        about = np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1)
+        normals = np.cross(np.gradient(grid, axis=0), about).reshape(-1, 3)
+        axis = centres[1] - centres[0]
+        normals = np.concatenate([normals, [-axis, axis]])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return TrueObject(
+            np.concatenate([vertices, centres]),
+            np.concatenate([self._triangles, *caps]),
+            normals,
+        )
+
+
+def proper(
+    true_object: TrueObject,
+    *,
+    eye: Floats,
+    flat: bool,
+    metres_per_px: float = METRES_PER_PX,
+    half_window_m: float = HALF_WINDOW_M,
+) -> Image:
+    """The picture (rows, columns, 3) that the eye ought to see: the object itself, on black.
+
+    The object must lie before the eye (ValueError).
+    """
+    if (true_object.vertices[:, 2] > eye[2] - 1e-3).any():
+        raise ValueError("the object reaches up to the eye")
+    vertices, triangles = true_object.vertices, true_object.triangles
+    size = round(2.0 * half_window_m / metres_per_px)
+    shadow = eye[:2] + (vertices[:, :2] - eye[:2]) * (eye[2] / (eye[2] - vertices[:, 2:]))
+    span = shadow / metres_per_px * [1.0, -1.0] + 0.5 * size
+    left, top = np.clip(np.floor(span.min(axis=0)).astype(int), 0, size)
+    right, bottom = np.clip(np.ceil(span.max(axis=0)).astype(int), 0, size)
+    whole = np.zeros((size, size, 3), np.uint8)
+    if right <= left or bottom <= top:
+        return whole
+    # Only the object's own part of the picture is traced, so that it can be traced finely.
+    rays = eye_rays(
+        eye, metres_per_px=metres_per_px, half_window_m=half_window_m, samples=PROPER_SAMPLES
+    )
+    rays = replace(
+        rays,
+        first=rays.first + PROPER_SAMPLES * (left * rays.right + top * rays.down),
+        width=PROPER_SAMPLES * int(right - left),
+        height=PROPER_SAMPLES * int(bottom - top),
+    )
+    corners = vertices[triangles]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    front = triangles[np.einsum("ti,ti->t", outward, eye - corners[:, 0]) > 0.0]
+    hits = first_hits(rays, vertices, front)
+    hit = hits.triangle >= 0
+    picture = np.zeros((rays.height, rays.width, 3), np.float32)
+    if flat:
+        picture[hit] = 255.0
+    else:
+        row, column = np.nonzero(hit)
+        index = hits.triangle[hit]
+        ones = np.column_stack([np.ones(len(row)), column, row])
+        weights = np.einsum("nij,nj->ni", hits.weights[index], ones)
+        normals = np.einsum("ni,nij->nj", weights, true_object.normals[front[index]])
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        brightness = AMBIENT + (1.0 - AMBIENT) * np.maximum(normals @ LIGHT, 0.0)
+        picture[hit] = 255.0 * brightness[:, None] * OBJECT_COLOUR
+    whole[top:bottom, left:right] = _averaged(picture, PROPER_SAMPLES)
+    return whole
+
+
+class _Silhouette:
+    """The largest bright blob of a picture, and where lines through it begin and end."""
+
+    def __init__(self, picture: Image) -> None:
+        gray = picture.astype(np.float64).mean(axis=2)
+        bright = gray[gray > 25.0]
+        if len(bright) < 400:
+            raise NotMeasurableError(f"only {len(bright)} pixels of the picture are lit")
+        self.white = float(np.quantile(bright, 0.9))
+        mask = (gray > 0.5 * self.white).astype(np.uint8)
+        _, labels, statistics, _ = cv2.connectedComponentsWithStats(mask)
+        largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
+        left, top, width, height, area = statistics[largest]
+        if area < 400:
+            raise NotMeasurableError(f"the largest bright blob has only {area} pixels")
+        if left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]:
+            raise NotMeasurableError("the object reaches the picture's border")
+        # Other blobs go; a margin keeps the edge's own soft pixels.
+        keep = cv2.dilate((labels == largest).astype(np.uint8), np.ones((9, 9), np.uint8))
+        self._gray = np.where(keep > 0, gray, 0.0) / self.white
+        self.middle_column = left + 0.5 * (width - 1)
+        self.middle_row = top + 0.5 * (height - 1)
+
+    def rows_of_column(self, column: float) -> tuple[float, float]:
+        """Where the object begins and ends (rows) on a column, between columns interpolated."""
+        return self._ends_between(self._gray.T, column)
+
+    def columns_of_row(self, row: float) -> tuple[float, float]:
+        """Where the object begins and ends (columns) on a row."""
+        return self._ends_between(self._gray, row)
+
+    def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:
+        before = int(np.floor(at))
+        share = at - before
+        first, second = _ends(lines[before]), _ends(lines[before + 1])
+        return (
+            (1 - share) * first[0] + share * second[0],
+            (1 - share) * first[1] + share * second[1],
+        )
+
+
+def _ends(profile: Floats) -> tuple[float, float]:
+    """Sub-pixel first and last edge of a bright run.
+
+    The edge is where a sharp one would have to be for the same light: exact for any blur that is
+    symmetric, unlike the crossing of half the brightness.
+    """
+    bright = np.nonzero(profile > 0.5)[0]
+    if len(bright) < 12:
+        raise NotMeasurableError("the object is too narrow, or missing, where it is measured")
+    return _edge(profile, bright[0]), len(profile) - 1 - _edge(
+        profile[::-1], len(profile) - 1 - bright[-1]
+    )
+
+
+def _edge(profile: Floats, first: int) -> float:
+    reach = 5
+    low, high = max(first - reach, 0), first + reach
+    plateau = float(np.median(profile[first + 2 : high + 1]))
+    return high + 0.5 - float(profile[low : high + 1].sum()) / max(plateau, 1e-6)
+
+
+INSET = 0.05
+"""Widths of the tilted cylinder are taken this share of its height inside the upper and lower edge,
+where its rounded corners no longer count."""
+
+MIDDLE_COLUMNS = 17
+"""Heights are means over this many columns about the middle."""
+
+
+def _height(shape: _Silhouette) -> tuple[float, float]:
+    offsets = np.arange(MIDDLE_COLUMNS) - MIDDLE_COLUMNS // 2
+    rows = np.array([shape.rows_of_column(shape.middle_column + offset) for offset in offsets])
+    top, bottom = rows.mean(axis=0)
+    return float(top), float(bottom)
+
+
+def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, float]:
+    """Height, upside width and downside width (m) of the cylinder in a flat-shaded picture.
+
+    As section VI-B measures them.  NotMeasurableError when it is cut off, broken or missing.
+    """
+    shape = _Silhouette(picture)
+    top, bottom = _height(shape)
+    inset = INSET * (bottom - top)
+    upper = shape.columns_of_row(top + inset)
+    lower = shape.columns_of_row(bottom - inset)
+    return (
+        (bottom - top) * metres_per_px,
+        (upper[1] - upper[0]) * metres_per_px,
+        (lower[1] - lower[0]) * metres_per_px,
+    )
+
+
+def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
+    """Height and width (m) through the middle of the cylinder in a flat-shaded picture.
+
+    As section VI-C measures them.  NotMeasurableError when it is cut off, broken or missing.
+    """
+    shape = _Silhouette(picture)
+    top, bottom = _height(shape)
+    left, right = shape.columns_of_row(0.5 * (top + bottom))
+    return (bottom - top) * metres_per_px, (right - left) * metres_per_px
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """The truth in which a frame was shown.
+
+    world_from_flange_...: (4, 4).  finger_tip: (3,) or None.  skin_vertices, displacement:
+    (skin vertices, 3) or both None for the object at rest.
+    """
+
+    scene: Scene
+    world_from_flange_left: Floats
+    world_from_flange_right: Floats
+    finger_tip: Floats | None
+    skin_vertices: NDArray[np.float32] | None
+    displacement: NDArray[np.float32] | None
+    flat: bool
+    metres_per_px: float
+
+
+def true_sheet(
+    scene: Scene,
+    world_from_flange_left: Floats,
+    world_from_flange_right: Floats,
+    finger_tip: Floats | None,
+) -> DeformedSheet:
+    """The membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or None."""
+    arms, sheet = scene.arms, scene.sheet
+    edges = [
+        world_from_flange
+        @ transform_from_rpy(spec.flange_from_edge.position_m, spec.flange_from_edge.rpy_rad)
+        for world_from_flange, spec in (
+            (world_from_flange_left, arms.left),
+            (world_from_flange_right, arms.right),
+        )
+    ]
+    rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
+    return solve(
+        rubber, edges[0], edges[1], finger_tip=finger_tip, finger_radius_m=scene.finger.radius_m
+    )
+
+
+def take_picture(projected: Image, situation: Situation, *, eye: Floats) -> tuple[Image, Image]:
+    """What the eye sees of a projected picture, and what it ought to see: both (rows, columns, 3).
+
+    Raises NotConvergedError or ValueError when the situation has no picture.
+    """
+    scene = situation.scene
+    sheet = true_sheet(
+        scene,
+        situation.world_from_flange_left,
+        situation.world_from_flange_right,
+        situation.finger_tip,
+    )
+    cylinder = TrueCylinder(scene)
+    if situation.skin_vertices is None or situation.displacement is None:
+        true_object = cylinder.at_rest()
+    else:
+        true_object = cylinder.displaced(
+            situation.skin_vertices.astype(np.float64), situation.displacement.astype(np.float64)
+        )
+    scale = situation.metres_per_px
+    return (
+        seen(projected, sheet, scene, eye=eye, metres_per_px=scale),
+        proper(true_object, eye=eye, flat=situation.flat, metres_per_px=scale),
+    )

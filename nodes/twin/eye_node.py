@@ -1,0 +1,119 @@
+"""The twin's eye: takes pictures of the projected frames on the true sheet, for the experiments."""
+
+from __future__ import annotations
+
+import asyncio
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+from pydantic import Field
+
+from messages.base import Header
+from messages.scene import Positive, Scene
+from messages.types import Display, Frame, Skin, SoftBody, TwinArms, TwinEye, TwinFinger
+from nodes.node import Input, Node, NodeParameters, Output
+from nodes.twin.eye import METRES_PER_PX, Situation, take_picture
+
+Key = tuple[str, str]
+
+
+class TwinEyeParameters(NodeParameters):
+    metres_per_px: Positive = Field(default=METRES_PER_PX, description="on the imaginary screen")
+    most_waiting: int = Field(default=32, ge=1, description="labels that may wait for a picture")
+    again_after_s: Positive = Field(
+        default=5.0, description="the same label is pictured anew after this long at the earliest"
+    )
+
+
+class TwinEyeNode(Node):
+    """Pictures each labelled mono frame that carries pixels, one per label and correction.
+
+    A picture takes about a second, so further frames of a label that waits, or was just pictured,
+    are passed over on purpose; they are not counted as lost.  The sheet, the finger and the object
+    are those of the frame's arrival: hold them still for a picture that shall be measured.
+    """
+
+    parameters: TwinEyeParameters
+    scene: Input[Scene]
+    frame: Input[Frame]
+    display: Input[Display]
+    twin__arms: Input[TwinArms]
+    twin__finger: Input[TwinFinger]
+    soft_body: Input[SoftBody]
+    skin: Input[Skin]
+    twin__eye: Output[TwinEye]
+
+    async def setup(self) -> None:
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix=self.name)
+        self._waiting: dict[Key, tuple[Situation, Frame, Header]] = {}
+        self._last: tuple[Key, int] | None = None
+        self._refused: set[Key] = set()
+        self._task: asyncio.Task[None] | None = None
+
+    async def close(self) -> None:
+        self._waiting.clear()
+        if self._task is not None:
+            await asyncio.gather(self._task, return_exceptions=True)
+        self._worker.shutdown()
+
+    def on_frame(self, frame: Frame, header: Header) -> None:
+        key = (frame.label, frame.correction)
+        if not frame.pixels or not frame.label or key in self._waiting or self._just_taken(key):
+            return
+        arms, scene = self.twin__arms.message, self.scene.message
+        if scene is None or arms is None:
+            self.note = "waits for the scene and the true arms"
+        elif frame.stereo != "mono":
+            self.note = f'pictures mono frames only; "{frame.label}" is {frame.stereo}'
+        elif len(self._waiting) >= self.parameters.most_waiting:
+            if key not in self._refused:
+                self._refused.add(key)
+                self.report_error("on_frame", OverflowError(f'no room for "{frame.label}"'))
+        else:
+            finger, body, skin = (
+                self.twin__finger.message,
+                self.soft_body.message,
+                self.skin.message,
+            )
+            matching = body is not None and skin is not None and body.mesh_id == skin.mesh_id
+            display = self.display.message
+            situation = Situation(
+                scene=scene,
+                world_from_flange_left=arms.world_from_flange_left,
+                world_from_flange_right=arms.world_from_flange_right,
+                finger_tip=None if finger is None else finger.position_world_m,
+                skin_vertices=skin.vertices_world_m if matching and skin is not None else None,
+                displacement=body.displacement_world_m if matching and body is not None else None,
+                flat=display is not None and display.shading == "flat",
+                metres_per_px=self.parameters.metres_per_px,
+            )
+            self._waiting[key] = (situation, frame, header)
+            if self._task is None or self._task.done():
+                self._task = asyncio.get_running_loop().create_task(self._picture_all())
+
+    def _just_taken(self, key: Key) -> bool:
+        if self._last is None or self._last[0] != key:
+            return False
+        return self.clock.now_ns() - self._last[1] < self.parameters.again_after_s * 1e9
+
+    async def _picture_all(self) -> None:
+        while self._waiting:
+            key, (situation, frame, header) = next(iter(self._waiting.items()))
+            await self.call("picture", self._picture, situation, frame, header)
+            self._waiting.pop(key, None)
+            self._refused.discard(key)
+            self._last = (key, self.clock.now_ns())
+
+    async def _picture(self, situation: Situation, frame: Frame, header: Header) -> None:
+        eye = frame.eyes_world_m.mean(axis=0)
+        job = partial(take_picture, frame.pixels[0], situation, eye=eye)
+        seen, proper = await asyncio.get_running_loop().run_in_executor(self._worker, job)
+        picture = TwinEye(
+            label=frame.label,
+            correction=frame.correction,
+            metres_per_px=self.parameters.metres_per_px,
+            seen=seen,
+            proper=proper,
+        )
+        self.note = f'pictured "{frame.label}"'
+        self.twin__eye.publish(picture, source_ns=header.source_ns)

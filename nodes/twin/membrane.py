@@ -1,0 +1,429 @@
+"""The true sheet: a finite-element membrane that is clamped at two edges and pushed by a finger.
+
+Incompressible neo-Hookean rubber in plane stress, W = mu/2 (I1 - 3) with mu = E/3.  A membrane has
+no bending stiffness and would buckle into ever finer wrinkles; where the taut law would press, the
+energy is therefore relaxed to that of a tension field (Pipkin, IMA J. Appl. Math. 36, 1986): along
+the wrinkles uniaxial, across them free, and nothing where the sheet is slack.  The relaxed energy
+is convex in the strain, so that Newton's method with a line search comes down to its least.
+
+Bilinear quadrilaterals with 2x2 Gauss points; the mesh is finer around the finger.  The fingertip
+is a rigid sphere that is pushed in along the sheet's normal, in steps; stiff penalties keep the
+sheet out of it, and what it has touched sticks to it, as rubber does to skin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Bools = NDArray[np.bool_]
+
+CELLS = 32
+FINEST_SHARE = 0.008
+"""Cell under the finger over the sheet's side: 1.9 mm of 240."""
+
+SLACK_TENSION = 2e-4
+"""Isotropic tension, in shear moduli, that keeps slack and wrinkled places from floating."""
+
+CONTACT_PA_PER_M = 1e10
+"""Pressure of the finger per depth of penetration: 0.01 mm under 10 N on 1 cm2."""
+
+LARGEST_STEP_RADII = 0.7
+"""Advance of the finger per step, in its radii: a longer one could jump through the sheet."""
+
+MOST_ITERATIONS = 80
+
+
+class NotConvergedError(RuntimeError):
+    """The membrane's equilibrium was not found; the message gives the residual."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rubber:
+    """width_m between the clamps when slack, height_m along them."""
+
+    width_m: float
+    height_m: float
+    thickness_m: float
+    young_modulus_pa: float
+
+
+@dataclass(frozen=True, slots=True)
+class DeformedSheet:
+    """rest_m: (rows, columns, 2) from the left bottom corner.  positions: (rows, columns, 3) world.
+
+    finger_force_n: (3,) of the sheet on the finger.  left_force_n, right_force_n: (3,) of the sheet
+    on the clamps.  iterations: Newton steps taken in all.
+    """
+
+    rest_m: Floats
+    positions: Floats
+    finger_force_n: Floats
+    left_force_n: Floats
+    right_force_n: Floats
+    iterations: int
+
+    def triangles(self) -> Indices:
+        """(triangles, 3) indices into the flattened positions, counter-clockwise for the user."""
+        rows, columns = self.positions.shape[:2]
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        right, above = corner + 1, corner + columns
+        return np.concatenate(
+            [
+                np.column_stack([corner, right, above + 1]),
+                np.column_stack([corner, above + 1, above]),
+            ]
+        )
+
+
+def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
+    """(cells + 1,) coordinates from 0 to `length_m`, finest at `focus_m`; uniform for None."""
+    if focus_m is None:
+        return np.linspace(0.0, length_m, cells + 1)
+    samples = np.linspace(0.0, length_m, 4001)
+    away = np.abs(samples - np.clip(focus_m, 0.0, length_m)) / length_m
+
+    def counted(growth: float) -> Floats:
+        density = 1.0 / (length_m * (FINEST_SHARE + growth * away))
+        steps = 0.5 * (density[1:] + density[:-1]) * np.diff(samples)
+        return np.concatenate([[0.0], np.cumsum(steps)])
+
+    low, high = 0.0, 2.0
+    for _ in range(50):
+        growth = 0.5 * (low + high)
+        low, high = (growth, high) if counted(growth)[-1] > cells else (low, growth)
+    count = counted(high)
+    return np.interp(np.linspace(0.0, count[-1], cells + 1), count, samples)
+
+
+class _Mesh:
+    """The assembled form of one rectangular mesh."""
+
+    def __init__(self, rubber: Rubber, x: Floats, y: Floats) -> None:
+        columns, rows = len(x), len(y)
+        self.shape = (rows, columns)
+        self.shear_modulus = rubber.young_modulus_pa / 3.0
+        corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+        self.elements = np.column_stack(
+            [corner, corner + 1, corner + columns + 1, corner + columns]
+        )
+        dx, dy = np.tile(np.diff(x), rows - 1), np.repeat(np.diff(y), columns - 1)
+        self.weight = (dx * dy * rubber.thickness_m / 4.0)[:, None]
+        point = 0.5 + np.array([-0.5, 0.5]) / np.sqrt(3.0)
+        s, t = (values.ravel() for values in np.meshgrid(point, point))
+        along_s = np.column_stack([-(1 - t), 1 - t, t, -t])
+        along_t = np.column_stack([-(1 - s), -s, s, 1 - s])
+        # (elements, Gauss points, nodes, 2): gradient of each shape function in the rest plane.
+        self.gradient = np.stack(
+            [along_s / dx[:, None, None], along_t / dy[:, None, None]], axis=-1
+        )
+        self.node_area = np.zeros(rows * columns)
+        np.add.at(self.node_area, self.elements, (dx * dy / 4.0)[:, None])
+        x_grid, y_grid = np.meshgrid(x, y)
+        self.rest = np.stack([x_grid, y_grid], axis=-1)
+        clamped = np.zeros(self.shape, bool)
+        clamped[:, [0, -1]] = True
+        self.free = np.nonzero(np.repeat(~clamped.ravel(), 3))[0]
+        number = np.full(rows * columns * 3, -1)
+        number[self.free] = np.arange(len(self.free))
+        dofs = (3 * self.elements[:, :, None] + np.arange(3)).reshape(-1, 12)
+        row = number[np.repeat(dofs, 12, axis=1)].ravel()
+        column = number[np.tile(dofs, (1, 12))].ravel()
+        self._kept = (row >= 0) & (column >= 0)
+        # Entries are summed into a fixed sparsity pattern: found once, used in every iteration.
+        size = len(self.free)
+        keys = column[self._kept].astype(np.int64) * size + row[self._kept]
+        unique, self._slot = np.unique(keys, return_inverse=True)
+        self._row_of = unique % size
+        self._start_of = np.searchsorted(unique // size, np.arange(size + 1))
+        self._diagonal = np.searchsorted(unique, np.arange(size) * (size + 1))
+        self.number = number
+        self._unique, self._size = unique, size
+
+    def deformation(self, positions: Floats) -> tuple[Floats, Floats]:
+        """F (elements, points, 3, 2) and C as (..., [C11, C22, C12]) at the Gauss points."""
+        at_nodes = positions[self.elements].transpose(0, 2, 1)[:, None]
+        f = at_nodes @ self.gradient
+        a, b = f[..., 0], f[..., 1]
+        c = np.stack([(a * a).sum(-1), (b * b).sum(-1), (a * b).sum(-1)], axis=-1)
+        return f, c
+
+    def energy(self, positions: Floats) -> float:
+        _, c = self.deformation(positions)
+        return float(np.sum(self.weight * relaxed_energy(c, self.shear_modulus)))
+
+    def forces(self, positions: Floats) -> tuple[Floats, Floats]:
+        """Gradient of the energy (nodes * 3,), and the element stiffness (elements, 12, 12)."""
+        f, c = self.deformation(positions)
+        stress, tangent = relaxed_stress(c, self.shear_modulus)
+        g, weight = self.gradient, self.weight
+        b = np.empty((*f.shape[:2], 3, 4, 3))
+        b[..., 0, :, :] = g[..., :, 0, None] * f[..., None, :, 0]
+        b[..., 1, :, :] = g[..., :, 1, None] * f[..., None, :, 1]
+        b[..., 2, :, :] = (
+            g[..., :, 1, None] * f[..., None, :, 0] + g[..., :, 0, None] * f[..., None, :, 1]
+        )
+        elements, points = f.shape[:2]
+        b = b.reshape(elements, points * 3, 12)
+        weighted = (weight[..., None] * stress).reshape(elements, 1, points * 3)
+        force = (weighted @ b)[:, 0]
+        db = (weight[..., None, None] * tangent) @ b.reshape(elements, points, 3, 12)
+        stiffness = b.transpose(0, 2, 1) @ db.reshape(elements, points * 3, 12)
+        full = np.empty((elements, points, 2, 2))
+        full[..., 0, 0], full[..., 1, 1] = stress[..., 0], stress[..., 1]
+        full[..., 0, 1] = full[..., 1, 0] = stress[..., 2]
+        geometric = np.sum(g @ (weight[..., None, None] * full) @ g.swapaxes(-1, -2), axis=1)
+        blocks = stiffness.reshape(elements, 4, 3, 4, 3)
+        for i in range(3):
+            blocks[:, :, i, :, i] += geometric
+        total = np.zeros(len(positions) * 3)
+        dofs = (3 * self.elements[:, :, None] + np.arange(3)).reshape(-1, 12)
+        np.add.at(total, dofs, force)
+        return total, blocks.reshape(elements, 12, 12)
+
+    def matrix(self, stiffness: Floats, contact: Floats) -> csc_array:
+        """The sparse stiffness of the free coordinates; contact: (nodes, 3, 3) on the diagonal."""
+        values = np.bincount(self._slot, stiffness.ravel()[self._kept], minlength=len(self._unique))
+        for node in np.nonzero(contact.any(axis=(1, 2)))[0]:
+            dofs = self.number[3 * node : 3 * node + 3]
+            if dofs[0] >= 0:
+                keys = dofs[None, :] * self._size + dofs[:, None]
+                values[np.searchsorted(self._unique, keys)] += contact[node]
+        return csc_array((values, self._row_of, self._start_of), shape=(self._size, self._size))
+
+
+def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
+    """Larger and smaller eigenvalue (...,) of C, and the larger one's unit vector (..., 2)."""
+    mean, half = 0.5 * (c[..., 0] + c[..., 1]), 0.5 * (c[..., 0] - c[..., 1])
+    radius = np.hypot(half, c[..., 2])
+    angle = 0.5 * np.arctan2(c[..., 2], half)
+    return mean + radius, mean - radius, np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def relaxed_energy(c: Floats, shear_modulus: float) -> Floats:
+    """Energy per rest volume (...,) of C (..., 3) = [C11, C22, C12]: taut, wrinkled or slack."""
+    large, small, _ = _eigen(c)
+    stretched = np.maximum(large, 1.0)
+    taut = small > stretched**-0.5
+    determinant = np.where(taut, large * small, 1.0)
+    full = large + small + 1.0 / determinant - 3.0
+    uniaxial = stretched + 2.0 * stretched**-0.5 - 3.0
+    slack = SLACK_TENSION * (c[..., 0] + c[..., 1])
+    return 0.5 * shear_modulus * (np.where(taut, full, uniaxial) + slack)
+
+
+def relaxed_stress(c: Floats, shear_modulus: float) -> tuple[Floats, Floats]:
+    """Second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12] and its tangent (..., 3, 3).
+
+    The tangent takes the strain [E11, E22, 2 E12].  Derivatives of `relaxed_energy`.
+    """
+    large, small, along = _eigen(c)
+    taut = small > np.maximum(large, 1.0) ** -0.5
+    stress, tangent = np.empty(c.shape), np.empty((*c.shape, 3))
+
+    c11, c22, c12 = np.moveaxis(c[taut], -1, 0)
+    determinant = c11 * c22 - c12 * c12
+    inverse = np.stack([c22, c11, -c12], axis=-1) / determinant[:, None]
+    i1, i2, i3 = np.moveaxis(inverse, -1, 0)
+    stress[taut] = [1.0, 1.0, 0.0] - inverse / determinant[:, None]
+    d = np.empty((len(i1), 3, 3))
+    d[:, 0, 0], d[:, 1, 1] = 2.0 * i1 * i1, 2.0 * i2 * i2
+    d[:, 0, 1] = d[:, 1, 0] = i3 * i3 + i1 * i2
+    d[:, 0, 2] = d[:, 2, 0] = 2.0 * i1 * i3
+    d[:, 1, 2] = d[:, 2, 1] = 2.0 * i2 * i3
+    d[:, 2, 2] = 0.5 * (i1 * i2 + i3 * i3) + i3 * i3
+    tangent[taut] = d * (2.0 / determinant)[:, None, None]
+
+    loose = ~taut
+    stretched, across = np.maximum(large[loose], 1.0), small[loose]
+    n1, n2 = np.moveaxis(along[loose], -1, 0)
+    parallel = np.stack([n1 * n1, n2 * n2, n1 * n2], axis=-1)
+    turning = np.stack([-2.0 * n1 * n2, 2.0 * n1 * n2, n1 * n1 - n2 * n2], axis=-1)
+    pull = 1.0 - stretched**-1.5
+    pull_slope = np.where(large[loose] > 1.0, 1.5 * stretched**-2.5, 0.0)
+    stress[loose] = pull[:, None] * parallel
+    tangent[loose] = (2.0 * pull_slope)[:, None, None] * (
+        parallel[:, :, None] * parallel[:, None, :]
+    ) + (pull / np.maximum(stretched - across, 1e-9))[:, None, None] * (
+        turning[:, :, None] * turning[:, None, :]
+    )
+    stress += [SLACK_TENSION, SLACK_TENSION, 0.0]
+    return shear_modulus * stress, shear_modulus * tangent
+
+
+class _Finger:
+    """A rigid sphere: nodes are kept out by a penalty on their depth, and stick once they touched.
+
+    stuck: (nodes,) which nodes stick; each is held at its place in `anchor` (nodes, 3).
+    """
+
+    def __init__(
+        self, centre: Floats, radius_m: float, node_area: Floats, stuck: Bools, anchor: Floats
+    ) -> None:
+        self._centre, self._radius = centre, radius_m
+        self._stiffness = CONTACT_PA_PER_M * node_area
+        self._stuck, self._anchor = stuck, anchor
+
+    def _depth(self, positions: Floats) -> tuple[Floats, Floats]:
+        offset = positions - self._centre
+        distance = np.linalg.norm(offset, axis=1)
+        outward = offset / np.maximum(distance, 1e-12)[:, None]
+        return np.where(self._stuck, 0.0, np.maximum(self._radius - distance, 0.0)), outward
+
+    def touching(self, positions: Floats) -> Bools:
+        """(nodes,) what sticks now or is pressed."""
+        return self._stuck | (self._depth(positions)[0] > 0.0)
+
+    def energy(self, positions: Floats) -> float:
+        depth, _ = self._depth(positions)
+        away = np.sum((positions - self._anchor) ** 2, axis=1)
+        return float(0.5 * np.sum(self._stiffness * np.where(self._stuck, away, depth**2)))
+
+    def forces(self, positions: Floats) -> tuple[Floats, Floats]:
+        """Gradient (nodes, 3), and its derivative (nodes, 3, 3) less the part that could sink."""
+        depth, outward = self._depth(positions)
+        stiff = np.where(depth > 0.0, self._stiffness, 0.0)
+        held = np.where(self._stuck, self._stiffness, 0.0)
+        gradient = held[:, None] * (positions - self._anchor) - (stiff * depth)[:, None] * outward
+        derivative = stiff[:, None, None] * outward[:, :, None] * outward[:, None, :]
+        return gradient, derivative + held[:, None, None] * np.eye(3)
+
+
+def solve(
+    rubber: Rubber,
+    world_from_left_edge: Floats,
+    world_from_right_edge: Floats,
+    *,
+    finger_tip: Floats | None = None,
+    finger_radius_m: float = 0.007,
+    cells: int = CELLS,
+) -> DeformedSheet:
+    """Equilibrium of the sheet between its edges, pushed by a fingertip from the user's side.
+
+    world_from_..._edge: (4, 4), origin in the clamped edge's middle, y along it.  finger_tip: the
+    foremost point (3,) of the sphere, whose centre is `finger_radius_m` towards the user; None, or
+    a tip before the sheet, pushes nothing.  NotConvergedError if no equilibrium was found.
+    """
+    left, right = world_from_left_edge, world_from_right_edge
+    x_axis = right[:3, 3] - left[:3, 3]
+    distance = float(np.linalg.norm(x_axis))
+    if distance < 1e-3:
+        raise ValueError(f"the sheet's edges are {distance * 1e3:.2f} mm apart")
+    x_axis = x_axis / distance
+    normal = np.cross(x_axis, left[:3, 1] + right[:3, 1])
+    normal /= np.linalg.norm(normal)
+    y_axis = np.cross(normal, x_axis)
+    middle = 0.5 * (left[:3, 3] + right[:3, 3])
+
+    depth = 0.0
+    focus: tuple[float | None, float | None] = (None, None)
+    if finger_tip is not None:
+        offset = finger_tip - middle
+        depth = float(-offset @ normal)
+        if depth > 0.0:
+            focus = (
+                float((offset @ x_axis / distance + 0.5) * rubber.width_m),
+                float(offset @ y_axis + 0.5 * rubber.height_m),
+            )
+    mesh = _Mesh(
+        rubber,
+        graded_axis(rubber.width_m, cells, focus[0]),
+        graded_axis(rubber.height_m, cells, focus[1]),
+    )
+    share = mesh.rest[..., 0, None] / rubber.width_m
+    along = mesh.rest[..., 1, None] - 0.5 * rubber.height_m
+    flat = (1 - share) * (left[:3, 3] + along * left[:3, 1]) + share * (
+        right[:3, 3] + along * right[:3, 1]
+    )
+    positions, iterations = _relax(mesh, flat.reshape(-1, 3), None)
+
+    finger = None
+    if finger_tip is not None and depth > 0.0:
+        steps = int(np.ceil(depth / (LARGEST_STEP_RADII * finger_radius_m)))
+        advance = -(depth / steps) * normal
+        carried = _cone(mesh, focus, rubber)
+        stuck = np.zeros(len(positions), bool)
+        for step in range(1, steps + 1):
+            centre = finger_tip + finger_radius_m * normal - (steps - step) * advance
+            positions = positions + np.where(stuck, 1.0, carried)[:, None] * advance
+            finger = _Finger(centre, finger_radius_m, mesh.node_area, stuck, positions)
+            positions, count = _relax(mesh, positions, finger)
+            stuck = finger.touching(positions)
+            iterations += count
+
+    gradient, _ = mesh.forces(positions)
+    at_nodes = gradient.reshape(*mesh.shape, 3)
+    contact = np.zeros(3) if finger is None else -finger.forces(positions)[0].sum(axis=0)
+    return DeformedSheet(
+        rest_m=mesh.rest,
+        positions=positions.reshape(*mesh.shape, 3),
+        finger_force_n=-contact,
+        left_force_n=-at_nodes[:, 0].sum(axis=0),
+        right_force_n=-at_nodes[:, -1].sum(axis=0),
+        iterations=iterations,
+    )
+
+
+def _cone(mesh: _Mesh, focus: tuple[float | None, float | None], rubber: Rubber) -> Floats:
+    """(nodes,) 1 at the focus, falling to 0 at the clamps and, as far off, along them."""
+    x, y = mesh.rest[..., 0].ravel(), mesh.rest[..., 1].ravel()
+    focus_x, focus_y = focus
+    assert focus_x is not None
+    assert focus_y is not None
+    reach = np.where(x < focus_x, focus_x, rubber.width_m - focus_x)
+    radius = np.hypot((x - focus_x) / np.maximum(reach, 1e-6), (y - focus_y) / np.max(reach))
+    cone: Floats = np.clip(1.0 - radius, 0.0, 1.0)
+    return cone
+
+
+def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, int]:
+    """Newton's method with a line search on the energy; returns positions and steps taken."""
+    positions = start.copy()
+    scale = mesh.shear_modulus * float(mesh.weight.sum()) / float(np.ptp(mesh.rest[..., 0]))
+
+    def energy(at: Floats) -> float:
+        return mesh.energy(at) + (0.0 if finger is None else finger.energy(at))
+
+    current = energy(positions)
+    residual = np.inf
+    for iteration in range(1, MOST_ITERATIONS + 1):
+        gradient, stiffness = mesh.forces(positions)
+        contact = np.zeros((len(positions), 3, 3))
+        if finger is not None:
+            push, contact = finger.forces(positions)
+            gradient = gradient + push.ravel()
+        downhill = -gradient[mesh.free]
+        residual = float(np.linalg.norm(downhill))
+        if residual < 1e-7 * scale:
+            return positions, iteration
+        factor = splu(
+            mesh.matrix(stiffness, contact),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+        free_step = factor.solve(downhill)
+        slope = float(free_step @ downhill)
+        step = np.zeros(positions.shape)
+        step.reshape(-1)[mesh.free] = free_step
+        length = min(1.0, 0.02 / max(float(np.abs(step).max()), 1e-12))
+        for _ in range(30):
+            trial = positions + length * step
+            value = energy(trial)
+            if value <= current - 1e-4 * length * slope + 1e-14 * abs(current):
+                break
+            length *= 0.5
+        else:
+            break
+        positions, current = trial, value
+    if residual < 1e-5 * scale:
+        return positions, iteration
+    raise NotConvergedError(
+        f"membrane: residual {residual:.2e} N after {iteration} steps, wanted {1e-7 * scale:.2e}"
+    )
