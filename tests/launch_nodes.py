@@ -16,10 +16,11 @@ from nodes.node import Input, Node, NodeParameters, Output, periodic
 class BeaconParameters(NodeParameters):
     rate_hz: float = 50.0
     crash_after: int = 0
-    crash_mark: Path | None = None
+    mark: Path | None = None
     ready_after_s: float = 0.0
     deaf: bool = False
     exit_code: int | None = None
+    with_child: bool = False
 
 
 class Beacon(Node):
@@ -30,6 +31,8 @@ class Beacon(Node):
 
     async def setup(self) -> None:
         self.count = 0
+        if self.parameters.with_child:
+            await asyncio.create_subprocess_exec("sleep", "1000")
         if self.parameters.deaf:
             for number in (signal.SIGINT, signal.SIGTERM):
                 asyncio.get_running_loop().remove_signal_handler(number)
@@ -58,12 +61,15 @@ class Beacon(Node):
 
 
 class Listener(Node):
-    """Stops the graph's world when the finger has come far enough."""
+    """Says an e-stop, once, when the finger has come far enough."""
 
     parameters: NodeParameters
     twin__finger: Input[TwinFinger]
     estop: Output[EStop]
 
+    said = False
+
     def on_twin__finger(self, finger: TwinFinger, header: Header) -> None:
-        if finger.path_time_s == 10.0:
+        if finger.path_time_s >= 10.0 and not self.said:
+            self.said = True
             self.estop.publish(EStop(engaged=True, reason="ten"), source_ns=header.source_ns)

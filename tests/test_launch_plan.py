@@ -1,0 +1,253 @@
+"""Launch files: what is wrong with one is said before any process starts, with line and remedy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from launch.documents import BadInputError, parse_value
+from launch.plan import FIRST_PORT, PORTS, Plan, _ports, load_plan
+
+ROOT = Path(__file__).resolve().parent.parent
+BEACON = "tests.launch_nodes:Beacon"
+LISTENER = "tests.launch_nodes:Listener"
+GRAPH = f"""
+nodes:
+  beacon:
+    type: {BEACON}
+    parameters:
+      rate_hz: 20
+  listener:
+    type: {LISTENER}
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "graph.yaml"
+    path.write_text(text)
+    return path
+
+
+def complaint(folder: Path, text: str, **options: object) -> str:
+    with pytest.raises(BadInputError) as caught:
+        load_plan(write(folder, text), **options)  # type: ignore[arg-type]  # options of the test
+    return str(caught.value)
+
+
+def test_a_plan_knows_every_endpoint(tmp_path: Path) -> None:
+    plan = load_plan(write(tmp_path, GRAPH))
+    assert plan.nodes["listener"].inputs[0].endpoints == ("ipc://@run/beacon.twin.finger",)
+    assert plan.nodes["beacon"].parameters["rate_hz"] == 20.0
+    assert plan.nodes["beacon"].parameters["ready_after_s"] == 0.0
+    assert [writer.name for writer in plan.writers["estop"]] == ["listener", "tools"]
+
+
+def test_the_same_file_gives_the_same_hash_and_another_value_another(tmp_path: Path) -> None:
+    path = write(tmp_path, GRAPH)
+    assert load_plan(path).hash == load_plan(path).hash
+    assert load_plan(path).hash != load_plan(path, settings=["beacon.rate_hz=21"]).hash
+
+
+def test_the_hash_does_not_depend_on_where_the_file_lies(tmp_path: Path) -> None:
+    text = GRAPH.replace("rate_hz: 20", "mark: here/mark")
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    one, other = load_plan(write(tmp_path / "a", text)), load_plan(write(tmp_path / "b", text))
+    assert one.hash == other.hash
+    assert one.nodes["beacon"].parameters["mark"] == str(tmp_path / "a/here/mark")
+
+
+def test_a_plan_survives_json(tmp_path: Path) -> None:
+    plan = load_plan(write(tmp_path, GRAPH))
+    assert Plan.model_validate_json(plan.model_dump_json()) == plan
+
+
+def test_tcp_between_hosts_and_ipc_within(tmp_path: Path) -> None:
+    text = """
+hosts:
+  main: {address: 127.0.0.1}
+  left: {address: 127.0.0.2}
+nodes:
+  beacon: {type: "tests.launch_nodes:Beacon", host: left}
+  near: {type: "tests.launch_nodes:Listener", host: left}
+  far: {type: "tests.launch_nodes:Listener", host: main}
+"""
+    plan = load_plan(write(tmp_path, text))
+    writer = plan.writers["twin/finger"][0]
+    assert writer.tcp is not None
+    assert writer.tcp.startswith("tcp://127.0.0.2:")
+    assert plan.nodes["near"].inputs[0].endpoints == (writer.ipc,)
+    assert plan.nodes["far"].inputs[0].endpoints == (writer.tcp,)
+    far = plan.writer("estop", "far")
+    assert far is not None
+    assert far.tcp is None
+
+
+def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
+    links = [("main", f"node_{i}", "status") for i in range(300)]
+    ports = _ports(links)
+    assert len(set(ports.values())) == 300
+    assert all(FIRST_PORT <= port < FIRST_PORT + PORTS for port in ports.values())
+    assert ports == _ports(links)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is empty"),
+        ("- a\n", "it must hold keys and values"),
+        ("nodes: {a: [}\n", "graph.yaml:1: not YAML"),
+        ("nodes: {}\n", "there is no node"),
+        ("nodes:\n  a: {type: x}\n  a: {type: y}\n", "duplicate key"),
+        (GRAPH + "hots: {}\n", 'graph.yaml:9: hots: unknown key "hots"; did you mean "hosts"?'),
+        (
+            GRAPH.replace("    parameters", "    paramters"),
+            'graph.yaml:5: nodes.beacon.paramters: unknown key "paramters"; '
+            'did you mean "parameters"?',
+        ),
+        (GRAPH.replace(f"type: {BEACON}", "type: planer"), 'did you mean "planner"?'),
+        (GRAPH.replace(f"type: {BEACON}", "type: no.such:Thing"), "cannot be imported"),
+        (GRAPH.replace(f"type: {BEACON}", "type: pathlib:Path"), "is no node class"),
+        (GRAPH.replace(f"    type: {LISTENER}", "    host: main"), '"type" is missing'),
+        (
+            GRAPH.replace("rate_hz", "rate"),
+            'graph.yaml:6: nodes.beacon.parameters.rate: unknown key "rate"; '
+            'did you mean "rate_hz"?',
+        ),
+        (
+            GRAPH.replace("rate_hz: 20", "rate_hz: fast"),
+            "graph.yaml:6: nodes.beacon.parameters.rate_hz: 'fast' does not fit",
+        ),
+        (GRAPH + "    host: left\n", 'unknown host "left"; there are: main'),
+        (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),
+        (GRAPH + "hosts: {main: {}}\n", 'graph.yaml:9: hosts.main: "address" is missing'),
+        (GRAPH + "hosts: {main: {address: left.lab}}\n", '"left.lab" is no IP address'),
+        (GRAPH + "hosts: {main: {address: 0.0.0.0}}\n", "names no single host"),
+        (
+            GRAPH + "hosts: {main: {address: 127.0.0.1}, left: {address: 127.0.0.1}}\n",
+            'is the address of host "main" too',
+        ),
+        (
+            GRAPH + "    topics: {finger: twin/finger}\n",
+            f'"{LISTENER}" has no port "finger"; did you mean "twin__finger"?',
+        ),
+        (
+            GRAPH + "    topics: {twin__finger: twin/fingr}\n",
+            'graph.yaml:9: nodes.listener.topics.twin__finger: unknown topic "twin/fingr"; '
+            'did you mean "twin/finger"?',
+        ),
+        (
+            GRAPH + "    topics: {twin__finger: twin/arms}\n",
+            'topic "twin/arms" carries TwinArms, port "twin__finger" takes TwinFinger',
+        ),
+        (
+            GRAPH + f"  second: {{type: '{BEACON}'}}\n",
+            'topic "twin/finger" is written by "beacon" already; a topic has one writer',
+        ),
+        (
+            f"nodes: {{listener: {{type: '{LISTENER}'}}}}\n",
+            'nobody writes topic "twin/finger"; add the node that does',
+        ),
+        (GRAPH + "scene: nowhere.yaml\n", '"nowhere.yaml" is no file'),
+        (GRAPH + "from_tools: [fingertp]\n", 'did you mean "fingertip"?'),
+        (GRAPH + "from_tools: [twin/finger]\n", 'is written by "beacon" already'),
+        (GRAPH + f"  tools: {{type: '{LISTENER}'}}\n", '"tools" is taken'),
+        (GRAPH + "    restart: {policy: somtimes}\n", "'never', 'on_failure' or 'always'"),
+        (GRAPH + "record: {bagg: a.mcap}\n", 'did you mean "bag"?'),
+        (GRAPH + "record: {bag: a.mcap, topics: [stereo]}\n", 'nobody writes topic "stereo"'),
+        (
+            GRAPH.replace(f"type: {BEACON}", "type: arm_bridge").replace(
+                "rate_hz: 20", "side: left"
+            ),
+            'port "arm" is not connected; say in "topics" which it is: arm_left or arm_right',
+        ),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, text: str, said: str) -> None:
+    assert said in complaint(tmp_path, text)
+
+
+def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
+    text = GRAPH.replace("rate_hz", "rate") + "    host: left\nfrom_tools: [nothing]\n"
+    with pytest.raises(BadInputError) as caught:
+        load_plan(write(tmp_path, text))
+    assert len(caught.value.problems) == 3
+
+
+def test_a_file_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="cannot be read"):
+        load_plan(tmp_path / "no.yaml")
+
+
+def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
+    scene = (ROOT / "launch/scenes/cylinder.yaml").read_text()
+    line = next(i for i, text in enumerate(scene.splitlines(), 1) if "interocular_m" in text)
+    (tmp_path / "scene.yaml").write_text(scene.replace("interocular_m", "interocular"))
+    said = complaint(tmp_path, GRAPH + "scene: scene.yaml\n")
+    assert f'scene.yaml:{line}: eyes.interocular: unknown key "interocular"' in said
+    assert 'did you mean "interocular_m"?' in said
+    assert '"interocular_m" is missing' in said
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("beacon", "write node.parameter=value"),
+        ("beacn.rate_hz=3", 'there is no node "beacn"; did you mean "beacon"?'),
+        ("beacon.rate=3", '--set beacon.rate=3: nodes.beacon.parameters.rate: unknown key "rate"'),
+        ("beacon.rate_hz=slow", "--set beacon.rate_hz=slow: nodes.beacon.parameters.rate_hz"),
+        ("beacon.rate_hz.deep=3", "holds no further keys"),
+    ],
+)
+def test_wrong_settings_are_named(tmp_path: Path, setting: str, said: str) -> None:
+    assert said in complaint(tmp_path, GRAPH, settings=[setting])
+
+
+def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
+    plan = load_plan(
+        write(tmp_path, GRAPH),
+        settings=["beacon.rate_hz=7", "recorder.compress=false"],
+        record=tmp_path / "a.mcap",
+    )
+    assert plan.nodes["beacon"].parameters["rate_hz"] == 7.0
+    recorder = plan.nodes["recorder"]
+    assert recorder.parameters["bag"] == str(tmp_path / "a.mcap")
+    assert recorder.parameters["compress"] is False
+    assert {port.topic for port in recorder.inputs} == {
+        "twin/finger", "estop", "status", "display", "twin/finger_path",
+    }  # fmt: skip
+
+
+def test_a_topic_from_tools_needs_no_node(tmp_path: Path) -> None:
+    text = f"nodes: {{listener: {{type: '{LISTENER}'}}}}\nfrom_tools: [twin/finger]\n"
+    plan = load_plan(write(tmp_path, text))
+    assert plan.nodes["listener"].inputs[0].endpoints == ("ipc://@run/tools.twin.finger",)
+
+
+def test_a_port_can_be_left_out(tmp_path: Path) -> None:
+    text = f"nodes: {{listener: {{type: '{LISTENER}', topics: {{twin__finger: null}}}}}}\n"
+    plan = load_plan(write(tmp_path, text))
+    assert plan.nodes["listener"].inputs[0].endpoints == ()
+
+
+@pytest.mark.parametrize("name", ["demo", "lab", "replay"])
+def test_the_launch_files_of_the_house_resolve(name: str) -> None:
+    plan = load_plan(ROOT / "launch" / f"{name}.yaml")
+    assert plan.scene_message() is not None
+    for node in plan.nodes.values():
+        for port in node.inputs:
+            if not port.endpoints:
+                continue
+            local = [one for one in port.endpoints if one.startswith("ipc")]
+            far = [one for one in port.endpoints if one.startswith("tcp")]
+            hosts = {writer.host for writer in plan.writers.get(port.topic, ())}
+            assert bool(local) == (node.host in hosts)
+            assert bool(far) == bool(hosts - {node.host})
+
+
+def test_values_are_read_as_yaml() -> None:
+    assert parse_value("3") == 3
+    assert parse_value("1.0e-3") == pytest.approx(1e-3)
+    assert parse_value("[1, a]") == [1, "a"]
+    assert parse_value("on_failure") == "on_failure"

@@ -1,0 +1,374 @@
+"""The supervisor: nodes come up, come back, and nothing of them stays."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from launch import runs, supervisor
+from launch.documents import BadInputError
+from launch.plan import Plan, load_plan
+from launch.supervisor import NodeFailedError, RunningGraph
+from messages.bag import BagReader
+
+ROOT = Path(__file__).resolve().parent.parent
+FLEXSHEET = [sys.executable, str(ROOT / "flexsheet.py")]
+DEADLINE_S = 30.0
+
+
+@pytest.fixture(autouse=True)
+def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A directory of runs of the test's own, with a short path."""
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(folder))
+    yield folder
+    shutil.rmtree(folder)
+
+
+def beacon(**keys: Any) -> dict[str, Any]:
+    return {"type": "tests.launch_nodes:Beacon", **keys}
+
+
+def plan_of(folder: Path, **nodes: dict[str, Any]) -> Plan:
+    return load_plan(write(folder, nodes))
+
+
+def write(folder: Path, nodes: dict[str, Any], **more: Any) -> Path:
+    path = folder / "graph.yaml"
+    # JSON is YAML.
+    path.write_text(json.dumps({"nodes": nodes, **more}))
+    return path
+
+
+LISTENER = {"type": "tests.launch_nodes:Listener"}
+
+
+def processes_of(run_id: str) -> list[psutil.Process]:
+    """All processes that carry the run's tag."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if process.environ().get(runs.RUN_VARIABLE) == run_id:
+                found.append(process)
+        except psutil.Error:
+            continue
+    return found
+
+
+def sockets_in(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob("*") if path.is_socket()]
+
+
+def wait_until(condition: Callable[[], Any], what: str) -> None:
+    end = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end, f"waited in vain: {what}"
+        time.sleep(0.02)
+
+
+def assert_nothing_left(folder: Path) -> None:
+    for run in runs.all_runs():
+        assert processes_of(run.id) == []
+        assert not run.is_alive()
+    assert sockets_in(folder) == []
+
+
+async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:
+    descriptors, threads = set(os.listdir("/proc/self/fd")), threading.active_count()
+    plan = plan_of(tmp_path, beacon=beacon(), listener=LISTENER)
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        assert graph.pids.keys() == {"beacon", "listener"}
+        assert all(os.getsid(pid) == pid for pid in graph.pids.values())
+        assert [run.id for run in runs.live_runs()] == [graph.run.id]
+        assert len(sockets_in(runs_root)) == 4
+    assert graph.exit_codes == {"beacon": 0, "listener": 0}
+    assert_nothing_left(runs_root)
+    assert set(os.listdir("/proc/self/fd")) == descriptors
+    assert threading.active_count() == threads
+    assert (graph.run.logs / "launch.log").read_text().startswith(f"run {graph.run.id}")
+
+
+async def test_a_killed_node_comes_back_and_the_others_stay(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(restart={"delay_s": 0.01}), listener=LISTENER)
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        before = graph.pids
+        graph.kill("beacon")
+        async with asyncio.timeout(DEADLINE_S):
+            await graph.wait_ready_again("beacon", 1)
+        assert graph.pids["beacon"] != before["beacon"]
+        assert graph.pids["listener"] == before["listener"]
+        assert graph.restarts == {"beacon": 1, "listener": 0}
+
+
+async def test_crashes_are_answered_with_growing_delays_and_then_an_end(tmp_path: Path) -> None:
+    restart = {"delay_s": 0.02, "max_delay_s": 0.05, "max_restarts": 3}
+    plan = plan_of(tmp_path, beacon=beacon(parameters={"crash_after": 2}, restart=restart))
+    said: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+        with pytest.raises(NodeFailedError, match="beacon ended with exit code 3, after 3 restart"):
+            await asyncio.wait_for(graph.wait(), DEADLINE_S)
+    delays = [line.split("starts again in ")[1] for line in said if "starts again" in line]
+    assert delays == ["0.02 s", "0.04 s", "0.05 s"]
+    assert graph.exit_codes == {"beacon": 3}
+
+
+async def test_a_node_that_may_not_restart_fails_for_good(tmp_path: Path) -> None:
+    plan = plan_of(
+        tmp_path, beacon=beacon(parameters={"exit_code": 5}, restart={"policy": "never"})
+    )
+    async with RunningGraph(plan) as graph:
+        with pytest.raises(NodeFailedError, match="beacon ended with exit code 5"):
+            await asyncio.wait_for(graph.wait(), DEADLINE_S)
+    assert graph.restarts == {"beacon": 0}
+
+
+async def test_a_node_that_has_done_its_work_ends_the_graph_in_order(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(parameters={"exit_code": 0}))
+    async with RunningGraph(plan) as graph:
+        await asyncio.wait_for(graph.wait(), DEADLINE_S)
+        await asyncio.wait_for(graph.wait_ready(), DEADLINE_S)
+    assert graph.exit_codes == {"beacon": 0}
+
+
+async def test_always_means_after_a_good_end_too(tmp_path: Path) -> None:
+    restart = {"policy": "always", "delay_s": 0.0, "max_restarts": 1}
+    plan = plan_of(tmp_path, beacon=beacon(parameters={"exit_code": 0}, restart=restart))
+    async with RunningGraph(plan) as graph:
+        with pytest.raises(NodeFailedError, match="beacon ended, after 1 restarts"):
+            await asyncio.wait_for(graph.wait(), DEADLINE_S)
+
+
+async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_root: Path) -> None:
+    plan = plan_of(
+        tmp_path,
+        beacon=beacon(
+            parameters={"ready_after_s": 1000}, start_deadline_s=0.3, restart={"policy": "never"}
+        ),
+    )
+    async with RunningGraph(plan) as graph:
+        with pytest.raises(NodeFailedError, match=r"was not ready within 0\.3 s"):
+            await asyncio.wait_for(graph.wait_ready(), DEADLINE_S)
+        assert graph.pids == {}
+    assert_nothing_left(runs_root)
+
+
+async def test_waiting_for_ready_has_a_deadline_of_its_own(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(parameters={"ready_after_s": 1000}))
+    async with RunningGraph(plan) as graph:
+        with pytest.raises(TimeoutError, match="beacon"):
+            await graph.wait_ready(0.05)
+
+
+async def test_a_node_that_hears_no_signal_is_killed_with_its_children(
+    tmp_path: Path, runs_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "STOP_GRACE_S", 0.2)
+    plan = plan_of(tmp_path, beacon=beacon(parameters={"deaf": True, "with_child": True}))
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        assert len(processes_of(graph.run.id)) == 2
+    assert graph.exit_codes == {"beacon": -signal.SIGKILL}
+    wait_until(lambda: not processes_of(graph.run.id), "the killed child to be gone")
+    assert_nothing_left(runs_root)
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.2, 0.4])
+async def test_cancelled_at_any_moment_nothing_stays(
+    tmp_path: Path, runs_root: Path, delay_s: float
+) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(), listener=LISTENER)
+
+    async def use() -> None:
+        async with RunningGraph(plan) as graph:
+            await graph.wait_ready()
+            await asyncio.sleep(1000)
+
+    task = asyncio.create_task(use())
+    await asyncio.sleep(delay_s)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert_nothing_left(runs_root)
+
+
+async def test_a_port_in_use_is_named_before_anything_starts(
+    tmp_path: Path, runs_root: Path
+) -> None:
+    nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
+    hosts = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+    plan = load_plan(write(tmp_path, nodes, hosts=hosts))
+    endpoint = plan.writers["twin/finger"][0].tcp
+    assert endpoint is not None
+    with socket.create_server(("127.0.0.2", int(endpoint.rpartition(":")[2]))):
+        with pytest.raises(BadInputError, match="is the graph running already"):
+            await RunningGraph(plan).__aenter__()
+        # The other host's launcher does not bind it.
+        async with RunningGraph(plan, host="main") as graph:
+            await graph.wait_ready(DEADLINE_S)
+    assert_nothing_left(runs_root)
+
+
+def heard_estop(bag: Path) -> bool:
+    """Whether the listener has heard ten messages of the beacon, which it says by an e-stop."""
+    return "estop" in BagReader(bag).topics
+
+
+async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None:
+    nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
+    hosts = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+    plan = load_plan(write(tmp_path, nodes, hosts=hosts), record=tmp_path / "a.mcap")
+    async with RunningGraph(plan, host="main") as main:
+        await main.wait_ready(DEADLINE_S)
+        async with RunningGraph(plan, host="left") as left:
+            await left.wait_ready(DEADLINE_S)
+            assert (main.pids.keys(), left.pids.keys()) == ({"listener", "recorder"}, {"beacon"})
+            heard = partial(heard_estop, tmp_path / "a.mcap")
+            await asyncio.to_thread(wait_until, heard, "the listener to hear the beacon")
+
+
+async def test_addresses_beyond_loopback_are_refused_without_keys(tmp_path: Path) -> None:
+    hosts = {"main": {"address": "192.0.2.1"}}
+    plan = load_plan(write(tmp_path, {"beacon": beacon()}, hosts=hosts))
+    with pytest.raises(BadInputError, match=r"graph.yaml:1: hosts.main.address: 192.0.2.1 is bey"):
+        await RunningGraph(plan).__aenter__()
+
+
+async def test_an_unknown_host_is_refused(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, beacon=beacon())
+    with pytest.raises(BadInputError, match="unknown host"):
+        await RunningGraph(plan, host="left").__aenter__()
+
+
+async def test_the_directory_of_runs_must_be_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "target"
+    target.mkdir()
+    (tmp_path / "link").symlink_to(target)
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path / "link"))
+    with pytest.raises(runs.RunDirectoryError, match="belongs to somebody else"):
+        await RunningGraph(plan_of(tmp_path, beacon=beacon())).__aenter__()
+
+
+def start_command(*arguments: str, **options: Any) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [*FLEXSHEET, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd="/",
+        **options,
+    )
+
+
+def wait_for_words(process: subprocess.Popen[str], words: str) -> None:
+    assert process.stderr is not None
+    seen = []
+    for line in process.stderr:
+        seen.append(line)
+        if words in line:
+            return
+    pytest.fail(f'"{words}" was never said: {"".join(seen)}')
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 0.6, 0.8, 1.0, None])
+def test_interrupted_at_any_moment_the_command_leaves_nothing(
+    tmp_path: Path, runs_root: Path, delay_s: float | None
+) -> None:
+    path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
+    process = start_command("launch", str(path))
+    if delay_s is None:
+        wait_for_words(process, "are ready")
+    else:
+        time.sleep(delay_s)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=DEADLINE_S)
+    # Before the loop runs there is nothing to stop, and Python's or typer's own answer holds.
+    assert process.returncode in ((0,) if delay_s is None else (0, 1, 130, -signal.SIGINT))
+    assert_nothing_left(runs_root)
+
+
+def test_a_killed_launcher_leaves_no_node_behind(tmp_path: Path, runs_root: Path) -> None:
+    nodes = {
+        "beacon": beacon(parameters={"with_child": True}),
+        "listener": LISTENER,
+        "deaf": {
+            "type": "tests.launch_nodes:Beacon",
+            "parameters": {"deaf": True},
+            "topics": {"twin__finger": None},
+        },
+    }
+    process = start_command("launch", str(write(tmp_path, nodes)))
+    wait_for_words(process, "are ready")
+    (run,) = runs.live_runs()
+    assert len(processes_of(run.id)) == 4
+    process.kill()
+    process.communicate(timeout=DEADLINE_S)
+    wait_until(lambda: len(processes_of(run.id)) <= 2, "the nodes that listen to end")
+    runs.sweep()
+    wait_until(lambda: not processes_of(run.id), "the deaf node and the child to end")
+    assert_nothing_left(runs_root)
+
+
+def test_orphans_are_swept_and_nobody_else_is(tmp_path: Path) -> None:
+    """An orphan that neither signal nor lifeline reached; a live launcher's; one without a tag."""
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead_run = f"{dead.pid}.1.1"
+    dead.wait()
+    own_run = runs.create_run()
+    tags = {"orphan": dead_run, "living": own_run.id, "stranger": None}
+    processes = {}
+    for name, tag in tags.items():
+        environment = {**os.environ, **({runs.RUN_VARIABLE: tag} if tag else {})}
+        processes[name] = subprocess.Popen(["sleep", "1000"], env=environment)
+    try:
+        wait_until(lambda: len(runs.orphans()) == 1, "sleep to be started")
+        assert runs.sweep() == [processes["orphan"].pid]
+        assert processes["orphan"].poll() is not None
+        assert processes["living"].poll() is None
+        assert processes["stranger"].poll() is None
+        assert own_run.is_alive()
+    finally:
+        for process in processes.values():
+            process.kill()
+            process.wait()
+
+
+def test_old_runs_are_tidied_up(runs_root: Path) -> None:
+    for i in range(runs.FINISHED_RUNS_KEPT + 3):
+        (runs_root / f"1.{i}.1").mkdir(parents=True)
+    runs.sweep()
+    assert len(runs.all_runs()) == runs.FINISHED_RUNS_KEPT
+
+
+def test_foreign_packages_on_the_path_do_not_win(tmp_path: Path) -> None:
+    """As with ROS 2 sourced, which has a package named launch."""
+    for name in ("launch", "nodes", "messages"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('the foreign one')\n")
+    path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(
+        [*FLEXSHEET, "launch", str(path), "--duration", "0.1"],
+        env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "all 2 nodes are ready" in done.stderr

@@ -1,0 +1,178 @@
+"""The recorder writes what came, counts what it cannot write, and loses little in a crash."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import json
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch import runs
+from launch.plan import load_plan
+from launch.supervisor import RunningGraph
+from messages.bag import BagError, BagReader, BagWriter
+from messages.base import Header
+from messages.clock import VirtualClock
+from messages.topics import TOPICS
+from messages.types import EStop
+from messages.wire import encode
+from nodes.recorder.files import free_path
+from nodes.recorder.node import Recorder, RecorderParameters
+
+DEADLINE_S = 30.0
+
+
+@pytest.fixture(autouse=True)
+def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(folder))
+    yield folder
+    shutil.rmtree(folder)
+
+
+def recorder(clock: VirtualClock, **parameters: Any) -> Recorder:
+    return Recorder(
+        RecorderParameters(**{"attach": (), **parameters}),
+        name="recorder",
+        clock=clock,
+        send=lambda topic, message, header: None,
+        topics={"in/estop": "estop", "in/status": "status", "status": "status"},
+    )
+
+
+def names_in(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def estop_message(number: int) -> tuple[list[Any], Header]:
+    header = Header(number, 100 + number, 200 + number, "clock", "hand", 7)
+    return encode(EStop(engaged=True, reason=f"number {number}"), header), header
+
+
+async def test_it_writes_what_came_with_times_and_attachments(tmp_path: Path) -> None:
+    clock = VirtualClock(5000, clock_id="clock")
+    (tmp_path / "launch.yaml").write_text("nodes: {}\n")
+    node = recorder(clock, bag=tmp_path / "deep/a.mcap", attach=(tmp_path / "launch.yaml",))
+    await node.setup()
+    for number in (1, 2):
+        clock.move_to(5000 + number)
+        frames, header = estop_message(number)
+        node.deliver("in/estop", frames, header)
+    await node.close()
+    reader = BagReader(tmp_path / "deep/a.mcap")
+    entries = list(reader)
+    assert [(topic, header.sequence, log) for topic, _, header, log in entries] == [
+        ("estop", 1, 5001), ("estop", 2, 5002),
+    ]  # fmt: skip
+    assert [bytes(frames[0]) for _, frames, _ in reader.frames()] == [
+        bytes(estop_message(number)[0][0]) for number in (1, 2)
+    ]
+    assert reader.attachment("launch.yaml") == b"nodes: {}\n"
+    assert reader.metadata["recording"]["clock_id"] == "clock"
+    assert node.inputs["in/estop"].counts.messages == 2
+
+
+def test_which_topics_it_wants() -> None:
+    written = [TOPICS[name] for name in ("scene", "stereo", "fingertip")]
+
+    def wants(**parameters: Any) -> list[str]:
+        return list(Recorder.further_inputs(RecorderParameters(bag="a", **parameters), written))
+
+    assert wants() == ["scene", "fingertip"]
+    assert wants(also=("stereo", "scene")) == ["scene", "fingertip", "stereo"]
+    assert wants(topics=("stereo",)) == ["stereo"]
+
+
+async def test_it_never_writes_over_a_bag(tmp_path: Path) -> None:
+    for _ in range(2):
+        node = recorder(VirtualClock(), bag=tmp_path / "a.mcap")
+        await node.setup()
+        await node.close()
+    assert names_in(tmp_path) == ["a-2.mcap", "a.mcap"]
+
+
+def test_free_paths_count_up(tmp_path: Path) -> None:
+    for expected in ("a.mcap", "a-2.mcap", "a-3.mcap"):
+        path = free_path(tmp_path / "a.mcap")
+        assert path.name == expected
+        path.touch()
+
+
+async def test_a_bag_is_named_after_its_start(tmp_path: Path) -> None:
+    node = recorder(VirtualClock(), bag=tmp_path / "run-%Y.mcap")
+    await node.setup()
+    await node.close()
+    (name,) = names_in(tmp_path)
+    assert name.removeprefix("run-").removesuffix(".mcap").isdigit()
+
+
+async def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    node = recorder(VirtualClock(), bag=tmp_path / "file" / "a.mcap")
+    with pytest.raises(BagError, match="file: cannot be made"):
+        await node.setup()
+    await node.close()
+    node = recorder(VirtualClock(), bag=tmp_path / "a.mcap", attach=(tmp_path / "no.yaml",))
+    with pytest.raises(OSError, match=r"no\.yaml"):
+        await node.setup()
+    await node.close()
+
+
+async def test_a_full_disk_is_said_and_what_is_lost_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = recorder(VirtualClock(), bag=tmp_path / "a.mcap")
+    await node.setup()
+    node.deliver("in/estop", *estop_message(1))
+
+    def refuse(*arguments: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(BagWriter, "write_frames", refuse)
+    for number in (2, 3, 4):
+        node.deliver("in/estop", *estop_message(number))
+    assert node.inputs["in/estop"].counts.dropped == 3
+    assert node.errors == 1
+    assert node.note.startswith("NOT RECORDING")
+    assert "No space left" in node.note
+    monkeypatch.undo()
+    await node.close()
+    assert len(list(BagReader(tmp_path / "a.mcap"))) == 1
+
+
+async def test_killed_it_loses_at_most_the_last_second(tmp_path: Path) -> None:
+    nodes = {
+        "beacon": {"type": "tests.launch_nodes:Beacon", "parameters": {"rate_hz": 100}},
+        "recorder": {
+            "type": "recorder",
+            "parameters": {"bag": str(tmp_path / "a.mcap")},
+            "restart": {"delay_s": 0.0},
+        },
+    }
+    (tmp_path / "graph.yaml").write_text(json.dumps({"nodes": nodes}))
+    async with RunningGraph(load_plan(tmp_path / "graph.yaml")) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        await asyncio.sleep(2.5)
+        killed_ns = time.monotonic_ns()
+        graph.kill("recorder")
+        async with asyncio.timeout(DEADLINE_S):
+            await graph.wait_ready_again("recorder", 1)
+        await asyncio.sleep(0.3)
+    cut = BagReader(tmp_path / "a.mcap", ["twin/finger"])
+    assert not cut.complete
+    entries = list(cut)
+    sequences = [header.sequence for _, _, header, _ in entries]
+    assert sequences == list(range(sequences[0], sequences[-1] + 1))
+    # A second between flushes, and what a busy machine adds to it.
+    assert killed_ns - entries[-1][3] < 1.5e9
+    assert cut.attachment("plan.json")
+    second = BagReader(tmp_path / "a-2.mcap", ["twin/finger"])
+    assert second.complete
+    assert next(iter(second))[2].sequence > sequences[-1]
