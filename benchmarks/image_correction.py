@@ -19,8 +19,9 @@ from ruamel.yaml import YAML
 
 from messages.scene import Scene
 from messages.types import Correction, Display
-from nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
+from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
+from nodes.renderer.families import rolled_on
 from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.stage import Stage, sheet_between
 from nodes.twin.eye import METRES_PER_PX, TrueCylinder, proper, push_sizes, seen, tilt_sizes
@@ -54,14 +55,6 @@ class Bench:
         wanted = np.array(push_sizes(self._proper, METRES_PER_PX))
         return np.abs(np.array(push_sizes(picture, METRES_PER_PX)) - wanted)
 
-    def rolled(self, tilt_rad: float) -> Floats:
-        """world_from_sheet tangent to the cylinder, rolled there from the upright position."""
-        pose, radius = self.scene.object.world_from_object, self.scene.object.geometry.radius_m
-        axis = transform_from_rpy(pose.position_m, pose.rpy_rad)[:3, 3]
-        rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
-        touched = axis + radius * rotation[:, 2]
-        return transform(rotation, touched + radius * tilt_rad * rotation[:, 1])
-
     def _seen(self, correction: Correction, world_from_sheet: Floats, tip: Floats | None) -> Image:
         sheet = self.scene.sheet
         edges = edge_poses(world_from_sheet, sheet.width_m * self.stretch)
@@ -94,7 +87,7 @@ def main() -> None:
         for degrees in (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50):
             tilt = np.radians(degrees)
             turned = transform(rotation_from_vector([tilt, 0.0, 0.0]), np.zeros(3))
-            pose = bench.rolled(tilt) if name == "rolls" else turned
+            pose = rolled_on(scene, tilt) if name == "rolls" else turned
             for correction in CORRECTIONS[:2]:
                 errors = 1e3 * bench.tilt_errors(correction, pose)
                 cells = " | ".join(f"{value:.3f}" for value in (*errors, errors.mean()))

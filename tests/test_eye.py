@@ -16,6 +16,7 @@ from messages.topics import Topic
 from messages.types import Display, Frame, TwinArms, TwinEye
 from nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
 from nodes.models.sheet import edge_poses, flange_pose
+from nodes.renderer.families import rolled_on
 from nodes.twin import eye_node
 from nodes.twin.eye import (
     METRES_PER_PX,
@@ -206,7 +207,7 @@ def test_what_cannot_be_measured_is_said(what: str) -> None:
 
 def test_row_of_figure_11(bench: Bench) -> None:
     """At 50 degrees the uncorrected error is the paper's tens of mm; corrected, a tenth."""
-    pose = bench.rolled(np.radians(50.0))
+    pose = rolled_on(bench.scene, np.radians(50.0))
     assert 27.0 < 1e3 * bench.tilt_errors("none", pose).mean() < 34.0
     corrected = 1e3 * bench.tilt_errors("one_plane", pose)
     assert corrected.max() < 0.15

@@ -91,26 +91,30 @@ def screen_for(method: Correction, sheet: Sheet) -> Screen | None:
     return flat_screen(sheet.plane)
 
 
+def projector_homography(scene: Scene) -> Floats:
+    """(3, 3): the imaginary screen, metres, to projector pixels; ValueError if there is none."""
+    lens = scene.projector.lens
+    return pixel_from_screen(
+        fx_px=lens.fx_px,
+        fy_px=lens.fy_px,
+        cx_px=lens.cx_px,
+        cy_px=lens.cy_px,
+        distortion=lens.distortion,
+        world_from_projector=transform_of(scene.projector.world_from_projector),
+    )
+
+
 class Stage:
     """A scene ready to be drawn."""
 
     def __init__(self, scene: Scene, context: moderngl.Context, *, spacing_m: float) -> None:
         """ValueError for a projector that no homography describes."""
         projector, cylinder = scene.projector, scene.object.geometry
-        lens = projector.lens
         self.scene = scene
         self._world_from_projector = transform_of(projector.world_from_projector)
         self._world_from_object = transform_of(scene.object.world_from_object)
-        homography = pixel_from_screen(
-            fx_px=lens.fx_px,
-            fy_px=lens.fy_px,
-            cx_px=lens.cx_px,
-            cy_px=lens.cy_px,
-            distortion=lens.distortion,
-            world_from_projector=self._world_from_projector,
-        )
         self._clip_from_screen = clip_from_screen(
-            homography, projector.width_px, projector.height_px
+            projector_homography(scene), projector.width_px, projector.height_px
         )
         self._shape = CylinderShape(cylinder.radius_m, cylinder.length_m)
         self._surface = cylinder_surface(

@@ -10,6 +10,7 @@ It shares no code with the renderer: own rays, own projector, own object.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -478,6 +479,45 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
     return (bottom - top) * metres_per_px, (right - left) * metres_per_px
 
 
+def seen_at(
+    scene: Scene,
+    world_from_left_edge: Floats,
+    world_from_right_edge: Floats,
+    finger_tip: Floats | None,
+) -> Callable[[Floats], tuple[Floats, Bools]]:
+    """Judge of single points of light on the true sheet between two edges (4, 4).
+
+    Returns a function of projector pixels (n, 2): where on the imaginary screen (n, 2) the eye sees
+    their light, metres, and whether it falls on the sheet before the eye.
+    """
+    sheet = _sheet_between(scene, world_from_left_edge, world_from_right_edge, finger_tip)
+    projector = TrueProjector(scene.projector, sheet.positions.reshape(-1, 3), sheet.triangles())
+    eye = scene.eyes.centre_world_m
+
+    def judge(pixels: Floats) -> tuple[Floats, Bools]:
+        points, lit = projector.lands_at(pixels)
+        ahead = eye[2] - points[:, 2]
+        lit = lit & (ahead > 1e-3)
+        share = eye[2] / np.where(lit, ahead, 1.0)
+        return eye[:2] + (points[:, :2] - eye[:2]) * share[:, None], lit
+
+    return judge
+
+
+def _sheet_between(
+    scene: Scene, left_edge: Floats, right_edge: Floats, finger_tip: Floats | None
+) -> DeformedSheet:
+    sheet = scene.sheet
+    rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
+    return solve(
+        rubber,
+        left_edge,
+        right_edge,
+        finger_tip=finger_tip,
+        finger_radius_m=scene.finger.radius_m,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Situation:
     """The truth in which a frame was shown.
@@ -503,7 +543,7 @@ def true_sheet(
     finger_tip: Floats | None,
 ) -> DeformedSheet:
     """The membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or None."""
-    arms, sheet = scene.arms, scene.sheet
+    arms = scene.arms
     edges = [
         world_from_flange
         @ transform_from_rpy(spec.flange_from_edge.position_m, spec.flange_from_edge.rpy_rad)
@@ -512,10 +552,7 @@ def true_sheet(
             (world_from_flange_right, arms.right),
         )
     ]
-    rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
-    return solve(
-        rubber, edges[0], edges[1], finger_tip=finger_tip, finger_radius_m=scene.finger.radius_m
-    )
+    return _sheet_between(scene, edges[0], edges[1], finger_tip)
 
 
 def take_picture(projected: Image, situation: Situation, *, eye: Floats) -> tuple[Image, Image]:
