@@ -328,6 +328,37 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
     assert lost == [0, 0, 0, 3, 3]
 
 
+class BrokenReader(StutteringReader):
+    """OpenCV itself fails on what the device sends."""
+
+    def read(self) -> Pictures | None:
+        raise cv2.error("no such colour")
+
+
+def test_an_error_inside_opencv_is_a_device_error_and_tried_again(scene: Scene) -> None:
+    failures: list[str] = []
+
+    def fail(error: DeviceError) -> None:
+        failures.append(str(error))
+        if len(failures) == 2:
+            thread.stop()
+
+    thread = ReaderThread(
+        BrokenReader,
+        camera=scene.camera,
+        name="broken",
+        now=lambda: 0,
+        retry_s=0.001,
+        deliver=lambda pictures, count: pytest.fail("nothing to deliver"),
+        fail=fail,
+        finish=lambda pairs: pytest.fail("not finished"),
+    )
+    thread.start()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert failures == ["broken: OpenCV: no such colour"] * 2
+
+
 @pytest.mark.parametrize(
     "source",
     [

@@ -51,7 +51,11 @@ class TwinSource(Source):
 
 
 class OpenCvSource(Source):
-    """Cameras that OpenCV opens (V4L/UVC): by number, by path, or by a stream's address."""
+    """Cameras that OpenCV opens (V4L/UVC): by number, by path, or by a stream's address.
+
+    Two cameras without a common trigger see a moving finger at two times; the triangulator then
+    finds it inconsistent.  One device that gives both views has no such trouble.
+    """
 
     kind: Literal["opencv"]
     left: int | str = Field(description="the left camera, or the one that gives both side by side")
@@ -118,9 +122,9 @@ def open_reader(source: AnySource, camera: StereoCamera, now: Now) -> Reader:
 
 
 def gray(image: NDArray[Any]) -> Image:
-    """A decoded picture (h, w), (h, w, 1) or blue-green-red (h, w, 3) as grey (h, w)."""
+    """A decoded picture as grey (h, w): grey or luma first (h, w, 1 or 2), or blue-green-red."""
     if image.ndim == 3:
-        image = image[:, :, 0] if image.shape[2] == 1 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
@@ -345,7 +349,11 @@ class ReaderThread(threading.Thread):
                     self._read(reader)
                 finally:
                     reader.close()
-            except DeviceError as error:
+            except (DeviceError, cv2.error) as error:
+                if self._stopping.is_set():
+                    return
+                if not isinstance(error, DeviceError):
+                    error = DeviceError(f"{self.name}: OpenCV: {error}")
                 self._fail(error)
                 self._stopping.wait(self._wait_s)
                 self._wait_s = min(2.0 * self._wait_s, MAX_RETRY_S)
@@ -361,6 +369,8 @@ class ReaderThread(threading.Thread):
                 due_ns = start_ns + round(1e9 * frame / reader.rate_hz)
                 self._stopping.wait(max(0.0, (due_ns - self._now()) * 1e-9))
             pictures = reader.read()
+            if self._stopping.is_set():
+                return
             if pictures is None:
                 self._finish(self._pairs)
                 return

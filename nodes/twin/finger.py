@@ -269,9 +269,9 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
        length, the arc that the working range's tilt and the sheet's usable height allow, and 50 mm
        of depth.
     3. Moved: its median x, y is put before the object's middle.
-    4. Laid on: the depth becomes the distance to the object's surface; the deepest tenth presses
-       into it by up to a sixth of `push_depth_m`, the rest hovers or reaches.  Height y becomes
-       arc length over the surface, so that moving up and down strokes it.
+    4. Laid on: the depth becomes the distance to the object's surface; the deepest 30 % press into
+       it by up to a sixth of `push_depth_m`, the rest hovers or reaches.  Height y becomes arc
+       length over the surface, so that moving up and down strokes it.
     5. Slowed, if it must be, by one factor, to 0.8 of the scene's finger speed.
 
     Points are kept inside the scene's finger volume.  Raises FingerPathError for another file.
@@ -292,7 +292,7 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
     along = np.clip(points[:, 0], -half[0], half[0])
     arc = np.clip(points[:, 1], -half[1], half[1])
     press_m = scene.working_range.push_depth_m / 6.0
-    touch = np.quantile(points[:, 2], 0.1)
+    touch = np.quantile(points[:, 2], 0.3)
     distance = np.maximum(points[:, 2] - touch, -press_m)
     angle = arc / cylinder.radius_m
     radius = cylinder.radius_m + distance

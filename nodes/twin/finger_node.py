@@ -36,6 +36,7 @@ class TwinFingerNode(Node):
     twin__stereo: Output[StereoPair]
 
     camera: TwinCamera | None = None
+    filming: asyncio.Task[None] | None = None
     motion: FingerMotion
     motion_from_ns = 0
     path_label = ""
@@ -47,11 +48,12 @@ class TwinFingerNode(Node):
         return asyncio.Event()
 
     async def setup(self) -> None:
-        self._task = asyncio.create_task(self._film())
+        self.filming = asyncio.create_task(self._film())
 
     async def close(self) -> None:
-        self._task.cancel()
-        await asyncio.gather(self._task, return_exceptions=True)
+        if self.filming is not None:
+            self.filming.cancel()
+            await asyncio.gather(self.filming, return_exceptions=True)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         first = self.camera is None
@@ -131,16 +133,16 @@ class TwinFingerNode(Node):
                 self.missed_frames += missed
                 start_ns += missed * self.period_ns
             await self._sleep_until(start_ns)
-            middle_ns = start_ns + self.exposure_ns // 2
-            try:
-                pair = self.expose(middle_ns)
-            except Exception as error:
-                self.report_error("expose", error)
-                continue
-            read_out_ns = start_ns + self.exposure_ns + round(1e9 * self.parameters.transfer_s)
-            await self._sleep_until(read_out_ns)
-            self.twin__stereo.publish(pair, source_ns=middle_ns)
-            self.note = f'path "{self.path_label}", {self.missed_frames} frames missed'
+            await self.call("frame", self._take_frame, start_ns)
+
+    async def _take_frame(self, start_ns: int) -> None:
+        """One frame from the start of its exposure until it is read out."""
+        middle_ns = start_ns + self.exposure_ns // 2
+        pair = self.expose(middle_ns)
+        read_out_ns = start_ns + self.exposure_ns + round(1e9 * self.parameters.transfer_s)
+        await self._sleep_until(read_out_ns)
+        self.twin__stereo.publish(pair, source_ns=middle_ns)
+        self.note = f'path "{self.path_label}", {self.missed_frames} frames missed'
 
     async def _sleep_until(self, at_ns: int) -> None:
         await asyncio.sleep(max(0.0, (at_ns - self.clock.now_ns()) * 1e-9))
