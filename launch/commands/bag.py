@@ -95,7 +95,7 @@ def info(bag: BagArgument, as_json: JsonOption = False) -> None:
     print_table(
         ("topic", "message", "count", "rate_hz", "readable"),
         [
-            (one.name, one.type, one.count, f"{one.rate_hz:.2f}", "" if one.readable else "no")
+            (one.name, one.type, one.count, f"{one.rate_hz:.2f}", "yes" if one.readable else "NO")
             for one in summary.topics
         ],
     )

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from launch.commands.graph import JsonOption
+from launch.commands.graph import JsonOption, running_graph
 from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, print_table
 
 app = typer.Typer(no_args_is_help=True, help="Nodes: which there are, what they take and give.")
@@ -14,13 +14,28 @@ app = typer.Typer(no_args_is_help=True, help="Nodes: which there are, what they 
 
 @app.command("list")
 def list_nodes(as_json: JsonOption = False) -> None:
-    """The node types that a launch file can name."""
+    """The node types that a launch file can name, and the nodes of the graph that runs."""
+    from launch.runs import live_runs
     from nodes import NODES
 
+    running: dict[str, list[str]] = {}
+    if live_runs():
+        plan, _ = running_graph(None)
+        for node in plan.nodes.values():
+            running.setdefault(node.type, []).append(node.name)
+    types = {**NODES, **{name: name for name in running if name not in NODES}}
     if as_json:
-        print_json([{"type": name, "class": path} for name, path in NODES.items()])
+        print_json(
+            [
+                {"type": name, "class": path, "running": running.get(name, [])}
+                for name, path in types.items()
+            ]
+        )
     else:
-        print_table(("type", "class"), NODES.items())
+        print_table(
+            ("type", "class", "running as"),
+            [(name, path, ", ".join(running.get(name, []))) for name, path in types.items()],
+        )
 
 
 @app.command()

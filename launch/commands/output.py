@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 words = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -52,3 +54,15 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
     width = max(len(name) for name, _ in pairs)
     for name, value in pairs:
         print(f"{name:<{width}}  {value}")
+
+
+@contextmanager
+def progress_words() -> Iterator[Callable[[str], None]]:
+    """Shows on stderr what is being done and since when; a line each where it is no terminal."""
+    if not words.is_terminal:
+        yield lambda text: words.print(text, markup=False)
+        return
+    columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=words) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda text: bar.update(task, description=text)

@@ -1,0 +1,71 @@
+"""`flexsheet chart`: speed against accuracy of a method family."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    print_json,
+    print_table,
+    progress_words,
+    words,
+)
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
+
+
+def chart(
+    *,
+    family: Annotated[str | None, typer.Argument(help="Method family; without it, all.")] = None,
+    scene_file: Annotated[
+        Path, typer.Option("--scene", metavar="FILE", help="Scene to measure on.")
+    ] = SCENE_FILE,
+    output: Annotated[
+        Path, typer.Option("--output", metavar="FOLDER", help="For pictures and numbers.")
+    ] = Path("runs/charts"),
+    as_json: JsonOption = False,
+) -> None:
+    """Chart speed against accuracy of a family's methods, on this machine and one scene."""
+    from launch import charts
+    from launch.plan import load_scene
+
+    scene = load_scene(scene_file)
+    try:
+        families = [charts.family_named(name) for name in ([family] if family else charts.FAMILIES)]
+    except charts.UnknownFamilyError as error:
+        raise CommandError(str(error), BAD_INPUT) from None
+    results = []
+    for each in families:
+        with progress_words() as progress:
+            points = charts.measure_family(each, scene, progress=progress)
+        result = charts.finite(charts.chart_result(each, scene, points))
+        picture, _ = charts.write_chart(result, output)
+        words.print(f"chart: {picture}")
+        results.append(result)
+        if not as_json:
+            _print_points(result)
+    if as_json:
+        print_json(results[0] if family else results)
+
+
+def _print_points(result: dict[str, Any]) -> None:
+    rows = [
+        (
+            point["method"],
+            ", ".join(f"{key} {value}" for key, value in point["params"].items()),
+            f"{point['median_s'] * 1e6:.1f}",
+            f"{point['p99_s'] * 1e6:.1f}",
+            "-" if point["error"] is None else f"{point['error']:.4g}",
+            "yes" if point["in_range"] else "no",
+            "front" if point["method"] in result["front"] else "",
+        )
+        for point in result["points"]
+    ]
+    error = f"error, {result['unit']}"
+    print_table(("method", "case", "median, µs", "p99, µs", error, "in range", ""), rows)

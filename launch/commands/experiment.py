@@ -1,0 +1,174 @@
+"""`flexsheet experiment` and `flexsheet demo`: the paper's experiments, run on the graph."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import print_json, print_table, progress_words, words
+
+if TYPE_CHECKING:
+    from launch.experiments.run import Procedure, Progress
+
+app = typer.Typer(no_args_is_help=True, help="The paper's experiments, through the running graph.")
+
+DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
+
+LaunchOption = Annotated[
+    Path,
+    typer.Option("--launch", metavar="FILE", help="The graph to experiment on."),
+]
+OutputOption = Annotated[
+    Path | None,
+    typer.Option("--output", metavar="FOLDER", help="For bag and results; default: runs/..."),
+]
+SettingsOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NODE.PARAM=VALUE", help="Over what the file says."),
+]
+
+
+def _folder(output: Path | None, name: str) -> Path:
+    from launch.experiments.run import new_folder
+
+    if output is None:
+        return new_folder(name)
+    output.mkdir(parents=True, exist_ok=True)
+    return output
+
+
+def _record(
+    launch_file: Path,
+    settings: list[str] | None,
+    bag: Path,
+    procedure: Procedure,
+    progress: Progress,
+) -> None:
+    from launch.experiments.run import run_experiment
+
+    run_experiment(launch_file, settings or (), bag, procedure, progress)
+    progress("reading the bag")
+
+
+@app.command()
+def stroke(
+    *,
+    seconds: Annotated[float, typer.Option(min=1.0, max=600.0, help="Moving time.")] = 10.0,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Stroke the cylinder by 60 degrees (section V, Table I)."""
+    from launch.experiments import stroke as experiment
+    from launch.experiments.run import stroke_procedure
+
+    bag = _folder(output, "stroke") / "stroke.mcap"
+    with progress_words() as progress:
+        procedure = stroke_procedure([seconds], progress)
+        _record(launch_file, settings, bag, procedure, progress)
+        result = experiment.stroke_result(experiment.read_recording(bag), seconds, bag)
+    if as_json:
+        print_json(result)
+    else:
+        print_strokes([result])
+        words.print(f"bag: {bag}")
+
+
+@app.command()
+def tilt(
+    *,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Errors of the picture on an inclined sheet (section VI-B, Fig. 11)."""
+    from launch.experiments import image
+    from launch.experiments.run import tilt_procedure
+
+    bag = _folder(output, "tilt") / "tilt.mcap"
+    with progress_words() as progress:
+        procedure = tilt_procedure(image.TILTS_DEG, image.CORRECTIONS, progress)
+        _record(launch_file, settings, bag, procedure, progress)
+        rows = image.tilt_rows(image.read_pictures(bag), image.TILTS_DEG)
+    _print_rows(rows, bag, as_json=as_json)
+
+
+@app.command()
+def push(
+    *,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Errors of the picture on a pushed sheet (section VI-C, Fig. 13)."""
+    from launch.experiments import image
+    from launch.experiments.run import push_procedure
+
+    bag = _folder(output, "push") / "push.mcap"
+    with progress_words() as progress:
+        procedure = push_procedure(image.DEPTHS_MM, image.CORRECTIONS, progress)
+        _record(launch_file, settings, bag, procedure, progress)
+        rows = image.push_rows(image.read_pictures(bag), image.DEPTHS_MM)
+    _print_rows(rows, bag, as_json=as_json)
+
+
+def _print_rows(rows: list[dict[str, Any]], bag: Path, *, as_json: bool) -> None:
+    if as_json:
+        print_json({"rows": rows, "bag": str(bag)})
+        return
+    cells = [
+        [f"{cell:.2f}" if isinstance(cell, float) else cell for cell in row.values()]
+        for row in rows
+    ]
+    print_table(list(rows[0]), cells)
+    words.print(f"bag: {bag}")
+
+
+def print_strokes(results: list[dict[str, Any]]) -> None:
+    """Table I of the paper beside ours, mean and standard deviation."""
+    from launch.experiments.stroke import PAPER_TABLE_1
+
+    columns = ["moving time"]
+    for name, unit in (("Δd", "mm"), ("Δθ", "°")):
+        columns += [f"{name} paper, {unit}", f"{name} ours, {unit}", f"true {name}, {unit}"]
+    rows = []
+    for result in results:
+        row = [f"{result['seconds']:g} s"]
+        for key in ("delta_d_mm", "delta_theta_deg"):
+            paper = PAPER_TABLE_1.get(result["seconds"], {}).get(key)
+            row.append("-" if paper is None else f"{paper[0]:.3f} ± {paper[1]:.3f}")
+            for ours in (result[key], result[f"true_{key}"]):
+                row.append(f"{ours['mean']:.3f} ± {ours['std']:.3f}")
+        rows.append(row)
+    print_table(columns, rows)
+
+
+def demo(
+    *,
+    launch_file: LaunchOption = DEMO_FILE,
+    finger_path: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CSV", help="A recorded finger (t_s,x_mm,y_mm,z_mm) instead of the strokes."
+        ),
+    ] = None,
+    output: OutputOption = None,
+) -> None:
+    """Run the whole system on this machine: stroke, tilt and push the sheet; then pictures."""
+    from launch.experiments.demo import recorded_finger, run_demo
+
+    path = None if finger_path is None else recorded_finger(launch_file, finger_path)
+    folder = _folder(output, "demo")
+    with progress_words() as progress:
+        result = run_demo(launch_file, folder, progress, path=path)
+    if result.strokes:
+        print_strokes(result.strokes)
+    words.print(f"bag: {result.bag}")
+    for picture in result.pictures:
+        words.print(f"picture: {picture}")

@@ -1,0 +1,445 @@
+"""The `flexsheet` command: data on stdout, words on stderr, exit codes that mean something."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch import cli, runs
+from messages.bag import BagReader, BagWriter
+from messages.base import Header
+from messages.topics import TOPICS
+from messages.types import EStop
+from nodes import NODES
+
+ROOT = Path(__file__).resolve().parent.parent
+GRAPH: dict[str, Any] = {
+    "nodes": {
+        "beacon": {"type": "tests.launch_nodes:Beacon"},
+        "listener": {"type": "tests.launch_nodes:Listener"},
+    }
+}
+LISTENING: dict[str, Any] = {
+    "nodes": {"listener": {"type": "tests.launch_nodes:Listener"}},
+    "from_tools": ["twin/finger"],
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """What a command left: exit code, stdout, stderr."""
+
+    code: int
+    out: str
+    err: str
+
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+
+class Command:
+    """Runs the command in this process."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+        self._capsys, self._monkeypatch = capsys, monkeypatch
+
+    def __call__(self, *arguments: object) -> Said:
+        self._monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
+        self._capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        out, err = self._capsys.readouterr()
+        return Said(int(end.value.code or 0), out, err)
+
+
+@pytest.fixture
+def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    return Command(capsys, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def runs_root() -> Iterator[Path]:
+    """A directory of runs for this file's tests."""
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    before = os.environ.get(runs.ROOT_VARIABLE)
+    os.environ[runs.ROOT_VARIABLE] = str(folder)
+    yield folder
+    if before is None:
+        del os.environ[runs.ROOT_VARIABLE]
+    else:
+        os.environ[runs.ROOT_VARIABLE] = before
+    shutil.rmtree(folder)
+
+
+class Launched:
+    """`flexsheet launch` in a process of its own, from ready to stop."""
+
+    def __init__(self, path: Path, *options: object) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, str(ROOT / "flexsheet.py"), "launch", str(path), *map(str, options)],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stderr is not None
+        said = ""
+        for line in self.process.stderr:
+            said += line
+            if "are ready" in line:
+                break
+        else:
+            pytest.fail(f"the graph did not come up: {said}")
+        # Nobody reads on: the pipe must not fill.
+        self._drain = threading.Thread(target=self.process.stderr.read)
+        self._drain.start()
+
+    def stop(self) -> int:
+        self.process.send_signal(signal.SIGINT)
+        self._drain.join()
+        code = self.process.wait()
+        assert self.process.stderr is not None
+        self.process.stderr.close()
+        return code
+
+
+def write(folder: Path, graph: dict[str, Any]) -> Path:
+    path = folder / "graph.yaml"
+    path.write_text(json.dumps(graph))
+    return path
+
+
+@pytest.fixture(scope="module")
+def running(runs_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A tiny graph that runs, recording; gives its bag, which is whole after the tests."""
+    folder = tmp_path_factory.mktemp("graph")
+    launched = Launched(write(folder, GRAPH), "--record", folder / "run.mcap")
+    yield folder / "run.mcap"
+    assert launched.stop() == 0
+
+
+@pytest.fixture(scope="module")
+def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A whole bag of the tiny graph, all of it from the beginning."""
+    folder = tmp_path_factory.mktemp("recorded")
+    launched = Launched(
+        write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=0.8"
+    )
+    # The listener hears the tenth beat a fifth of a second after the start.
+    while "estop" not in BagReader(folder / "a.mcap").topics:
+        time.sleep(0.05)
+    assert launched.stop() == 0
+    return folder / "a.mcap"
+
+
+def test_help_names_every_command(flexsheet: Command) -> None:
+    said = flexsheet("--help")
+    assert said.code == 0
+    for name in ("launch", "node", "topic", "bag", "calibrate", "doctor"):
+        assert name in said.out
+
+
+def test_help_and_the_table_of_topics_load_no_heavy_library() -> None:
+    code = (
+        "import sys; sys.argv = ['flexsheet', 'topic', 'list', '--json']; import flexsheet\n"
+        "try: flexsheet.main()\n"
+        "except SystemExit: pass\n"
+        "print([name for name in ('cv2', 'scipy', 'matplotlib', 'mcap', 'moderngl') "
+        "if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True
+    )
+    assert done.stderr.strip() == "[]"
+    assert len(json.loads(done.stdout)) == len(TOPICS)
+
+
+def test_topic_list_is_the_table(flexsheet: Command) -> None:
+    rows = flexsheet("topic", "list", "--json").json()
+    assert [row["topic"] for row in rows] == list(TOPICS)
+    assert "twin/finger_path" in flexsheet("topic", "list").out
+
+
+def test_node_list_and_describe(flexsheet: Command) -> None:
+    assert [row["type"] for row in flexsheet("node", "list", "--json").json()] == list(NODES)
+    described = flexsheet("node", "describe", "planner", "--json").json()
+    assert {"port": "sheet_target", "direction": "output", "message": "SheetTarget"} in described[
+        "ports"
+    ]
+    assert "lead_s" in [row["parameter"] for row in described["parameters"]]
+    said = flexsheet("node", "describe", "tests.launch_nodes:Beacon")
+    assert "twin__finger" in said.out
+    assert "rate_hz" in said.out
+    said = flexsheet("node", "describe", "planer")
+    assert (said.code, said.out) == (2, "")
+    assert 'did you mean "planner"?' in said.err
+
+
+def test_dry_run_prints_the_plan_and_starts_nothing(
+    flexsheet: Command, tmp_path: Path, runs_root: Path
+) -> None:
+    before = list(runs_root.iterdir())
+    path = write(tmp_path, GRAPH)
+    plan = flexsheet("launch", path, "--dry-run", "--json").json()
+    assert plan["nodes"]["listener"]["inputs"][0]["topic"] == "twin/finger"
+    said = flexsheet("launch", path, "--dry-run", "--set", "beacon.rate_hz=12")
+    assert said.code == 0
+    assert "rate_hz=12.0" in said.out
+    assert "ipc://@run/beacon.twin.finger" in said.out
+    assert list(runs_root.iterdir()) == before
+
+
+def test_a_bad_launch_file_is_exit_code_two(flexsheet: Command, tmp_path: Path) -> None:
+    (tmp_path / "graph.yaml").write_text("nodes:\n  a:\n    typ: camera\n")
+    said = flexsheet("launch", tmp_path / "graph.yaml")
+    assert (said.code, said.out) == (2, "")
+    assert 'graph.yaml:3: nodes.a.typ: unknown key "typ"; did you mean "type"?' in said.err
+    assert "Traceback" not in said.err
+
+
+def test_a_node_that_fails_for_good_is_exit_code_one(tmp_path: Path, runs_root: Path) -> None:
+    beacon = {"type": "tests.launch_nodes:Beacon", "parameters": {"exit_code": 3}}
+    path = write(tmp_path, {"nodes": {"beacon": {**beacon, "restart": {"policy": "never"}}}})
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "flexsheet.py"), "launch", str(path)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert "beacon ended with exit code 3" in done.stderr
+
+
+def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> None:
+    said = flexsheet("topic", "echo", "twin/finger", "--once", "--timeout", "20")
+    assert said.code == 0
+    assert said.out.startswith("--- beacon #")
+    assert "path_label: count" in said.out
+    said = flexsheet(
+        "topic", "echo", "twin/finger", "--count", "2", "--field", "path_time_s", "--json"
+    )
+    one, two = (json.loads(line) for line in said.out.splitlines())
+    assert two["message"] > one["message"] > 0
+    assert one["header"]["writer"] == "beacon"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "word"),
+    [
+        (("echo", "twin/fingr"), 2, 'did you mean "twin/finger"?'),
+        (("echo", "twin/finger", "--field", "path_tim_s"), 2, 'did you mean "path_time_s"?'),
+        (("echo", "fingertip"), 1, 'nobody writes "fingertip"'),
+        (("echo", "display", "--once", "--timeout", "0.2"), 1, 'nothing came on "display"'),
+        (("hz", "display", "--duration", "0.2"), 1, 'nothing came on "display"'),
+        (("pub", "estop", "{engaged: maybe}"), 2, "is no EStop: engaged"),
+        (("pub", "estop", "{engaged: ["), 2, "neither YAML nor JSON"),
+        (("pub", "estop", "@nowhere.yaml"), 2, "cannot be read"),
+        (("echo", "estop", "--run", "/nowhere"), 2, "no plan.json"),
+    ],
+)
+def test_wrong_words_to_topics(
+    flexsheet: Command, running: Path, arguments: tuple[str, ...], code: int, word: str
+) -> None:
+    said = flexsheet("topic", *arguments)
+    assert said.code == code
+    assert word in said.err
+
+
+def test_nobody_publishes_for_a_node(flexsheet: Command, running: Path) -> None:
+    finger = (
+        "{path_label: '', path_done: true, path_time_s: 0, position_world_m: [0, 0, 0], "
+        "velocity_world_m_per_s: [0, 0, 0]}"
+    )
+    said = flexsheet("topic", "pub", "twin/finger", finger)
+    assert said.code == 2
+    assert "is written by beacon" in said.err
+
+
+def test_hz_goes_by_the_writers_stamps(flexsheet: Command, running: Path) -> None:
+    (row,) = flexsheet("topic", "hz", "twin/finger", "--duration", "1", "--json").json()
+    assert row["writer"] == "beacon"
+    assert row["lost"] == 0
+    assert 5 < row["rate_hz"] < 60
+    assert "beacon" in flexsheet("topic", "hz", "status", "--duration", "2.5").out
+
+
+def test_info_knows_the_graph(flexsheet: Command, running: Path) -> None:
+    described = flexsheet("topic", "info", "twin/finger", "--json").json()
+    assert described["writers"] == ["beacon"]
+    assert described["readers"] == ["listener", "recorder"]
+    assert "path_time_s" in described["fields"]
+
+
+def test_pub_reaches_the_graph(flexsheet: Command, running: Path) -> None:
+    said = flexsheet("topic", "pub", "display", "{correction: none, stereo: mono}", "--count", "2")
+    assert said.code == 0
+    assert 'sent 2 on "display"' in said.err
+    live = flexsheet("bag", "info", running, "--json")
+    assert live.code == 0
+
+
+def test_a_running_graph_can_be_recorded(flexsheet: Command, running: Path, tmp_path: Path) -> None:
+    bag = tmp_path / "b.mcap"
+    said = flexsheet("bag", "record", bag, "--topic", "twin/finger", "--duration", "0.5")
+    assert said.code == 0
+    info = flexsheet("bag", "info", bag, "--json").json()
+    assert info["complete"]
+    assert [topic["name"] for topic in info["topics"]] == ["twin/finger"]
+    said = flexsheet("bag", "record", bag)
+    assert (said.code, "exists already" in said.err) == (2, True)
+    said = flexsheet("bag", "record", tmp_path / "c.mcap", "--topic", "stereo")
+    assert (said.code, "nobody writes it" in said.err) == (2, True)
+
+
+def test_verify_steps_a_node_and_compares(
+    flexsheet: Command, recorded: Path, tmp_path: Path
+) -> None:
+    result = flexsheet("bag", "verify", "listener", recorded, "--json").json()
+    assert result["ok"]
+    assert result["same_bytes"]
+    assert result["topics"]["estop"] == {
+        "recorded": 1, "replayed": 1, "compared": 1, "beyond_tolerance": 0, "worst": {},
+    }  # fmt: skip
+    assert flexsheet("bag", "verify", "listener", recorded).code == 0
+    again = flexsheet("bag", "verify", "listener", recorded, "--json").json()
+    assert again["digest"] == result["digest"]
+
+
+def test_verify_sees_another_output(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
+    forged = tmp_path / "forged.mcap"
+    reader = BagReader(recorded)
+    with BagWriter(forged) as writer:
+        writer.add_attachment("plan.json", reader.attachment("plan.json"), "application/json")
+        for topic, message, header, log_ns in reader:
+            other = EStop(engaged=True, reason="eleven") if topic == "estop" else message
+            writer.write(TOPICS[topic], other, header, log_ns)
+    said = flexsheet("bag", "verify", "listener", forged, "--json")
+    assert said.code == 1
+    assert said.json()["topics"]["estop"]["worst"] == {"reason": 1.0}
+
+
+def test_verify_says_what_it_lacks(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
+    said = flexsheet("bag", "verify", "listner", recorded)
+    assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)
+    bare = tmp_path / "bare.mcap"
+    with BagWriter(bare):
+        pass
+    assert 'no attachment "plan.json"' in flexsheet("bag", "verify", "listener", bare).err
+    assert flexsheet("bag", "info", tmp_path / "no.mcap").code == 1
+
+
+def test_a_bag_plays_into_a_graph(
+    flexsheet: Command, recorded: Path, runs_root: Path, tmp_path: Path
+) -> None:
+    launched = Launched(write(tmp_path, LISTENING), "--record", tmp_path / "b.mcap")
+    said = flexsheet("bag", "play", recorded, "--rate", "4", "--topic", "twin/finger")
+    newest = runs.live_runs()[0]
+    refused = flexsheet("bag", "play", recorded, "--topic", "stereo", "--run", newest.directory)
+    assert launched.stop() == 0
+    assert said.code == 0, said.err
+    assert (refused.code, "not in the bag" in refused.err) == (1, True)
+    sent = list(BagReader(recorded, ["twin/finger"]))
+    got = list(BagReader(tmp_path / "b.mcap", ["twin/finger"]))
+    assert [message.path_time_s for _, message, _, _ in got] == [  # type: ignore[attr-defined]  # one type on the topic
+        message.path_time_s
+        for _, message, _, _ in sent  # type: ignore[attr-defined]
+    ]
+    # As old when played as when recorded, four times as close together.
+    began = got[0][2].source_ns - sent[0][2].source_ns // 4
+    for (_, _, played, _), (_, _, original, _) in zip(got, sent, strict=True):
+        assert abs(played.source_ns - original.source_ns // 4 - began) < 50e6
+    (stop,) = list(BagReader(tmp_path / "b.mcap", ["estop"]))
+    assert stop[2].writer == "listener"
+
+
+def test_play_can_bring_its_graph_and_restores_latched_topics_first(
+    flexsheet: Command, runs_root: Path, tmp_path: Path
+) -> None:
+    bag = tmp_path / "made.mcap"
+    with BagWriter(bag) as writer:
+        for i in range(5):
+            header = Header(i + 1, 10**9 + i * 10**8, 0, "c", "hand", 1)
+            stop = EStop(engaged=False, reason=f"number {i}")
+            writer.write(TOPICS["estop"], stop, header, 10**9 + i * 10**8)
+    graph = write(tmp_path, {**GRAPH, "record": {"bag": "played.mcap"}})
+    said = flexsheet("bag", "play", bag, "--start", "0.25", "--into", graph)
+    assert said.code == 0, said.err
+    assert "played 3 messages on estop" in said.err
+    entries = BagReader(tmp_path / "played.mcap", ["estop"])
+    reasons = [
+        message.reason
+        for _, message, header, _ in entries
+        if isinstance(message, EStop) and header.writer == "tools"
+    ]
+    assert reasons == ["number 2", "number 3", "number 4"]
+
+
+def test_without_a_graph_that_is_said(
+    flexsheet: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(tmp_path))
+    said = flexsheet("topic", "echo", "twin/finger")
+    assert said.code == 1
+    assert "no graph is running" in said.err
+
+
+def test_doctor_examines_the_machine(flexsheet: Command, runs_root: Path) -> None:
+    said = flexsheet("doctor", "--json")
+    findings = {finding["check"]: finding for finding in said.json()}
+    assert findings["python"]["state"] == "ok"
+    assert findings["leftovers"]["state"] == "ok"
+    assert said.code == int(any(one["state"] == "failed" for one in findings.values()))
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        ({"--board": "9by6"}, "give the inner corners"),
+        ({"--left": "/nowhere/*.jpg"}, "no file matches"),
+        ({"-o": "/nowhere/c.yaml"}, "does not exist"),
+    ],
+)
+def test_wrong_words_to_calibrate(
+    flexsheet: Command, tmp_path: Path, options: dict[str, str], word: str
+) -> None:
+    (tmp_path / "left.png").touch()
+    given = {
+        "--left": str(tmp_path / "left.png"),
+        "--right": str(tmp_path / "left.png"),
+        "--board": "9x6",
+        "--square-mm": "25",
+        "-o": str(tmp_path / "c.yaml"),
+        **options,
+    }
+    said = flexsheet("calibrate", "stereo", *(word for pair in given.items() for word in pair))
+    assert said.code == 2
+    assert word in said.err
+
+
+def test_calibrating_with_real_pictures(flexsheet: Command, tmp_path: Path) -> None:
+    pictures = ROOT.parent / "shared/data/stereo"
+    if not pictures.is_dir():
+        pytest.skip("the real stereo pairs are not here")
+    given = ("--left", pictures / "left0[1-8].jpg", "--right", pictures / "right0[1-8].jpg",
+             "--board", "9x6", "--square-mm", "24.23")  # fmt: skip
+    said = flexsheet("calibrate", "stereo", *given, "-o", tmp_path / "c.yaml", "--json")
+    assert said.code == 0, said.err
+    assert said.json()["pairs"] >= 5
+    given = ("--left", pictures / "left1[0-4].jpg", "--right", pictures / "right1[0-4].jpg",
+             "--board", "9x6", "--square-mm", "24.23")  # fmt: skip
+    checked = flexsheet(
+        "calibrate", "check", "--calibration", tmp_path / "c.yaml", *given, "--json"
+    )
+    assert checked.code == 0, checked.err
+    assert {
+        "pairs", "square_rms_mm", "diagonal_rms_mm", "rigid_fit_rms_mm", "reprojection_rms_px",
+    } <= checked.json().keys()  # fmt: skip
