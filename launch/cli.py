@@ -6,7 +6,7 @@ import sys
 
 import typer
 
-from launch.commands import bag, calibrate, doctor, launching, node, topic
+from launch.commands import bag, calibrate, chart, doctor, experiment, launching, node, topic
 from launch.commands.output import BAD_INPUT, FAILED, CommandError, words
 
 app = typer.Typer(
@@ -21,6 +21,9 @@ app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(bag.app, name="bag")
 app.add_typer(calibrate.app, name="calibrate")
+app.add_typer(experiment.app, name="experiment")
+app.command()(experiment.demo)
+app.command()(chart.chart)
 app.command()(doctor.doctor)
 
 
@@ -40,6 +43,7 @@ def _exit_code(error: Exception) -> int | None:
     """The exit code of an error that is the user's to put right; None for an error of ours."""
     # Imported only now: a command that goes well should not wait for these.
     from launch.documents import BadInputError
+    from launch.experiments import ExperimentError
     from launch.runs import RunDirectoryError
     from messages.bag import BagError
     from messages.bus import BusError
@@ -48,6 +52,6 @@ def _exit_code(error: Exception) -> int | None:
         return error.code
     if isinstance(error, BadInputError):
         return BAD_INPUT
-    if isinstance(error, BusError | RunDirectoryError | BagError):
+    if isinstance(error, BusError | RunDirectoryError | BagError | ExperimentError):
         return FAILED
     return None

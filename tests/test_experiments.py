@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from launch.charts import UnknownFamilyError, chart_result, family_named, finite, write_chart
-from launch.experiments import image, stroke
+from launch.experiments import ExperimentError, image, stroke
 from messages.scene import Scene
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 
@@ -83,7 +83,7 @@ def test_the_stroke_path_is_the_papers() -> None:
 
 
 def test_a_track_needs_samples() -> None:
-    with pytest.raises(ValueError, match="1 samples of fingertip"):
+    with pytest.raises(ExperimentError, match="1 samples of fingertip"):
         stroke.track([(0, np.zeros(3))], "fingertip")
 
 
@@ -100,7 +100,7 @@ def test_a_missing_stroke_is_named_with_what_there_is() -> None:
         delays_s={},
         drops=0,
     )
-    with pytest.raises(ValueError, match=r"no finger path .*it has: wandering"):
+    with pytest.raises(ExperimentError, match=r"no finger path .*it has: wandering"):
         stroke.stroke_errors(recording, 10.0)
 
 

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
-from launch.experiments import image, stroke
+from launch.experiments import ExperimentError, image, stroke
 from launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from launch.experiments.run import (
     Progress,
@@ -19,7 +17,9 @@ from launch.experiments.run import (
     stroke_procedure,
     tilt_procedure,
 )
+from launch.plan import load_plan
 from messages.types import Correction, FingerPath
+from nodes.twin.finger import FingerPathError, recorded_path
 
 SECONDS = (10.0, 30.0)
 TILT_DEG = -40
@@ -62,8 +62,12 @@ def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoRes
         folder / "stroke.png",
         folder / "latency.png",
     )
-    tilted = [photographs[image.tilt_label(TILT_DEG, name)] for name in TILT_CORRECTIONS]
-    pushed = [photographs[image.push_label(DEPTH_MM, name)] for name in PUSH_CORRECTIONS]
+    tilted = [
+        image.picture_of(photographs, image.tilt_label(TILT_DEG, name)) for name in TILT_CORRECTIONS
+    ]
+    pushed = [
+        image.picture_of(photographs, image.push_label(DEPTH_MM, name)) for name in PUSH_CORRECTIONS
+    ]
     draw_eye_views(
         [(f"sheet tilted {TILT_DEG}°", tilted), (f"sheet pushed {DEPTH_MM} mm", pushed)], views
     )
@@ -77,23 +81,12 @@ def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoRes
     return DemoResult(folder=folder, bag=bag, strokes=results, pictures=pictures)
 
 
-def table_1(strokes: list[dict[str, Any]]) -> Table:
-    """Table I of the paper beside ours."""
-    table = Table(title="Table I: errors while stroking (mean ± standard deviation)")
-    table.add_column("moving time")
-    for name in ("Δd paper, mm", "Δd ours, mm", "true Δd, mm"):
-        table.add_column(name, justify="right")
-    for name in ("Δθ paper, °", "Δθ ours, °", "true Δθ, °"):
-        table.add_column(name, justify="right")
-    for result in strokes:
-        paper = stroke.PAPER_TABLE_1.get(result["seconds"], {})
-        cells = [f"{result['seconds']:g} s"]
-        for key in ("delta_d_mm", "delta_theta_deg"):
-            mean_std = paper.get(key)
-            cells.append("-" if mean_std is None else f"{mean_std[0]:.3f} ± {mean_std[1]:.3f}")
-            cells.extend(
-                f"{result[name]['mean']:.3f} ± {result[name]['std']:.3f}"
-                for name in (key, f"true_{key}")
-            )
-        table.add_row(*cells)
-    return table
+def recorded_finger(launch_file: Path, csv: Path) -> FingerPath:
+    """The finger of a recording, brought into the launch file's scene."""
+    scene = load_plan(launch_file).scene_message()
+    if scene is None:
+        raise ExperimentError(f'{launch_file}: key "scene": the finger needs a scene; name one')
+    try:
+        return recorded_path(csv, scene)
+    except FingerPathError as error:
+        raise ExperimentError(str(error)) from None

@@ -15,6 +15,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from launch.experiments import ExperimentError
 from launch.plan import RUN_DIRECTORY, TOOLS, Plan
 from launch.runs import Run
 from messages.base import Header, Message
@@ -42,10 +43,6 @@ SETTLED_TURN_RAD_PER_S = 5e-3
 SETTLED_MESSAGES = 30
 WAIT_S = 20.0
 PICTURE_WAIT_S = 40.0
-
-
-class ExperimentError(RuntimeError):
-    """The graph did not do what the experiment waits for."""
 
 
 class Driver:

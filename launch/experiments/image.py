@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from messages.bag import BagReader
-from nodes.twin.eye import push_sizes, tilt_sizes
 from numpy.typing import NDArray
 
+from launch.experiments import ExperimentError
 from launch.experiments.stroke import object_pose
+from messages.bag import BagReader
 from messages.scene import Scene
 from messages.types import Correction, FingerPath, TwinEye
 from nodes.models.rigid import apply
+from nodes.twin.eye import push_sizes, tilt_sizes
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILTS_DEG = (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50)
@@ -100,12 +101,22 @@ def size_errors_mm(
     return [float(error) for error in np.abs(seen - proper) * 1e3]
 
 
+def picture_of(pictures: dict[str, Picture], label: str) -> Picture:
+    """The picture of that label; ExperimentError when the bag has none."""
+    if label not in pictures:
+        have = ", ".join(pictures) or "none"
+        raise ExperimentError(f'the bag has no picture "{label}"; it has: {have}')
+    return pictures[label]
+
+
 def tilt_rows(pictures: dict[str, Picture], tilts_deg: tuple[float, ...]) -> list[dict[str, Any]]:
-    """Rows of `experiment tilt`; KeyError names a picture that was not taken."""
+    """Rows of `experiment tilt`, from its pictures."""
     rows = []
     for theta_deg in tilts_deg:
         for correction in CORRECTIONS:
-            errors = size_errors_mm(pictures[tilt_label(theta_deg, correction)], tilt_sizes)
+            errors = size_errors_mm(
+                picture_of(pictures, tilt_label(theta_deg, correction)), tilt_sizes
+            )
             rows.append(
                 {
                     "theta_deg": theta_deg,
@@ -120,11 +131,13 @@ def tilt_rows(pictures: dict[str, Picture], tilts_deg: tuple[float, ...]) -> lis
 
 
 def push_rows(pictures: dict[str, Picture], depths_mm: tuple[float, ...]) -> list[dict[str, Any]]:
-    """Rows of `experiment push`; KeyError names a picture that was not taken."""
+    """Rows of `experiment push`, from its pictures."""
     rows = []
     for depth_mm in depths_mm:
         for correction in CORRECTIONS:
-            errors = size_errors_mm(pictures[push_label(depth_mm, correction)], push_sizes)
+            errors = size_errors_mm(
+                picture_of(pictures, push_label(depth_mm, correction)), push_sizes
+            )
             rows.append(
                 {
                     "depth_mm": depth_mm,

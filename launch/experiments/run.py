@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from launch.experiments import image, stroke
+from launch.experiments import ExperimentError, image, stroke
 from launch.experiments.driver import Driver
 from launch.plan import Plan, load_plan
 from launch.supervisor import RunningGraph
@@ -37,7 +37,9 @@ async def drive(plan: Plan, procedure: Procedure, progress: Progress) -> None:
     """
     scene = plan.scene_message()
     if scene is None:
-        raise ValueError(f'{plan.launch_file}: key "scene": an experiment needs a scene; name one')
+        raise ExperimentError(
+            f'{plan.launch_file}: key "scene": an experiment needs a scene; name one'
+        )
     async with RunningGraph(plan) as graph:
         progress("starting the nodes")
         await graph.wait_ready()
@@ -61,7 +63,7 @@ async def _unless_it_ends(graph: RunningGraph, work: Coroutine[Any, Any, None]) 
         await asyncio.wait((task, end), return_when=asyncio.FIRST_COMPLETED)
         if not task.done():
             end.result()
-            raise RuntimeError(f"the nodes ended before the experiment; logs: {graph.run.logs}")
+            raise ExperimentError(f"the nodes ended before the experiment; logs: {graph.run.logs}")
         task.result()
     finally:
         for each in (task, end):

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from messages.bag import BagReader
 from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
+from launch.experiments import ExperimentError
+from messages.bag import BagReader
 from messages.scene import ArmSpec, Scene
 from messages.types import (
     ArmState,
@@ -115,7 +116,9 @@ class Track:
 def track(samples: list[tuple[int, Floats]], what: str) -> Track:
     """A track of (time, value) samples, in the order of time, repeated times dropped."""
     if len(samples) < 2:
-        raise ValueError(f"the bag has {len(samples)} samples of {what}; the experiment needs more")
+        raise ExperimentError(
+            f"the bag has {len(samples)} samples of {what}; the experiment needs more"
+        )
     times = np.array([time for time, _ in samples], dtype=np.int64)
     values = np.array([value for _, value in samples])
     times, first = np.unique(times, return_index=True)
@@ -208,7 +211,7 @@ def read_recording(bag: Path) -> Recording:
             case _:
                 pass
     if scene is None:
-        raise ValueError(f"{bag}: no scene was recorded")
+        raise ExperimentError(f"{bag}: no scene was recorded")
 
     def edges(key: str, arm: ArmSpec) -> Track:
         pose = arm.flange_from_edge
@@ -325,11 +328,11 @@ class StrokeErrors:
 
 
 def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
-    """Errors at every exposure of the stroke of that duration; ValueError when it is not there."""
+    """Errors at every exposure of that stroke; ExperimentError when the bag does not have it."""
     label = stroke_label(seconds)
     if label not in recording.windows_ns:
         have = ", ".join(recording.windows_ns) or "none"
-        raise ValueError(f'the bag has no finger path "{label}"; it has: {have}')
+        raise ExperimentError(f'the bag has no finger path "{label}"; it has: {have}')
     zero_ns, end_ns = recording.windows_ns[label]
     begin_s, finish_s = stroke_window_s(seconds)
     begin_ns = zero_ns + round(begin_s * 1e9)
@@ -340,7 +343,7 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
         keep &= edges.covers(times)
     times = times[keep]
     if len(times) < 10:
-        raise ValueError(f'only {len(times)} fingertips were recorded during "{label}"')
+        raise ExperimentError(f'only {len(times)} fingertips were recorded during "{label}"')
     scene = recording.scene
     delta_d, delta_theta = sheet_errors(scene, recording.fingertip, recording.measured_edges, times)
     true_d, true_theta = sheet_errors(scene, recording.finger, recording.true_edges, times)
