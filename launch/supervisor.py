@@ -35,6 +35,7 @@ from messages.clock import SystemClock
 from messages.topics import topic_named
 from nodes.runner import NodeConfig, PortConfig
 
+COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 ENTRY = Path(__file__).resolve().parent.parent / "flexsheet.py"
 STOP_GRACE_S = 3.0
 LOG_READ_BYTES = 65_536
@@ -466,7 +467,10 @@ def describe_exit(code: int) -> str | None:
 
 
 def git_state(directory: Path) -> str:
-    """Commit of the code and whether it was changed since, as JSON; nulls outside of git."""
+    """Commit of the code and whether it was changed since, as JSON.
+
+    Outside of git (in a container) the commit is what COMMIT_VARIABLE says, else null.
+    """
 
     def git(*arguments: str) -> str | None:
         try:
@@ -483,7 +487,7 @@ def git_state(directory: Path) -> str:
 
     changes = git("status", "--porcelain")
     state = {
-        "commit": git("rev-parse", "HEAD"),
+        "commit": git("rev-parse", "HEAD") or os.environ.get(COMMIT_VARIABLE) or None,
         "changed": None if changes is None else bool(changes),
     }
     return json.dumps(state)

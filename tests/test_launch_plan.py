@@ -251,3 +251,11 @@ def test_values_are_read_as_yaml() -> None:
     assert parse_value("1.0e-3") == pytest.approx(1e-3)
     assert parse_value("[1, a]") == [1, "a"]
     assert parse_value("on_failure") == "on_failure"
+
+
+def test_the_example_of_the_page_on_launch_files_resolves(tmp_path: Path) -> None:
+    page = (ROOT / "docs/launch-files.md").read_text()
+    example = page.split("```yaml\n")[1].split("```")[0]
+    plan = load_plan(write(tmp_path, example.replace("scenes/", f"{ROOT}/launch/scenes/")))
+    assert plan.nodes["watcher"].outputs[-1].endpoints == ()
+    assert "in/stereo" in [port.port for port in plan.nodes["recorder"].inputs]
