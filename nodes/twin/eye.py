@@ -11,13 +11,14 @@ It shares no code with the renderer: own rays, own projector, own object.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+from scipy.spatial import Delaunay
 
 from messages.scene import Projector, Scene
 from nodes.models.rigid import apply, inverse, transform_from_rpy
@@ -32,8 +33,11 @@ METRES_PER_PX = 0.00035
 """Half of the paper's 0.7 mm."""
 
 HALF_WINDOW_M = 0.12
+MARGIN_PX = 3
 SEEN_SAMPLES = 2
-PROPER_SAMPLES = 8
+FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
+"""A silhouette is measured, so its edge is sampled more finely than shading needs."""
+
 SHADOW_TOLERANCE = 0.002
 """Relative depth behind the lit surface from which a point lies in its shadow."""
 
@@ -180,19 +184,26 @@ class TrueProjector:
         return rays.origin + directions / np.where(inside, total, 1.0)[:, None], inside
 
 
-def eye_rays(eye: Floats, *, metres_per_px: float, half_window_m: float, samples: int) -> Rays:
-    """Rays of the measuring camera, `samples` x `samples` to a pixel, top left first."""
-    pixels = round(2.0 * half_window_m / metres_per_px)
+Box = tuple[int, int, int, int]
+"""Part of a picture: left, top, and behind its last column and row."""
+
+
+def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
+    """Rays of the measuring camera through part of its picture of `size` x `size` pixels.
+
+    `samples` x `samples` rays to a pixel, top left first.
+    """
+    left, top, right, bottom = box
     pitch = metres_per_px / samples
-    count = pixels * samples
-    edge = 0.5 * (count - 1) * pitch
+    edge = 0.5 * size * metres_per_px - 0.5 * pitch
+    corner = np.array([-edge + left * metres_per_px, edge - top * metres_per_px, 0.0])
     return Rays(
         origin=eye,
-        first=np.array([-edge, edge, 0.0]) - eye,
+        first=corner - eye,
         right=np.array([pitch, 0.0, 0.0]),
         down=np.array([0.0, -pitch, 0.0]),
-        width=count,
-        height=count,
+        width=(right - left) * samples,
+        height=(bottom - top) * samples,
     )
 
 
@@ -211,26 +222,48 @@ def seen(
     sheet, and where a fold keeps the light away.
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
-    rays = eye_rays(
-        eye, metres_per_px=metres_per_px, half_window_m=half_window_m, samples=SEEN_SAMPLES
-    )
+    projector = TrueProjector(scene.projector, vertices, triangles)
+    size = round(2.0 * half_window_m / metres_per_px)
+    whole = np.zeros((size, size, 3), np.uint8)
+    # Where nothing is projected nothing is seen: only the light's own part is traced.
+    bright = np.argwhere(projected.any(axis=2))[:, ::-1].astype(np.float64)
+    points, lands = projector.lands_at(bright)
+    lands &= points[:, 2] < eye[2] - 1e-3
+    box = _box(points[lands], eye, metres_per_px, size)
+    if box is None:
+        return whole
+    rays = eye_rays(eye, metres_per_px=metres_per_px, size=size, box=box, samples=SEEN_SAMPLES)
     hits = first_hits(rays, vertices, triangles)
     hit = hits.triangle >= 0
     points = rays.origin + rays.directions()[hit] / hits.inverse_range[hit][:, None]
-    pixels, lit = TrueProjector(scene.projector, vertices, triangles).pixels_of(points)
+    pixels, lit = projector.pixels_of(points)
     where = np.full((rays.height, rays.width, 2), -10.0, np.float32)
     where[hit] = np.where(lit[:, None], pixels, -10.0)
     sampled = cv2.remap(
         projected, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT
     )
-    return _averaged(sampled.astype(np.float32), SEEN_SAMPLES)
+    _put(whole, box, sampled.astype(np.float32), SEEN_SAMPLES)
+    return whole
 
 
-def _averaged(image: NDArray[np.float32], samples: int) -> Image:
-    height, width = image.shape[0] // samples, image.shape[1] // samples
-    mean = image.reshape(height, samples, width, samples, 3).mean(axis=(1, 3))
-    rounded: Image = np.rint(mean).astype(np.uint8)
-    return rounded
+def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | None:
+    """The part of the picture that shows points (n, 3), with a margin; None for none of it."""
+    if len(points) == 0:
+        return None
+    on_screen = eye[:2] + (points[:, :2] - eye[:2]) * (eye[2] / (eye[2] - points[:, 2:]))
+    span = on_screen / metres_per_px * [1.0, -1.0] + 0.5 * size
+    left, top = np.clip(np.floor(span.min(axis=0)).astype(int) - MARGIN_PX, 0, size)
+    right, bottom = np.clip(np.ceil(span.max(axis=0)).astype(int) + MARGIN_PX, 0, size)
+    if right <= left or bottom <= top:
+        return None
+    return int(left), int(top), int(right), int(bottom)
+
+
+def _put(whole: Image, box: Box, samples_of: NDArray[np.float32], samples: int) -> None:
+    """Average samples x samples to a pixel and put them into their part of the picture."""
+    left, top, right, bottom = box
+    blocks = samples_of.reshape(bottom - top, samples, right - left, samples, -1)
+    whole[top:bottom, left:right] = np.rint(blocks.mean(axis=(1, 3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,12 +275,22 @@ class TrueObject:
     normals: Floats
 
 
+@dataclass(frozen=True, slots=True)
+class _Unrolled:
+    """A skin's side laid flat: which of its vertices, and the triangles between them."""
+
+    key: bytes
+    vertices: Indices
+    triangulation: Delaunay
+
+
 class TrueCylinder:
     """The scene's cylinder, at rest or moved as a skin is, on a mesh of its own."""
 
     def __init__(self, scene: Scene, *, around: int = 180, along: int = 48) -> None:
         cylinder, pose = scene.object.geometry, scene.object.world_from_object
         self._around, self._along = around, along
+        self._unrolled: _Unrolled | None = None
         self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._length, self._radius = cylinder.length_m, cylinder.radius_m
         angle = 2.0 * np.pi * np.arange(around) / around
@@ -277,24 +320,34 @@ class TrueCylinder:
         Skin vertices off the cylinder's side (inside its end caps) are left out.  ValueError if too
         few lie on it.
         """
-        local = apply(inverse(self._world_from_object), skin_vertices)
-        radius = np.hypot(local[:, 1], local[:, 2])
-        side = np.abs(radius - self._radius) < 0.02 * self._radius
-        if side.sum() < 8:
-            raise ValueError(f"{side.sum()} of {len(side)} skin vertices lie on the cylinder")
-        angle = np.arctan2(local[side, 1], local[side, 2]) * self._radius
-        turn = 2.0 * np.pi * self._radius
-        # Unrolled three times over, so that the seam lies inside; stretched a little at the ends.
-        places = np.concatenate(
-            [np.column_stack([local[side, 0], angle + k * turn]) for k in (-1, 0, 1)]
-        )
-        values = np.tile(displacement[side], (3, 1))
+        unrolled = self._unrolled_skin(skin_vertices)
+        values = displacement[unrolled.vertices]
         at = np.column_stack([self._station, self._angle * self._radius])
-        moved = LinearNDInterpolator(places, values)(at)
+        moved = LinearNDInterpolator(unrolled.triangulation, values)(at)
         outside = np.isnan(moved).any(axis=1)
         if outside.any():
-            moved[outside] = NearestNDInterpolator(places, values)(at[outside])
+            moved[outside] = NearestNDInterpolator(unrolled.triangulation.points, values)(
+                at[outside]
+            )
         return self._object(self._rest + moved)
+
+    def _unrolled_skin(self, skin_vertices: Floats) -> _Unrolled:
+        """The skin's side as a plane, with a margin beyond the seam; kept while the skin is one."""
+        key = skin_vertices.tobytes()
+        if self._unrolled is None or self._unrolled.key != key:
+            local = apply(inverse(self._world_from_object), skin_vertices)
+            radius = np.hypot(local[:, 1], local[:, 2])
+            side = np.nonzero(np.abs(radius - self._radius) < 0.02 * self._radius)[0]
+            if len(side) < 8:
+                raise ValueError(f"{len(side)} of {len(local)} skin vertices lie on the cylinder")
+            angle = np.arctan2(local[side, 1], local[side, 2]) % (2.0 * np.pi)
+            angles = np.concatenate([angle - 2.0 * np.pi, angle, angle + 2.0 * np.pi])
+            vertices = np.tile(side, 3)
+            near = (angles > -1.0) & (angles < 2.0 * np.pi + 1.0)
+            angles, vertices = angles[near], vertices[near]
+            places = np.column_stack([local[vertices, 0], angles * self._radius])
+            self._unrolled = _Unrolled(key, vertices, Delaunay(places))
+        return self._unrolled
 
     def _object(self, vertices: Floats) -> TrueObject:
         """Close the ends by a fan about each rim's mean, and find the normals."""
@@ -336,32 +389,22 @@ def proper(
         raise ValueError("the object reaches up to the eye")
     vertices, triangles = true_object.vertices, true_object.triangles
     size = round(2.0 * half_window_m / metres_per_px)
-    shadow = eye[:2] + (vertices[:, :2] - eye[:2]) * (eye[2] / (eye[2] - vertices[:, 2:]))
-    span = shadow / metres_per_px * [1.0, -1.0] + 0.5 * size
-    left, top = np.clip(np.floor(span.min(axis=0)).astype(int), 0, size)
-    right, bottom = np.clip(np.ceil(span.max(axis=0)).astype(int), 0, size)
     whole = np.zeros((size, size, 3), np.uint8)
-    if right <= left or bottom <= top:
-        return whole
     # Only the object's own part of the picture is traced, so that it can be traced finely.
-    rays = eye_rays(
-        eye, metres_per_px=metres_per_px, half_window_m=half_window_m, samples=PROPER_SAMPLES
-    )
-    rays = replace(
-        rays,
-        first=rays.first + PROPER_SAMPLES * (left * rays.right + top * rays.down),
-        width=PROPER_SAMPLES * int(right - left),
-        height=PROPER_SAMPLES * int(bottom - top),
-    )
+    box = _box(vertices, eye, metres_per_px, size)
+    if box is None:
+        return whole
+    samples = FLAT_SAMPLES if flat else SOFT_SAMPLES
+    rays = eye_rays(eye, metres_per_px=metres_per_px, size=size, box=box, samples=samples)
     corners = vertices[triangles]
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     front = triangles[np.einsum("ti,ti->t", outward, eye - corners[:, 0]) > 0.0]
     hits = first_hits(rays, vertices, front)
     hit = hits.triangle >= 0
-    picture = np.zeros((rays.height, rays.width, 3), np.float32)
     if flat:
-        picture[hit] = 255.0
+        picture = 255.0 * hit[..., None].astype(np.float32)
     else:
+        picture = np.zeros((rays.height, rays.width, 3), np.float32)
         row, column = np.nonzero(hit)
         index = hits.triangle[hit]
         ones = np.column_stack([np.ones(len(row)), column, row])
@@ -370,7 +413,7 @@ def proper(
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
         brightness = AMBIENT + (1.0 - AMBIENT) * np.maximum(normals @ LIGHT, 0.0)
         picture[hit] = 255.0 * brightness[:, None] * OBJECT_COLOUR
-    whole[top:bottom, left:right] = _averaged(picture, PROPER_SAMPLES)
+    _put(whole, box, picture, samples)
     return whole
 
 
@@ -555,27 +598,48 @@ def true_sheet(
     return _sheet_between(scene, edges[0], edges[1], finger_tip)
 
 
-def take_picture(projected: Image, situation: Situation, *, eye: Floats) -> tuple[Image, Image]:
-    """What the eye sees of a projected picture, and what it ought to see: both (rows, columns, 3).
+class Camera:
+    """The measuring camera: takes pictures, and keeps what does not change between them."""
 
-    Raises NotConvergedError or ValueError when the situation has no picture.
-    """
-    scene = situation.scene
-    sheet = true_sheet(
-        scene,
-        situation.world_from_flange_left,
-        situation.world_from_flange_right,
-        situation.finger_tip,
-    )
-    cylinder = TrueCylinder(scene)
-    if situation.skin_vertices is None or situation.displacement is None:
-        true_object = cylinder.at_rest()
-    else:
-        true_object = cylinder.displaced(
-            situation.skin_vertices.astype(np.float64), situation.displacement.astype(np.float64)
+    def __init__(self) -> None:
+        self._scene: Scene | None = None
+        self._cylinder: TrueCylinder | None = None
+        self._proper: tuple[tuple[bytes, ...], Image] | None = None
+
+    def take(self, projected: Image, situation: Situation, *, eye: Floats) -> tuple[Image, Image]:
+        """What the eye sees of a projected picture, and what it ought to: both (rows, columns, 3).
+
+        Raises NotConvergedError or ValueError when the situation has no picture.
+        """
+        sheet = true_sheet(
+            situation.scene,
+            situation.world_from_flange_left,
+            situation.world_from_flange_right,
+            situation.finger_tip,
         )
-    scale = situation.metres_per_px
-    return (
-        seen(projected, sheet, scene, eye=eye, metres_per_px=scale),
-        proper(true_object, eye=eye, flat=situation.flat, metres_per_px=scale),
-    )
+        scale = situation.metres_per_px
+        return (
+            seen(projected, sheet, situation.scene, eye=eye, metres_per_px=scale),
+            self._proper_picture(situation, eye),
+        )
+
+    def _proper_picture(self, situation: Situation, eye: Floats) -> Image:
+        if self._cylinder is None or self._scene is not situation.scene:
+            self._scene, self._cylinder = situation.scene, TrueCylinder(situation.scene)
+            self._proper = None
+        skin, displacement = situation.skin_vertices, situation.displacement
+        if skin is None or displacement is None or not displacement.any():
+            skin = displacement = np.empty((0, 3), np.float32)
+        settings = np.array([*eye, situation.flat, situation.metres_per_px])
+        key = (settings.tobytes(), skin.tobytes(), displacement.tobytes())
+        if self._proper is None or self._proper[0] != key:
+            true_object = (
+                self._cylinder.displaced(skin.astype(np.float64), displacement.astype(np.float64))
+                if len(skin)
+                else self._cylinder.at_rest()
+            )
+            picture = proper(
+                true_object, eye=eye, flat=situation.flat, metres_per_px=situation.metres_per_px
+            )
+            self._proper = key, picture
+        return self._proper[1]

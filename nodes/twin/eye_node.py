@@ -12,7 +12,7 @@ from messages.base import Header
 from messages.scene import Positive, Scene
 from messages.types import Display, Frame, Skin, SoftBody, TwinArms, TwinEye, TwinFinger
 from nodes.node import Input, Node, NodeParameters, Output
-from nodes.twin.eye import METRES_PER_PX, Situation, take_picture
+from nodes.twin.eye import METRES_PER_PX, Camera, Situation
 
 Key = tuple[str, str]
 
@@ -44,6 +44,7 @@ class TwinEyeNode(Node):
     twin__eye: Output[TwinEye]
 
     async def setup(self) -> None:
+        self._camera = Camera()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=self.name)
         self._waiting: dict[Key, tuple[Situation, Frame, Header]] = {}
         self._last: tuple[Key, int] | None = None
@@ -106,7 +107,7 @@ class TwinEyeNode(Node):
 
     async def _picture(self, situation: Situation, frame: Frame, header: Header) -> None:
         eye = frame.eyes_world_m.mean(axis=0)
-        job = partial(take_picture, frame.pixels[0], situation, eye=eye)
+        job = partial(self._camera.take, frame.pixels[0], situation, eye=eye)
         seen, proper = await asyncio.get_running_loop().run_in_executor(self._worker, job)
         picture = TwinEye(
             label=frame.label,
