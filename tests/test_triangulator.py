@@ -60,8 +60,9 @@ def disc(
 @given(x=st.floats(20, 100), y=st.floats(20, 80), radius=st.floats(2.5, 8))
 @settings(max_examples=40, deadline=None)
 def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: float) -> None:
+    """Without a lens's blur the least mark is hardest: the grid's worst place, not its mean."""
     image = disc((x, y), radius=radius)
-    for name, limit_px in (("moments", 0.35), ("weighted_centroid", 0.03)):
+    for name, limit_px in (("moments", 0.35), ("weighted_centroid", 0.06)):
         marks = find_marks(image, LOOKS, MARK_METHODS[name].centroid)
         assert len(marks) == 1
         assert np.linalg.norm(marks[0] - [x, y]) < limit_px
