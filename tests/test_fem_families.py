@@ -19,8 +19,8 @@ def test_finer_meshes_come_nearer_to_the_reference(tmp_path: Path) -> None:
     trials = list(
         soft_body_trials(
             scene,
-            spacings_m={"coarse": 0.008, "fine": 0.0055},
-            reference_spacing_m=0.004,
+            spacings_m={"coarse": 0.0085, "fine": 0.006},
+            reference_spacing_m=0.0045,
             cache_dir=tmp_path,
         )
     )

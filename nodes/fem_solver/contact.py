@@ -27,7 +27,7 @@ Ints = NDArray[np.int64]
 
 BED_RATIO = 40.0
 """Stiffness of the contact bed (Pa/m) in units of E / finger radius."""
-POINT_SPACING_RATIO = 0.3
+POINT_SPACING_RATIO = 0.4
 """Largest spacing of the contact points, in finger radii."""
 FLANK_RATIO = 0.9
 """Beyond this part of the radius the fingertip goes on as a cone, tangent to the sphere."""
