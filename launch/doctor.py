@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,8 +14,8 @@ from pathlib import Path
 from typing import Literal
 
 from launch.documents import BadInputError
-from launch.plan import Plan, load_plan
-from launch.runs import live_runs, orphans, root
+from launch.plan import load_plan
+from launch.runs import is_free, live_runs, orphans, root
 from launch.system import MANUAL, opengl_problem
 
 DEMO = Path(__file__).parent / "demo.yaml"
@@ -158,28 +157,8 @@ def check_demo() -> Finding:
         plan = load_plan(DEMO)
     except BadInputError as error:
         return Finding("demo", "failed", str(error))
-    taken = [port for port in listening_ports(plan) if not _is_free(port)]
+    taken = [port for _, port in plan.ports_of_its_own(None) if not is_free("127.0.0.1", port)]
     if taken:
         what = f"ports in use: {', '.join(map(str, taken))}"
         return Finding("demo", "warning", what, "is a graph running? else change them with --set")
     return Finding("demo", "ok", f"{len(plan.nodes)} nodes, plan {plan.hash}, its ports are free")
-
-
-def listening_ports(plan: Plan) -> list[int]:
-    """Ports that a node of the plan opens by itself: parameters named `..._port`."""
-    return [
-        value
-        for node in plan.nodes.values()
-        for name, value in node.parameters.items()
-        if name.endswith("_port") and isinstance(value, int) and value > 0
-    ]
-
-
-def _is_free(port: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", port))
-        except OSError:
-            return False
-    return True

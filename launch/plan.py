@@ -161,6 +161,15 @@ class Plan(Strict):
         """The nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
+    def ports_of_its_own(self, host: str | None) -> list[tuple[str, int]]:
+        """(node, TCP port) that nodes listen on by themselves: parameters named `..._port`."""
+        return [
+            (node.name, value)
+            for node in self.nodes_on(host)
+            for name, value in node.parameters.items()
+            if name.endswith("_port") and isinstance(value, int) and value > 0
+        ]
+
     def scene_message(self) -> Scene | None:
         return None if self.scene is None else Scene.model_validate(self.scene)
 
@@ -274,6 +283,10 @@ def _apply_setting(document: Document, setting: str) -> None:
 
 def _apply_record(document: Document, bag: Path) -> None:
     origin = f"--record {bag}"
+    if bag.exists():
+        raise BadInputError(
+            [Problem(origin, (), "exists already", "a bag is never written over; name another")]
+        )
     names = document.values.get("nodes")
     for name, spec in names.items() if isinstance(names, dict) else ():
         if isinstance(spec, dict) and spec.get("type") == "recorder":

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -110,11 +111,15 @@ def orphans() -> list[psutil.Process]:
     found = []
     for process in psutil.process_iter():
         try:
+            if process.uids().real != os.getuid() or process.pid == os.getpid():
+                continue
             run_id = process.environ().get(RUN_VARIABLE)
-            if run_id and process.pid != os.getpid() and not launcher_is_alive(run_id):
+            # In another namespace (a container's) the launcher's pid means another process.
+            same_namespace = _pid_namespace(process.pid) == _pid_namespace()
+            if run_id and same_namespace and not launcher_is_alive(run_id):
                 found.append(process)
-        except psutil.Error:
-            # Another user's process, or one that has ended meanwhile: not ours to sweep.
+        except (psutil.Error, OSError):
+            # One that may not be looked into, or has ended meanwhile: not ours to sweep.
             continue
     return found
 
@@ -133,6 +138,18 @@ def sweep() -> list[int]:
         else:
             shutil.rmtree(run.directory, ignore_errors=True)
     return [process.pid for process in found]
+
+
+def is_free(address: str, port: int) -> bool:
+    """Whether a TCP port can be listened on."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address, port))
+        except OSError:
+            return False
+    return True
 
 
 def _signal(processes: Iterable[psutil.Process], number: int) -> None:
@@ -154,8 +171,8 @@ def _is_of_our_namespace(run: Run) -> bool:
     return bool(marker.get("pid_namespace") == _pid_namespace())
 
 
-def _pid_namespace() -> int:
-    return os.stat("/proc/self/ns/pid").st_ino
+def _pid_namespace(pid: int | str = "self") -> int:
+    return os.stat(f"/proc/{pid}/ns/pid").st_ino
 
 
 def _start_ticks(pid: int) -> int | None:

@@ -16,7 +16,6 @@ import json
 import os
 import random
 import signal
-import socket
 import subprocess
 import sys
 from collections import deque
@@ -28,7 +27,7 @@ from typing import Any, Self
 from launch.child import LIFELINE_VARIABLE, PARENT_VARIABLE
 from launch.documents import BadInputError, Problem, read_document
 from launch.plan import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort, is_loopback
-from launch.runs import RUN_VARIABLE, Run, create_run, sweep
+from launch.runs import RUN_VARIABLE, Run, create_run, is_free, sweep
 from messages.base import Header
 from messages.bus import Publisher
 from messages.clock import SystemClock
@@ -522,27 +521,23 @@ def _refuse_open_network(plan: Plan, host: str | None) -> None:
 
 
 def _check_ports(plan: Plan, host: str | None) -> None:
-    """Every TCP port that this launcher's processes will bind must be free."""
-    problems = []
-    for topic, writers in plan.writers.items():
-        for writer in writers:
-            if writer.tcp is None or host not in (None, writer.host):
-                continue
-            address, _, port = writer.tcp.removeprefix("tcp://").rpartition(":")
-            family = socket.AF_INET6 if address.startswith("[") else socket.AF_INET
-            with socket.socket(family, socket.SOCK_STREAM) as probe:
-                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                try:
-                    probe.bind((address.strip("[]"), int(port)))
-                except OSError as error:
-                    problems.append(
-                        Problem(
-                            plan.launch_file,
-                            ("hosts", writer.host),
-                            f'{writer.tcp} for topic "{topic}" of "{writer.name}" '
-                            f"cannot be bound: {error.strerror}",
-                            "is the graph running already?",
-                        )
-                    )
+    """Every TCP port that this launcher's processes will listen on must be free."""
+    wanted = [
+        (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))
+        for topic, writers in plan.writers.items()
+        for writer in writers
+        if writer.tcp is not None and host in (None, writer.host)
+    ]
+    wanted += [(node, "127.0.0.1", str(port)) for node, port in plan.ports_of_its_own(host)]
+    problems = [
+        Problem(
+            plan.launch_file,
+            (),
+            f"port {port} of {address}, for {what}, is in use",
+            "is the graph running already?",
+        )
+        for what, address, port in wanted
+        if not is_free(address.strip("[]"), int(port))
+    ]
     if problems:
         raise BadInputError(problems)

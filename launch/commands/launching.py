@@ -69,7 +69,9 @@ async def _run(plan: Plan, host: str | None, duration_s: float | None) -> int:
         asked_to_stop.set()
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        loop.add_signal_handler(number, on_signal)
+        # What nohup has set stays so.
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+            loop.add_signal_handler(number, on_signal)
     stop = asyncio.create_task(asked_to_stop.wait())
     try:
         async with graph:
