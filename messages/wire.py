@@ -196,7 +196,7 @@ def decode(frames: Sequence[Any], expected: Topic | type[Message]) -> tuple[Mess
 
 def size_of(frames: Sequence[Any]) -> int:
     """Bytes of all frames together."""
-    return sum(len(frame) for frame in frames)
+    return sum(map(len, frames))
 
 
 def _unpack(frames: Sequence[Any]) -> Any:
