@@ -22,17 +22,24 @@ class Compliance:
     note: str
 
 
+RESERVE = 0.85
+"""Share of the largest edge force and strain that is planned with.
+
+The bridges stop the arms where commanded or measured poses reach the limits themselves; two arms
+that move are never exactly as far apart as planned (one sees the other a cycle or two late).
+"""
+
+
 def stretch_range(sheet: SheetSpec) -> tuple[float, float]:
-    """Least and largest stretch: the scene's, and no more than the arms may pull."""
+    """Least and largest stretch: the scene's, and what the arms may pull, less the reserve."""
     strongest = stretch_for_edge_force(
-        sheet.max_edge_force_n,
+        RESERVE * sheet.max_edge_force_n,
         young_modulus_pa=sheet.young_modulus_pa,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
-    return sheet.min_stretch_ratio, max(
-        sheet.min_stretch_ratio, min(sheet.max_stretch_ratio, strongest)
-    )
+    longest = 1.0 + RESERVE * (sheet.max_stretch_ratio - 1.0)
+    return sheet.min_stretch_ratio, max(sheet.min_stretch_ratio, min(longest, strongest))
 
 
 def compliance_for(stiffness_n_per_m: float, sheet: SheetSpec) -> Compliance:
