@@ -84,7 +84,7 @@ def test_shader_moves_points_as_the_numpy_equations(scene: Scene, stage: Stage) 
 def test_uncorrected_silhouette_lies_where_the_projector_model_says(
     scene: Scene, stage: Stage
 ) -> None:
-    stage.rest()
+    stage.shape(None)
     sheet = stage.sheet_at_rest()
     shown = Display(correction="none", stereo="mono", shading="flat")
     picture = stage.draw(shown, sheet, Look(flat=True, pattern="object"), read=True)
@@ -137,7 +137,7 @@ def test_black_and_grid_patterns(stage: Stage) -> None:
 
 
 def test_marks_are_drawn_on_the_object(stage: Stage) -> None:
-    stage.rest()
+    stage.shape(None)
     shown = Display(correction="none", stereo="mono")
     look = Look(False, "object", np.zeros(3), np.array([0.02, 0.0, 0.0]))
     picture = stage.draw(shown, stage.sheet_at_rest(), look, read=True)
@@ -149,7 +149,7 @@ def test_marks_are_drawn_on_the_object(stage: Stage) -> None:
 
 def test_second_eye_sees_the_front_shifted_the_other_way(stage: Stage) -> None:
     """The object lies behind the screen: the right eye sees it further right (mirrored: left)."""
-    stage.rest()
+    stage.shape(None)
     shown = Display(correction="none", stereo="side_by_side", shading="flat")
     picture = stage.draw(shown, stage.sheet_at_rest(), Look(True, "object"), read=True)
     assert picture is not None
@@ -511,3 +511,29 @@ async def test_a_new_scene_is_drawn_and_a_bad_one_is_reported(bench: Bench) -> N
     bench.forward(100)
     await bench.finger(0.0, 0.0, 0.1)
     assert bench.sent[-1][0].pixels[0].shape == (600, 400, 3)
+
+
+async def test_a_silent_solver_leaves_the_object_as_it_was(bench: Bench) -> None:
+    """The dent does not flicker when the solver is late; the fingertip draws meanwhile."""
+    skin, body = skin_and_body(0.01)
+    await bench.step("scene", bench.scene)
+    await bench.step("skin", skin)
+    await bench.step(
+        "display", Display(correction="none", stereo="mono", shading="flat", pixels_every=1)
+    )
+    await bench.step("soft_body", body)
+    bench.forward(300)
+    await bench.finger(0.0, 0.0, 0.1)
+    assert len(bench.sent) == 2
+    assert np.array_equal(bench.sent[0][0].pixels[0], bench.sent[1][0].pixels[0])
+    assert bench.sent[1][1].source_ns == bench.clock.now_ns() - 4 * MS
+
+
+async def test_displacement_of_another_size_is_reported(bench: Bench) -> None:
+    skin, body = skin_and_body(0.0)
+    await bench.step("scene", bench.scene)
+    await bench.step("skin", skin)
+    short = body.model_copy(update={"displacement_world_m": body.displacement_world_m[:5]})
+    await bench.node.step("soft_body", short, Header(1, 0, 0, "virtual", "test", 1))
+    assert "fits no skin" in bench.node.last_error
+    assert bench.sent == []

@@ -59,12 +59,15 @@ class Look:
 class Canvas:
     """A context with the shaders, the meshes and the frame of one projector."""
 
-    def __init__(self, context: moderngl.Context, width_px: int, height_px: int) -> None:
+    def __init__(
+        self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
+    ) -> None:
+        """samples: to a pixel, at its edges; as many as the driver has, if those are fewer."""
         self.width_px, self.height_px = width_px, height_px
         self.context = context
         vertex, fragment = _shader("object.vert.glsl"), _shader("object.frag.glsl")
         self._program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
-        samples = min(SAMPLES, self.context.max_samples)
+        samples = min(samples, self.context.max_samples)
         size = (width_px, height_px)
         self._frame = self.context.framebuffer(
             self.context.renderbuffer(size, 4, samples=samples),

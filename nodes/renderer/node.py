@@ -19,7 +19,7 @@ from messages.types import (
 )
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 from nodes.renderer.belief import SheetBelief
-from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.gl import SAMPLES, headless_context
 from nodes.renderer.stage import Stage
 
 
@@ -32,6 +32,12 @@ class RendererParameters(NodeParameters):
         default=0.1, description="older poses, fingertips and soft bodies are not used"
     )
     spacing_m: Positive = Field(default=0.0025, description="between vertices of the drawn surface")
+    samples: int = Field(
+        default=SAMPLES,
+        ge=0,
+        le=16,
+        description="of a pixel; fewer draw faster without a GPU",
+    )
     correction: Correction = Field(default="four_triangles", description="until a display message")
     stereo: StereoMode = Field(default="side_by_side", description="until a display message")
 
@@ -71,7 +77,8 @@ class Renderer(Node):
         if self._stage is not None:
             self._stage.canvas.release()
         self._stage, self._belief = None, self._new_belief()
-        self._stage = Stage(scene, self._context, spacing_m=self.parameters.spacing_m)
+        spacing_m, samples = self.parameters.spacing_m, self.parameters.samples
+        self._stage = Stage(scene, self._context, spacing_m=spacing_m, samples=samples)
 
     def on_display(self, display: Display, header: Header) -> None:
         self._shown, self._since_pixels = display, 0
@@ -94,8 +101,10 @@ class Renderer(Node):
         now_ns = self.clock.now_ns()
         if self._stage is None or now_ns < self._due_ns - self._period_ns // 4:
             return
-        self._due_ns = max(self._due_ns + self._period_ns, now_ns + self._period_ns // 2)
         self._draw(self._stage, now_ns)
+        # Where drawing is slower than the rate, what has come meanwhile is read before the next.
+        rest_until_ns = self.clock.now_ns() + self._period_ns // 2
+        self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
 
     def _draw(self, stage: Stage, start_ns: int) -> None:
         shown, predicted_to_ns = self._shown, start_ns + int(self.parameters.lead_s * 1e9)
@@ -106,7 +115,8 @@ class Renderer(Node):
         self.note = self._belief.note
         self._since_pixels += 1
         with_pixels = 0 < shown.pixels_every <= self._since_pixels
-        picture = stage.draw(shown, sheet, self._look(stage), read=with_pixels)
+        look = stage.look(shown, self.fingertip.message, self.sheet_target.message)
+        picture = stage.draw(shown, sheet, look, read=with_pixels)
         if with_pixels:
             self._since_pixels = 0
         end_ns = self.clock.now_ns()
@@ -119,9 +129,7 @@ class Renderer(Node):
             label=shown.label,
             eyes_world_m=stage.eyes(shown),
             world_from_sheet=sheet.world_from_sheet,
-            pushed_point_world_m=sheet.plane.point
-            if sheet.pushed_point is None
-            else sheet.pushed_point,
+            pushed_point_world_m=sheet.foremost_point,
             predicted_to_ns=predicted_to_ns,
             draw_s=(end_ns - start_ns) * 1e-9,
             late_frames=self._late,
@@ -130,30 +138,17 @@ class Renderer(Node):
         self.frame.publish(frame, source_ns=source_ns)
 
     def _shape_object(self, stage: Stage, now_ns: int) -> int:
-        """Deform the drawn object; returns the exposure (ns) that the picture goes back to."""
-        skin, body = self.skin.message, self.soft_body.message
+        """Deform the drawn object as the newest soft body says, however old that is.
+
+        Returns the exposure (ns) that the picture goes back to.
+        """
+        skin, body, stale_s = self.skin.message, self.soft_body.message, self.parameters.stale_s
         if skin is not None and stage.mesh_id != skin.mesh_id:
             stage.follow(skin)
-        fresh = self.soft_body.age_s() <= self.parameters.stale_s
-        if fresh and body is not None and body.mesh_id == stage.mesh_id:
-            stage.deform(body.displacement_world_m)
-        else:
-            stage.rest()
-        used = self.soft_body if fresh else self.fingertip
-        recent = used.header is not None and used.age_s() <= self.parameters.stale_s
+        stage.shape(body if body is not None and body.mesh_id == stage.mesh_id else None)
+        used = self.soft_body if self.soft_body.age_s() <= stale_s else self.fingertip
+        recent = used.header is not None and used.age_s() <= stale_s
         return used.header.source_ns if recent and used.header is not None else now_ns
 
     def _new_belief(self) -> SheetBelief:
         return SheetBelief(stale_s=self.parameters.stale_s, lead_s=self.parameters.lead_s)
-
-    def _look(self, stage: Stage) -> Look:
-        shown, finger, target = self._shown, self.fingertip.message, self.sheet_target.message
-        marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
-        return Look(
-            flat=shown.shading == "flat",
-            pattern=shown.pattern,
-            fingertip_mark=stage.surface_point(finger.position_world_m)
-            if marks and finger is not None and finger.valid
-            else None,
-            target_mark=target.contact_world_m if marks and target is not None else None,
-        )

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from messages.scene import Pose, Scene
-from messages.types import Correction, Display, Skin
+from messages.types import Correction, Display, Fingertip, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import apply, inverse, moved, transform, transform_from_rpy
 from nodes.models.shapes import CylinderShape
 from nodes.models.sheet import corners, sheet_from_edges
@@ -22,7 +23,7 @@ from nodes.renderer.correction import (
     plane_is_usable,
     pushed_screen,
 )
-from nodes.renderer.gl import Canvas, Look, View
+from nodes.renderer.gl import SAMPLES, Canvas, Look, View
 from nodes.renderer.output import Image, pack
 from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
 
@@ -46,6 +47,11 @@ class Sheet:
     @property
     def plane(self) -> Plane:
         return Plane(self.world_from_sheet[:3, 3], self.world_from_sheet[:3, 2])
+
+    @property
+    def foremost_point(self) -> Floats:
+        """The pushed point, or the sheet's centre when nothing pushes it."""
+        return self.plane.point if self.pushed_point is None else self.pushed_point
 
 
 def transform_of(pose: Pose) -> Floats:
@@ -107,7 +113,14 @@ def projector_homography(scene: Scene) -> Floats:
 class Stage:
     """A scene ready to be drawn."""
 
-    def __init__(self, scene: Scene, context: moderngl.Context, *, spacing_m: float) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        context: moderngl.Context,
+        *,
+        spacing_m: float,
+        samples: int = SAMPLES,
+    ) -> None:
         """ValueError for a projector that no homography describes."""
         projector, cylinder = scene.projector, scene.object.geometry
         self.scene = scene
@@ -123,16 +136,13 @@ class Stage:
             world_from_object=self._world_from_object,
             spacing_m=spacing_m,
         )
-        self.canvas = Canvas(context, projector.width_px, projector.height_px)
+        self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
         self.canvas.set_mesh(self._surface.rest_world_m, self._surface.triangles)
-        self.rest()
-        self._follow = None
+        self._follow: csr_array | None = None
+        self._shaped_by: SoftBody | None = None
+        self._is_shaped = False
+        self.shape(None)
         self.mesh_id: str | None = None
-
-    def rest(self) -> None:
-        """Put the object back to its undeformed shape."""
-        rest = self._surface.rest_world_m
-        self.canvas.set_shape(rest, normals_of(self._surface, rest))
 
     def follow(self, skin: Skin) -> None:
         """From now on the drawn surface follows displacements of this skin."""
@@ -141,12 +151,33 @@ class Stage:
         )
         self.mesh_id = skin.mesh_id
 
-    def deform(self, displacement: NDArray[np.float32]) -> None:
-        """Move the surface by a displacement (skin vertices, 3); ValueError without its skin."""
-        if self._follow is None or self._follow.shape[1] != len(displacement):
-            raise ValueError(f"displacement of {len(displacement)} vertices fits no skin")
-        positions = self._surface.rest_world_m + self._follow @ displacement
+    def shape(self, body: SoftBody | None) -> None:
+        """Deform the surface as a soft body of the followed skin says; None puts it to rest.
+
+        ValueError when the displacement is not of that skin.
+        """
+        if body is self._shaped_by and self._is_shaped:
+            return
+        positions = self._surface.rest_world_m
+        if body is not None:
+            displacement = body.displacement_world_m
+            if self._follow is None or self._follow.shape[1] != len(displacement):
+                raise ValueError(f"displacement of {len(displacement)} vertices fits no skin")
+            positions = positions + self._follow @ displacement
         self.canvas.set_shape(positions, normals_of(self._surface, positions))
+        self._shaped_by, self._is_shaped = body, True
+
+    def look(self, shown: Display, finger: Fingertip | None, target: SheetTarget | None) -> Look:
+        """How to paint what is shown: marks where the finger is and where the sheet is tangent."""
+        marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
+        return Look(
+            flat=shown.shading == "flat",
+            pattern=shown.pattern,
+            fingertip_mark=self.surface_point(finger.position_world_m)
+            if marks and finger is not None and finger.valid
+            else None,
+            target_mark=target.contact_world_m if marks and target is not None else None,
+        )
 
     def surface_point(self, world_point: Floats) -> Floats:
         """The point (3,) of the undeformed object nearest to a world point, for the marks."""
