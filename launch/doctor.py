@@ -85,10 +85,9 @@ def check_opencv() -> Finding:
         import cv2
     except ImportError as error:
         return Finding("opencv", "failed", str(error), "make setup")
-    backends = [
-        cv2.videoio_registry.getBackendName(one) for one in cv2.videoio_registry.getBackends()
-    ]
-    return Finding("opencv", "ok", f"{cv2.__version__}, cameras and files by {', '.join(backends)}")
+    registry = cv2.videoio_registry
+    names = dict.fromkeys(registry.getBackendName(one) for one in registry.getBackends())
+    return Finding("opencv", "ok", f"{cv2.__version__}, cameras and files by {', '.join(names)}")
 
 
 def check_opengl() -> Finding:

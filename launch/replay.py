@@ -64,8 +64,7 @@ class Pass:
 class Comparison:
     """Replayed against recorded messages of one topic, paired by their source stamps.
 
-    worst: largest difference per field that differs at all; numbers by their difference, anything
-    else counts 1 where it is not equal.
+    worst: largest difference per field that differs at all; anything but numbers counts 1.
     """
 
     recorded: int = 0
@@ -108,6 +107,8 @@ def verify(bag: Path, name: str, *, tolerance: float = 1e-6) -> Verification:
             f'{bag}: no node "{name}" in its plan; {did_you_mean(name, list(plan.nodes))}'
         )
     node = plan.nodes[name]
+    if node_class(node.type).opens_devices:
+        raise BagError(f"{name} reaches for devices of its own (an arm would move): not replayed")
     _check_inputs(bag, reader, plan, node)
     first, second = (asyncio.run(replay(bag, node)) for _ in range(2))
     return Verification(
@@ -233,8 +234,8 @@ def _difference(a: Any, b: Any) -> float:
         if a.shape != b.shape:
             return float("inf")
         return float(np.abs(a.astype(float) - b.astype(float)).max(initial=0.0))
-    if isinstance(a, float) and isinstance(b, float):
-        return abs(a - b)
+    if isinstance(a, float | int) and isinstance(b, float | int):
+        return float(abs(a - b))
     return 0.0 if a == b else 1.0
 
 

@@ -203,6 +203,8 @@ class Node:
     handler_errors_shown: ClassVar[int] = 3
     takes_frames: ClassVar[bool] = False
     """Whether `deliver` is given each message as the wire's frames, unopened."""
+    opens_devices: ClassVar[bool] = False
+    """Whether it reaches for devices, ports or files of its own: a replay must not start it."""
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:

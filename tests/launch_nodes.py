@@ -60,6 +60,25 @@ class Beacon(Node):
             time.sleep(1.0)
 
 
+class RelayParameters(NodeParameters):
+    rate_hz: float = 10.0
+    random: bool = False
+
+
+class Relay(Node):
+    """Publishes at its rate how old the newest finger is, and whether chance has a say."""
+
+    parameters: RelayParameters
+    twin__finger: Input[TwinFinger]
+    estop: Output[EStop]
+
+    @periodic("rate_hz")
+    def tell(self) -> None:
+        chance = os.urandom(4).hex() if self.parameters.random else ""
+        age_ms = 1e3 * self.twin__finger.age_s()
+        self.estop.publish(EStop(engaged=False, reason=f"{age_ms:.0f} ms {chance}"))
+
+
 class Listener(Node):
     """Says an e-stop, once, when the finger has come far enough."""
 

@@ -330,6 +330,8 @@ def test_verify_sees_another_output(flexsheet: Command, recorded: Path, tmp_path
 def test_verify_says_what_it_lacks(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
     said = flexsheet("bag", "verify", "listner", recorded)
     assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)
+    said = flexsheet("bag", "verify", "recorder", recorded)
+    assert (said.code, "reaches for devices of its own" in said.err) == (1, True)
     bare = tmp_path / "bare.mcap"
     with BagWriter(bare):
         pass

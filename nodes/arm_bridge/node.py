@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
 
 from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import ArmState, EStop, SheetTarget, Side
 from nodes.arm_bridge.control import ArmControl, ArmGeometry, Goal, OtherArm, Patience
-from nodes.arm_bridge.modbus import ArmLink, ArmLinkError
+from nodes.arm_bridge.modbus import ArmLink, ArmLinkError, ArmSilentError
 from nodes.models.motion import SheetMotion, extrapolated
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
@@ -33,6 +35,8 @@ class ArmBridgeParameters(NodeParameters):
 
 class ArmBridge(Node):
     """Sends one arm's joints over Modbus TCP and publishes what the arm answers."""
+
+    opens_devices: ClassVar[bool] = True
 
     parameters: ArmBridgeParameters
     scene: Input[Scene]
@@ -89,6 +93,8 @@ class ArmBridge(Node):
             )
         except ArmLinkError as error:
             self._failures += 1
+            if isinstance(error, ArmSilentError) and control.miss_answer(str(error)):
+                return
             if control.mode != "disconnected":
                 self.log.warning("arm lost", problem=str(error))
             control.lose_connection(str(error))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import ClassVar
 
 from messages.base import Header
 from messages.scene import Positive, Scene, StereoCamera
@@ -30,6 +31,8 @@ class CameraParameters(NodeParameters):
 
 class Camera(Node):
     """Publishes stereo pairs with the time of their exposure."""
+
+    opens_devices: ClassVar[bool] = True
 
     parameters: CameraParameters
     scene: Input[Scene]

@@ -44,6 +44,7 @@ class Recorder(Node):
 
     parameters: RecorderParameters
     takes_frames: ClassVar[bool] = True
+    opens_devices: ClassVar[bool] = True
 
     @classmethod
     def further_inputs(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -32,6 +32,8 @@ class TwinArmsParameters(NodeParameters):
 
 class TwinArmsNode(Node):
     """Simulates both arms; they are switched on by the first scene, holding the sheet in it."""
+
+    opens_devices: ClassVar[bool] = True
 
     parameters: TwinArmsParameters
     scene: Input[Scene]
