@@ -210,6 +210,18 @@ def test_the_arm_that_can_still_move_slackens_the_sheet_alone() -> None:
     assert arms[1].control.mode == "idle"
 
 
+def test_one_missed_answer_is_forgiven_and_a_second_is_not() -> None:
+    arms = pair()
+    assert not ArmControl(PATIENCE, largest_lag_rad=0.1).miss_answer("late")
+    run(arms, on_time(HOME), 10)
+    assert arms[0].control.miss_answer("late")
+    assert (arms[0].control.mode, arms[0].control.all_faults) == ("hold", ())
+    assert not arms[0].control.miss_answer("late")
+    run(arms, on_time(HOME), 1)
+    assert arms[0].control.mode == "follow"
+    assert arms[0].control.miss_answer("late")
+
+
 def test_the_estop_latches_until_reset_at_rest() -> None:
     arms = pair()
     goal = on_time(sheet_at(0.05))

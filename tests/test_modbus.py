@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import struct
 import zlib
@@ -167,7 +168,7 @@ async def test_a_silent_arm_is_closed_and_reopened_with_back_off() -> None:
                 pause_s += 0.01
             pauses.append(pause_s)
             now_s += pause_s
-        assert pauses == pytest.approx([0.05, 0.1, 0.2, 0.4, 0.8, 1.0, 1.0], abs=0.02)
+        assert pauses == pytest.approx([0.0, 0.05, 0.1, 0.2, 0.4, 0.8, 1.0], abs=0.02)
         controller.fault = "none"
         assert await exchange(link, now_s) == 8
         assert link.connected
@@ -215,3 +216,16 @@ async def test_a_sequence_that_is_not_newer_is_refused() -> None:
         with pytest.raises(ArmRefusedError, match="Modbus exception 3"):
             await exchange(link)
         assert controller.refused == 1
+
+
+async def test_a_cancellation_is_not_swallowed_by_an_answer_that_comes_with_it() -> None:
+    async with linked() as (link, _controller):
+        for turns in range(1, 12):
+            await exchange(link)
+            task = asyncio.create_task(exchange(link))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            done = task.done()
+            task.cancel()
+            await asyncio.wait([task])
+            assert done or task.cancelled()

@@ -219,6 +219,7 @@ class ArmControl:
         self._settled = False
         self._clear_arm = False
         self._has_pulled = False
+        self._missed = False
         self._goal_rad: Floats | None = None
         self._relax_from: float | None = None
 
@@ -233,6 +234,18 @@ class ArmControl:
     def at_rest(self) -> bool:
         return float(np.abs(self._velocity).max()) <= REST_RAD_PER_S
 
+    def miss_answer(self, text: str) -> bool:
+        """One exchange without an answer is forgiven while moving; False for a second in a row.
+
+        The arm's own watchdog guards the meantime, and the next command goes on from this one.
+        """
+        if self._missed or self.measured_rad is None:
+            return False
+        self._missed = True
+        if self.mode == "follow":
+            self.mode, self.reason = "hold", text
+        return True
+
     def lose_connection(self, text: str) -> None:
         """The arm cannot be reached: forget all but a latched fault or e-stop."""
         self.measured_rad = None
@@ -243,7 +256,7 @@ class ArmControl:
         """What the arm answered; the first answer after a connection starts from there."""
         if self.measured_rad is None:
             self._start_at(joints_rad)
-        self.measured_rad = joints_rad
+        self.measured_rad, self._missed = joints_rad, False
         if arm_faults and not self.faults:
             if arm_faults == ("watchdog: no command",):
                 # The cycle came late, the arm has stopped by itself: begin again from where it is.

@@ -7,6 +7,7 @@ its block, high byte first.
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import struct
@@ -168,12 +169,22 @@ def decode_status(registers: Sequence[int]) -> ArmStatus:
     )
 
 
+def _be_cancelled() -> None:
+    """Raise the cancellation that Python 3.11's `wait_for`, inside pymodbus, swallows.
+
+    It does when the answer comes in the same turn of the loop; the task would then never end.
+    """
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
+
+
 class ArmLink:
     """One connection to one arm.
 
     Any failure that leaves an answer outstanding closes the connection, because pymodbus 3.16.1 can
     hand a late answer to the next request; the echoed sequence and the CRC catch what remains.  It
-    opens again with a back-off that doubles to `longest_pause_s`.
+    opens again at once after a first failure, then with a pause that doubles to `longest_pause_s`.
     """
 
     def __init__(
@@ -188,7 +199,7 @@ class ArmLink:
         self.host, self.port = host, port
         self._timeout_s = timeout_s
         self._first_pause_s, self._longest_pause_s = first_pause_s, longest_pause_s
-        self._pause_s = first_pause_s
+        self._pause_s = 0.0
         self._try_again_ns = 0
         self._client: AsyncModbusTcpClient | None = None
         self._sequence = 0
@@ -213,9 +224,10 @@ class ArmLink:
         except ArmLinkError:
             self.close()
             self._try_again_ns = now_ns + int(self._pause_s * 1e9)
-            self._pause_s = min(2.0 * self._pause_s, self._longest_pause_s)
+            longer_s = max(2.0 * self._pause_s, self._first_pause_s)
+            self._pause_s = min(longer_s, self._longest_pause_s)
             raise
-        self._pause_s = self._first_pause_s
+        self._pause_s = 0.0
         return status
 
     async def _open(self) -> AsyncModbusTcpClient:
@@ -249,6 +261,7 @@ class ArmLink:
             raise ArmSilentError(
                 f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
             ) from error
+        _be_cancelled()
         if answer.isError():
             code = getattr(answer, "exception_code", "?")
             raise ArmRefusedError(f"the arm refused the command: Modbus exception {code}")
