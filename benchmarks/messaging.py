@@ -469,7 +469,8 @@ def markdown(report: dict[str, Any]) -> str:
         f"load average {report['load'][0]:.1f} before and {report['load'][1]:.1f} after.  "
         f"{report['rounds']} rounds; ratios are medians over the rounds of the ratio to "
         f'"{FLOOR}" within the round.  Superseded: dropped for a newer one while the receiver '
-        "waited for its turn.",
+        "waited for its turn.  A load above the number of cores means that other work shared them, "
+        "and p99 is then mostly its doing.",
         "",
         "To reach (a typed, validated message against raw blocking ZeroMQ): fingertip 1.50 at p50, "
         f"1.30 at p99; stereo pair 1.20.  Reached in this run: {reached(report)}.",
