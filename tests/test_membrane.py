@@ -116,8 +116,11 @@ def test_pose_carries_the_solution_along() -> None:
     assert np.allclose(there.positions, apply(pose, here.positions), atol=1e-6)
 
 
-def test_finger_before_the_sheet_pushes_nothing() -> None:
-    sheet = solve(RUBBER, *edges(1.04), finger_tip=np.array([0.0, 0.0, 0.005]))
+@pytest.mark.parametrize("tip", [(0.0, 0.0, 0.005), (0.2, 0.0, -0.3), (0.0, -0.13, -0.01)])
+def test_finger_before_or_beside_the_sheet_pushes_nothing(
+    tip: tuple[float, float, float],
+) -> None:
+    sheet = solve(RUBBER, *edges(1.04), finger_tip=np.array(tip), cells=16)
     assert not sheet.finger_force_n.any()
 
 

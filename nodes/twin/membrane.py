@@ -308,7 +308,7 @@ def solve(
 
     world_from_..._edge: (4, 4), origin in the clamped edge's middle, y along it.  finger_tip: the
     foremost point (3,) of the sphere, whose centre is `finger_radius_m` towards the user; None, or
-    a tip before the sheet, pushes nothing.  NotConvergedError if no equilibrium was found.
+    a tip before the sheet or beside it, pushes nothing.  NotConvergedError if no equilibrium was found.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
@@ -325,11 +325,13 @@ def solve(
     focus: tuple[float | None, float | None] = (None, None)
     if finger_tip is not None:
         offset = finger_tip - middle
-        depth = float(-offset @ normal)
+        across, along_edge = float(offset @ x_axis / distance), float(offset @ y_axis)
+        over = abs(across) < 0.5 and abs(along_edge) < 0.5 * rubber.height_m
+        depth = float(-offset @ normal) if over else 0.0
         if depth > 0.0:
             focus = (
-                float((offset @ x_axis / distance + 0.5) * rubber.width_m),
-                float(offset @ y_axis + 0.5 * rubber.height_m),
+                (across + 0.5) * rubber.width_m,
+                along_edge + 0.5 * rubber.height_m,
             )
     mesh = _Mesh(
         rubber,
