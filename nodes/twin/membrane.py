@@ -308,7 +308,8 @@ def solve(
 
     world_from_..._edge: (4, 4), origin in the clamped edge's middle, y along it.  finger_tip: the
     foremost point (3,) of the sphere, whose centre is `finger_radius_m` towards the user; None, or
-    a tip before the sheet or beside it, pushes nothing.  NotConvergedError if no equilibrium was found.
+    a tip before the sheet or beside it, pushes nothing.  NotConvergedError if no
+    equilibrium was found.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
