@@ -24,6 +24,7 @@ from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.models.rigid import inverse, transform_from_rpy
 from nodes.models.sheet import sheet_from_edges
 from nodes.planner.node import Planner, PlannerParameters
+from nodes.twin.arms import STATE_MOVING, STATE_STOPPED
 from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 
 Floats = NDArray[np.float64]
@@ -145,8 +146,8 @@ async def running_rig(**bridge_parameters: Any) -> AsyncIterator[tuple[Rig, dict
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        for node in nodes.values():
-            await node.close()
+        for name in ("left", "right", "planner", "twin"):
+            await nodes[name].close()
         await asyncio.sleep(0.02)
 
 
@@ -367,3 +368,11 @@ async def test_a_fault_relaxes_the_sheet_on_both_arms() -> None:
         await until(slack)
         await until(lambda: rig.newest("left").mode == "fault")
         assert rig.newest("right").faults == ()
+
+
+async def test_a_bridge_that_ends_tells_its_arm_to_stop() -> None:
+    async with running_rig() as (rig, nodes):
+        await both_follow(rig, nodes["planner"], AT_FRONT)
+        controllers = [server.controller for server in nodes["twin"].servers.values()]
+        assert {controller.state for controller in controllers} == {STATE_MOVING}
+    assert {controller.state for controller in controllers} == {STATE_STOPPED}

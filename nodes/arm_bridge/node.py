@@ -57,6 +57,13 @@ class ArmBridge(Node):
         self._failures = 0
 
     async def close(self) -> None:
+        """Bid the arm stop; if that fails, its own watchdog stops it."""
+        if self._link.connected:
+            joints_rad, now_ns = self._control.commanded_rad, self.clock.now_ns()
+            try:
+                await self._link.exchange(mode="stop", joints_rad=joints_rad, now_ns=now_ns)
+            except ArmLinkError as error:
+                self.log.warning("arm not told to stop", problem=str(error))
         self._link.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
