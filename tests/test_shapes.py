@@ -26,7 +26,8 @@ def test_the_nearest_point_is_on_the_side_and_no_other_is_nearer(
     distance = np.linalg.norm(query - found.point)
     for angle in np.linspace(0.0, 2 * np.pi, 24):
         rim = np.array([found.point[0], 0.035 * np.sin(angle), 0.035 * np.cos(angle)])
-        assert np.linalg.norm(query - rim) >= distance - 1e-12
+        # Within a micrometre of the axis all are taken as equally near.
+        assert np.linalg.norm(query - rim) >= distance - 2e-6
 
 
 @pytest.mark.parametrize(
