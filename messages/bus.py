@@ -17,6 +17,7 @@ import errno
 import logging
 import os
 import socket
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -36,6 +37,8 @@ QUEUE_BYTES = 1 << 30
 BATCH = 256
 LINGER_MS = 500
 IPC_PATH_BYTES = 107
+BIND_PATIENCE_S = 1.0
+IPC_CLOSING_S = 0.02
 REFUSABLE_BYTES = 256 << 20
 
 _log = logging.getLogger("flexsheet.bus")
@@ -325,9 +328,16 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.MAXMSGSIZE: topic.max_bytes + REFUSABLE_BYTES,
         zmq.RECONNECT_IVL: 20,
         zmq.RECONNECT_IVL_MAX: 500,
-        zmq.HEARTBEAT_IVL: 1000,
-        zmq.HEARTBEAT_TIMEOUT: 5000,
     }
+    if kind != zmq.SUB:
+        # Publishers ask, and tell subscribers to expect it.  A subscriber must not ask by itself:
+        # libzmq 4.3.5 aborts the process when its heartbeat comes due after a publisher has gone
+        # whose messages still fill the queue.
+        options |= {
+            zmq.HEARTBEAT_IVL: 1000,
+            zmq.HEARTBEAT_TIMEOUT: 5000,
+            zmq.HEARTBEAT_TTL: 5000,
+        }
     for option, value in options.items():
         opened.setsockopt(option, value)
     return opened
@@ -336,19 +346,26 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
 def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str) -> str:
     """Bind and return the endpoint with its port filled in."""
     _check_endpoint(topic, endpoint)
-    if _ipc_is_served(endpoint):
-        raise BusError(
-            f'topic "{topic.name}": {endpoint} is in use by another process; '
-            "is the same launch file running already?"
-        )
-    try:
-        opened.bind(endpoint)
-    except zmq.ZMQError as error:
-        if error.errno == errno.EADDRINUSE:
-            remedy = "is in use by another process; is the same launch file running already?"
-        else:
-            remedy = f"cannot be bound: {error.strerror}; is its folder or address on this host?"
-        raise BusError(f'topic "{topic.name}": {endpoint} {remedy}') from error
+    patience_ends = time.monotonic() + BIND_PATIENCE_S
+    while True:
+        try:
+            if _ipc_is_served(endpoint):
+                raise zmq.ZMQError(errno.EADDRINUSE)
+            opened.bind(endpoint)
+            break
+        except zmq.ZMQError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise BusError(
+                    f'topic "{topic.name}": {endpoint} cannot be bound: {error.strerror}; '
+                    "is its folder or address on this host?"
+                ) from error
+            # A writer that was just closed keeps its endpoint until ZeroMQ's thread lets go of it.
+            if time.monotonic() > patience_ends:
+                raise BusError(
+                    f'topic "{topic.name}": {endpoint} is in use by another process; '
+                    "is the same launch file running already?"
+                ) from error
+            time.sleep(0.01)
     bound: str = opened.getsockopt_string(zmq.LAST_ENDPOINT)
     return bound
 
@@ -378,6 +395,10 @@ def _ipc_is_served(endpoint: str) -> bool:
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         try:
             probe.connect(path)
+        except ConnectionRefusedError:
+            # The file is a killed writer's, or one that is closing now will remove it: not ours!
+            time.sleep(IPC_CLOSING_S)
+            return False
         except OSError:
             return False
     return True

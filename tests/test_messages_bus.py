@@ -250,6 +250,22 @@ async def test_subscriber_before_publisher_and_restart_is_no_gap(room: Room) -> 
     assert ear.counts == Counts()
 
 
+async def test_many_restarts_in_a_row(room: Room) -> None:
+    topic = TOPICS["estop"]
+    ear = room.ear(topic)
+    for epoch in range(1, 16):
+        publisher = room.mouth(topic)
+        publisher.send(stop("a"), header(1, epoch=epoch))
+        await until(partial(heard_epoch, ear, epoch), f"start {epoch}")
+        publisher.close()
+    assert len(ear.heard) == 15
+    assert ear.counts == Counts()
+
+
+def heard_epoch(ear: Ear, epoch: int) -> bool:
+    return bool(ear.heard) and ear.heard[-1][1].epoch == epoch
+
+
 async def test_gap_is_counted(room: Room) -> None:
     topic = TOPICS["estop"]
     publisher = room.mouth(topic)
