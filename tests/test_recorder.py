@@ -6,6 +6,8 @@ import asyncio
 import errno
 import json
 import shutil
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -26,6 +28,7 @@ from messages.wire import encode
 from nodes.recorder.files import free_path
 from nodes.recorder.node import Recorder, RecorderParameters
 
+ROOT = Path(__file__).resolve().parent.parent
 DEADLINE_S = 30.0
 
 
@@ -176,3 +179,38 @@ async def test_killed_it_loses_at_most_the_last_second(tmp_path: Path) -> None:
     second = BagReader(tmp_path / "a-2.mcap", ["twin/finger"])
     assert second.complete
     assert next(iter(second))[2].sequence > sequences[-1]
+
+
+FLOODED = """
+import asyncio, time
+import numpy as np
+from messages.base import Header
+from messages.bus import Publisher, Subscriber
+from messages.topics import topic_named
+from messages.types import StereoPair
+from nodes.node import PortCounts
+
+async def main():
+    topic, endpoint = topic_named("stereo"), ["ipc://" + sys.argv[1]]
+    pixels = np.zeros((480, 640), np.uint8)
+    pair = StereoPair(device="", exposure_s=0, dropped_frames=0, left=pixels, right=pixels)
+    publisher = Publisher(topic, endpoint)
+    Subscriber(topic, endpoint, lambda *_: None, PortCounts()).start()
+    await asyncio.sleep(0.2)
+    for i in range(200):
+        publisher.send(pair, Header(i + 1, 0, 0, "c", "w", 1))
+        time.sleep(0.001)
+    publisher.close()
+    time.sleep(2.5)
+
+asyncio.run(main())
+"""
+
+
+def test_a_reader_that_is_behind_outlives_its_writer(runs_root: Path) -> None:
+    """libzmq's heartbeat once aborted the recorder when the camera ended before it."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import sys\n" + FLOODED, str(runs_root / "s")],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
