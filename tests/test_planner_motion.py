@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from nodes.models.motion import (
+    EdgeBound,
     SheetBounds,
     SheetMotion,
     coast_sheet,
@@ -25,6 +26,7 @@ Floats = NDArray[np.float64]
 STEP_S = 1.0 / 60.0
 SPEED, ACCELERATION = 0.2, 3.0
 BOUNDS = SheetBounds(SPEED, ACCELERATION, 2.0, 40.0, 0.03, 0.3)
+EDGES = EdgeBound(0.2125, 0.12)
 AT_REST = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
 
 
@@ -98,9 +100,12 @@ def test_a_sheet_gets_to_any_pose_and_stays_rigid(
     motion = AT_REST
     for _ in range(400):
         before = motion
-        motion = follow_sheet(motion, target, bounds=BOUNDS, step_s=STEP_S)
+        motion = follow_sheet(motion, target, bounds=BOUNDS, edges=EDGES, step_s=STEP_S)
         twist = twist_between(before.world_from_sheet, motion.world_from_sheet, STEP_S)
         assert np.linalg.norm(twist[3:]) <= BOUNDS.turn_rad_per_s * (1 + 1e-6)
+        # While one slows for the other both may add up to a little more, for a step or two.
+        edge_speed = np.linalg.norm(twist[:3]) + EDGES.reach_m * np.linalg.norm(twist[3:])
+        assert edge_speed <= 1.1 * EDGES.speed_m_per_s
         assert is_rigid(motion.world_from_sheet, 1e-12)
     assert motion.world_from_sheet == pytest.approx(target.world_from_sheet, abs=1e-9)
     assert motion.stretch_ratio == pytest.approx(stretch, abs=1e-9)

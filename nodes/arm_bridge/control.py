@@ -31,7 +31,7 @@ from nodes.arm_bridge.limiter import (
     sheet_trouble,
     with_tool_speed,
 )
-from nodes.models.motion import SheetBounds, SheetMotion, coast_sheet, follow_sheet
+from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, coast_sheet, follow_sheet
 from nodes.models.rigid import (
     apply,
     inverse,
@@ -63,6 +63,9 @@ START_BOUNDS = SheetBounds(
     stretch_acceleration_per_s2=0.2,
 )
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
+
+EDGE_SPEED_SHARE = 0.95
+"""Share of the tool speed that the sheet's motion may use; beyond it the joints are cut."""
 
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
 LEAP_M, LEAP_RAD = 0.03, 0.35
@@ -132,6 +135,7 @@ class ArmGeometry:
         self.max_tool_speed = scene.arms.max_tool_speed_m_per_s
         sheet = scene.sheet
         half = 0.5 * sheet.height_m
+        self.edge_bound = EdgeBound(EDGE_SPEED_SHARE * self.max_tool_speed, half)
         self._tool_points = apply(
             self.flange_from_edge,
             np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
@@ -335,7 +339,7 @@ class ArmControl:
             sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
         else:
             self.mode, self.reason = "follow", ""
-            sheet = self._towards(goal.motion, sheet, step_s)
+            sheet = self._towards(goal.motion, sheet, geometry.edge_bound, step_s)
         return self._carry(sheet, geometry, other, step_s)
 
     def _watch(self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats) -> None:
@@ -366,7 +370,9 @@ class ArmControl:
         self.mode, self.reason = "follow", ""
         return Command("move", measured)
 
-    def _towards(self, target: SheetMotion, sheet: SheetMotion, step_s: float) -> SheetMotion:
+    def _towards(
+        self, target: SheetMotion, sheet: SheetMotion, edges: EdgeBound, step_s: float
+    ) -> SheetMotion:
         """The sheet's next motion: gently until it is on its target, then with it."""
         distance, angle = _lag(sheet, target)
         if self._settled and (distance > LEAP_M or angle > LEAP_RAD):
@@ -378,7 +384,7 @@ class ArmControl:
         ):
             self._settled = True
         bounds = FOLLOW_BOUNDS if self._settled else START_BOUNDS
-        return follow_sheet(sheet, target, bounds=bounds, step_s=step_s)
+        return follow_sheet(sheet, target, bounds=bounds, edges=edges, step_s=step_s)
 
     def _carry(
         self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
@@ -438,7 +444,9 @@ class ArmControl:
             stretch_ratio=2.0 - self._relax_from,
             stretch_rate_per_s=0.0,
         )
-        sheet = follow_sheet(self._sheet, target, bounds=RELAX_BOUNDS, step_s=step_s)
+        sheet = follow_sheet(
+            self._sheet, target, bounds=RELAX_BOUNDS, edges=geometry.edge_bound, step_s=step_s
+        )
         try:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError:

@@ -47,13 +47,14 @@ def follow(
     step nor the velocity changes faster than `max_acceleration`.
     """
     target_velocity = _shortened(target_velocity, max_speed)
-    offset = error - target_velocity * step_s
-    distance = float(np.linalg.norm(offset))
-    wanted = target_velocity
-    if distance > 0.0:
-        brake = BRAKE_SHARE * max_acceleration
-        speed = float(closing_speed(np.array(distance), brake, step_s))
-        wanted = _shortened(target_velocity + offset * (speed / distance), max_speed)
+    wanted = wanted_velocity(
+        error,
+        target_velocity,
+        max_speed=max_speed,
+        max_acceleration=max_acceleration,
+        step_s=step_s,
+    )
+    distance = float(np.linalg.norm(error - target_velocity * step_s))
     reach = (1.0 - BRAKE_SHARE) * max_acceleration * step_s
     mean = velocity + _shortened(wanted - velocity, reach)
     landed = float(np.linalg.norm(error - mean * step_s)) <= 1e-12 + 1e-9 * distance
@@ -61,6 +62,24 @@ def follow(
         step_s * (1.0 + 1e-9)
     )
     return mean * step_s, target_velocity if landed and settles else mean
+
+
+def wanted_velocity(
+    error: Floats,
+    target_velocity: Floats,
+    *,
+    max_speed: float,
+    max_acceleration: float,
+    step_s: float,
+) -> Floats:
+    """The velocity (n,) that closes in on the target as fast as one can still stop there."""
+    offset = error - target_velocity * step_s
+    distance = float(np.linalg.norm(offset))
+    if distance == 0.0:
+        return _shortened(target_velocity, max_speed)
+    brake = BRAKE_SHARE * max_acceleration
+    speed = float(closing_speed(np.array(distance), brake, step_s))
+    return _shortened(target_velocity + offset * (speed / distance), max_speed)
 
 
 def _shortened(vector: Floats, longest: float) -> Floats:
@@ -91,23 +110,61 @@ class SheetBounds:
     stretch_acceleration_per_s2: float
 
 
+@dataclass(frozen=True, slots=True)
+class EdgeBound:
+    """How fast any point of a clamped edge may move, and how far the edge reaches from its middle.
+
+    A sheet that turns while it moves is slowed in both alike.  An arm that had to cut the speed of
+    its edge by itself, joint by joint, would leave the sheet's way and so the other arm.
+    """
+
+    speed_m_per_s: float
+    reach_m: float
+
+    def share(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
+        """The part (0..1) of a speed and a turning speed that keeps the edges within the bound."""
+        edge = speed_m_per_s + self.reach_m * turn_rad_per_s
+        return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
+
+
 def follow_sheet(
-    now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, step_s: float
+    now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> SheetMotion:
     """The sheet `step_s` (> 0) later, on its way to `target`, which holds at the step's end."""
+    away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
+    turned = vector_from_rotation(target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T)
+    speed, turn_speed = (
+        float(
+            np.linalg.norm(
+                wanted_velocity(
+                    error, velocity, max_speed=most, max_acceleration=sharpest, step_s=step_s
+                )
+            )
+        )
+        for error, velocity, most, sharpest in (
+            (away, target.twist_world[:3], bounds.speed_m_per_s, bounds.acceleration_m_per_s2),
+            (
+                turned,
+                target.twist_world[3:],
+                bounds.turn_rad_per_s,
+                bounds.turn_acceleration_rad_per_s2,
+            ),
+        )
+    )
+    share = edges.share(speed, turn_speed)
     shift, linear = follow(
-        target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3],
+        away,
         now.twist_world[:3],
         target.twist_world[:3],
-        max_speed=bounds.speed_m_per_s,
+        max_speed=bounds.speed_m_per_s if share == 1.0 else share * speed,
         max_acceleration=bounds.acceleration_m_per_s2,
         step_s=step_s,
     )
     turn, angular = follow(
-        vector_from_rotation(target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T),
+        turned,
         now.twist_world[3:],
         target.twist_world[3:],
-        max_speed=bounds.turn_rad_per_s,
+        max_speed=bounds.turn_rad_per_s if share == 1.0 else share * turn_speed,
         max_acceleration=bounds.turn_acceleration_rad_per_s2,
         step_s=step_s,
     )

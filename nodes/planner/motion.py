@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from messages.types import Phase
-from nodes.models.motion import SheetBounds, SheetMotion, coast_sheet, follow_sheet
+from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, coast_sheet, follow_sheet
 from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.models.shapes import CylinderShape
 from nodes.planner.rolling import (
@@ -25,6 +25,9 @@ from nodes.planner.rolling import (
 )
 
 Floats = NDArray[np.float64]
+
+EDGE_SPEED_SHARE = 0.85
+"""Share of the tool speed that is planned with; the bridges keep to a little more, then cut."""
 
 LONGEST_STEP_S = 0.1
 """After a longer gap the sheet is taken to stand still where it was: the arms have stopped."""
@@ -52,6 +55,9 @@ class Plan:
         self._object_from_world = inverse(self._world_from_object)
         self._turn = np.kron(np.eye(2), self._world_from_object[:3, :3])
         self._bounds = bounds
+        self._edges = EdgeBound(
+            EDGE_SPEED_SHARE * scene.arms.max_tool_speed_m_per_s, 0.5 * scene.sheet.height_m
+        )
         user = self._object_from_world[:3, 2]
         front = float(np.arctan2(user[1], user[2]))
         self._encounter = Encounter(
@@ -90,7 +96,11 @@ class Plan:
             0.0,
         )
         self.motion = follow_sheet(
-            self._before(step_s), target, bounds=self._bounds, step_s=min(step_s, LONGEST_STEP_S)
+            self._before(step_s),
+            target,
+            bounds=self._bounds,
+            edges=self._edges,
+            step_s=min(step_s, LONGEST_STEP_S),
         )
         return self._planned(shown)
 
