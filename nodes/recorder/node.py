@@ -29,7 +29,10 @@ class RecorderParameters(NodeParameters):
         default=(), description="empty: all that the table of topics says are logged"
     )
     also: tuple[str, ...] = Field(default=(), description="topics beside those, as stereo")
-    compress: bool = True
+    compress: bool | None = Field(
+        default=None,
+        description="null: unless pictures come, which take longer to compress than to write",
+    )
     attach: tuple[Path, ...] = Field(
         default=RUN_FILES, description="files that go into the bag; @run is the run's directory"
     )
@@ -77,9 +80,11 @@ class Recorder(Node):
             "started": now.isoformat(),
             "plan_hash": self.plan_hash,
         }
-        self._bag = BagWriter(
-            free_path(path), {"recording": recording}, compress=self.parameters.compress
-        )
+        compress = self.parameters.compress
+        if compress is None:
+            # The camera's pixels are what the table does not log by itself.
+            compress = all(source.topic.logged for source in self.inputs.values())
+        self._bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
         for file in self.parameters.attach:
             media_type = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
             self._bag.add_attachment(file.name, file.read_bytes(), media_type)
