@@ -16,8 +16,11 @@ from messages.scene import Scene
 from nodes.methods import Family, Point, measure, pareto_front
 
 FAMILIES: dict[str, str] = {
+    "mark": "nodes.triangulator.families:MARK",
     "triangulation": "nodes.triangulator.families:TRIANGULATION",
-    "correction": "nodes.renderer.families:CORRECTION",
+    "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
+    "soft-body": "nodes.fem_solver.families:SOFT_BODY",
+    "correction": "launch.families:CORRECTION",
 }
 """Families by their name on the command line; each node's folder describes its own."""
 

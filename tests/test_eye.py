@@ -252,15 +252,19 @@ class EyeBench:
         for side, edge in zip(("left", "right"), edge_poses(np.eye(4), 0.25), strict=True):
             pose = getattr(self.scene.arms, side).flange_from_edge
             flanges.append(flange_pose(edge, transform_from_rpy(pose.position_m, pose.rpy_rad)))
-        await self.step(
-            "twin__arms",
-            TwinArms(
-                joints_left_rad=np.zeros(6),
-                joints_right_rad=np.zeros(6),
-                world_from_flange_left=flanges[0],
-                world_from_flange_right=flanges[1],
-            ),
+        self.arms = TwinArms(
+            joints_left_rad=np.zeros(6),
+            joints_right_rad=np.zeros(6),
+            world_from_flange_left=flanges[0],
+            world_from_flange_right=flanges[1],
         )
+        await self.step("twin__arms", self.arms)
+
+    async def show(self, *frames: Frame) -> None:
+        """Frames, each followed by the true arms at the instant that it was drawn for."""
+        for each in frames:
+            await self.step("frame", each)
+            await self.step("twin__arms", self.arms)
 
     async def finish(self) -> None:
         if self.node._task is not None:
@@ -289,11 +293,9 @@ async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
     await bench.ready()
     display = Display(correction="none", stereo="mono", shading="flat", label="a")
     await bench.step("display", display)
-    for label in ("a", "a", "b", "", "a"):
-        await bench.step("frame", frame(label))
-    await bench.step("frame", frame("a", correction="one_plane"))
-    await bench.step("frame", frame("c", pixels=()))
-    await bench.step("frame", frame("d", stereo="anaglyph"))
+    await bench.show(*(frame(label) for label in ("a", "a", "b", "", "a")))
+    await bench.show(frame("a", correction="one_plane"))
+    await bench.show(frame("c", pixels=()), frame("d", stereo="anaglyph"))
     assert "mono frames only" in bench.node.note
     await bench.finish()
     assert [(eye.label, eye.correction) for eye, _ in bench.sent] == [
@@ -307,11 +309,11 @@ async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
     assert picture.seen[60, 60].tolist() == [200, 200, 200]
     assert picture.proper[60, 60].tolist() == [255, 255, 255]
     # The label just taken is passed over, but not for ever.
-    await bench.step("frame", frame("a", correction="one_plane"))
+    await bench.show(frame("a", correction="one_plane"))
     await bench.finish()
     assert len(bench.sent) == 3
     bench.clock.move_to(bench.clock.now_ns() + 6 * 10**9)
-    await bench.step("frame", frame("a", correction="one_plane"))
+    await bench.show(frame("a", correction="one_plane"))
     await bench.finish()
     assert len(bench.sent) == 4
     assert bench.node.errors == 0
@@ -330,14 +332,26 @@ async def test_eye_node_reports_what_has_no_picture_and_goes_on(
         raise ValueError("folded beyond seeing")
 
     monkeypatch.setattr(bench.node._camera, "take", fails_once)
-    for label in ("a", "b", "c", "c"):
-        await bench.step("frame", frame(label))
+    await bench.show(*(frame(label) for label in ("a", "b", "c", "c")))
     assert "no room" in bench.node.last_error
     assert bench.node.errors == 1
     await bench.finish()
     assert bench.node.errors == 2
     assert "folded beyond seeing" in bench.node.last_error
     assert [eye.label for eye, _ in bench.sent] == ["b"]
+    await bench.node.close()
+
+
+async def test_eye_node_takes_the_sheet_at_the_instant_of_the_light(scene: Scene) -> None:
+    bench = EyeBench(scene)
+    await bench.ready()
+    # Arms' stamps are 123 in this bench: before this frame's light nothing is pictured.
+    await bench.show(frame("early", predicted_to_ns=124))
+    await bench.finish()
+    assert bench.sent == []
+    await bench.node.step("twin__arms", bench.arms, Header(2, 124, 124, "virtual", "test", 1))
+    await bench.finish()
+    assert [eye.label for eye, _ in bench.sent] == ["early"]
     await bench.node.close()
 
 

@@ -255,13 +255,9 @@ def touched(angle_deg: float = 0.0) -> Encounter:
 @pytest.mark.parametrize(
     ("finger", "words", "depth"),
     [
-        (np.array([0.0, 0.0, 0.0]), "axis", RADIUS),
-        (np.array([0.0, 0.0, 0.004]), "axis", RADIUS - 0.004),
-        (np.array([0.0, 0.001, -0.0146]), "axis", RADIUS + 0.0146),
-        (on_cylinder(180.0, -0.001), "axis", 2 * RADIUS - 0.001),
+        (np.array([0.0, 0.0, -1.1 * RADIUS]), "through the object", 2.1 * RADIUS),
         (on_cylinder(0.0, -0.001, 0.061), "past the object's end", 0.001),
         (on_cylinder(0.0, -0.001, -0.08), "past the object's end", 0.001),
-        (on_cylinder(60.0, -0.001), "usable height", 0.001),
     ],
 )
 def test_the_sheet_holds_where_it_cannot_follow(finger: Floats, words: str, depth: float) -> None:
@@ -274,6 +270,48 @@ def test_the_sheet_holds_where_it_cannot_follow(finger: Floats, words: str, dept
     assert abs(shown.y_m) <= REACH.half_height_m + 1e-12
     back = encounter.step(on_cylinder(0.0, -0.001), np.zeros(3), 0.0)
     assert (back.phase, back.angle_rad) == ("contact", 0.0)
+
+
+def test_the_sheet_holds_at_its_usable_height_and_goes_on_when_the_finger_is_back() -> None:
+    encounter = touched()
+    for angle_deg in np.arange(0.0, 61.0, 2.0):
+        shown = encounter.step(on_cylinder(angle_deg, -0.001), np.zeros(3), 0.0)
+        assert abs(shown.y_m) <= REACH.half_height_m + 1e-12
+    assert (shown.phase, shown.angle_rate) == ("hold", 0.0)
+    assert "usable height" in shown.reason
+    for angle_deg in np.arange(60.0, -1.0, -2.0):
+        shown = encounter.step(on_cylinder(angle_deg, -0.001), np.zeros(3), 0.0)
+    assert (shown.phase, shown.angle_rad) == ("contact", pytest.approx(0.0, abs=1e-9))
+
+
+def test_a_deep_push_neither_shakes_nor_leaves_the_sheet() -> None:
+    """To the axis and past it, with a measured finger that trembles by a tenth of a millimetre."""
+    encounter = touched()
+    noise = np.random.default_rng(1)
+    for depth in np.concatenate([np.linspace(0.001, 0.05, 200), np.full(200, 0.05)]):
+        finger = np.array([0.0, 0.0, RADIUS - depth]) + noise.normal(0.0, 1e-4, 3)
+        shown = encounter.step(finger, np.zeros(3), 0.0)
+        assert shown.phase == "contact"
+        assert abs(shown.angle_rad) < math.radians(1.2)
+        assert shown.push_depth_m == pytest.approx(depth, abs=6e-4)
+
+
+@pytest.mark.parametrize("depth", [0.002, 0.012, 0.03])
+def test_stroking_while_pushing_rolls_by_what_the_finger_moves_and_never_steps(
+    depth: float,
+) -> None:
+    encounter = touched()
+    for depth_now in np.linspace(0.001, depth, 50):
+        encounter.step(np.array([0.0, 0.0, RADIUS - depth_now]), np.zeros(3), 0.0)
+    angles = [
+        encounter.step(np.array([0.0, y, RADIUS - depth]), np.array([0.0, 0.1, 0.0]), 0.0).angle_rad
+        for y in np.arange(0.0, 0.008, 0.0005)
+    ]
+    steps = np.diff(angles)
+    assert (steps > 0.0).all()
+    # Between rolling along the sheet (dy / R) and about the axis (dy / (R - depth)).
+    assert steps.max() <= 0.0005 / (RADIUS - min(depth, 0.018)) * 1.3
+    assert steps.min() >= 0.0005 / RADIUS * 0.7
 
 
 def test_a_finger_on_the_axis_from_the_first_is_held_and_not_met() -> None:

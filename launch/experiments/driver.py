@@ -37,10 +37,12 @@ from nodes.node import Output, PortCounts
 READ = ("twin/finger", "twin/eye", "sheet_target", "arm_left", "arm_right", "soft_body", "status")
 WRITTEN = ("twin/finger_path", "display")
 
-SETTLED_POSITION_M = 5e-5
-SETTLED_SPEED_M_PER_S = 5e-4
-SETTLED_TURN_RAD_PER_S = 5e-3
-SETTLED_MESSAGES = 30
+# The measured finger is never quite still, so neither is the sheet; these tell resting from going.
+SETTLED_POSITION_M = 1e-3
+SETTLED_SPEED_M_PER_S = 0.05
+SETTLED_TURN_RAD_PER_S = 0.8
+SETTLED_MESSAGES = 100
+PIXELS_EVERY = 10
 WAIT_S = 20.0
 PICTURE_WAIT_S = 40.0
 
@@ -189,7 +191,7 @@ class Driver:
                 stereo="mono",
                 shading="flat",
                 marks=False,
-                pixels_every=1,
+                pixels_every=PIXELS_EVERY,
                 label=label,
             )
         )
@@ -199,6 +201,8 @@ class Driver:
             return isinstance(eye, TwinEye) and eye.label == label
 
         await self.wait_for(taken, f'the eye\'s picture of "{label}"', PICTURE_WAIT_S)
+        # What is not photographed need not be sent with its pixels.
+        self.show(Display(correction=correction, stereo="side_by_side"))
         eye = self._newest["twin/eye"]
         assert isinstance(eye, TwinEye)
         return eye

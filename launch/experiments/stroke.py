@@ -29,8 +29,8 @@ from nodes.models.rigid import apply, inverse, transform_from_rpy
 Floats = NDArray[np.float64]
 
 STROKE_ANGLE_RAD = np.radians(60.0)
-APPROACH_S = 1.5
-DWELL_S = 1.0
+APPROACH_S = 0.8
+DWELL_S = 0.7
 HOVER_M = 0.04
 WANDER_M = 0.0005
 TREMOR_M = 0.00005
@@ -62,7 +62,7 @@ def stroke_path(scene: Scene, seconds: float) -> FingerPath:
         [
             [0.0, APPROACH_S, APPROACH_S + DWELL_S - 1e-3],
             APPROACH_S + DWELL_S + stroke_times,
-            APPROACH_S + DWELL_S + seconds + np.array([0.5, 0.5 + APPROACH_S]),
+            APPROACH_S + DWELL_S + seconds + np.array([0.3, 0.3 + APPROACH_S]),
         ]
     )
     points = np.column_stack(

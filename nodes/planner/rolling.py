@@ -22,6 +22,10 @@ Floats = NDArray[np.float64]
 BEYOND_TILT = "finger beyond the tilt that the arms present"
 
 
+SHALLOW, DEEP = 0.15, 0.5
+"""Depths over the radius: up to the first the finger's own angle counts, from the second on not."""
+
+
 @dataclass(frozen=True, slots=True)
 class Reach:
     """How far the sheet can go, and when the finger counts as touching.
@@ -69,6 +73,7 @@ class Encounter:
         self._touching = False
         self._anchor_angle = self._anchor_y = 0.0
         self._angle = reach.front_rad
+        self._finger = np.zeros(3)
 
     @property
     def angle_rad(self) -> float:
@@ -85,11 +90,11 @@ class Encounter:
         sheet_y_at: y of the sheet's point that lies nearest to the surface point under the finger
             now; used as A' when this step begins a contact.
         """
-        height = float(np.hypot(finger[1], finger[2])) - self._shape.radius_m
-        if self._touching and height > self._reach.release_m:
+        if self._touching and self._above_sheet(finger) > self._reach.release_m:
             self._touching = False
         if self._touching:
-            return self._roll(finger, velocity, height)
+            return self._roll(finger, velocity)
+        height = float(np.hypot(finger[1], finger[2])) - self._shape.radius_m
         if height + self._shape.radius_m < self._reach.axis_m:
             return self._hold("finger on the object's axis", self._shape.radius_m)
         angle, limited = self._reachable(self._shape.angle_rad(finger))
@@ -99,23 +104,23 @@ class Encounter:
             half = self._reach.half_height_m
             self._touching = True
             self._anchor_angle, self._anchor_y = angle, min(max(sheet_y_at, -half), half)
-            return self._roll(finger, velocity, height)
+            self._finger = finger
+            return self._roll(finger, velocity)
         rate = 0.0 if limited else _angle_rate(finger, velocity)
         return Presentation(
             "approach", BEYOND_TILT if limited else "", angle, 0.0, rate, False, 0.0
         )
 
-    def _roll(self, finger: Floats, velocity: Floats, height: float) -> Presentation:
+    def _roll(self, finger: Floats, velocity: Floats) -> Presentation:
         """In touch: roll to the finger, or say what keeps the sheet from it."""
-        outwards = float(finger @ normal_at(self._angle))
-        depth = max(0.0, -height)
-        if outwards < self._reach.axis_m:
-            return self._hold(
-                "finger at the object's axis or beyond it", self._shape.radius_m - outwards
-            )
+        depth = max(0.0, -self._above_sheet(finger))
+        before, self._finger = self._finger, finger
         if abs(finger[0]) > 0.5 * self._shape.length_m:
             return self._hold("finger past the object's end", depth)
-        angle, limited = self._reachable(self._shape.angle_rad(finger))
+        if depth > 2.0 * self._shape.radius_m:
+            return self._hold("finger through the object", depth)
+        carried, rate = self._carried(finger, finger - before, velocity, depth)
+        angle, limited = self._reachable(carried)
         y, half = self._sheet_y(angle), self._reach.half_height_m
         if abs(y) > half:
             edge_y = half if y > 0 else -half
@@ -124,7 +129,32 @@ class Encounter:
         self._angle = angle
         if limited:
             return self._hold(BEYOND_TILT, depth)
-        return Presentation("contact", "", angle, y, _angle_rate(finger, velocity), True, depth)
+        return Presentation("contact", "", angle, y, rate, True, depth)
+
+    def _carried(
+        self, finger: Floats, moved: Floats, velocity: Floats, depth: float
+    ) -> tuple[float, float]:
+        """Angle (rad) and rate (rad/s) to which a finger in touch carries the sheet.
+
+        On the surface it is the finger's own angle about the axis.  Deep inside that angle means
+        little (at the axis every side is as near), and what the finger feels is the dented sheet;
+        there the sheet rolls by how far the finger moves along it.  In between the two are blended,
+        so that stroking while pushing makes no step.
+        """
+        shallow, deep = SHALLOW * self._shape.radius_m, DEEP * self._shape.radius_m
+        share = min(max((deep - depth) / (deep - shallow), 0.0), 1.0)
+        along = np.array([0.0, cos(self._angle), -sin(self._angle)])
+        angle = self._angle + (1.0 - share) * float(moved @ along) / self._shape.radius_m
+        rate = (1.0 - share) * float(velocity @ along) / self._shape.radius_m
+        if share > 0.0:
+            aside = self._shape.angle_rad(finger) - self._angle
+            angle += share * ((aside + pi) % (2.0 * pi) - pi)
+            rate += share * _angle_rate(finger, velocity)
+        return angle, rate
+
+    def _above_sheet(self, finger: Floats) -> float:
+        """Height (m) of a finger over the plane presented last; negative when it pushes."""
+        return float(finger @ normal_at(self._angle)) - self._shape.radius_m
 
     def _hold(self, reason: str, depth: float) -> Presentation:
         y = self._sheet_y(self._angle) if self._touching else 0.0

@@ -8,6 +8,7 @@ Modern Robotics, ch. 4), inverse kinematics Gauss-Newton on it.
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import struct
 import zlib
@@ -24,6 +25,9 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 
 Floats = NDArray[np.float64]
 Fault = Literal["none", "silent", "slow", "exception", "bad_crc", "old_version", "frozen"]
+
+# A client that goes away in the middle of an answer is no news; the library dumps its last packets.
+logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 CONTROLLER_CYCLE_S = 0.0071
 

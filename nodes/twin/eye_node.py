@@ -29,8 +29,8 @@ class TwinEyeNode(Node):
     """Pictures each labelled mono frame that carries pixels, one per label and correction.
 
     A picture takes about a second, so further frames of a label that waits, or was just pictured,
-    are passed over on purpose; they are not counted as lost.  The sheet, the finger and the object
-    are those of the frame's arrival: hold them still for a picture that shall be measured.
+    are passed over on purpose; they are not counted as lost.  The sheet and the finger are the true
+    ones at the instant that the frame was drawn for, which is a few milliseconds after it arrives.
     """
 
     parameters: TwinEyeParameters
@@ -49,6 +49,7 @@ class TwinEyeNode(Node):
         self._waiting: dict[Key, tuple[Situation, Frame, Header]] = {}
         self._last: tuple[Key, int] | None = None
         self._refused: set[Key] = set()
+        self._before_light: tuple[Frame, Header] | None = None
         self._task: asyncio.Task[None] | None = None
 
     async def close(self) -> None:
@@ -61,8 +62,7 @@ class TwinEyeNode(Node):
         key = (frame.label, frame.correction)
         if not frame.pixels or not frame.label or key in self._waiting or self._just_taken(key):
             return
-        arms, scene = self.twin__arms.message, self.scene.message
-        if scene is None or arms is None:
+        if self.scene.message is None or self.twin__arms.message is None:
             self.note = "waits for the scene and the true arms"
         elif frame.stereo != "mono":
             self.note = f'pictures mono frames only; "{frame.label}" is {frame.stereo}'
@@ -70,27 +70,36 @@ class TwinEyeNode(Node):
             if key not in self._refused:
                 self._refused.add(key)
                 self.report_error("on_frame", OverflowError(f'no room for "{frame.label}"'))
-        else:
-            finger, body, skin = (
-                self.twin__finger.message,
-                self.soft_body.message,
-                self.skin.message,
-            )
-            matching = body is not None and skin is not None and body.mesh_id == skin.mesh_id
-            display = self.display.message
-            situation = Situation(
-                scene=scene,
-                world_from_flange_left=arms.world_from_flange_left,
-                world_from_flange_right=arms.world_from_flange_right,
-                finger_tip=None if finger is None else finger.position_world_m,
-                skin_vertices=skin.vertices_world_m if matching and skin is not None else None,
-                displacement=body.displacement_world_m if matching and body is not None else None,
-                flat=display is not None and display.shading == "flat",
-                metres_per_px=self.parameters.metres_per_px,
-            )
-            self._waiting[key] = (situation, frame, header)
-            if self._task is None or self._task.done():
-                self._task = asyncio.get_running_loop().create_task(self._picture_all())
+        elif self._before_light is None:
+            self._before_light = (frame, header)
+
+    def on_twin__arms(self, arms: TwinArms, header: Header) -> None:
+        scene = self.scene.message
+        if self._before_light is None or scene is None:
+            return
+        frame, frame_header = self._before_light
+        if header.clock_id == frame_header.clock_id and header.source_ns < frame.predicted_to_ns:
+            return
+        self._before_light = None
+        situation = self._situation(scene, arms)
+        self._waiting[frame.label, frame.correction] = (situation, frame, frame_header)
+        if self._task is None or self._task.done():
+            self._task = asyncio.get_running_loop().create_task(self._picture_all())
+
+    def _situation(self, scene: Scene, arms: TwinArms) -> Situation:
+        finger, body, skin = self.twin__finger.message, self.soft_body.message, self.skin.message
+        matching = body is not None and skin is not None and body.mesh_id == skin.mesh_id
+        display = self.display.message
+        return Situation(
+            scene=scene,
+            world_from_flange_left=arms.world_from_flange_left,
+            world_from_flange_right=arms.world_from_flange_right,
+            finger_tip=None if finger is None else finger.position_world_m,
+            skin_vertices=skin.vertices_world_m if matching and skin is not None else None,
+            displacement=body.displacement_world_m if matching and body is not None else None,
+            flat=display is not None and display.shading == "flat",
+            metres_per_px=self.parameters.metres_per_px,
+        )
 
     def _just_taken(self, key: Key) -> bool:
         if self._last is None or self._last[0] != key:
