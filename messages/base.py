@@ -45,9 +45,22 @@ class Header:
 
 @cache
 def schema_fingerprint(message_type: type[Message]) -> bytes:
-    """First 8 bytes of the SHA-256 of the type's JSON Schema: equal if and only if the fields are.
+    """First 8 bytes of the SHA-256 of the type's JSON Schema, its prose left out.
 
-    Descriptions count too; that is deliberate, since units live in them.
+    Equal if and only if names, types, ranges, dtypes and shapes of the fields are.
     """
-    schema = json.dumps(message_type.model_json_schema(), sort_keys=True)
+    schema = json.dumps(_without_prose(message_type.model_json_schema()), sort_keys=True)
     return hashlib.sha256(schema.encode()).digest()[:8]
+
+
+def _without_prose(schema: object) -> object:
+    """A JSON Schema without titles and descriptions; a field that is named so stays."""
+    if isinstance(schema, dict):
+        return {
+            key: _without_prose(value)
+            for key, value in schema.items()
+            if not (key in ("title", "description") and isinstance(value, str))
+        }
+    if isinstance(schema, list):
+        return [_without_prose(value) for value in schema]
+    return schema

@@ -26,7 +26,7 @@ class Part(BaseModel):
 
 
 class Pose(Part):
-    """Where a frame sits in another; roll, pitch, yaw turn about the fixed x, y, z axes, in order."""
+    """Where a frame sits in another; roll, pitch, yaw turn about fixed x, y, z axes, in order."""
 
     position_m: Vector3
     rpy_rad: Vector3

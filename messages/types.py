@@ -30,6 +30,7 @@ from messages.scene import Finite, NonNegative, Part, Positive
 
 Side = Literal["left", "right"]
 Correction = Literal["none", "one_plane", "four_triangles"]
+Shading = Literal["soft", "flat"]
 StereoMode = Literal["mono", "side_by_side", "top_bottom", "anaglyph"]
 
 
@@ -133,7 +134,7 @@ class Display(Message):
     correction: Correction
     stereo: StereoMode
     swap_eyes: bool = False
-    shading: Literal["soft", "flat"] = "soft"
+    shading: Shading = "soft"
     pattern: Literal["object", "grid", "black"] = "object"
     marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
     pixels_every: int = Field(

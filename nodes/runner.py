@@ -17,10 +17,10 @@ from typing import Any
 import psutil
 import structlog
 import uvloop
-from messages.bus import Publisher, Subscriber
 from pydantic import BaseModel, ConfigDict
 
 from messages.base import Header, Message
+from messages.bus import Publisher, Subscriber
 from messages.clock import SystemClock
 from messages.topics import Topic, topic_named
 from messages.types import Status

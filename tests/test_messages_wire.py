@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, create_model
 from ruamel.yaml import YAML
 
 from messages.arrays import ArraySpec
@@ -353,6 +353,19 @@ def test_size_limit_holds_at_both_ends() -> None:
     assert encode(stop, HEADER, max_bytes=size)
     with pytest.raises(WireError, match=f"message of {size} bytes, at most {size - 1}"):
         encode(stop, HEADER, max_bytes=size - 1)
+
+
+def test_a_better_sentence_does_not_change_the_fingerprint_but_a_field_does() -> None:
+    def example(doc: str, **fields: object) -> type[Message]:
+        return create_model("Example", __base__=Message, __doc__=doc, **fields)
+
+    plain = example("One.", title=(str, Field(description="of the example")))
+    reworded = example("Another.", title=(str, Field(description="what it is called")))
+    widened = example("One.", title=(str | None, Field(description="of the example")))
+    renamed = example("One.", name=(str, Field(description="of the example")))
+    fingerprints = [schema_fingerprint(kind) for kind in (plain, reworded, widened, renamed)]
+    assert fingerprints[0] == fingerprints[1]
+    assert len(set(fingerprints)) == 3
 
 
 def test_every_topic_type_has_a_fingerprint_of_its_own() -> None:

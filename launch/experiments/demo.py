@@ -45,8 +45,8 @@ def run_demo(
     bag = folder / "demo.mcap"
     procedure = in_turn(
         stroke_procedure(SECONDS, progress, path=path),
-        tilt_procedure([TILT_DEG], TILT_CORRECTIONS, progress),
-        push_procedure([DEPTH_MM], PUSH_CORRECTIONS, progress),
+        tilt_procedure([TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
+        push_procedure([DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
     )
     run_experiment(launch_file, [], bag, procedure, progress)
     progress("reading the bag and drawing")

@@ -8,31 +8,32 @@ nodes were.
 from __future__ import annotations
 
 import asyncio
-import random
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
 from launch.experiments import ExperimentError
-from launch.plan import RUN_DIRECTORY, TOOLS, Plan
+from launch.plan import TOOLS, Plan
 from launch.runs import Run
+from launch.supervisor import local_endpoints
+from launch.tools import ToolsWriter
 from messages.base import Header, Message
-from messages.bus import Publisher, Subscriber
-from messages.clock import SystemClock
+from messages.bus import Subscriber
 from messages.topics import topic_named
 from messages.types import (
     ArmState,
     Correction,
     Display,
     FingerPath,
+    Shading,
     SheetTarget,
     Status,
     TwinEye,
     TwinFinger,
 )
-from nodes.node import Output, PortCounts
+from nodes.node import PortCounts
 
 READ = ("twin/finger", "twin/eye", "sheet_target", "arm_left", "arm_right", "soft_body", "status")
 WRITTEN = ("twin/finger_path", "display")
@@ -52,30 +53,22 @@ class Driver:
 
     def __init__(self, plan: Plan, run: Run) -> None:
         self._plan, self._run = plan, run
-        self._clock = SystemClock()
+        self._writer: ToolsWriter | None = None
         self._subscribers: list[Subscriber] = []
-        self._publishers: dict[str, Publisher] = {}
-        self._outputs: dict[str, Output[Any]] = {}
         self._newest: dict[str, Message] = {}
         self._notes: dict[str, str] = {}
         self._waiters: list[tuple[Callable[[], bool], asyncio.Future[None]]] = []
         self._settled_since = 0
 
     async def __aenter__(self) -> Self:
-        epoch = random.SystemRandom().getrandbits(32)
-        for name in WRITTEN:
-            topic = topic_named(name)
-            writer = self._plan.writer(name, TOOLS)
-            if writer is None:
-                raise ExperimentError(f'the launch file lets no tool write "{name}"')
-            self._publishers[name] = Publisher(
-                topic, [self._endpoint(one) for one in writer.endpoints]
-            )
-            self._outputs[name] = Output(topic, self._clock, self._send, TOOLS, epoch)
+        self._writer = ToolsWriter(self._plan, self._run, WRITTEN)
         for name in READ:
-            endpoints = [self._endpoint(one) for one in self._plan.endpoints_to_read(name)]
             subscriber = Subscriber(
-                topic_named(name), endpoints, self._handler(name), PortCounts(), on_problem=str
+                topic_named(name),
+                local_endpoints(self._run, self._plan.endpoints_to_read(name)),
+                self._handler(name),
+                PortCounts(),
+                on_problem=self._note_problem,
             )
             subscriber.start()
             self._subscribers.append(subscriber)
@@ -89,14 +82,16 @@ class Driver:
     ) -> None:
         for subscriber in self._subscribers:
             subscriber.close()
-        for publisher in self._publishers.values():
-            publisher.close()
+        if self._writer is not None:
+            self._writer.close()
 
-    def _endpoint(self, endpoint: str) -> str:
-        return endpoint.replace(RUN_DIRECTORY, str(self._run.directory))
+    def _note_problem(self, text: str) -> None:
+        self._notes[TOOLS] = text
 
-    def _send(self, topic: Any, message: Message, header: Header) -> None:
-        self._publishers[topic.name].send(message, header)
+    def _publish(self, topic: str, message: Message) -> None:
+        if self._writer is None:
+            raise RuntimeError("the driver is used outside of its context")
+        self._writer.publish(topic, message)
 
     def _handler(self, name: str) -> Callable[[Message, Header], None]:
         def handle(message: Message, header: Header) -> None:
@@ -155,7 +150,7 @@ class Driver:
         await self.wait_for(up, "both arms to follow and the soft body to answer", 3 * WAIT_S)
 
     def move_finger(self, path: FingerPath) -> None:
-        self._outputs["twin/finger_path"].publish(path)
+        self._publish("twin/finger_path", path)
 
     async def follow(self, path: FingerPath) -> None:
         """Send the finger along a path and wait until it is through."""
@@ -181,15 +176,20 @@ class Driver:
         )
 
     def show(self, display: Display) -> None:
-        self._outputs["display"].publish(display)
+        self._publish("display", display)
 
-    async def take_picture(self, label: str, correction: Correction) -> TwinEye:
-        """Show the object flat with that correction, and wait for the eye's picture of it."""
+    async def take_picture(
+        self, label: str, correction: Correction, shading: Shading = "flat"
+    ) -> TwinEye:
+        """Show the object with that correction, and wait for the eye's picture of it.
+
+        Flat, its outline can be measured; soft, a person sees what it is.
+        """
         self.show(
             Display(
                 correction=correction,
                 stereo="mono",
-                shading="flat",
+                shading=shading,
                 marks=False,
                 pixels_every=PIXELS_EVERY,
                 label=label,

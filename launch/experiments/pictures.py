@@ -18,8 +18,15 @@ EVENTS = (
     "soft body",
     "left arm command",
     "right arm command",
+    "frame begun",
     "frame drawn",
 )
+
+CORRECTION_NAMES = {
+    "none": "not corrected",
+    "one_plane": "corrected for one plane",
+    "four_triangles": "corrected for 4 triangles",
+}
 
 
 def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) -> None:
@@ -28,7 +35,9 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) ->
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
     for row, (title, pictures) in zip(axes, rows, strict=True):
-        shown = [(picture.correction, picture.seen, picture) for picture in pictures]
+        shown: list[tuple[str, np.ndarray, Picture]] = [
+            (CORRECTION_NAMES[picture.correction], picture.seen, picture) for picture in pictures
+        ]
         shown.append(("as it should be", pictures[0].proper, pictures[0]))
         for axis in row:
             axis.set_axis_off()
@@ -40,7 +49,7 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) ->
                 axis.add_patch(
                     Rectangle((left, top), width, height, fill=False, color="C1", linewidth=0.8)
                 )
-            axis.set_title(f"{title}\n{name.replace('_', ' ')}", fontsize=9)
+            axis.set_title(f"{title}\n{name}", fontsize=9)
     figure.suptitle("What the user's eye sees (orange: the box around the proper image)")
     figure.savefig(path, dpi=110)
 
@@ -102,8 +111,8 @@ def draw_latency(recording: Recording, path: Path) -> None:
         axes.text(high, row, f"  {median:.1f} / {high:.1f} ms", va="center", fontsize=8)
     axes.set_yticks(range(len(events)), events)
     axes.invert_yaxis()
-    axes.set_xlim(left=0)
-    axes.margins(x=0.2)
+    longest_ms = max(np.quantile(recording.delays_s[event], 0.99) for event in events) * 1e3
+    axes.set_xlim(0, 1.25 * longest_ms)
     axes.set_xlabel("ms since the middle of the exposure: 1-99 % (bar), median (line)")
     axes.set_title("Where the milliseconds go")
     axes.grid(visible=True, axis="x", alpha=0.2)

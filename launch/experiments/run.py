@@ -13,7 +13,7 @@ from launch.experiments.driver import Driver
 from launch.plan import Plan, load_plan
 from launch.supervisor import RunningGraph
 from messages.scene import Scene
-from messages.types import Correction, FingerPath
+from messages.types import Correction, FingerPath, Shading
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")
@@ -101,7 +101,11 @@ def stroke_procedure(
 
 
 def tilt_procedure(
-    tilts_deg: Sequence[float], corrections: Sequence[Correction], progress: Progress
+    tilts_deg: Sequence[float],
+    corrections: Sequence[Correction],
+    progress: Progress,
+    *,
+    shading: Shading = "flat",
 ) -> Procedure:
     """Incline the sheet by each angle and photograph it with each correction."""
 
@@ -112,13 +116,17 @@ def tilt_procedure(
             for correction in corrections:
                 label = image.tilt_label(theta_deg, correction)
                 progress(label)
-                await driver.take_picture(label, correction)
+                await driver.take_picture(label, correction, shading)
 
     return procedure
 
 
 def push_procedure(
-    depths_mm: Sequence[float], corrections: Sequence[Correction], progress: Progress
+    depths_mm: Sequence[float],
+    corrections: Sequence[Correction],
+    progress: Progress,
+    *,
+    shading: Shading = "flat",
 ) -> Procedure:
     """Push the middle by each depth and photograph the sheet with each correction."""
 
@@ -130,7 +138,7 @@ def push_procedure(
             for correction in corrections:
                 label = image.push_label(depth_mm, correction)
                 progress(label)
-                await driver.take_picture(label, correction)
+                await driver.take_picture(label, correction, shading)
 
     return procedure
 

@@ -110,7 +110,8 @@ class Track:
         return np.column_stack([np.interp(x, xp, column) for column in self.values.T])
 
     def covers(self, times_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        return (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
+        inside: NDArray[np.bool_] = (times_ns >= self.times_ns[0]) & (times_ns <= self.times_ns[-1])
+        return inside
 
 
 def track(samples: list[tuple[int, Floats]], what: str) -> Track:
@@ -204,6 +205,8 @@ def read_recording(bag: Path) -> Recording:
             case SoftBody():
                 delay("soft body", header.source_ns, header.publish_ns)
             case Frame():
+                begun_ns = header.publish_ns - round(message.draw_s * 1e9)
+                delay("frame begun", header.source_ns, begun_ns)
                 delay("frame drawn", header.source_ns, header.publish_ns)
             case Status():
                 for port in message.inputs:
@@ -351,7 +354,7 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
     world_from_object = object_pose(scene)
     true_points = recording.finger.at(times)
     return StrokeErrors(
-        seconds=(times - begin_ns) * 1e-9,
+        seconds=np.asarray((times - begin_ns) * 1e-9, dtype=np.float64),
         delta_d_m=delta_d,
         true_delta_d_m=true_d,
         delta_theta_rad=delta_theta,
@@ -372,7 +375,7 @@ def tangential_distance(
         angle = np.arctan2(local[:, 1], local[:, 2])
         radius = scene.object.geometry.radius_m
         on_surface.append(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))
-    return np.linalg.norm(on_surface[0] - on_surface[1], axis=1)
+    return np.asarray(np.linalg.norm(on_surface[0] - on_surface[1], axis=1))
 
 
 def stroke_result(recording: Recording, seconds: float, bag: Path) -> dict[str, Any]:
@@ -389,6 +392,9 @@ def stroke_result(recording: Recording, seconds: float, bag: Path) -> dict[str, 
         "latency_ms": {
             "exposure_to_arm": percentiles_ms(recording.arm_delays_s()),
             "exposure_to_frame": percentiles_ms(recording.delays_s.get("frame drawn", NOTHING)),
+            "exposure_to_frame_begun": percentiles_ms(
+                recording.delays_s.get("frame begun", NOTHING)
+            ),
         },
         "drops": recording.drops,
         "bag": str(bag),
