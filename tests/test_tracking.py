@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 from nodes.triangulator.tracking import (
     Tracker,
     TrackingSettings,
+    agility,
     corrected,
     predicted,
     reachable,
@@ -21,7 +24,11 @@ Floats = NDArray[np.float64]
 FRAME_NS = 16_666_667
 NOISE = np.diag([1e-5, 2e-5, 8e-5]) ** 2
 SETTINGS = TrackingSettings(
-    acceleration_noise=0.5, max_speed_m_per_s=1.5, forget_after_s=0.1, confirm_frames=3
+    acceleration_noise=0.5,
+    largest_acceleration_noise=1.0,
+    max_speed_m_per_s=1.5,
+    forget_after_s=0.1,
+    confirm_frames=3,
 )
 
 
@@ -127,3 +134,51 @@ def test_noise_widens_the_gate() -> None:
     way = np.array([0.03, 0.0, 0.0])
     assert not reachable(way, FRAME_NS, NOISE, 1.5)
     assert reachable(way, FRAME_NS, np.eye(3) * 1e-3**2, 1.5)
+
+
+CALM = replace(SETTINGS, acceleration_noise=0.003)
+
+
+def predicted_errors_m(positions: Floats, settings: TrackingSettings, lead_frames: int) -> Floats:
+    """How far (n,) the track, carried on by some frames, is from where the finger then is."""
+    generator = np.random.default_rng(7)
+    tracker = Tracker(settings)
+    errors = []
+    for frame in range(len(positions) - lead_frames):
+        measured = positions[frame] + np.sqrt(np.diag(NOISE)) * generator.standard_normal(3)
+        assert tracker.take((frame + 1) * FRAME_NS, measured, NOISE)
+        assert tracker.track is not None
+        ahead = tracker.track.velocity * lead_frames * FRAME_NS * 1e-9
+        errors.append(tracker.track.position + ahead - positions[frame + lead_frames])
+    return np.linalg.norm(errors, axis=1)
+
+
+def test_tremor_is_not_predicted_the_wrong_way() -> None:
+    """A stroke with a 10 Hz tremor: the calm filter leaves less than one that follows it all."""
+    times_s = np.arange(400) / 60.0
+    stroke = np.outer(times_s, [0.0, 0.0037, 0.0])
+    stroke[:, 1] += 5e-5 * np.sin(2 * np.pi * 10.0 * times_s)
+    calm = predicted_errors_m(stroke, CALM, 3)[60:].mean()
+    quick = predicted_errors_m(stroke, SETTINGS, 3)[60:].mean()
+    assert calm < 0.6 * quick
+
+
+def test_a_start_and_a_stop_are_followed_as_quickly_as_by_the_agile_filter() -> None:
+    """0.5 m/s from one frame to the next, and back to rest: caught up with within four frames."""
+    speed = np.zeros(120)
+    speed[40:80] = 0.5
+    reach = np.outer(np.cumsum(speed) / 60.0, [0.0, 0.0, 1.0])
+    errors = predicted_errors_m(reach, CALM, 0)
+    for begin in (40, 80):
+        assert errors[begin + 4 : begin + 30].max() < 1e-3
+    assert agility(
+        started(0, np.zeros(3), NOISE * 1e-6, 1e-9), FRAME_NS, np.full(3, 0.01), NOISE, CALM
+    ) == pytest.approx(CALM.largest_acceleration_noise)
+
+
+@given(st.floats(1e-6, 1.0), st.integers(1_000_000, 90_000_000))
+@settings(max_examples=50, deadline=None)
+def test_agility_stays_within_its_settings(way_m: float, step_ns: int) -> None:
+    track = corrected(started(0, np.zeros(3), NOISE, 1.5), np.zeros(3), NOISE)
+    noise = agility(track, step_ns, np.array([way_m, 0.0, 0.0]), NOISE, CALM)
+    assert CALM.acceleration_noise <= noise <= CALM.largest_acceleration_noise

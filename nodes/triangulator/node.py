@@ -39,7 +39,12 @@ class TriangulatorParameters(NodeParameters):
     mark_min_area_px: Annotated[int, Field(ge=1)] = 6
     mark_max_area_px: Annotated[int, Field(ge=1)] = 1500
     window_half_px: Annotated[int, Field(ge=8)] = 28
-    acceleration_noise: Positive = Field(default=0.5, description="m/s^2 per root hertz")
+    acceleration_noise: Positive = Field(
+        default=0.003, description="of a hand that goes evenly, m/s^2 per root hertz"
+    )
+    largest_acceleration_noise: Positive = Field(
+        default=1.0, description="of a hand that starts, stops or turns"
+    )
     forget_after_s: Positive = 0.1
     confirm_frames: Annotated[int, Field(ge=1)] = 3
 
@@ -82,6 +87,7 @@ class Triangulator(Node):
         )
         self.tracking = TrackingSettings(
             acceleration_noise=p.acceleration_noise,
+            largest_acceleration_noise=p.largest_acceleration_noise,
             max_speed_m_per_s=scene.finger.max_speed_m_per_s,
             forget_after_s=p.forget_after_s,
             confirm_frames=p.confirm_frames,

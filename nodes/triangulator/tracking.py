@@ -14,6 +14,9 @@ Floats = NDArray[np.float64]
 
 POSITION, VELOCITY = np.arange(3), np.arange(3, 6)
 
+EVEN_MOTION = 12.0
+"""Mean square of the normalised innovation up to which a hand counts as going evenly."""
+
 GATE_SIGMAS = 5.0
 """Measurement noise that the gate forgives on top of a finger's fastest motion."""
 
@@ -39,7 +42,10 @@ class Track:
 class TrackingSettings:
     """How a finger moves.
 
-    acceleration_noise: root of the spectral density of a white acceleration, m/s^2 per root hertz.
+    acceleration_noise: root of the spectral density of a white acceleration, m/s^2 per root hertz,
+        of a hand that goes evenly.  Tremor is not to be followed: an arm cannot, and a velocity
+        that holds it predicts it the wrong way.
+    largest_acceleration_noise: the same of a hand that starts, stops or turns; see `agility`.
     max_speed_m_per_s: faster is no finger.
     forget_after_s: without a measurement for so long the next one starts a new track.
     confirm_frames: measurements in a row that must agree with one another, but not with the track,
@@ -47,6 +53,7 @@ class TrackingSettings:
     """
 
     acceleration_noise: float
+    largest_acceleration_noise: float
     max_speed_m_per_s: float
     forget_after_s: float
     confirm_frames: int
@@ -88,6 +95,26 @@ def corrected(track: Track, measured: Floats, covariance: Floats) -> Track:
     return Track(track.at_ns, state, 0.5 * (full + full.T))
 
 
+def agility(
+    track: Track, at_ns: int, measured: Floats, covariance: Floats, settings: TrackingSettings
+) -> float:
+    """The acceleration noise with which to carry a track on to a measured point (3,).
+
+    The settings' own while the point lies where an even motion leads, by the mean square of the
+    normalised innovation; else as much as its innovation speaks for, |v|^2 = q^2 dt^3, up to the
+    largest (adaptive process noise: Bar-Shalom, Li, Kirubarajan, section 11.2).
+    """
+    calm = settings.acceleration_noise
+    ahead = predicted(track, at_ns, calm)
+    innovation = measured - ahead.position
+    spread = ahead.covariance[:3, :3] + covariance
+    if innovation @ np.linalg.solve(spread, innovation) <= 3.0 * EVEN_MOTION:
+        return calm
+    dt = (at_ns - track.at_ns) * 1e-9
+    wanted = float(np.linalg.norm(innovation)) / dt**1.5
+    return float(min(max(wanted, calm), settings.largest_acceleration_noise))
+
+
 def reachable(way: Floats, duration_ns: int, covariance: Floats, max_speed: float) -> bool:
     """Whether a finger can go the way (3,) to a measured point in a time, but for its noise."""
     slack_m = GATE_SIGMAS * float(np.sqrt(np.trace(covariance)))
@@ -125,7 +152,8 @@ class Tracker:
             return True
         since_ns = at_ns - self.track.at_ns
         if reachable(measured - self.track.position, since_ns, covariance, speed):
-            ahead = predicted(self.track, at_ns, settings.acceleration_noise)
+            noise = agility(self.track, at_ns, measured, covariance, settings)
+            ahead = predicted(self.track, at_ns, noise)
             self.track = corrected(ahead, measured, covariance)
             self._refused, self._agreeing = None, 0
             return True
