@@ -297,9 +297,15 @@ class Node:
             self.report_error(what, error)
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Count an error and keep it for the status; the first few are logged with their trace."""
+        """Count an error and keep it for the status.
+
+        The first few are logged with their trace, then each that doubles the count: a handler that
+        fails at 140 Hz must not bury the log.
+        """
         self.errors += 1
         self.last_error = f"{what}: {type(error).__name__}: {error}"
+        if self.errors > self.handler_errors_shown and self.errors & (self.errors - 1):
+            return
         trace = traceback.format_exc() if self.errors <= self.handler_errors_shown else None
         self.log.error(
             "handler failed", what=what, error=str(error), count=self.errors, trace=trace

@@ -15,12 +15,13 @@ from ruamel.yaml import YAML
 from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.types import ArmState, Side
-from nodes.arm_bridge.control import ArmControl, ArmGeometry, Command, Goal, OtherArm, Patience
+from nodes.arm_bridge.control import ArmControl, Command, Goal, OtherArm, Patience, pace
+from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.kinematics import KINEMATICS
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.methods import measure
 from nodes.models.motion import SheetMotion
-from nodes.models.rigid import transform_from_rpy, twist_between
+from nodes.models.rigid import transform_from_rpy, twist_between, vector_from_rotation
 from nodes.models.sheet import edge_poses
 
 Floats = NDArray[np.float64]
@@ -131,6 +132,34 @@ def test_a_far_target_is_reached_slowly_and_together() -> None:
     assert longest <= 0.24 * 1.06 + 1e-6
     for edge, arm in zip(edge_poses(goal.motion.world_from_sheet, 0.24 * 1.06), arms, strict=True):
         assert arm.edge == pytest.approx(edge, abs=1e-7)
+
+
+def test_the_arm_that_is_ahead_waits_for_the_one_behind() -> None:
+    """One arm misses every second cycle, as a busy machine would have it: no fault, both arrive."""
+    arms = pair()
+    run(arms, on_time(HOME), 60)
+    goal = on_time(sheet_at(0.02, tilt=1.0))
+    widest = 0.0
+    for cycle in range(900):
+        arms[0].cycle(goal, arms[1].as_other())
+        if cycle % 2 == 0:
+            arms[1].cycle(goal, arms[0].as_other())
+        turn = vector_from_rotation(arms[0].edge[:3, :3].T @ arms[1].edge[:3, :3])
+        widest = max(widest, float(np.linalg.norm(turn)))
+        assert {arm.control.mode for arm in arms} == {"follow"}
+    assert widest < 0.12
+    for edge, arm in zip(edge_poses(goal.motion.world_from_sheet, 0.24 * 1.02), arms, strict=True):
+        assert arm.edge == pytest.approx(edge, abs=1e-6)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.03, 0.2])
+def test_never_both_arms_wait(ahead: float) -> None:
+    target = transform_from_rpy([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
+    one = transform_from_rpy([-0.12, 0.0, 0.0], [0.3 + ahead, 0.0, 0.0])
+    other = transform_from_rpy([0.12, 0.0, 0.0], [0.3, 0.0, 0.0])
+    paces = pace(one, other, target), pace(other, one, target)
+    assert max(paces) == 1.0
+    assert min(paces) == (0.0 if ahead == 0.2 else 1.0)
 
 
 def test_a_moving_target_is_followed_without_lag() -> None:

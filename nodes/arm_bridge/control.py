@@ -12,39 +12,35 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Pose, Scene
-from messages.types import ArmMode, Side
+from messages.types import ArmMode, ArmState
+from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.kinematics import (
-    JOINT_MAX_RAD,
-    JOINT_MIN_RAD,
-    JOINT_SPEED_RAD_PER_S,
     UnreachableError,
-    forward,
-    inverse_kinematics,
 )
 from nodes.arm_bridge.limiter import (
-    JointLimits,
-    SheetLimits,
     braked,
     limited,
     place_trouble,
     sheet_trouble,
     with_tool_speed,
 )
-from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, coast_sheet, follow_sheet
+from nodes.models.motion import (
+    EdgeBound,
+    SheetBounds,
+    SheetMotion,
+    coast_sheet,
+    extrapolated,
+    follow_sheet,
+)
 from nodes.models.rigid import (
-    apply,
     inverse,
     is_rigid,
-    transform_from_rpy,
     vector_from_rotation,
 )
-from nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
 
 Floats = NDArray[np.float64]
 
 REST_RAD_PER_S = 1e-6
-RANGE_MARGIN_RAD = np.radians(2.0)
 
 FOLLOW_BOUNDS = SheetBounds(
     speed_m_per_s=0.22,
@@ -64,11 +60,11 @@ START_BOUNDS = SheetBounds(
 )
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
-EDGE_SPEED_SHARE = 0.95
-"""Share of the tool speed that the sheet's motion may use; beyond it the joints are cut."""
-
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
-LEAP_M, LEAP_RAD = 0.03, 0.35
+WAIT_FROM_RAD, WAIT_FULL_RAD = 0.05, 0.12
+"""How far apart the edges may get before the arm that is ahead slows, and where it stands still."""
+SKEW_LENGTH_M = 0.25
+"""An edge that far out of line with the other counts as one radian apart."""
 SLACK_STRETCH = 1.0005
 
 
@@ -88,6 +84,11 @@ class Goal:
     overdue_s: float
 
 
+def goal_ahead(motion: SheetMotion, ahead_s: float, overdue_s: float, *, furthest_s: float) -> Goal:
+    """The target carried on by `ahead_s` (of either sign), but no further than `furthest_s`."""
+    return Goal(extrapolated(motion, min(max(ahead_s, -furthest_s), furthest_s)), overdue_s)
+
+
 @dataclass(frozen=True, slots=True)
 class OtherArm:
     """The other arm as its bridge tells: world poses of its flange, and whether it is well."""
@@ -97,6 +98,17 @@ class OtherArm:
     mode: ArmMode
     faults: tuple[str, ...]
     age_s: float
+
+    @classmethod
+    def from_state(cls, state: ArmState, age_s: float) -> OtherArm:
+        """What the other bridge's message says, `age_s` after it came."""
+        return cls(
+            state.world_from_flange,
+            state.world_from_flange_commanded,
+            state.mode,
+            state.faults,
+            age_s,
+        )
 
     @property
     def trouble(self) -> str | None:
@@ -114,92 +126,6 @@ class Command:
 
     mode: str
     joints_rad: Floats
-
-
-def _transform(pose: Pose) -> Floats:
-    return transform_from_rpy(pose.position_m, pose.rpy_rad)
-
-
-class ArmGeometry:
-    """Where an arm of the scene stands, how it holds its edge, and what limits it."""
-
-    def __init__(self, scene: Scene, side: Side) -> None:
-        self.left = side == "left"
-        arm, other = scene.arms.left, scene.arms.right
-        if not self.left:
-            arm, other = other, arm
-        self.world_from_base = _transform(arm.world_from_base)
-        self.base_from_world = inverse(self.world_from_base)
-        self.flange_from_edge = _transform(arm.flange_from_edge)
-        self.other_flange_from_edge = _transform(other.flange_from_edge)
-        self.max_tool_speed = scene.arms.max_tool_speed_m_per_s
-        sheet = scene.sheet
-        half = 0.5 * sheet.height_m
-        self.edge_bound = EdgeBound(EDGE_SPEED_SHARE * self.max_tool_speed, half)
-        self._tool_points = apply(
-            self.flange_from_edge,
-            np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
-        )
-        self.joint_limits = JointLimits(
-            JOINT_MIN_RAD + RANGE_MARGIN_RAD,
-            JOINT_MAX_RAD - RANGE_MARGIN_RAD,
-            0.95 * JOINT_SPEED_RAD_PER_S,
-            6.0 * JOINT_SPEED_RAD_PER_S,
-        )
-        self.sheet_limits = SheetLimits(
-            width_m=sheet.width_m,
-            height_m=sheet.height_m,
-            thickness_m=sheet.thickness_m,
-            young_modulus_pa=sheet.young_modulus_pa,
-            longest_m=sheet.width_m * (sheet.max_stretch_ratio + 0.005),
-            max_edge_force_n=sheet.max_edge_force_n,
-            max_twist_rad=0.2,
-            min_flange_distance_m=scene.arms.min_distance_m,
-            workspace_min_m=scene.arms.workspace_min_m,
-            workspace_max_m=scene.arms.workspace_max_m,
-        )
-
-    def world_from_flange(self, joints_rad: Floats) -> Floats:
-        return self.world_from_base @ forward(joints_rad)
-
-    def world_from_edge(self, joints_rad: Floats) -> Floats:
-        return self.world_from_flange(joints_rad) @ self.flange_from_edge
-
-    def tool_points(self, joints_rad: Floats) -> Floats:
-        """Middle and both ends of the clamped edge (3, 3), in the base frame."""
-        return apply(forward(joints_rad), self._tool_points)
-
-    def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Joints that hold this arm's edge of the sheet there; UnreachableError."""
-        edges = edge_poses(
-            motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
-        )
-        flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
-        return inverse_kinematics(self.base_from_world @ flange, present_rad)
-
-    def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """The sheet at rest between this arm's edge and the other's."""
-        left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
-        distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
-        stretch = distance / self.sheet_limits.width_m
-        return SheetMotion(sheet_from_edges(left, right), np.zeros(6), stretch, 0.0)
-
-    def sheet_state(
-        self, joints_rad: Floats, other: OtherArm | None
-    ) -> tuple[float | None, float | None]:
-        """Distance of the edges (m) and force on each (N), as measured; None without the other."""
-        if other is None:
-            return None, None
-        own = self.world_from_edge(joints_rad)
-        across = (other.world_from_flange @ self.other_flange_from_edge)[:3, 3] - own[:3, 3]
-        distance, limits = float(np.linalg.norm(across)), self.sheet_limits
-        force = edge_force_n(
-            distance / limits.width_m,
-            young_modulus_pa=limits.young_modulus_pa,
-            height_m=limits.height_m,
-            thickness_m=limits.thickness_m,
-        )
-        return distance, force
 
 
 class ArmControl:
@@ -339,7 +265,12 @@ class ArmControl:
             sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
         else:
             self.mode, self.reason = "follow", ""
-            sheet = self._towards(goal.motion, sheet, geometry.edge_bound, step_s)
+            share = pace(
+                geometry.world_from_edge(self.commanded_rad),
+                other.world_from_flange_commanded @ geometry.other_flange_from_edge,
+                goal.motion.world_from_sheet,
+            )
+            sheet = self._towards(goal.motion, sheet, geometry.edge_bound, share, step_s)
         return self._carry(sheet, geometry, other, step_s)
 
     def _watch(self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats) -> None:
@@ -371,20 +302,26 @@ class ArmControl:
         return Command("move", measured)
 
     def _towards(
-        self, target: SheetMotion, sheet: SheetMotion, edges: EdgeBound, step_s: float
+        self,
+        target: SheetMotion,
+        sheet: SheetMotion,
+        edges: EdgeBound,
+        share: float,
+        step_s: float,
     ) -> SheetMotion:
-        """The sheet's next motion: gently until it is on its target, then with it."""
+        """The sheet's next motion: gently until it is on its target, from then on with it.
+
+        share: of the speeds, less than 1 for the arm that is ahead of the other.
+        """
         distance, angle = _lag(sheet, target)
-        if self._settled and (distance > LEAP_M or angle > LEAP_RAD):
-            self._settled = False
-        elif (
+        if (
             distance < SETTLED_M
             and angle < SETTLED_RAD
             and abs(target.stretch_ratio - sheet.stretch_ratio) < SETTLED_STRETCH
         ):
             self._settled = True
         bounds = FOLLOW_BOUNDS if self._settled else START_BOUNDS
-        return follow_sheet(sheet, target, bounds=bounds, edges=edges, step_s=step_s)
+        return follow_sheet(sheet, target, bounds=slowed(bounds, share), edges=edges, step_s=step_s)
 
     def _carry(
         self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
@@ -517,3 +454,36 @@ def _lag(sheet: SheetMotion, target: SheetMotion) -> tuple[float, float]:
     turn = target.world_from_sheet[:3, :3] @ sheet.world_from_sheet[:3, :3].T
     shift = target.world_from_sheet[:3, 3] - sheet.world_from_sheet[:3, 3]
     return float(np.linalg.norm(shift)), float(np.linalg.norm(vector_from_rotation(turn)))
+
+
+def pace(own_edge: Floats, other_edge: Floats, target: Floats) -> float:
+    """Share (0..1) of its speed with which an arm goes on, so that it waits for one behind it.
+
+    own_edge, other_edge: world poses of the commanded edges; target: world_from_sheet.  Each bridge
+    moves the sheet by its own cycle, and a cycle late on one side is a turn of the sheet's edges to
+    one another.  The arm whose edge is nearer to the target is ahead; it slows in proportion.
+    Only one of the two ever waits, so they cannot wait for each other.
+    """
+    apart = _apart(own_edge, other_edge)
+    if apart <= WAIT_FROM_RAD or _apart(own_edge, target) >= _apart(other_edge, target):
+        return 1.0
+    return max(0.0, (WAIT_FULL_RAD - apart) / (WAIT_FULL_RAD - WAIT_FROM_RAD))
+
+
+def slowed(bounds: SheetBounds, share: float) -> SheetBounds:
+    """The bounds with that share of their speeds; accelerations stay."""
+    if share == 1.0:
+        return bounds
+    return replace(
+        bounds,
+        speed_m_per_s=share * bounds.speed_m_per_s,
+        turn_rad_per_s=share * bounds.turn_rad_per_s,
+        stretch_rate_per_s=share * bounds.stretch_rate_per_s,
+    )
+
+
+def _apart(pose: Floats, other: Floats) -> float:
+    """How far (rad) two poses are turned and out of line; their distance along x does not count."""
+    between = inverse(pose) @ other
+    turn = np.linalg.norm(vector_from_rotation(between[:3, :3]))
+    return float(turn + np.linalg.norm(between[1:3, 3]) / SKEW_LENGTH_M)

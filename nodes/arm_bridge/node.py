@@ -9,9 +9,10 @@ from pydantic import Field
 from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import ArmState, EStop, SheetTarget, Side
-from nodes.arm_bridge.control import ArmControl, ArmGeometry, Goal, OtherArm, Patience
+from nodes.arm_bridge.control import ArmControl, Goal, OtherArm, Patience, goal_ahead
+from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.modbus import ArmLink, ArmLinkError, ArmSilentError
-from nodes.models.motion import SheetMotion, extrapolated
+from nodes.models.motion import SheetMotion
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
 
@@ -120,41 +121,36 @@ class ArmBridge(Node):
         # Another host's clock: the target counts as if it had arrived in no time.
         offset_ns = 0 if same_clock else received_ns - header.publish_ns
         ahead_s = (now_ns - target.valid_at_ns - offset_ns) * 1e-9 + given.servo_lag_s
-        limit_s = given.furthest_extrapolation_s
-        motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
         overdue_s = (now_ns - received_ns) * 1e-9 - given.target_period_s
-        return Goal(extrapolated(motion, min(max(ahead_s, -limit_s), limit_s)), overdue_s)
+        motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
+        return goal_ahead(motion, ahead_s, overdue_s, furthest_s=given.furthest_extrapolation_s)
 
     def _other(self) -> OtherArm | None:
         state = self.other_arm.message
-        if state is None:
-            return None
-        return OtherArm(
-            state.world_from_flange,
-            state.world_from_flange_commanded,
-            state.mode,
-            state.faults,
-            (self.clock.now_ns() - self.other_arm.received_ns) * 1e-9,
-        )
+        age_s = (self.clock.now_ns() - self.other_arm.received_ns) * 1e-9
+        return None if state is None else OtherArm.from_state(state, age_s)
 
     def _publish(self, geometry: ArmGeometry) -> None:
         control, other, header = self._control, self._other(), self.sheet_target.header
         measured = control.commanded_rad if control.measured_rad is None else control.measured_rad
-        distance, force = geometry.sheet_state(measured, other)
-        age_s = (self.clock.now_ns() - self.sheet_target.received_ns) * 1e-9
-        state = ArmState(
-            side=self.parameters.side,
-            mode=control.mode,
-            faults=control.all_faults,
-            joints_rad=measured,
-            joints_commanded_rad=control.commanded_rad,
-            world_from_flange=geometry.world_from_flange(measured),
-            world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
-            command_age_s=None if header is None else max(age_s, 0.0),
-            target_source_ns=0 if header is None else header.source_ns,
-            command_sent_ns=self._sent_ns,
-            edge_distance_m=distance,
-            edge_force_n=force,
-            cycle_s=self._exchange_s,
+        distance, force = geometry.sheet_state(
+            measured, None if other is None else other.world_from_flange
         )
-        self.arm.publish(state)
+        age_s = (self.clock.now_ns() - self.sheet_target.received_ns) * 1e-9
+        self.arm.publish(
+            ArmState(
+                side=self.parameters.side,
+                mode=control.mode,
+                faults=control.all_faults,
+                joints_rad=measured,
+                joints_commanded_rad=control.commanded_rad,
+                world_from_flange=geometry.world_from_flange(measured),
+                world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
+                command_age_s=None if header is None else max(age_s, 0.0),
+                target_source_ns=0 if header is None else header.source_ns,
+                command_sent_ns=self._sent_ns,
+                edge_distance_m=distance,
+                edge_force_n=force,
+                cycle_s=self._exchange_s,
+            )
+        )

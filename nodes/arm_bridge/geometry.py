@@ -1,0 +1,113 @@
+"""One arm's place in the scene: where it stands, how it holds its edge, what limits it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Pose, Scene
+from messages.types import Side
+from nodes.arm_bridge.kinematics import (
+    JOINT_MAX_RAD,
+    JOINT_MIN_RAD,
+    JOINT_SPEED_RAD_PER_S,
+    forward,
+    inverse_kinematics,
+)
+from nodes.arm_bridge.limiter import JointLimits, SheetLimits
+from nodes.models.motion import EdgeBound, SheetMotion
+from nodes.models.rigid import apply, inverse, transform_from_rpy
+from nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
+
+Floats = NDArray[np.float64]
+
+RANGE_MARGIN_RAD = np.radians(2.0)
+
+EDGE_SPEED_SHARE = 0.95
+"""Share of the tool speed that the sheet's motion may use; beyond it the joints are cut."""
+
+
+def _transform(pose: Pose) -> Floats:
+    return transform_from_rpy(pose.position_m, pose.rpy_rad)
+
+
+class ArmGeometry:
+    """Where an arm of the scene stands, how it holds its edge, and what limits it."""
+
+    def __init__(self, scene: Scene, side: Side) -> None:
+        self.left = side == "left"
+        arm, other = scene.arms.left, scene.arms.right
+        if not self.left:
+            arm, other = other, arm
+        self.world_from_base = _transform(arm.world_from_base)
+        self.base_from_world = inverse(self.world_from_base)
+        self.flange_from_edge = _transform(arm.flange_from_edge)
+        self.other_flange_from_edge = _transform(other.flange_from_edge)
+        self.max_tool_speed = scene.arms.max_tool_speed_m_per_s
+        sheet = scene.sheet
+        half = 0.5 * sheet.height_m
+        self.edge_bound = EdgeBound(EDGE_SPEED_SHARE * self.max_tool_speed, half)
+        self._tool_points = apply(
+            self.flange_from_edge,
+            np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
+        )
+        self.joint_limits = JointLimits(
+            JOINT_MIN_RAD + RANGE_MARGIN_RAD,
+            JOINT_MAX_RAD - RANGE_MARGIN_RAD,
+            0.95 * JOINT_SPEED_RAD_PER_S,
+            6.0 * JOINT_SPEED_RAD_PER_S,
+        )
+        self.sheet_limits = SheetLimits(
+            width_m=sheet.width_m,
+            height_m=sheet.height_m,
+            thickness_m=sheet.thickness_m,
+            young_modulus_pa=sheet.young_modulus_pa,
+            longest_m=sheet.width_m * (sheet.max_stretch_ratio + 0.005),
+            max_edge_force_n=sheet.max_edge_force_n,
+            max_twist_rad=0.2,
+            min_flange_distance_m=scene.arms.min_distance_m,
+            workspace_min_m=scene.arms.workspace_min_m,
+            workspace_max_m=scene.arms.workspace_max_m,
+        )
+
+    def world_from_flange(self, joints_rad: Floats) -> Floats:
+        return self.world_from_base @ forward(joints_rad)
+
+    def world_from_edge(self, joints_rad: Floats) -> Floats:
+        return self.world_from_flange(joints_rad) @ self.flange_from_edge
+
+    def tool_points(self, joints_rad: Floats) -> Floats:
+        """Middle and both ends of the clamped edge (3, 3), in the base frame."""
+        return apply(forward(joints_rad), self._tool_points)
+
+    def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
+        """Joints that hold this arm's edge of the sheet there; UnreachableError."""
+        edges = edge_poses(
+            motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
+        )
+        flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
+        return inverse_kinematics(self.base_from_world @ flange, present_rad)
+
+    def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
+        """The sheet at rest between this arm's edge and the other's."""
+        left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
+        distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
+        stretch = distance / self.sheet_limits.width_m
+        return SheetMotion(sheet_from_edges(left, right), np.zeros(6), stretch, 0.0)
+
+    def sheet_state(
+        self, joints_rad: Floats, world_from_other_flange: Floats | None
+    ) -> tuple[float | None, float | None]:
+        """Distance of the edges (m) and force on each (N), as measured; None without the other."""
+        if world_from_other_flange is None:
+            return None, None
+        other_edge = world_from_other_flange @ self.other_flange_from_edge
+        across = other_edge[:3, 3] - self.world_from_edge(joints_rad)[:3, 3]
+        distance, limits = float(np.linalg.norm(across)), self.sheet_limits
+        force = edge_force_n(
+            distance / limits.width_m,
+            young_modulus_pa=limits.young_modulus_pa,
+            height_m=limits.height_m,
+            thickness_m=limits.thickness_m,
+        )
+        return distance, force
