@@ -4,7 +4,8 @@
 
 Prints two tables in mm: the error of each size as the eye sees it on the true sheet.  The tilted
 sheet either rolls on the cylinder (its plane tangent, the touched line staying put on it) or turns
-about its own centre.  Positive tilts turn the sheet's front downwards.
+about its own centre.  Positive tilts turn the sheet's front upwards, as a finger
+does that strokes up.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|---|")
     for name in ("rolls", "turns"):
         for degrees in (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50):
-            tilt = np.radians(degrees)
+            tilt = -np.radians(degrees)
             turned = transform(rotation_from_vector([tilt, 0.0, 0.0]), np.zeros(3))
             pose = rolled_on(scene, tilt) if name == "rolls" else turned
             for correction in CORRECTIONS[:2]:

@@ -15,6 +15,7 @@ from launch.commands.graph import JsonOption, RunOption, run_interruptible, runn
 from launch.commands.output import (
     BAD_INPUT,
     FAILED,
+    OTHER_THAN_LIVE,
     CommandError,
     print_fields,
     print_json,
@@ -127,10 +128,11 @@ def verify(
     ] = 1e-6,
     as_json: JsonOption = False,
 ) -> None:
-    """Step one node through its recorded inputs, twice; exit code 1 when anything differs.
+    """Step one node through its recorded inputs, twice, and compare.
 
-    The two passes must give the same bytes.  Against what the node published when it was recorded,
-    numbers may differ by the tolerance.
+    Exit code 1: the two passes gave different bytes, or the node failed.  Exit code 3: they gave the
+    same, but other numbers than the node published live; a live node skips inputs when it is late,
+    and which ones is not in the bag.
     """
     from launch.replay import verify as verify_node
 
@@ -140,8 +142,10 @@ def verify(
         print_json({**asdict(result), "ok": result.ok})
     else:
         _print_verification(result)
-    if not result.ok:
+    if not result.repeatable:
         raise typer.Exit(FAILED)
+    if not result.as_live:
+        raise typer.Exit(OTHER_THAN_LIVE)
 
 
 def _print_verification(result: Verification) -> None:

@@ -14,7 +14,7 @@ from rich.table import Table
 
 words = Console(stderr=True, highlight=False, soft_wrap=True)
 
-FAILED, BAD_INPUT = 1, 2
+FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
 
 
 class CommandError(Exception):

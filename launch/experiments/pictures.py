@@ -22,6 +22,10 @@ EVENTS = (
     "frame drawn",
 )
 
+BLACK = 8
+SHOWN = (0.18, 0.82)
+"""The part of the eye's picture that is printed; around it is only dark sheet."""
+
 CORRECTION_NAMES = {
     "none": "not corrected",
     "one_plane": "corrected for one plane",
@@ -50,16 +54,18 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) ->
                     Rectangle((left, top), width, height, fill=False, color="C1", linewidth=0.8)
                 )
             axis.set_title(f"{title}\n{name}", fontsize=9)
+            rows_px, columns_px, _ = pixels.shape
+            axis.set_xlim(SHOWN[0] * columns_px, SHOWN[1] * columns_px)
+            axis.set_ylim(SHOWN[1] * rows_px, SHOWN[0] * rows_px)
     figure.suptitle("What the user's eye sees (orange: the box around the proper image)")
     figure.savefig(path, dpi=110)
 
 
 def outline_box(picture: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Left, top, width, height of what is brighter than half the maximum; None: all black."""
-    gray = picture.max(axis=2)
-    if gray.max() == 0:
+    """Left, top, width, height of what is not black; None where all is."""
+    ys, xs = np.nonzero(picture.max(axis=2) > BLACK)
+    if len(xs) == 0:
         return None
-    ys, xs = np.nonzero(gray > gray.max() / 2)
     return (
         float(xs.min()),
         float(ys.min()),
