@@ -76,36 +76,44 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
 
 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
-    """Draw the result: log time across, error up, the front as a line, the tolerance dashed."""
+    """Draw the result: log time across, error up; a line is the front of one case.
+
+    The scene's tolerance is dashed.  Errors below a ten-thousandth of it are drawn there: they are
+    rounding, and would press all the rest into a corner.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(8, 5.5), layout="constrained")
     axes = figure.subplots()
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
-    worst: dict[str, tuple[float, float]] = {}
+    least = 1e-4 * result["tolerance"]
     for index, method in enumerate(methods):
         color = f"C{index % 10}"
         mine = [point for point in result["points"] if point["method"] == method]
         for in_range, marker in ((True, "o"), (False, "x")):
             shown = [point for point in mine if point["in_range"] == in_range]
             if shown:
+                front = "" if method not in result["front"] else ", on the front"
                 axes.plot(
                     [point["median_s"] * 1e6 for point in shown],
-                    [max(point["error"], 1e-9) for point in shown],
+                    [max(point["error"], least) for point in shown],
                     marker,
                     color=color,
                     alpha=0.7,
-                    label=f"{method}{'' if in_range else ' (out of its range)'}",
+                    label=f"{method}{front if in_range else ' (out of its range)'}",
                 )
-        in_range_points = [point for point in mine if point["in_range"]]
-        if in_range_points:
-            worst[method] = (
-                max(point["median_s"] for point in in_range_points) * 1e6,
-                max(max(point["error"], 1e-9) for point in in_range_points),
-            )
-    front = [worst[method] for method in result["front"] if method in worst]
-    if front:
-        axes.step(*zip(*front, strict=True), where="post", color="0.4", label="front (worst case)")
+    for case in unique_cases(result["points"]):
+        usable = [
+            point for point in result["points"] if point["in_range"] and point["case"] == case
+        ]
+        steps = sorted((point["median_s"] * 1e6, max(point["error"], least)) for point in usable)
+        best = [
+            step
+            for i, step in enumerate(steps)
+            if all(step[1] < earlier[1] for earlier in steps[:i])
+        ]
+        if len(best) > 1:
+            axes.step(*zip(*best, strict=True), where="post", color="0.6", linewidth=0.8)
     axes.axhline(result["tolerance"], linestyle="--", color="0.2", label="the scene's tolerance")
     axes.set_xscale("log")
     axes.set_yscale("log")
@@ -115,6 +123,15 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
     axes.grid(visible=True, which="both", alpha=0.2)
     axes.legend(fontsize=8)
     figure.savefig(path, dpi=110)
+
+
+def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The cases of points, each once, in their order."""
+    cases: list[dict[str, Any]] = []
+    for point in points:
+        if point["case"] not in cases:
+            cases.append(point["case"])
+    return cases
 
 
 def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:

@@ -154,16 +154,21 @@ def test_an_unknown_family_gets_a_suggestion() -> None:
 
 
 def test_the_front_holds_what_nothing_beats_and_ignores_what_is_out_of_range() -> None:
-    def point(method: str, time_s: float, error: float, in_range: bool = True) -> Point:
-        return Point(method, {}, time_s, time_s, error, in_range)
+    def point(
+        method: str, time_s: float, error: float, in_range: bool = True, depth_mm: int = 1
+    ) -> Point:
+        case: dict[str, float | int | str] = {"depth_mm": depth_mm}
+        return Point(method, case, case, time_s, time_s, error, in_range)
 
     points = [
         point("cheap", 1.0, 9.0),
         point("dear", 9.0, 1.0),
         point("bad", 9.0, 9.0),
         point("cheap", 1.0, 99.0, in_range=False),
+        point("shallow", 0.5, 0.0, depth_mm=0),
+        point("dear", 9.0, 0.0, depth_mm=0),
     ]
-    assert pareto_front(points) == ["cheap", "dear"]
+    assert pareto_front(points) == ["shallow", "cheap", "dear"]
 
 
 def test_json_never_holds_nan() -> None:

@@ -58,7 +58,8 @@ def soft_body_trials(
             wanted = reference.respond(push)
             yield Trial(
                 method=name,
-                case={"depth_mm": 1e3 * depth, "skin_nodes": len(model.response.rest)},
+                case={"depth_mm": 1e3 * depth},
+                size={"skin_nodes": len(model.response.rest)},
                 run=partial(method.respond, push),
                 error=partial(
                     _error_mm,
