@@ -130,9 +130,9 @@ def verify(
 ) -> None:
     """Step one node through its recorded inputs, twice, and compare.
 
-    Exit code 1: the two passes gave different bytes, or the node failed.  Exit code 3: they gave the
-    same, but other numbers than the node published live; a live node skips inputs when it is late,
-    and which ones is not in the bag.
+    Exit code 1: the two passes gave different bytes, or the node failed.  Exit code 3: they gave
+    the same, but other numbers than the node published live; a live node skips inputs when it is
+    late, and which ones is not in the bag.
     """
     from launch.replay import verify as verify_node
 
