@@ -70,7 +70,9 @@ def stroke(
     with progress_words() as progress:
         procedure = stroke_procedure([seconds], progress)
         _record(launch_file, settings, bag, procedure, progress)
-        result = experiment.stroke_result(experiment.read_recording(bag), seconds, bag)
+        recording = experiment.read_recording(bag)
+        errors = experiment.stroke_errors(recording, seconds)
+        result = experiment.stroke_result(recording, errors, seconds, bag)
     if as_json:
         print_json(result)
     else:

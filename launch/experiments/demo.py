@@ -73,10 +73,13 @@ def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoRes
     )
     draw_latency(recording, latency)
     pictures = [views, latency]
-    if strokes:
-        draw_stroke({one: stroke.stroke_errors(recording, one) for one in strokes}, plot)
+    errors = {seconds: stroke.stroke_errors(recording, seconds) for seconds in strokes}
+    if errors:
+        draw_stroke(errors, plot)
         pictures.append(plot)
-    results = [stroke.stroke_result(recording, one, bag) for one in strokes]
+    results = [
+        stroke.stroke_result(recording, one, seconds, bag) for seconds, one in errors.items()
+    ]
     (folder / "stroke.json").write_text(json.dumps(results, indent=1) + "\n")
     return DemoResult(folder=folder, bag=bag, strokes=results, pictures=pictures)
 

@@ -378,9 +378,10 @@ def tangential_distance(
     return np.asarray(np.linalg.norm(on_surface[0] - on_surface[1], axis=1))
 
 
-def stroke_result(recording: Recording, seconds: float, bag: Path) -> dict[str, Any]:
+def stroke_result(
+    recording: Recording, errors: StrokeErrors, seconds: float, bag: Path
+) -> dict[str, Any]:
     """The figures of `experiment stroke --json`; lengths in mm, angles in degrees, times in ms."""
-    errors = stroke_errors(recording, seconds)
     return {
         "seconds": seconds,
         "delta_d_mm": summary(errors.delta_d_m, 1e3),
