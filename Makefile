@@ -28,12 +28,15 @@ lint: $(STAMP)
 test: setup lint
 	$(BIN)/pytest
 
+# Longer than the tests: what docs/messaging.md, docs/image-correction.md and docs/results.md hold.
 bench: setup
 	$(BIN)/python -m benchmarks.messaging
+	$(BIN)/python -m benchmarks.image_correction
+	$(BIN)/python -m benchmarks.recovery
 
 docs: setup
 	$(BIN)/python -m messages.reference > docs/messages.md
-	$(BIN)/flexsheet chart --all --output docs/charts
+	$(BIN)/flexsheet chart --output docs/charts
 
 clean:
 	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

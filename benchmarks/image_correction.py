@@ -1,6 +1,6 @@
 """Figures 11 and 13 of the paper, without the graph: the renderer's pictures, judged by the twin.
 
-    python benchmarks/image_correction.py [--scene FILE] [--stretch 1.05]
+    python -m benchmarks.image_correction [--scene FILE] [--stretch 1.05]
 
 Prints two tables in mm: the error of each size as the eye sees it on the true sheet.  The tilted
 sheet either rolls on the cylinder (its plane tangent, the touched line staying put on it) or turns
@@ -48,13 +48,13 @@ class Bench:
         """|height|, |upside width|, |downside width| (m) against the proper picture."""
         picture = self._seen(correction, world_from_sheet, None)
         wanted = np.array(tilt_sizes(self._proper, METRES_PER_PX))
-        return np.abs(np.array(tilt_sizes(picture, METRES_PER_PX)) - wanted)
+        return np.asarray(np.abs(np.array(tilt_sizes(picture, METRES_PER_PX)) - wanted))
 
     def push_errors(self, correction: Correction, depth_m: float) -> Floats:
         """|height|, |width| (m) against the proper picture; the drawn object is not deformed."""
         picture = self._seen(correction, np.eye(4), np.array([0.0, 0.0, -depth_m]))
         wanted = np.array(push_sizes(self._proper, METRES_PER_PX))
-        return np.abs(np.array(push_sizes(picture, METRES_PER_PX)) - wanted)
+        return np.asarray(np.abs(np.array(push_sizes(picture, METRES_PER_PX)) - wanted))
 
     def _seen(self, correction: Correction, world_from_sheet: Floats, tip: Floats | None) -> Image:
         sheet = self.scene.sheet

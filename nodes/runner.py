@@ -28,6 +28,7 @@ from nodes import node_class
 from nodes.node import Node, Timer, parameters_of, timers_of
 
 STATUS_PERIOD_S = 1.0
+CANCEL_AGAIN_S = 0.2
 
 
 class PortConfig(BaseModel):
@@ -173,12 +174,23 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
             task.result()
         node.status.publish(status_of(node, "stopping", process))
     finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        await end_tasks(tasks)
         node.stop_mailboxes()
         await node.close()
         links.close()
+
+
+async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
+    """Cancel tasks until they have ended.
+
+    Once is not always enough: a library under a handler can swallow a cancellation (as `wait_for`
+    of Python 3.11 does when its result comes at the same moment).
+    """
+    pending = {task for task in tasks if not task.done()}
+    while pending:
+        for task in pending:
+            task.cancel()
+        _, pending = await asyncio.wait(pending, timeout=CANCEL_AGAIN_S)
 
 
 def report_ready(config: NodeConfig) -> None:

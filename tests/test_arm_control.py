@@ -152,14 +152,26 @@ def test_the_arm_that_is_ahead_waits_for_the_one_behind() -> None:
         assert arm.edge == pytest.approx(edge, abs=1e-6)
 
 
-@pytest.mark.parametrize("ahead", [0.0, 0.03, 0.2])
-def test_never_both_arms_wait(ahead: float) -> None:
+poses = st.builds(
+    transform_from_rpy,
+    st.tuples(st.floats(-0.05, 0.05), st.floats(-0.05, 0.05), st.floats(-0.05, 0.05)),
+    st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)),
+)
+
+
+@given(one=poses, other=poses, target=poses)
+@settings(max_examples=200, deadline=None)
+def test_never_do_both_arms_wait(one: Floats, other: Floats, target: Floats) -> None:
+    assert max(pace(one, other, target), pace(other, one, target)) == 1.0
+
+
+@pytest.mark.parametrize(("lead", "share"), [(0.03, 1.0), (0.085, 0.5), (0.2, 0.0)])
+def test_the_leading_arm_slows_by_its_lead_and_the_other_not(lead: float, share: float) -> None:
     target = transform_from_rpy([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
-    one = transform_from_rpy([-0.12, 0.0, 0.0], [0.3 + ahead, 0.0, 0.0])
-    other = transform_from_rpy([0.12, 0.0, 0.0], [0.3, 0.0, 0.0])
-    paces = pace(one, other, target), pace(other, one, target)
-    assert max(paces) == 1.0
-    assert min(paces) == (0.0 if ahead == 0.2 else 1.0)
+    ahead = transform_from_rpy([-0.12, 0.0, 0.0], [0.3 + lead, 0.0, 0.0])
+    behind = transform_from_rpy([0.12, 0.0, 0.0], [0.3, 0.0, 0.0])
+    assert pace(ahead, behind, target) == pytest.approx(share)
+    assert pace(behind, ahead, target) == 1.0
 
 
 def test_a_moving_target_is_followed_without_lag() -> None:

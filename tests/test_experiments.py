@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -116,8 +117,31 @@ def test_tilt_and_push_paths_go_where_their_label_says() -> None:
     hover = image.tilt_path(SCENE, -40.0).positions_world_m[-1] - AXIS
     assert np.degrees(np.arctan2(hover[1], hover[2])) == pytest.approx(-40.0)
     assert np.linalg.norm(hover) == pytest.approx(RADIUS + image.HOVER_M)
-    pushed = image.push_path(SCENE, 30.0).positions_world_m[-1]
-    np.testing.assert_allclose(pushed, [0.0, 0.0, -0.03], atol=1e-7)
+    push = image.push_path(SCENE, 30.0)
+    np.testing.assert_allclose(push.positions_world_m[0], [0.0, 0.0, image.HOVER_M], atol=1e-7)
+    np.testing.assert_allclose(push.positions_world_m[-1], [0.0, 0.0, -0.03], atol=1e-7)
+
+
+def test_rows_have_the_papers_sizes_and_a_missing_picture_is_named() -> None:
+    white = np.zeros((400, 400, 3), np.uint8)
+    white[150:250, 100:300] = 255
+    wider = np.zeros_like(white)
+    wider[150:250, 95:305] = 255
+    series = replace(image.PUSH, values=(10,))
+    pictures = {
+        label: image.Picture(label, correction, 0.001, wider, white)
+        for correction in image.CORRECTIONS
+        for label in [series.label(10, correction)]
+    }
+    rows = image.rows(pictures, series)
+    assert [row["method"] for row in rows] == list(image.CORRECTIONS)
+    assert rows[0]["depth_mm"] == 10
+    assert rows[0]["delta_h_mm"] == pytest.approx(0.0, abs=1e-6)
+    assert rows[0]["delta_w_mm"] == pytest.approx(10.0, abs=0.1)
+    assert rows[0]["mean_mm"] == pytest.approx(5.0, abs=0.1)
+    pictures.popitem()
+    with pytest.raises(ExperimentError, match="no picture"):
+        image.rows(pictures, series)
 
 
 def make_family() -> Family:

@@ -199,9 +199,9 @@ def test_the_arms_stand_safely_while_the_triangulator_is_gone_and_follow_again(
             faults.update(message.faults)
     assert session.restarts[KILLED] == 1
     for side, seen in modes.items():
-        first = seen.index("follow")
-        assert {"hold", "stopping", "idle"} & set(seen[first:]), side
-        assert seen[-1] == "follow", side
+        halted = [i for i, mode in enumerate(seen) if mode in ("hold", "stopping", "idle")]
+        first, last = seen.index("follow"), len(seen) - 1 - seen[::-1].index("follow")
+        assert any(first < i < last for i in halted), side
 
 
 def test_frames_show_what_the_finger_did(session: Session) -> None:
@@ -215,7 +215,7 @@ def test_frames_show_what_the_finger_did(session: Session) -> None:
 
 
 def test_every_node_ended_well_and_nothing_is_left(session: Session) -> None:
-    assert set(session.exit_codes.values()) == {0}, session.exit_codes
+    assert {name: code for name, code in session.exit_codes.items() if code != 0} == {}
     assert processes_of_run(session.run_id) == []
     assert session.threads_after <= session.threads_before
     listening = {

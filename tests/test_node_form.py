@@ -24,7 +24,7 @@ from nodes.node import (
     ports_of,
     timers_of,
 )
-from nodes.runner import status_of
+from nodes.runner import end_tasks, status_of
 
 
 class EchoParameters(NodeParameters):
@@ -156,6 +156,26 @@ async def test_a_slow_handler_skips_what_was_superseded_and_counts_it() -> None:
         await node.second.wait()
     assert node.seen == [1, 4]
     assert node.inputs["fingertip"].counts.dropped == 2
+
+
+async def test_a_task_that_swallows_its_cancellation_is_ended_all_the_same() -> None:
+    cancellations = 0
+
+    async def stubborn() -> None:
+        nonlocal cancellations
+        while cancellations < 2:
+            try:
+                await asyncio.Event().wait()
+            except asyncio.CancelledError:
+                cancellations += 1
+        await asyncio.Event().wait()
+
+    task = asyncio.create_task(stubborn())
+    await asyncio.sleep(0)
+    async with asyncio.timeout(5):
+        await end_tasks([task])
+    assert task.cancelled()
+    assert cancellations == 2
 
 
 async def test_outputs_number_and_stamp_what_they_send() -> None:

@@ -11,6 +11,7 @@ from launch.commands.graph import JsonOption
 from launch.commands.output import print_json, print_table, progress_words, words
 
 if TYPE_CHECKING:
+    from launch.experiments.image import Series
     from launch.experiments.run import Procedure, Progress
 
 app = typer.Typer(no_args_is_help=True, help="The paper's experiments, through the running graph.")
@@ -89,15 +90,9 @@ def tilt(
     as_json: JsonOption = False,
 ) -> None:
     """Errors of the picture on an inclined sheet (section VI-B, Fig. 11)."""
-    from launch.experiments import image
-    from launch.experiments.run import tilt_procedure
+    from launch.experiments.image import TILT
 
-    bag = _folder(output, "tilt") / "tilt.mcap"
-    with progress_words() as progress:
-        procedure = tilt_procedure(image.TILTS_DEG, image.CORRECTIONS, progress)
-        _record(launch_file, settings, bag, procedure, progress)
-        rows = image.tilt_rows(image.read_pictures(bag), image.TILTS_DEG)
-    _print_rows(rows, bag, as_json=as_json)
+    _photograph(TILT, _folder(output, "tilt") / "tilt.mcap", launch_file, settings, as_json=as_json)
 
 
 @app.command()
@@ -109,14 +104,21 @@ def push(
     as_json: JsonOption = False,
 ) -> None:
     """Errors of the picture on a pushed sheet (section VI-C, Fig. 13)."""
-    from launch.experiments import image
-    from launch.experiments.run import push_procedure
+    from launch.experiments.image import PUSH
 
-    bag = _folder(output, "push") / "push.mcap"
+    _photograph(PUSH, _folder(output, "push") / "push.mcap", launch_file, settings, as_json=as_json)
+
+
+def _photograph(
+    series: Series, bag: Path, launch_file: Path, settings: list[str] | None, *, as_json: bool
+) -> None:
+    from launch.experiments import image
+    from launch.experiments.run import picture_procedure
+
     with progress_words() as progress:
-        procedure = push_procedure(image.DEPTHS_MM, image.CORRECTIONS, progress)
+        procedure = picture_procedure(series, series.values, image.CORRECTIONS, progress)
         _record(launch_file, settings, bag, procedure, progress)
-        rows = image.push_rows(image.read_pictures(bag), image.DEPTHS_MM)
+        rows = image.rows(image.read_pictures(bag), series)
     _print_rows(rows, bag, as_json=as_json)
 
 

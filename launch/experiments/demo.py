@@ -12,10 +12,9 @@ from launch.experiments.pictures import draw_eye_views, draw_latency, draw_strok
 from launch.experiments.run import (
     Progress,
     in_turn,
-    push_procedure,
+    picture_procedure,
     run_experiment,
     stroke_procedure,
-    tilt_procedure,
 )
 from launch.plan import load_plan
 from messages.types import Correction, FingerPath
@@ -45,8 +44,8 @@ def run_demo(
     bag = folder / "demo.mcap"
     procedure = in_turn(
         stroke_procedure(SECONDS, progress, path=path),
-        tilt_procedure([TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
-        push_procedure([DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
+        picture_procedure(image.TILT, [TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
+        picture_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
     )
     run_experiment(launch_file, [], bag, procedure, progress)
     progress("reading the bag and drawing")
@@ -63,10 +62,10 @@ def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoRes
         folder / "latency.png",
     )
     tilted = [
-        image.picture_of(photographs, image.tilt_label(TILT_DEG, name)) for name in TILT_CORRECTIONS
+        image.picture_of(photographs, image.TILT.label(TILT_DEG, name)) for name in TILT_CORRECTIONS
     ]
     pushed = [
-        image.picture_of(photographs, image.push_label(DEPTH_MM, name)) for name in PUSH_CORRECTIONS
+        image.picture_of(photographs, image.PUSH.label(DEPTH_MM, name)) for name in PUSH_CORRECTIONS
     ]
     draw_eye_views(
         [(f"sheet tilted {TILT_DEG}°", tilted), (f"sheet pushed {DEPTH_MM} mm", pushed)], views

@@ -6,7 +6,7 @@ the rows are computed from the pictures in the bag.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -23,32 +23,21 @@ from nodes.models.rigid import apply
 from nodes.twin.eye import push_sizes, tilt_sizes
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
-TILTS_DEG = (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50)
-DEPTHS_MM = (10, 20, 30, 40, 50)
 HOVER_M = 0.03
 REACH_S = 1.5
 
-PAPER_FIGURE_11_AT_50_DEG = {"none": 27.5, "one_plane": 2.1}
-PAPER_FIGURE_13_AT_50_MM = {"none": 15.8, "four_triangles": 2.1}
-"""Mean errors in mm that the paper's text gives for the largest tilt and the deepest push."""
 
-
-def tilt_label(theta_deg: float, correction: Correction) -> str:
-    return f"tilt {theta_deg:+g} deg, {correction}"
-
-
-def push_label(depth_mm: float, correction: Correction) -> str:
-    return f"push {depth_mm:g} mm, {correction}"
-
-
-def reach_path(scene: Scene, label: str, *, angle_rad: float, height_m: float) -> FingerPath:
-    """Go straight to the point at `angle_rad` around the cylinder, `height_m` above its side."""
-    distance = scene.object.geometry.radius_m + height_m
-    point = np.array([[0.0, distance * np.sin(angle_rad), distance * np.cos(angle_rad)]])
+def reach_path(scene: Scene, label: str, points: Sequence[tuple[float, float]]) -> FingerPath:
+    """Go straight from point to point, each (angle around the cylinder, height above its side)."""
+    radius = scene.object.geometry.radius_m
+    local = [
+        [0.0, (radius + height_m) * np.sin(angle_rad), (radius + height_m) * np.cos(angle_rad)]
+        for angle_rad, height_m in points
+    ]
     return FingerPath(
         label=label,
-        times_s=np.array([REACH_S]),
-        positions_world_m=apply(object_pose(scene), point),
+        times_s=REACH_S * np.arange(1.0, len(points) + 1.0),
+        positions_world_m=apply(object_pose(scene), np.array(local)),
         wander_m=0.0,
         tremor_m=0.0,
     )
@@ -56,14 +45,40 @@ def reach_path(scene: Scene, label: str, *, angle_rad: float, height_m: float) -
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
     """Hover above the cylinder at that angle: the sheet waits there, inclined by it."""
-    return reach_path(
-        scene, f"tilt {theta_deg:+g} deg", angle_rad=np.radians(theta_deg), height_m=HOVER_M
-    )
+    return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
 def push_path(scene: Scene, depth_mm: float) -> FingerPath:
-    """Push the middle of the front by that depth."""
-    return reach_path(scene, f"push {depth_mm:g} mm", angle_rad=0.0, height_m=-depth_mm * 1e-3)
+    """Push the middle of the front by that depth, from above."""
+    return reach_path(scene, f"push {depth_mm:g} mm", [(0.0, HOVER_M), (0.0, -depth_mm * 1e-3)])
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """One of the two experiments: what is varied, how the finger does it, what is measured.
+
+    sizes: of the cylinder in a picture (m); size_names: their letters in the paper.
+    """
+
+    key: str
+    path: Callable[[Scene, float], FingerPath]
+    sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
+    size_names: tuple[str, ...]
+    values: tuple[float, ...]
+
+    def label(self, value: float, correction: Correction) -> str:
+        """What the picture of that case is called."""
+        return f"{self.key} {value:+g}, {correction}"
+
+
+TILT = Series(
+    "theta_deg",
+    tilt_path,
+    tilt_sizes,
+    ("h", "u", "d"),
+    (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50),
+)
+PUSH = Series("depth_mm", push_path, push_sizes, ("h", "w"), (10, 20, 30, 40, 50))
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,42 +124,18 @@ def picture_of(pictures: dict[str, Picture], label: str) -> Picture:
     return pictures[label]
 
 
-def tilt_rows(pictures: dict[str, Picture], tilts_deg: tuple[float, ...]) -> list[dict[str, Any]]:
-    """Rows of `experiment tilt`, from its pictures."""
-    rows = []
-    for theta_deg in tilts_deg:
+def rows(pictures: dict[str, Picture], series: Series) -> list[dict[str, Any]]:
+    """The rows of an experiment from its pictures: one for each value and correction."""
+    result = []
+    for value in series.values:
         for correction in CORRECTIONS:
-            errors = size_errors_mm(
-                picture_of(pictures, tilt_label(theta_deg, correction)), tilt_sizes
+            picture = picture_of(pictures, series.label(value, correction))
+            errors = size_errors_mm(picture, series.sizes)
+            row: dict[str, Any] = {series.key: value, "method": correction}
+            row.update(
+                (f"delta_{name}_mm", error)
+                for name, error in zip(series.size_names, errors, strict=True)
             )
-            rows.append(
-                {
-                    "theta_deg": theta_deg,
-                    "method": correction,
-                    "delta_h_mm": errors[0],
-                    "delta_u_mm": errors[1],
-                    "delta_d_mm": errors[2],
-                    "mean_mm": float(np.mean(errors)),
-                }
-            )
-    return rows
-
-
-def push_rows(pictures: dict[str, Picture], depths_mm: tuple[float, ...]) -> list[dict[str, Any]]:
-    """Rows of `experiment push`, from its pictures."""
-    rows = []
-    for depth_mm in depths_mm:
-        for correction in CORRECTIONS:
-            errors = size_errors_mm(
-                picture_of(pictures, push_label(depth_mm, correction)), push_sizes
-            )
-            rows.append(
-                {
-                    "depth_mm": depth_mm,
-                    "method": correction,
-                    "delta_h_mm": errors[0],
-                    "delta_w_mm": errors[1],
-                    "mean_mm": float(np.mean(errors)),
-                }
-            )
-    return rows
+            row["mean_mm"] = float(np.mean(errors))
+            result.append(row)
+    return result

@@ -100,43 +100,22 @@ def stroke_procedure(
     return procedure
 
 
-def tilt_procedure(
-    tilts_deg: Sequence[float],
+def picture_procedure(
+    series: image.Series,
+    values: Sequence[float],
     corrections: Sequence[Correction],
     progress: Progress,
     *,
     shading: Shading = "flat",
 ) -> Procedure:
-    """Incline the sheet by each angle and photograph it with each correction."""
+    """Bring the sheet into each case and photograph it with each correction."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
-        for theta_deg in tilts_deg:
-            await driver.follow(image.tilt_path(scene, theta_deg))
+        for value in values:
+            await driver.follow(series.path(scene, value))
             await driver.wait_settled()
             for correction in corrections:
-                label = image.tilt_label(theta_deg, correction)
-                progress(label)
-                await driver.take_picture(label, correction, shading)
-
-    return procedure
-
-
-def push_procedure(
-    depths_mm: Sequence[float],
-    corrections: Sequence[Correction],
-    progress: Progress,
-    *,
-    shading: Shading = "flat",
-) -> Procedure:
-    """Push the middle by each depth and photograph the sheet with each correction."""
-
-    async def procedure(driver: Driver, scene: Scene) -> None:
-        await driver.follow(image.tilt_path(scene, 0.0))
-        for depth_mm in depths_mm:
-            await driver.follow(image.push_path(scene, depth_mm))
-            await driver.wait_settled()
-            for correction in corrections:
-                label = image.push_label(depth_mm, correction)
+                label = series.label(value, correction)
                 progress(label)
                 await driver.take_picture(label, correction, shading)
 

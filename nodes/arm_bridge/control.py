@@ -33,7 +33,6 @@ from nodes.models.motion import (
     follow_sheet,
 )
 from nodes.models.rigid import (
-    inverse,
     is_rigid,
     vector_from_rotation,
 )
@@ -42,11 +41,13 @@ Floats = NDArray[np.float64]
 
 REST_RAD_PER_S = 1e-6
 
+# Accelerations that the joints can follow (J6 by 22 rad/s^2, J2 by 9.4): beyond, the joints would
+# run on past a target that turns back, each arm by as much as its cycles happen to lie.
 FOLLOW_BOUNDS = SheetBounds(
     speed_m_per_s=0.22,
-    acceleration_m_per_s2=6.0,
+    acceleration_m_per_s2=2.6,
     turn_rad_per_s=2.5,
-    turn_acceleration_rad_per_s2=80.0,
+    turn_acceleration_rad_per_s2=16.0,
     stretch_rate_per_s=0.1,
     stretch_acceleration_per_s2=1.0,
 )
@@ -461,11 +462,14 @@ def pace(own_edge: Floats, other_edge: Floats, target: Floats) -> float:
 
     own_edge, other_edge: world poses of the commanded edges; target: world_from_sheet.  Each bridge
     moves the sheet by its own cycle, and a cycle late on one side is a turn of the sheet's edges to
-    one another.  The arm whose edge is nearer to the target is ahead; it slows in proportion.
-    Only one of the two ever waits, so they cannot wait for each other.
+    one another.  The arm that leads on the way from between both to the target slows in proportion
+    to its lead.  What one arm leads the other trails, so they never wait for each other.
     """
-    apart = _apart(own_edge, other_edge)
-    if apart <= WAIT_FROM_RAD or _apart(own_edge, target) >= _apart(other_edge, target):
+    across = target[:3, 0]
+    lead = _between(other_edge, own_edge, across)
+    way = _between(own_edge, target, across) + _between(other_edge, target, across)
+    apart = float(np.linalg.norm(lead))
+    if apart <= WAIT_FROM_RAD or float(lead @ way) <= 0.0:
         return 1.0
     return max(0.0, (WAIT_FULL_RAD - apart) / (WAIT_FULL_RAD - WAIT_FROM_RAD))
 
@@ -482,8 +486,12 @@ def slowed(bounds: SheetBounds, share: float) -> SheetBounds:
     )
 
 
-def _apart(pose: Floats, other: Floats) -> float:
-    """How far (rad) two poses are turned and out of line; their distance along x does not count."""
-    between = inverse(pose) @ other
-    turn = np.linalg.norm(vector_from_rotation(between[:3, :3]))
-    return float(turn + np.linalg.norm(between[1:3, 3]) / SKEW_LENGTH_M)
+def _between(pose: Floats, other: Floats, across: Floats) -> Floats:
+    """The way (6,) from one pose to another: turn (rad), then shift over SKEW_LENGTH_M.
+
+    across: unit vector (3,) from edge to edge; shift along it is left out, for the edges are a
+    sheet's width apart.  The way back is the negative, exactly.
+    """
+    turn = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
+    shift = other[:3, 3] - pose[:3, 3]
+    return np.concatenate([turn, (shift - across * (across @ shift)) / SKEW_LENGTH_M])

@@ -172,7 +172,8 @@ def decode_status(registers: Sequence[int]) -> ArmStatus:
 def _be_cancelled() -> None:
     """Raise the cancellation that Python 3.11's `wait_for`, inside pymodbus, swallows.
 
-    It does when the answer comes in the same turn of the loop; the task would then never end.
+    It does when an answer or a time-out comes in the same turn of the loop; the task would then
+    never end.
     """
     task = asyncio.current_task()
     if task is not None and task.cancelling():
@@ -227,6 +228,8 @@ class ArmLink:
             longer_s = max(2.0 * self._pause_s, self._first_pause_s)
             self._pause_s = min(longer_s, self._longest_pause_s)
             raise
+        finally:
+            _be_cancelled()
         self._pause_s = 0.0
         return status
 
@@ -261,7 +264,6 @@ class ArmLink:
             raise ArmSilentError(
                 f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
             ) from error
-        _be_cancelled()
         if answer.isError():
             code = getattr(answer, "exception_code", "?")
             raise ArmRefusedError(f"the arm refused the command: Modbus exception {code}")

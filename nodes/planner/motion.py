@@ -26,8 +26,8 @@ from nodes.planner.rolling import (
 
 Floats = NDArray[np.float64]
 
-EDGE_SPEED_SHARE = 0.85
-"""Share of the tool speed that is planned with; the bridges keep to a little more, then cut."""
+EDGE_SPEED_SHARE = 0.7
+"""Share of the tool speed that is planned with; the rest lets an arm that was late catch up."""
 
 LONGEST_STEP_S = 0.1
 """After a longer gap the sheet is taken to stand still where it was: the arms have stopped."""

@@ -24,9 +24,9 @@ class PlannerParameters(NodeParameters):
         default=0.14, description="how far past the scene's tilt the sheet still follows"
     )
     speed_m_per_s: Positive = 0.18
-    acceleration_m_per_s2: Positive = 3.0
+    acceleration_m_per_s2: Positive = 2.0
     turn_rad_per_s: Positive = 2.0
-    turn_acceleration_rad_per_s2: Positive = 40.0
+    turn_acceleration_rad_per_s2: Positive = 10.0
     stretch_rate_per_s: Positive = 0.03
     stretch_acceleration_per_s2: Positive = 0.3
 

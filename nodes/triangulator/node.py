@@ -11,12 +11,12 @@ from pydantic import Field
 
 from messages.base import Header
 from messages.calibration import StereoCalibration, load_calibration
-from messages.scene import Positive, Scene
+from messages.scene import NonNegative, Positive, Scene
 from messages.types import Fingertip, FingertipReason, StereoPair
 from nodes.node import Input, Node, NodeParameters, Output
 from nodes.triangulator.fingertip import Eyesight, locate
 from nodes.triangulator.mark import MARK_METHODS, MarkLooks
-from nodes.triangulator.tracking import Tracker, TrackingSettings
+from nodes.triangulator.tracking import Tracker, TrackingSettings, with_tremor
 from nodes.triangulator.triangulation import TRIANGULATION_METHODS, Measured, StereoGeometry
 
 UNKNOWN = np.diag([1.0] * 3 + [10.0] * 3)
@@ -41,6 +41,9 @@ class TriangulatorParameters(NodeParameters):
     window_half_px: Annotated[int, Field(ge=8)] = 28
     acceleration_noise: Positive = Field(
         default=0.003, description="of a hand that goes evenly, m/s^2 per root hertz"
+    )
+    tremor_m: NonNegative = Field(
+        default=5e-5, description="standard deviation of a tremor, which the track leaves out"
     )
     largest_acceleration_noise: Positive = Field(
         default=1.0, description="of a hand that starts, stops or turns"
@@ -133,7 +136,7 @@ class Triangulator(Node):
             reason=reason,
             position_world_m=position,
             velocity_world_m_per_s=np.zeros(3) if track is None else track.velocity.copy(),
-            covariance=UNKNOWN if track is None else track.covariance,
+            covariance=UNKNOWN if track is None else with_tremor(track, self.parameters.tremor_m),
             measured_world_m=position if measured is None else measured.point_world,
             reprojection_px=0.0 if measured is None else measured.reprojection_px,
         )

@@ -115,6 +115,13 @@ def agility(
     return float(min(max(wanted, calm), settings.largest_acceleration_noise))
 
 
+def with_tremor(track: Track, tremor_m: float) -> Floats:
+    """Covariance (6, 6) of the finger itself about a track that leaves its tremor out."""
+    covariance = track.covariance.copy()
+    covariance[POSITION, POSITION] += tremor_m**2
+    return covariance
+
+
 def reachable(way: Floats, duration_ns: int, covariance: Floats, max_speed: float) -> bool:
     """Whether a finger can go the way (3,) to a measured point in a time, but for its noise."""
     slack_m = GATE_SIGMAS * float(np.sqrt(np.trace(covariance)))
