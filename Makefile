@@ -1,5 +1,5 @@
 # Two commands from a fresh clone: `make demo` and `make test`.  Both set up what they need.
-PYTHON ?= python3
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed

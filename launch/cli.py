@@ -45,6 +45,7 @@ def _exit_code(error: Exception) -> int | None:
     from launch.documents import BadInputError
     from launch.experiments import ExperimentError
     from launch.runs import RunDirectoryError
+    from launch.supervisor import NodeFailedError
     from messages.bag import BagError
     from messages.bus import BusError
 
@@ -52,6 +53,7 @@ def _exit_code(error: Exception) -> int | None:
         return error.code
     if isinstance(error, BadInputError):
         return BAD_INPUT
-    if isinstance(error, BusError | RunDirectoryError | BagError | ExperimentError):
+    failures = BusError | RunDirectoryError | BagError | ExperimentError | NodeFailedError
+    if isinstance(error, failures):
         return FAILED
     return None

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from ruamel.yaml.error import YAMLError
 
 from launch.documents import (
     BadInputError,
@@ -269,12 +270,19 @@ def _apply_setting(document: Document, setting: str) -> None:
     names = document.values.get("nodes")
     known = list(names) if isinstance(names, dict) else []
     inner = tuple(parameter.split("."))
+    try:
+        value = parse_value(text)
+    except YAMLError as error:
+        reason = str(error).splitlines()[0]
+        raise BadInputError(
+            [Problem(origin, (), f'"{text}" is not a value in YAML: {reason}', "quote it?")]
+        ) from error
     if node in known:
         if not isinstance(document.values["nodes"][node], dict):
             raise BadInputError([document.problem(("nodes", node), "holds no keys")])
-        document.set(("nodes", node, "parameters", *inner), parse_value(text), origin)
+        document.set(("nodes", node, "parameters", *inner), value, origin)
     elif node == "recorder" and "record" in document.values:
-        document.set(("record", *inner), parse_value(text), origin)
+        document.set(("record", *inner), value, origin)
     else:
         raise BadInputError(
             [Problem(origin, (), f'there is no node "{node}"', did_you_mean(node, known))]

@@ -534,7 +534,7 @@ def _check_ports(plan: Plan, host: str | None) -> None:
             plan.launch_file,
             (),
             f"port {port} of {address}, for {what}, is in use",
-            "is the graph running already?",
+            "is a graph running already? other ports go by --set NODE.PARAMETER=PORT",
         )
         for what, address, port in wanted
         if not is_free(address.strip("[]"), int(port))

@@ -45,7 +45,10 @@ def main() -> int:
         return 0
     if os.geteuid() == 0 and shutil.which("apt-get"):
         print(f"headless OpenGL is missing; installing {' '.join(PACKAGES)}", file=sys.stderr)
-        install_packages()
+        try:
+            install_packages()
+        except subprocess.CalledProcessError as error:
+            print(f"{' '.join(error.cmd)} ended with {error.returncode}", file=sys.stderr)
         problem = opengl_problem()
         if problem is None:
             return 0

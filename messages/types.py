@@ -162,7 +162,7 @@ class Frame(Message):
 
 
 class EStop(Message):
-    """Emergency stop by software.  Bridges latch `engaged`; only `reset` by hand clears it."""
+    """Emergency stop by software.  Bridges latch it; `engaged` false clears it, at rest only."""
 
     engaged: bool
     reason: str

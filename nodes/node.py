@@ -234,6 +234,7 @@ class Node:
         self.outputs: dict[str, Output[Any]] = {}
         self.errors = 0
         self.last_error = ""
+        self.troubles_told = 0
         self.note = ""
         self.started_ns = clock.now_ns()
         if epoch is None:
@@ -311,6 +312,10 @@ class Node:
             "handler failed", what=what, error=str(error), count=self.errors, trace=trace
         )
 
+    def mailbox_tasks(self) -> list[asyncio.Task[None]]:
+        """Tasks in which coroutine handlers run now; for the runner to end."""
+        return [box.task for box in self._mailboxes.values() if box.task is not None]
+
     def stop_mailboxes(self) -> None:
         for mailbox in self._mailboxes.values():
             mailbox.stop()
@@ -326,7 +331,7 @@ class Mailbox:
         self._capacity = 1 if latest else EVERY_QUEUE_LENGTH
         self._overflow_is_error = not latest
         self._waiting: deque[tuple[Message, Header]] = deque()
-        self._task: asyncio.Task[None] | None = None
+        self.task: asyncio.Task[None] | None = None
 
     def put(self, message: Message, header: Header) -> None:
         if len(self._waiting) >= self._capacity:
@@ -337,8 +342,8 @@ class Mailbox:
                     f"on_{self._port}", OverflowError(f"queue of {self._capacity} overflowed")
                 )
         self._waiting.append((message, header))
-        if self._task is None or self._task.done():
-            self._task = asyncio.get_running_loop().create_task(self._drain())
+        if self.task is None or self.task.done():
+            self.task = asyncio.get_running_loop().create_task(self._drain())
 
     async def _drain(self) -> None:
         while self._waiting:
@@ -346,5 +351,5 @@ class Mailbox:
             await self._node.step(self._port, message, header)
 
     def stop(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
+        if self.task is not None:
+            self.task.cancel()

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict
 from messages.base import Header, Message
 from messages.bus import Publisher, Subscriber
 from messages.clock import SystemClock
-from messages.topics import Topic, topic_named
+from messages.topics import Delivery, Topic, topic_named
 from messages.types import Status
 from nodes import node_class
 from nodes.node import Node, Timer, parameters_of, timers_of
@@ -123,10 +123,16 @@ async def run_status(node: Node, process: psutil.Process) -> None:
 
 
 def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
-    """The status message: rates, ages, drops and errors of every port come for free."""
-    degraded = state == "running" and any(
-        port.counts.rejected or port.counts.gaps for port in node.inputs.values()
+    """The status message: rates, ages, drops and errors of every port come for free.
+
+    Degraded: something went wrong since the last one.  A gap on a `latest` topic is none of it.
+    """
+    troubles = node.errors + sum(
+        port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
+        for port in node.inputs.values()
     )
+    degraded = state == "running" and troubles > node.troubles_told
+    node.troubles_told = troubles
     return Status(
         node=node.name,
         state="degraded" if degraded else state,
@@ -161,6 +167,10 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
     try:
         links.open_outputs()
         await node.setup()
+    except BaseException:
+        links.close()
+        raise
+    try:
         links.open_inputs(node)
         tasks = [asyncio.create_task(run_timer(node, timer)) for timer in timers_of(class_)]
         tasks.append(asyncio.create_task(run_status(node, process)))
@@ -174,10 +184,11 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
             task.result()
         node.status.publish(status_of(node, "stopping", process))
     finally:
-        await end_tasks(tasks)
-        node.stop_mailboxes()
-        await node.close()
-        links.close()
+        await end_tasks([*tasks, *node.mailbox_tasks()])
+        try:
+            await node.close()
+        finally:
+            links.close()
 
 
 async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:

@@ -14,8 +14,8 @@ from ruamel.yaml import YAML
 
 from messages.clock import VirtualClock
 from messages.scene import Scene
-from messages.types import ArmState, Side
-from nodes.arm_bridge.control import ArmControl, Command, Goal, OtherArm, Patience, pace
+from messages.types import ArmState, EStop, Side
+from nodes.arm_bridge.control import ArmControl, Command, Goal, OtherArm, Patience, goal_ahead, pace
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.kinematics import KINEMATICS
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
@@ -428,3 +428,77 @@ def test_every_method_of_the_family_is_within_tolerance_in_its_range() -> None:
     assert {point.method for point in points} == set(KINEMATICS.methods)
     for point in points:
         assert not point.in_range or point.error <= KINEMATICS.tolerance(SCENE)
+
+
+def test_without_a_connection_the_last_measured_pose_is_kept_and_none_is_made_up() -> None:
+    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+    control.lose_connection("cable")
+    assert control.last_measured_rad is None
+    control.take_measurement(GUESS, ())
+    control.lose_connection("cable")
+    assert control.last_measured_rad is not None
+    assert (control.last_measured_rad == GUESS).all()
+
+
+def test_a_reset_from_before_the_stop_does_not_clear_it() -> None:
+    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+    stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
+    assert control.take_estop(stop, ("clock", 200)) is None
+    assert control.take_estop(reset, ("clock", 100)) == "it is older than the stop"
+    assert control.estop_reason == "hand"
+    assert control.take_estop(reset, ("clock", 300)) is None
+    assert control.estop_reason is None
+
+
+def test_a_sheet_that_seems_impossibly_long_is_not_relaxed() -> None:
+    arms = pair()
+    run(arms, on_time(sheet_at(stretch=1.05)), 300)
+    far = arms[0].as_other()
+    moved = far.world_from_flange.copy()
+    moved[0, 3] -= 0.06
+    phantom = replace(far, world_from_flange=moved, mode="fault", faults=("something",))
+    before = arms[1].edge
+    for _ in range(200):
+        arms[1].cycle(on_time(sheet_at(stretch=1.05)), phantom)
+    assert arms[1].edge == pytest.approx(before, abs=1e-4)
+    assert "no sheet" in arms[1].control.reason
+
+
+def test_a_target_that_arrived_just_now_but_is_old_is_overdue() -> None:
+    fresh = goal_ahead(HOME, 0.02, -0.01, furthest_s=0.06)
+    old = goal_ahead(HOME, 5.0, -0.01, furthest_s=0.06)
+    assert fresh.overdue_s == -0.01
+    assert old.overdue_s == pytest.approx(4.94)
+    arms = pair()
+    run(arms, on_time(HOME), 60)
+    run(arms, Goal(sheet_at(0.02), old.overdue_s), 60)
+    assert {arm.control.mode for arm in arms} == {"idle"}
+
+
+def test_a_new_scene_under_a_motion_brings_both_arms_to_rest_first() -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 60)
+    run(arms, on_time(sheet_at(0.03)), 10)
+    for arm in arms:
+        arm.control.interrupt()
+    run(arms, on_time(sheet_at(0.03)), 1)
+    assert {arm.control.mode for arm in arms} <= {"stopping", "idle"}
+    assert not any(arm.control.faults for arm in arms)
+    run(arms, on_time(sheet_at(0.03)), 400)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+    for edge, arm in zip(
+        edge_poses(sheet_at(0.03).world_from_sheet, 0.24 * 1.02), arms, strict=True
+    ):
+        assert arm.edge == pytest.approx(edge, abs=1e-6)
+
+
+def test_joints_on_another_branch_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 60)
+    monkeypatch.setattr(
+        arms[0].geometry.__class__,
+        "joints_for_sheet",
+        lambda self, motion, present: present + np.array([0.0, 0.0, 0.0, 3.0, 0.0, -3.0]),
+    )
+    arms[0].cycle(on_time(HOME), arms[1].as_other())
+    assert "leap" in arms[0].control.faults[0]

@@ -156,6 +156,7 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
 def demo(
     *,
     launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
     finger_path: Annotated[
         Path | None,
         typer.Option(
@@ -170,7 +171,7 @@ def demo(
     path = None if finger_path is None else recorded_finger(launch_file, finger_path)
     folder = _folder(output, "demo")
     with progress_words() as progress:
-        result = run_demo(launch_file, folder, progress, path=path)
+        result = run_demo(launch_file, settings or (), folder, progress, path=path)
     if result.strokes:
         print_strokes(result.strokes)
     words.print(f"bag: {result.bag}")

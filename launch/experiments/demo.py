@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from launch.experiments.run import (
 from launch.plan import load_plan
 from messages.types import Correction, FingerPath
 from nodes.twin.finger import FingerPathError, recorded_path
+
+METRES_PER_PX = 0.0007
+"""The paper's; enough to look at, and four times as quick as what the experiments measure in."""
 
 SECONDS = (10.0, 30.0)
 TILT_DEG = -40
@@ -38,7 +42,12 @@ class DemoResult:
 
 
 def run_demo(
-    launch_file: Path, folder: Path, progress: Progress, *, path: FingerPath | None = None
+    launch_file: Path,
+    settings: Sequence[str],
+    folder: Path,
+    progress: Progress,
+    *,
+    path: FingerPath | None = None,
 ) -> DemoResult:
     """Stroke in 10 s and in 30 s (or follow `path`), then picture a tilted and a pushed sheet."""
     bag = folder / "demo.mcap"
@@ -47,7 +56,9 @@ def run_demo(
         picture_procedure(image.TILT, [TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
         picture_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
     )
-    run_experiment(launch_file, [], bag, procedure, progress)
+    eyes = [node.name for node in load_plan(launch_file).nodes.values() if node.type == "twin_eye"]
+    coarse = [f"{name}.metres_per_px={METRES_PER_PX}" for name in eyes]
+    run_experiment(launch_file, [*coarse, *settings], bag, procedure, progress)
     progress("reading the bag and drawing")
     return summarize(bag, folder, strokes=() if path is not None else SECONDS)
 

@@ -57,10 +57,12 @@ def push_path(scene: Scene, depth_mm: float) -> FingerPath:
 class Series:
     """One of the two experiments: what is varied, how the finger does it, what is measured.
 
-    sizes: of the cylinder in a picture (m); size_names: their letters in the paper.
+    name: with the value, what a case is called.  sizes: of the cylinder in a picture (m);
+    size_names: their letters in the paper.
     """
 
     key: str
+    name: str
     path: Callable[[Scene, float], FingerPath]
     sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
     size_names: tuple[str, ...]
@@ -68,17 +70,18 @@ class Series:
 
     def label(self, value: float, correction: Correction) -> str:
         """What the picture of that case is called."""
-        return f"{self.key} {value:+g}, {correction}"
+        return f"{self.name.format(value)}, {correction}"
 
 
 TILT = Series(
     "theta_deg",
+    "tilted {:+g}°",
     tilt_path,
     tilt_sizes,
     ("h", "u", "d"),
     (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50),
 )
-PUSH = Series("depth_mm", push_path, push_sizes, ("h", "w"), (10, 20, 30, 40, 50))
+PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (10, 20, 30, 40, 50))
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import signal
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -80,7 +81,19 @@ def run_experiment(
 ) -> None:
     """Run a procedure on a launch file's graph and record it to `bag`."""
     plan = load_plan(launch_file, settings=settings, record=bag)
-    asyncio.run(drive(plan, procedure, progress))
+    asyncio.run(_interruptible(drive(plan, procedure, progress)))
+
+
+async def _interruptible(work: Coroutine[Any, Any, None]) -> None:
+    """Do `work`; SIGINT and SIGTERM end it in order, as an ExperimentError."""
+    task = asyncio.create_task(work)
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, task.cancel)
+    try:
+        await task
+    except asyncio.CancelledError:
+        raise ExperimentError("interrupted; all nodes have been ended") from None
 
 
 def stroke_procedure(

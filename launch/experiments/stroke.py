@@ -132,6 +132,7 @@ class Recording:
 
     Edges are (9,) rows: middle of the clamped edge, its y axis, its z axis, in the world.
     delays_s: from the middle of an exposure to each later event that came of it, by event.
+    drops: messages lost on the way or refused; what a `latest` reader passed over is not lost.
     """
 
     scene: Scene
@@ -178,7 +179,7 @@ def read_recording(bag: Path) -> Recording:
     def delay(event: str, source_ns: int, event_ns: int) -> None:
         delays.setdefault((event, source_ns), (event_ns - source_ns) * 1e-9)
 
-    losses: dict[tuple[str, str], int] = {}
+    losses: dict[tuple[str, int, str], int] = {}
     for _, message, header, _ in BagReader(bag):
         match message:
             case Scene():
@@ -210,7 +211,8 @@ def read_recording(bag: Path) -> Recording:
                 delay("frame drawn", header.source_ns, header.publish_ns)
             case Status():
                 for port in message.inputs:
-                    losses[message.node, port.topic] = port.gaps + port.rejected
+                    # Each start of a node counts anew; its last word is what it lost in all.
+                    losses[message.node, header.epoch, port.topic] = port.gaps + port.rejected
             case _:
                 pass
     if scene is None:

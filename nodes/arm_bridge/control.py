@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import ArmMode, ArmState
+from messages.types import ArmMode, ArmState, EStop, SheetTarget
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.kinematics import (
     UnreachableError,
@@ -67,6 +67,10 @@ WAIT_FROM_RAD, WAIT_FULL_RAD = 0.05, 0.12
 SKEW_LENGTH_M = 0.25
 """An edge that far out of line with the other counts as one radian apart."""
 SLACK_STRETCH = 1.0005
+FAR_BEYOND = 1.1
+"""A sheet that seems longer than so many times its limit is no sheet: nothing relaxes."""
+JUMP_RAD = 0.35
+"""Joints that would have to go further than this at once are on another branch of solutions."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +90,34 @@ class Goal:
 
 
 def goal_ahead(motion: SheetMotion, ahead_s: float, overdue_s: float, *, furthest_s: float) -> Goal:
-    """The target carried on by `ahead_s` (of either sign), but no further than `furthest_s`."""
-    return Goal(extrapolated(motion, min(max(ahead_s, -furthest_s), furthest_s)), overdue_s)
+    """The target carried on by `ahead_s` (of either sign), but no further than `furthest_s`.
+
+    overdue_s: since its arrival, beyond when the next was due.  A target that would have to be
+    carried on further is overdue by that much, however lately it has arrived.
+    """
+    carried_s = min(max(ahead_s, -furthest_s), furthest_s)
+    return Goal(extrapolated(motion, carried_s), max(overdue_s, ahead_s - furthest_s))
+
+
+def goal_of(
+    target: SheetTarget,
+    *,
+    valid_at_ns: int,
+    received_ns: int,
+    now_ns: int,
+    servo_lag_s: float,
+    period_s: float,
+    furthest_s: float,
+) -> Goal:
+    """A target's goal for a command that is sent now and acts `servo_lag_s` later.
+
+    The stamps are on one clock; `period_s` after its arrival the next target is due.  A target
+    states no rate of stretch, which the arms therefore trail.
+    """
+    motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
+    ahead_s = (now_ns - valid_at_ns) * 1e-9 + servo_lag_s
+    overdue_s = (now_ns - received_ns) * 1e-9 - period_s
+    return goal_ahead(motion, ahead_s, overdue_s, furthest_s=furthest_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +172,7 @@ class ArmControl:
         self.reason = "not connected yet"
         self.estop_reason: str | None = None
         self.measured_rad: Floats | None = None
+        self.last_measured_rad: Floats | None = None
         self.commanded_rad = np.zeros(6)
         self._patience = patience
         self._largest_lag_rad = largest_lag_rad
@@ -150,6 +181,8 @@ class ArmControl:
         self._settled = False
         self._clear_arm = False
         self._has_pulled = False
+        self._interrupted = False
+        self._engaged = ("", 0)
         self._missed = False
         self._goal_rad: Floats | None = None
         self._relax_from: float | None = None
@@ -177,6 +210,14 @@ class ArmControl:
             self.mode, self.reason = "hold", text
         return True
 
+    def fail_exchange(self, text: str, *, silent: bool) -> bool:
+        """An exchange has failed; True when with it the arm counts as lost, for the first time."""
+        if silent and self.miss_answer(text):
+            return False
+        newly = self.mode != "disconnected"
+        self.lose_connection(text)
+        return newly
+
     def lose_connection(self, text: str) -> None:
         """The arm cannot be reached: forget all but a latched fault or e-stop."""
         self.measured_rad = None
@@ -188,16 +229,38 @@ class ArmControl:
         if self.measured_rad is None:
             self._start_at(joints_rad)
         self.measured_rad, self._missed = joints_rad, False
-        if arm_faults and not self.faults:
-            if arm_faults == ("watchdog: no command",):
-                # The cycle came late, the arm has stopped by itself: begin again from where it is.
-                self._start_at(joints_rad)
-                self._clear_arm = True
-            else:
-                self.faults = tuple(f"arm: {text}" for text in arm_faults)
+        self.last_measured_rad = joints_rad
+        if arm_faults == ("watchdog: no command",):
+            # The cycle came late, the arm has stopped by itself: begin again from where it is.
+            self._start_at(joints_rad)
+            self._clear_arm = True
+            self.mode, self.reason = "stopping", "the arm's watchdog stopped it"
+        elif arm_faults and not self.faults:
+            self.faults = tuple(f"arm: {text}" for text in arm_faults)
+
+    def interrupt(self) -> None:
+        """Come to rest and begin anew: the scene has changed under the motion."""
+        self._interrupted = True
+        if self.mode in ("follow", "hold"):
+            self.mode = "stopping"
 
     def engage_estop(self, reason: str) -> None:
         self.estop_reason = reason
+
+    def take_estop(self, estop: EStop, stamp: tuple[str, int]) -> str | None:
+        """Engage or reset; returns why a reset is refused.
+
+        stamp: clock and time of the message.  Several nodes may write e-stops, and the last word of
+        each comes anew to a late reader: a reset from before the stop does not clear it.
+        """
+        if estop.engaged:
+            self._engaged = stamp
+            self.engage_estop(estop.reason)
+        elif stamp[0] == self._engaged[0] and stamp[1] < self._engaged[1]:
+            return "it is older than the stop"
+        elif not self.reset():
+            return "the arm still moves"
+        return None
 
     def reset(self) -> bool:
         """Clear e-stop and faults; refused (False) while the arm still moves."""
@@ -245,7 +308,9 @@ class ArmControl:
             return self._stop("idle", "after relaxing", geometry, step_s)
         if not _is_sound(goal.motion):
             return self._fail("sheet target is not a rigid pose", geometry, step_s)
-        if self._sheet is None and not self.at_rest:
+        if self._interrupted or (self._sheet is None and not self.at_rest):
+            self._has_pulled = self._has_pulled and not self._interrupted
+            self._interrupted = self._interrupted and not self.at_rest
             return self._stop("idle", "comes to rest", geometry, step_s)
         if self._sheet is None:
             return self._begin(geometry, other, measured)
@@ -332,6 +397,11 @@ class ArmControl:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
             return self._fail(str(error), geometry, step_s)
+        jump = float(np.abs(goal_rad - self.commanded_rad).max())
+        if jump > JUMP_RAD:
+            return self._fail(
+                f"joints would leap by {np.degrees(jump):.0f} degrees", geometry, step_s
+            )
         velocity = self._limited(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         trouble = place_trouble(
@@ -369,9 +439,12 @@ class ArmControl:
             geometry.world_from_edge(measured),
             other.world_from_flange @ geometry.other_flange_from_edge,
         )
+        limits = geometry.sheet_limits
         if between.stretch_ratio <= SLACK_STRETCH:
             self._has_pulled = False
             return self._stop(rest_mode, reason, geometry, step_s)
+        if between.stretch_ratio > FAR_BEYOND * limits.longest_m / limits.width_m:
+            return self._stop(rest_mode, f"{reason}; no sheet can be so long", geometry, step_s)
         if self._relax_from is None or self._sheet is None:
             self._start_at(measured)
             self._sheet, self._relax_from = between, between.stretch_ratio
@@ -390,6 +463,9 @@ class ArmControl:
         except UnreachableError:
             return self._stop(rest_mode, reason, geometry, step_s)
         velocity = self._limited(goal_rad, geometry, step_s)
+        flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
+        if place_trouble(flange, other.world_from_flange, limits) is not None:
+            return self._stop(rest_mode, reason, geometry, step_s)
         self._sheet, self._goal_rad = sheet, goal_rad
         self.mode, self.reason = "relax", reason
         return self._move(velocity, step_s)

@@ -228,6 +228,10 @@ class ArmLink:
             longer_s = max(2.0 * self._pause_s, self._first_pause_s)
             self._pause_s = min(longer_s, self._longest_pause_s)
             raise
+        except asyncio.CancelledError:
+            # The answer is outstanding still, and would be taken for the next one's.
+            self.close()
+            raise
         finally:
             _be_cancelled()
         self._pause_s = 0.0

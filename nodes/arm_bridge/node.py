@@ -9,10 +9,9 @@ from pydantic import Field
 from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import ArmState, EStop, SheetTarget, Side
-from nodes.arm_bridge.control import ArmControl, Goal, OtherArm, Patience, goal_ahead
+from nodes.arm_bridge.control import ArmControl, Goal, OtherArm, Patience, goal_of
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.modbus import ArmLink, ArmLinkError, ArmSilentError
-from nodes.models.motion import SheetMotion
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
 
@@ -38,7 +37,6 @@ class ArmBridge(Node):
     """Sends one arm's joints over Modbus TCP and publishes what the arm answers."""
 
     opens_devices: ClassVar[bool] = True
-
     parameters: ArmBridgeParameters
     scene: Input[Scene]
     sheet_target: Input[SheetTarget]
@@ -53,13 +51,13 @@ class ArmBridge(Node):
             Patience(given.hold_after_s, given.stop_after_s), largest_lag_rad=given.largest_lag_rad
         )
         self._geometry: ArmGeometry | None = None
-        self._cycle_ns = self._sent_ns = 0
-        self._exchange_s = 0.0
-        self._failures = 0
+        self._cycle_ns = self._sent_ns = self._measured_ns = 0
+        self._used: tuple[Header | None, int] = (None, 0)
+        self._exchange_s, self._failures = 0.0, 0
 
     async def close(self) -> None:
         """Bid the arm stop; if that fails, its own watchdog stops it."""
-        if self._link.connected:
+        if self._control.last_measured_rad is not None:
             joints_rad, now_ns = self._control.commanded_rad, self.clock.now_ns()
             try:
                 await self._link.exchange(mode="stop", joints_rad=joints_rad, now_ns=now_ns)
@@ -68,13 +66,13 @@ class ArmBridge(Node):
         self._link.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
+        self._control.interrupt()
         self._geometry = ArmGeometry(scene, self.parameters.side)
 
     def on_estop(self, estop: EStop, header: Header) -> None:
-        if estop.engaged:
-            self._control.engage_estop(estop.reason)
-        elif not self._control.reset():
-            self.log.warning("reset refused: the arm still moves")
+        refusal = self._control.take_estop(estop, (header.clock_id, header.source_ns))
+        if refusal is not None:
+            self.log.warning("reset refused", reason=refusal)
 
     @periodic("rate_hz")
     async def cycle(self) -> None:
@@ -87,13 +85,15 @@ class ArmBridge(Node):
         self._cycle_ns = now_ns
         if self._link.due(now_ns):
             await self._exchange(self._geometry, step_s)
-        control = self._control
-        self.note = f"{control.mode} {control.reason}; {self._failures} failed exchanges"
+        mode, reason = self._control.mode, self._control.reason
+        self.note = f"{mode} {reason}; {self._failures} failed exchanges"
         self._publish(self._geometry)
 
     async def _exchange(self, geometry: ArmGeometry, step_s: float) -> None:
         control = self._control
         command = control.step(geometry, self._goal(), self._other(), step_s)
+        # A target that comes while the arm answers is not behind the command that it answers.
+        self._used = (self.sheet_target.header, self.sheet_target.received_ns)
         self._sent_ns = self.clock.now_ns()
         try:
             status = await self._link.exchange(
@@ -101,13 +101,11 @@ class ArmBridge(Node):
             )
         except ArmLinkError as error:
             self._failures += 1
-            if isinstance(error, ArmSilentError) and control.miss_answer(str(error)):
-                return
-            if control.mode != "disconnected":
+            if control.fail_exchange(str(error), silent=isinstance(error, ArmSilentError)):
                 self.log.warning("arm lost", problem=str(error))
-            control.lose_connection(str(error))
             return
-        self._exchange_s = (self.clock.now_ns() - self._sent_ns) * 1e-9
+        self._measured_ns = self.clock.now_ns()
+        self._exchange_s = (self._measured_ns - self._sent_ns) * 1e-9
         control.take_measurement(status.joints_rad, status.faults)
 
     def _goal(self) -> Goal | None:
@@ -115,15 +113,18 @@ class ArmBridge(Node):
         target, header = self.sheet_target.message, self.sheet_target.header
         if target is None or header is None:
             return None
-        given, now_ns = self.parameters, self.clock.now_ns()
-        received_ns = self.sheet_target.received_ns
-        same_clock = header.clock_id == self.clock.id
+        given, received_ns = self.parameters, self.sheet_target.received_ns
         # Another host's clock: the target counts as if it had arrived in no time.
-        offset_ns = 0 if same_clock else received_ns - header.publish_ns
-        ahead_s = (now_ns - target.valid_at_ns - offset_ns) * 1e-9 + given.servo_lag_s
-        overdue_s = (now_ns - received_ns) * 1e-9 - given.target_period_s
-        motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
-        return goal_ahead(motion, ahead_s, overdue_s, furthest_s=given.furthest_extrapolation_s)
+        foreign = header.clock_id != self.clock.id
+        return goal_of(
+            target,
+            valid_at_ns=target.valid_at_ns + (received_ns - header.publish_ns if foreign else 0),
+            received_ns=received_ns,
+            now_ns=self.clock.now_ns(),
+            servo_lag_s=given.servo_lag_s,
+            period_s=given.target_period_s,
+            furthest_s=given.furthest_extrapolation_s,
+        )
 
     def _other(self) -> OtherArm | None:
         state = self.other_arm.message
@@ -131,12 +132,14 @@ class ArmBridge(Node):
         return None if state is None else OtherArm.from_state(state, age_s)
 
     def _publish(self, geometry: ArmGeometry) -> None:
-        control, other, header = self._control, self._other(), self.sheet_target.header
-        measured = control.commanded_rad if control.measured_rad is None else control.measured_rad
+        control, other = self._control, self._other()
+        header, received_ns = self._used
+        measured = control.last_measured_rad
+        if measured is None:
+            return
         distance, force = geometry.sheet_state(
             measured, None if other is None else other.world_from_flange
         )
-        age_s = (self.clock.now_ns() - self.sheet_target.received_ns) * 1e-9
         self.arm.publish(
             ArmState(
                 side=self.parameters.side,
@@ -146,11 +149,12 @@ class ArmBridge(Node):
                 joints_commanded_rad=control.commanded_rad,
                 world_from_flange=geometry.world_from_flange(measured),
                 world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
-                command_age_s=None if header is None else max(age_s, 0.0),
-                target_source_ns=0 if header is None else header.source_ns,
+                command_age_s=(self.clock.now_ns() - received_ns) * 1e-9 if header else None,
+                target_source_ns=header.source_ns if header else 0,
                 command_sent_ns=self._sent_ns,
                 edge_distance_m=distance,
                 edge_force_n=force,
                 cycle_s=self._exchange_s,
-            )
+            ),
+            source_ns=self._measured_ns,
         )

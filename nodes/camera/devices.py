@@ -80,8 +80,8 @@ class ImagesSource(Source):
     """Image files, in the order of their sorted names."""
 
     kind: Literal["images"]
-    left: str = Field(description="a pattern: pictures/left*.png")
-    right: str
+    left: Path = Field(description="a pattern: pictures/left*.png")
+    right: Path
     rate_hz: Positive | None = Field(default=None, description="null: the scene's camera rate")
     loop: bool = False
 
@@ -275,7 +275,7 @@ class ImagesReader:
     def __init__(self, source: ImagesSource, camera_rate_hz: float, now: Now) -> None:
         self._now, self._loop, self._next = now, source.loop, 0
         self.rate_hz: float | None = source.rate_hz or camera_rate_hz
-        left, right = sorted(glob(source.left)), sorted(glob(source.right))
+        left, right = sorted(glob(str(source.left))), sorted(glob(str(source.right)))
         for pattern, paths in ((source.left, left), (source.right, right)):
             if not paths:
                 raise DeviceError(f"{pattern}: matches no file")

@@ -25,7 +25,9 @@ class FemSolverParameters(NodeParameters):
     lead_s: NonNegative = Field(default=0.0, description="finger is predicted this far ahead")
     hold_s: NonNegative = Field(default=0.1, description="a lost finger keeps its dent this long")
     relax_s: Positive = Field(default=0.15, description="time constant of springing back after it")
-    cache_dir: str = Field(default="", description="of precomputations; empty: the user's cache")
+    cache_dir: Path | None = Field(
+        default=None, description="of precomputations; null: the user's cache"
+    )
 
 
 class FemSolver(Node):
@@ -70,8 +72,7 @@ class FemSolver(Node):
         """In a thread of its own: takes seconds when nothing is in the cache."""
         spec = body.spec_of(scene, self.parameters.skin_spacing_m)
         if self._model is None or self._model[0] != spec:
-            directory = self.parameters.cache_dir
-            path = Path(directory) if directory else precompute.default_cache_dir()
+            path = self.parameters.cache_dir or precompute.default_cache_dir()
             self._model = spec, precompute.load_or_compute(spec, path, self._progress)
         return body.scene_body(
             scene,

@@ -26,7 +26,7 @@ from nodes.planner.rolling import (
 
 Floats = NDArray[np.float64]
 
-EDGE_SPEED_SHARE = 0.7
+PLANNED_EDGE_SPEED = 0.7
 """Share of the tool speed that is planned with; the rest lets an arm that was late catch up."""
 
 LONGEST_STEP_S = 0.1
@@ -56,7 +56,7 @@ class Plan:
         self._turn = np.kron(np.eye(2), self._world_from_object[:3, :3])
         self._bounds = bounds
         self._edges = EdgeBound(
-            EDGE_SPEED_SHARE * scene.arms.max_tool_speed_m_per_s, 0.5 * scene.sheet.height_m
+            PLANNED_EDGE_SPEED * scene.arms.max_tool_speed_m_per_s, 0.5 * scene.sheet.height_m
         )
         user = self._object_from_world[:3, 2]
         front = float(np.arctan2(user[1], user[2]))

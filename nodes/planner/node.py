@@ -44,6 +44,8 @@ class Planner(Node):
         self._plan: Plan | None = None
         self._stretch_ratio = 1.0
         self._last_source_ns: int | None = None
+        self._writer = ("", 0)
+        self._first_step_s = 0.0
         self._late = 0
 
     def on_scene(self, scene: Scene, header: Header) -> None:
@@ -63,6 +65,7 @@ class Planner(Node):
             tilt_margin_rad=given.tilt_margin_rad,
         )
         self._stretch_ratio = scene.sheet.min_stretch_ratio
+        self._first_step_s = 1.0 / scene.camera.rate_hz
         self._last_source_ns = None
 
     def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
@@ -75,13 +78,17 @@ class Planner(Node):
         plan = self._plan
         if plan is None:
             return
+        writer = (header.clock_id, header.epoch)
+        if writer != self._writer:
+            # The triangulator was started anew, and its times with it.
+            self._writer, self._last_source_ns = writer, None
         last_ns, source_ns = self._last_source_ns, header.source_ns
         if last_ns is not None and source_ns <= last_ns:
             self._late += 1
             self.note = f"{self._late} fingertips came out of order and were left out"
             return
         self._last_source_ns = source_ns
-        step_s = 1.0 / 60.0 if last_ns is None else (source_ns - last_ns) * 1e-9
+        step_s = self._first_step_s if last_ns is None else (source_ns - last_ns) * 1e-9
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:
             planned = plan.hold(f"fingertip: {fingertip.reason}", step_s)

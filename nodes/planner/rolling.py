@@ -80,10 +80,6 @@ class Encounter:
         """The angle presented last."""
         return self._angle
 
-    @property
-    def touching(self) -> bool:
-        return self._touching
-
     def step(self, finger: Floats, velocity: Floats, sheet_y_at: float) -> Presentation:
         """What to present to a finger (3,) m that moves with `velocity` (3,) m/s.
 

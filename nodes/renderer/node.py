@@ -70,8 +70,7 @@ class Renderer(Node):
         self._period_ns = int(1e9 / self.parameters.rate_hz)
 
     async def close(self) -> None:
-        if hasattr(self, "_context"):
-            self._context.release()
+        self._context.release()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         if self._stage is not None:

@@ -1,5 +1,7 @@
 """Follows the fingertip from picture to picture: a Kalman filter of constant velocity, with a gate.
 
+Its process noise is small while the hand goes evenly and grows when it starts, stops or turns.
+
 A state is (position, velocity), 6 numbers in the world frame, m and m/s, with a 6x6 covariance.
 """
 
@@ -101,7 +103,7 @@ def agility(
     """The acceleration noise with which to carry a track on to a measured point (3,).
 
     The settings' own while the point lies where an even motion leads, by the mean square of the
-    normalised innovation; else as much as its innovation speaks for, |v|^2 = q^2 dt^3, up to the
+    normalised innovation; else as much as its innovation speaks for, |v|^2 = 3 q^2 dt^3, up to the
     largest (adaptive process noise: Bar-Shalom, Li, Kirubarajan, section 11.2).
     """
     calm = settings.acceleration_noise
@@ -111,7 +113,7 @@ def agility(
     if innovation @ np.linalg.solve(spread, innovation) <= 3.0 * EVEN_MOTION:
         return calm
     dt = (at_ns - track.at_ns) * 1e-9
-    wanted = float(np.linalg.norm(innovation)) / dt**1.5
+    wanted = float(np.linalg.norm(innovation)) / (np.sqrt(3.0) * dt**1.5)
     return float(min(max(wanted, calm), settings.largest_acceleration_noise))
 
 

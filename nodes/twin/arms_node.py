@@ -53,10 +53,12 @@ class TwinArmsNode(Node):
         for side, spec in arms.items():
             base = spec.world_from_base
             self._world_from_base[side] = transform_from_rpy(base.position_m, base.rpy_rad)
-        if self.servers:
+        if len(self.servers) == len(arms):
             return
         self._moved_ns = self._started_ns = self.clock.now_ns()
         for number, (side, spec) in enumerate(arms.items()):
+            if side in self.servers:
+                continue
             controller = Controller(
                 self._start_joints(side, spec, scene),
                 servo_lag_s=self.parameters.servo_lag_s,

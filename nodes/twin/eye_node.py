@@ -29,8 +29,9 @@ class TwinEyeNode(Node):
     """Pictures each labelled mono frame that carries pixels, one per label and correction.
 
     A picture takes about a second, so further frames of a label that waits, or was just pictured,
-    are passed over on purpose; they are not counted as lost.  The sheet and the finger are the true
-    ones at the instant that the frame was drawn for, which is a few milliseconds after it arrives.
+    are passed over on purpose; they are not counted as lost.  The sheet is the true one at the
+    instant that the frame was drawn for, a few milliseconds after it arrives; the finger is the one
+    of the newest exposure before that, the body the solver's newest.
     """
 
     parameters: TwinEyeParameters
