@@ -327,6 +327,30 @@ def test_verify_sees_another_output(flexsheet: Command, recorded: Path, tmp_path
     assert said.json()["topics"]["estop"]["worst"] == {"reason": 1.0}
 
 
+def test_a_node_that_fails_for_good_ends_an_experiment_in_a_sentence(
+    flexsheet: Command, tmp_path: Path
+) -> None:
+    launch_file = tmp_path / "broken.yaml"
+    scene = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
+    launch_file.write_text(
+        f"scene: {scene}\n"
+        "nodes:\n"
+        "  broken: {type: 'launch_nodes:Beacon', parameters: {exit_code: 3},\n"
+        "           restart: {policy: never}}\n"
+    )
+    said = flexsheet("experiment", "stroke", "--launch", launch_file, "--output", tmp_path / "o")
+    assert said.code == 1
+    assert "broken ended with exit code" in said.err
+    assert "Traceback" not in said.err
+
+
+def test_a_setting_that_is_no_yaml_is_named(flexsheet: Command) -> None:
+    said = flexsheet("launch", "launch/demo.yaml", "--dry-run", "--set", "planner.lead_s=[1,")
+    assert said.code == 2
+    assert "planner.lead_s=[1," in said.err
+    assert "Traceback" not in said.err
+
+
 def test_verify_says_what_it_lacks(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
     said = flexsheet("bag", "verify", "listner", recorded)
     assert (said.code, 'did you mean "listener"?' in said.err) == (1, True)

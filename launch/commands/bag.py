@@ -169,7 +169,7 @@ def _print_verification(result: Verification) -> None:
                 one.replayed,
                 one.compared,
                 one.beyond_tolerance,
-                _worst(one.worst),
+                _worst(one.worst) if one.compared else "none paired",
             )
             for topic, one in result.topics.items()
         ],
