@@ -15,8 +15,9 @@ from ruamel.yaml import YAML
 from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.types import ArmState, EStop, Side
-from nodes.arm_bridge.control import ArmControl, Command, Goal, OtherArm, Patience, goal_ahead, pace
+from nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.goal import Goal, goal_ahead, pace
 from nodes.arm_bridge.kinematics import KINEMATICS
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.methods import measure

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import ArmMode, ArmState, EStop, SheetTarget
+from messages.types import ArmMode, ArmState, EStop
 from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.goal import Goal, pace, slowed
 from nodes.arm_bridge.kinematics import (
     UnreachableError,
 )
@@ -29,7 +30,6 @@ from nodes.models.motion import (
     SheetBounds,
     SheetMotion,
     coast_sheet,
-    extrapolated,
     follow_sheet,
 )
 from nodes.models.rigid import (
@@ -40,6 +40,7 @@ from nodes.models.rigid import (
 Floats = NDArray[np.float64]
 
 REST_RAD_PER_S = 1e-6
+"""Slower than this an arm is at rest: a ten-thousandth of a degree a second."""
 
 # Accelerations that the joints can follow (J6 by 22 rad/s^2, J2 by 9.4): beyond, the joints would
 # run on past a target that turns back, each arm by as much as its cycles happen to lie.
@@ -51,6 +52,7 @@ FOLLOW_BOUNDS = SheetBounds(
     stretch_rate_per_s=0.1,
     stretch_acceleration_per_s2=1.0,
 )
+# From a standstill to the target, with a person perhaps at the sheet: a quarter of the tool speed.
 START_BOUNDS = SheetBounds(
     speed_m_per_s=0.06,
     acceleration_m_per_s2=0.3,
@@ -59,16 +61,18 @@ START_BOUNDS = SheetBounds(
     stretch_rate_per_s=0.03,
     stretch_acceleration_per_s2=0.2,
 )
+# Letting go is no haste either, but a taut sheet is what hurts: slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
+# On its target, for good: from then until it next stops, the sheet goes with the target.
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
-WAIT_FROM_RAD, WAIT_FULL_RAD = 0.05, 0.12
-"""How far apart the edges may get before the arm that is ahead slows, and where it stands still."""
-SKEW_LENGTH_M = 0.25
-"""An edge that far out of line with the other counts as one radian apart."""
+
 SLACK_STRETCH = 1.0005
+"""A sheet this long pulls with a tenth of a newton: let go."""
+
 FAR_BEYOND = 1.1
 """A sheet that seems longer than so many times its limit is no sheet: nothing relaxes."""
+
 JUMP_RAD = 0.35
 """Joints that would have to go further than this at once are on another branch of solutions."""
 
@@ -79,45 +83,6 @@ class Patience:
 
     hold_after_s: float
     stop_after_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Goal:
-    """The sheet's target at the moment when this command takes effect; age since it arrived."""
-
-    motion: SheetMotion
-    overdue_s: float
-
-
-def goal_ahead(motion: SheetMotion, ahead_s: float, overdue_s: float, *, furthest_s: float) -> Goal:
-    """The target carried on by `ahead_s` (of either sign), but no further than `furthest_s`.
-
-    overdue_s: since its arrival, beyond when the next was due.  A target that would have to be
-    carried on further is overdue by that much, however lately it has arrived.
-    """
-    carried_s = min(max(ahead_s, -furthest_s), furthest_s)
-    return Goal(extrapolated(motion, carried_s), max(overdue_s, ahead_s - furthest_s))
-
-
-def goal_of(
-    target: SheetTarget,
-    *,
-    valid_at_ns: int,
-    received_ns: int,
-    now_ns: int,
-    servo_lag_s: float,
-    period_s: float,
-    furthest_s: float,
-) -> Goal:
-    """A target's goal for a command that is sent now and acts `servo_lag_s` later.
-
-    The stamps are on one clock; `period_s` after its arrival the next target is due.  A target
-    states no rate of stretch, which the arms therefore trail.
-    """
-    motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
-    ahead_s = (now_ns - valid_at_ns) * 1e-9 + servo_lag_s
-    overdue_s = (now_ns - received_ns) * 1e-9 - period_s
-    return goal_ahead(motion, ahead_s, overdue_s, furthest_s=furthest_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -531,43 +496,3 @@ def _lag(sheet: SheetMotion, target: SheetMotion) -> tuple[float, float]:
     turn = target.world_from_sheet[:3, :3] @ sheet.world_from_sheet[:3, :3].T
     shift = target.world_from_sheet[:3, 3] - sheet.world_from_sheet[:3, 3]
     return float(np.linalg.norm(shift)), float(np.linalg.norm(vector_from_rotation(turn)))
-
-
-def pace(own_edge: Floats, other_edge: Floats, target: Floats) -> float:
-    """Share (0..1) of its speed with which an arm goes on, so that it waits for one behind it.
-
-    own_edge, other_edge: world poses of the commanded edges; target: world_from_sheet.  Each bridge
-    moves the sheet by its own cycle, and a cycle late on one side is a turn of the sheet's edges to
-    one another.  The arm that leads on the way from between both to the target slows in proportion
-    to its lead.  What one arm leads the other trails, so they never wait for each other.
-    """
-    across = target[:3, 0]
-    lead = _between(other_edge, own_edge, across)
-    way = _between(own_edge, target, across) + _between(other_edge, target, across)
-    apart = float(np.linalg.norm(lead))
-    if apart <= WAIT_FROM_RAD or float(lead @ way) <= 0.0:
-        return 1.0
-    return max(0.0, (WAIT_FULL_RAD - apart) / (WAIT_FULL_RAD - WAIT_FROM_RAD))
-
-
-def slowed(bounds: SheetBounds, share: float) -> SheetBounds:
-    """The bounds with that share of their speeds; accelerations stay."""
-    if share == 1.0:
-        return bounds
-    return replace(
-        bounds,
-        speed_m_per_s=share * bounds.speed_m_per_s,
-        turn_rad_per_s=share * bounds.turn_rad_per_s,
-        stretch_rate_per_s=share * bounds.stretch_rate_per_s,
-    )
-
-
-def _between(pose: Floats, other: Floats, across: Floats) -> Floats:
-    """The way (6,) from one pose to another: turn (rad), then shift over SKEW_LENGTH_M.
-
-    across: unit vector (3,) from edge to edge; shift along it is left out, for the edges are a
-    sheet's width apart.  The way back is the negative, exactly.
-    """
-    turn = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
-    shift = other[:3, 3] - pose[:3, 3]
-    return np.concatenate([turn, (shift - across * (across @ shift)) / SKEW_LENGTH_M])

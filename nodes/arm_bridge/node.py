@@ -9,8 +9,9 @@ from pydantic import Field
 from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import ArmState, EStop, SheetTarget, Side
-from nodes.arm_bridge.control import ArmControl, Goal, OtherArm, Patience, goal_of
+from nodes.arm_bridge.control import ArmControl, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.goal import Goal, goal_of
 from nodes.arm_bridge.modbus import ArmLink, ArmLinkError, ArmSilentError
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
@@ -47,9 +48,8 @@ class ArmBridge(Node):
     async def setup(self) -> None:
         given = self.parameters
         self._link = ArmLink(given.host, given.port, timeout_s=given.timeout_s)
-        self._control = ArmControl(
-            Patience(given.hold_after_s, given.stop_after_s), largest_lag_rad=given.largest_lag_rad
-        )
+        patience = Patience(given.hold_after_s, given.stop_after_s)
+        self._control = ArmControl(patience, largest_lag_rad=given.largest_lag_rad)
         self._geometry: ArmGeometry | None = None
         self._cycle_ns = self._sent_ns = self._measured_ns = 0
         self._used: tuple[Header | None, int] = (None, 0)
