@@ -67,3 +67,7 @@ class CylinderShape:
     def angle_rad(self, point: Floats) -> float:
         """Angle of a point about the axis, 0 on +z, growing towards +y."""
         return float(np.arctan2(point[1], point[2]))
+
+    def normal_curvatures(self) -> tuple[float, float]:
+        """Principal curvatures (1/m): along the axis, and around it; positive is convex."""
+        return 0.0, 1.0 / self.radius_m
