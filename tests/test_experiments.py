@@ -55,9 +55,9 @@ def test_a_known_lag_and_lift_come_out(lag_rad: float, lifted_m: float, depth_m:
     delta_d, delta_theta = stroke.sheet_errors(
         SCENE, finger_at(angles, depth_m), (left, right), TIMES
     )
-    expected = np.sqrt(
-        RADIUS**2 + (RADIUS + lifted_m) ** 2 - 2 * RADIUS * (RADIUS + lifted_m) * np.cos(lag_rad)
-    )
+    # The chord between two radii, in the form that stays exact for small ones.
+    chord = 2.0 * np.sqrt(RADIUS * (RADIUS + lifted_m)) * np.sin(0.5 * lag_rad)
+    expected = np.hypot(lifted_m, chord)
     np.testing.assert_allclose(delta_theta, abs(lag_rad), atol=1e-9)
     np.testing.assert_allclose(delta_d, expected, atol=1e-9)
 
