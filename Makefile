@@ -33,6 +33,7 @@ bench: setup
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
 	$(BIN)/python -m benchmarks.recovery
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body
 
 docs: setup
 	$(BIN)/python -m messages.reference > docs/messages.md
