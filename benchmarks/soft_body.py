@@ -77,7 +77,7 @@ def slide(built: body.SceneBody, spec: precompute.SoftBodySpec, depth_m: float) 
 
 
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
-    """Hertz's force of a sphere on a half-space bent like the cylinder, its patch taken as round."""
+    """Hertz's force of a sphere on a half-space bent like the cylinder, its patch taken round."""
     modulus, nu = scene.object.material.young_modulus_pa, scene.object.material.poisson_ratio
     finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / scene.object.geometry.radius_m
     radius = 1.0 / np.sqrt(finger * (finger + cylinder))
