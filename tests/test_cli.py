@@ -137,7 +137,9 @@ def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=0.8"
     )
     # The listener hears the tenth beat a fifth of a second after the start.
+    deadline = time.monotonic() + 30.0
     while "estop" not in BagReader(folder / "a.mcap").topics:
+        assert time.monotonic() < deadline, "the listener's stop was not recorded"
         time.sleep(0.05)
     assert launched.stop() == 0
     return folder / "a.mcap"

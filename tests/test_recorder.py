@@ -201,6 +201,7 @@ async def main():
         publisher.send(pair, Header(i + 1, 0, 0, "c", "w", 1))
         time.sleep(0.001)
     publisher.close()
+    # The loop stands still on purpose, for longer than a heartbeat: that is what the fault needs.
     time.sleep(2.5)
 
 asyncio.run(main())

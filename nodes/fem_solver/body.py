@@ -14,6 +14,7 @@ from nodes.fem_solver.contact import (
     LinearSoftBody,
     Push,
     Response,
+    SoftBodyMethod,
     approach_normal,
     push_on_cylinder,
 )
@@ -63,7 +64,7 @@ def world_from_mesh(scene: Scene) -> Floats:
 class SceneBody:
     """The soft body standing in its scene."""
 
-    method: LinearSoftBody
+    method: SoftBodyMethod
     spec: SoftBodySpec
     world_from_mesh: Floats
     skin: Skin

@@ -18,7 +18,6 @@ class Compliance:
     """The stretch that presents an object's stiffness; `note` says so where the sheet cannot."""
 
     stretch_ratio: float
-    presented_n_per_m: float
     note: str
 
 
@@ -64,4 +63,4 @@ def compliance_for(stiffness_n_per_m: float, sheet: SheetSpec) -> Compliance:
         note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet's {presented:.0f}"
     elif wanted > largest:
         note = f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet's {presented:.0f}"
-    return Compliance(stretch, presented, note)
+    return Compliance(stretch, note)
