@@ -80,9 +80,24 @@ class Response:
 
 
 class SoftBodyMethod(Protocol):
-    """What every method of the family offers, whatever is precomputed behind it."""
+    """What every method of the family offers, whatever is precomputed behind it.
 
-    def respond(self, push: Push) -> Response: ...
+    name: as the message says it.  at_rest: displacement (n, 3) of the untouched skin.
+    """
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def at_rest(self) -> Floats32: ...
+
+    def stiffness_n_per_m(self, surface: Floats) -> float:
+        """Stiffness (N/m) at the touchable place nearest to a surface point (3,), m."""
+        ...
+
+    def respond(self, push: Push) -> Response:
+        """The skin's answer to a push."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
