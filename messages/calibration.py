@@ -24,11 +24,19 @@ class CalibrationFileError(ValueError):
 
 
 class Board(Part):
-    """A chessboard: inner corners along its two directions, and the side of a square."""
+    """A chessboard, or a ChArUco board whose white squares carry markers.
 
+    columns, rows: inner corners along its two directions, for both kinds.
+    """
+
+    kind: Literal["chessboard", "charuco"] = "chessboard"
     columns: Annotated[int, Field(ge=3)]
     rows: Annotated[int, Field(ge=3)]
     square_m: Positive
+    marker_m: Positive | None = Field(default=None, description="side of a marker; ChArUco only")
+    dictionary: str | None = Field(
+        default=None, description="of the markers, as OpenCV names it: DICT_4X4_50; ChArUco only"
+    )
 
 
 class PairResidual(Part):

@@ -110,6 +110,9 @@ class StereoCamera(Part):
     height_px: Annotated[int, Field(gt=0)]
     rate_hz: Positive
     exposure_s: Positive
+    gain: Finite | None = Field(
+        default=None, description="in the device's own units; null: as the device has it"
+    )
     left: Lens
     right: Lens
     right_from_left: Transform

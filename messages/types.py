@@ -35,11 +35,21 @@ StereoMode = Literal["mono", "side_by_side", "top_bottom", "anaglyph"]
 
 
 class StereoPair(Message):
-    """Two pictures taken together.  The header's source stamp is the middle of the exposure."""
+    """Two pictures taken together.  The header's source stamp is the middle of the exposure.
+
+    Where the two cameras have no common trigger, it is the middle between both exposures.
+    """
 
     device: str
     exposure_s: NonNegative
+    skew_s: Finite = Field(
+        default=0.0, description="exposure of the right picture minus that of the left, as measured"
+    )
     dropped_frames: int = Field(ge=0, description="frames lost in the device since start")
+    left_origin_px: tuple[int, int] = Field(
+        default=(0, 0), description="column and row of the sensor where the left picture begins"
+    )
+    right_origin_px: tuple[int, int] = (0, 0)
     left: GrayImage
     right: GrayImage
 
