@@ -106,7 +106,7 @@ class TwinCamera:
         noisy = []
         for _ in range(self.sensor.noisy_backgrounds):
             noise = self._random.standard_normal((height, width), dtype=np.float32)
-            noisy.append(_quantized(background + deviation * noise))
+            noisy.append(quantized(background + deviation * noise))
         return Eye(lens, camera_from_world, background, noisy)
 
     def _background(self, height: int, width: int) -> NDArray[np.float32]:
@@ -149,7 +149,7 @@ class TwinCamera:
             levels += self._exposed(eye, tip, window, mark)
         levels /= steps
         noise = self._random.standard_normal(levels.shape, dtype=np.float32)
-        image[window] = _quantized(levels + self.sensor.noise(levels) * noise)
+        image[window] = quantized(levels + self.sensor.noise(levels) * noise)
         return image
 
     def _window(self, eye: Eye, tips: list[Floats]) -> tuple[slice, slice] | None:
@@ -209,6 +209,6 @@ def _smeared(distance: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(ndtr(distance), dtype=np.float32)
 
 
-def _quantized(levels: NDArray[np.float32]) -> Image:
+def quantized(levels: NDArray[np.float32]) -> Image:
     """Digital numbers as the converter gives them: rounded, clipped at 0 and 255."""
     return np.clip(np.rint(levels), 0, 255).astype(np.uint8)

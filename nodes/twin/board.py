@@ -1,0 +1,323 @@
+"""Pictures of a calibration board, as the twin's rig sees it, and the poses it is shown in.
+
+Each pixel's rays are cast onto the board's plane.  An edge of a square is smeared over the one ray
+that it crosses, so that the corners lie where the optics put them, to a few thousandths of a pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.calibration import Board
+from messages.scene import Lens, StereoCamera
+from nodes.models.rigid import apply, rotation_from_vector, transform
+from nodes.twin.pixels import Sensor, quantized
+from nodes.twin.rig import pixels_of, slopes_of
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+RAYS = 3
+"""Rays per pixel and direction."""
+
+PAPER_LEVEL = 175.0
+INK_LEVEL = 22.0
+ROOM_LEVEL = 45.0
+BORDER_SQUARES = 0.6
+"""White border around the squares."""
+
+TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
+SHARES_OF_HEIGHT = (0.95, 0.5, 0.75, 0.35, 0.6)
+"""What share of the picture's height the board fills, held upright: near and far."""
+
+MARGIN_PX = 6.0
+CHARUCO_SEEN = 0.6
+"""A ChArUco board may be cut by the picture as long as this share of its corners is seen."""
+
+CHARUCO_NEARER = 1.2
+"""It is shown nearer by this, since its markers are small."""
+
+
+class BoardError(ValueError):
+    """A board that cannot be drawn; the message says what to change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Light:
+    """Uneven light on a board: its level's change across the picture, and the room's texture."""
+
+    gain: float
+    slope_x: float
+    slope_y: float
+    room: Singles
+
+
+class TwinBoard:
+    """Shows a board to a rig, whose lenses are the true ones; noise and light come from `seed`."""
+
+    def __init__(
+        self, camera: StereoCamera, board: Board, *, seed: int, sensor: Sensor | None = None
+    ) -> None:
+        self.camera = camera
+        self.board = board
+        self.sensor = Sensor() if sensor is None else sensor
+        self._random = np.random.default_rng(seed)
+        self._markers = _markers(board) if board.kind == "charuco" else None
+        self._rays = tuple(self._cast(lens) for lens in (camera.left, camera.right))
+
+    def _cast(self, lens: Lens) -> Singles:
+        """Slopes (RAYS*height, RAYS*width, 2) of the rays through the picture.
+
+        Lenses bend so little from pixel to pixel that the rays of one pixel are evenly spread.
+        """
+        height, width = self.camera.height_px, self.camera.width_px
+        pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+        middle = slopes_of(lens, pixels.astype(np.float64))
+        down, right = np.gradient(middle, axis=(0, 1))
+        offsets = (np.arange(RAYS) + 0.5) / RAYS - 0.5
+        rays = np.empty((RAYS * height, RAYS * width, 2), np.float32)
+        for row, y in enumerate(offsets):
+            for column, x in enumerate(offsets):
+                rays[row::RAYS, column::RAYS] = middle + x * right + y * down
+        return rays
+
+    def corners(self, left_from_board: Floats) -> tuple[Floats, Floats]:
+        """True pixels (rows*columns, 2) of the inner corners in both views, columns first."""
+        board = self.board
+        grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2) * board.square_m
+        points = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
+        left, right = self._views(left_from_board, points)
+        return left, right
+
+    def _views(self, left_from_board: Floats, points: Floats) -> list[Floats]:
+        """Pixels (n, 2) of the board's points (n, 3) in each view; all must lie before both."""
+        seen = []
+        for lens, eye_from_left in (
+            (self.camera.left, np.eye(4)),
+            (self.camera.right, self.camera.right_from_left),
+        ):
+            in_eye = apply(eye_from_left @ left_from_board, points)
+            if in_eye[:, 2].min() <= 0:
+                raise BoardError("the board reaches behind the camera; hold it further away")
+            seen.append(pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:]))
+        return seen
+
+    def pair(self, left_from_board: Floats) -> tuple[Image, Image]:
+        """The left and right picture of the board at a pose (4, 4)."""
+        left, right = self.levels(left_from_board)
+        return self._exposed(left), self._exposed(right)
+
+    def _exposed(self, levels: Singles) -> Image:
+        noise = self._random.standard_normal(levels.shape, dtype=np.float32)
+        return quantized(levels + self.sensor.noise(levels) * noise)
+
+    def levels(self, left_from_board: Floats) -> tuple[Singles, Singles]:
+        """Both pictures before noise and rounding, (height, width)."""
+        self._views(left_from_board, self._outline())
+        light = self._light()
+        left, right = (
+            self._drawn(rays, eye_from_left @ left_from_board, light)
+            for rays, eye_from_left in zip(
+                self._rays, (np.eye(4), self.camera.right_from_left), strict=True
+            )
+        )
+        return left, right
+
+    def _light(self) -> Light:
+        gain, slope_x, slope_y = self._random.uniform([0.85, -0.2, -0.2], [1.1, 0.2, 0.2])
+        coarse = self._random.standard_normal((12, 16), dtype=np.float32)
+        size = (self.camera.width_px, self.camera.height_px)
+        room = ROOM_LEVEL + 12.0 * cv2.resize(coarse, size, interpolation=cv2.INTER_CUBIC)
+        return Light(gain, slope_x, slope_y, np.clip(room, 5.0, 90.0).astype(np.float32))
+
+    def _outline(self) -> Floats:
+        """Points (n, 3) along the edge of the board's paper, in the board's frame."""
+        board = self.board
+        low = -(1.0 + BORDER_SQUARES) * board.square_m
+        high = np.array([board.columns, board.rows]) * board.square_m + BORDER_SQUARES * (
+            board.square_m
+        )
+        shares = np.linspace(0.0, 1.0, 9)
+        x, y = low + shares * (high[0] - low), low + shares * (high[1] - low)
+        sides = [
+            np.stack([x, np.full_like(x, low)], axis=1),
+            np.stack([x, np.full_like(x, high[1])], axis=1),
+            np.stack([np.full_like(y, low), y], axis=1),
+            np.stack([np.full_like(y, high[0]), y], axis=1),
+        ]
+        flat = np.concatenate(sides)
+        return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
+
+    def _drawn(self, rays: Singles, eye_from_board: Floats, light: Light) -> Singles:
+        """Levels of one view; lens blur and falling light included."""
+        height, width = self.camera.height_px, self.camera.width_px
+        levels = light.room.copy()
+        in_eye = apply(eye_from_board, self._outline())
+        lens = self.camera.left if rays is self._rays[0] else self.camera.right
+        outline = pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:])
+        reach = 1 + int(np.ceil(4.0 * self.sensor.blur_px))
+        low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - reach, 0)
+        high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + reach + 1, (width, height))
+        if (low < high).all():
+            window = slice(low[1], high[1]), slice(low[0], high[0])
+            fine = rays[RAYS * low[1] : RAYS * high[1], RAYS * low[0] : RAYS * high[0]]
+            paper, inside = self._seen(fine, eye_from_board)
+            paper, inside = self._through_lens(paper), self._through_lens(inside)
+            levels[window] += paper - inside * levels[window]
+        x = np.linspace(-1.0, 1.0, width, dtype=np.float32)
+        y = np.linspace(-1.0, 1.0, height, dtype=np.float32)[:, None]
+        falling = 1.0 - 0.12 * (x * x + y * y)
+        lit = light.gain * (1.0 + light.slope_x * x + light.slope_y * y) * falling
+        return np.asarray(levels * lit, dtype=np.float32)
+
+    def _through_lens(self, fine: Singles) -> Singles:
+        """Mean over each pixel of what the rays see, blurred before the pixels sample it."""
+        spread = RAYS * self.sensor.blur_px
+        smooth = cv2.GaussianBlur(fine, (0, 0), spread, borderType=cv2.BORDER_REPLICATE)
+        height, width = fine.shape[0] // RAYS, fine.shape[1] // RAYS
+        return np.asarray(smooth.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3)), np.float32)
+
+    def _seen(self, rays: Singles, eye_from_board: Floats) -> tuple[Singles, Singles]:
+        """Level of the board where each ray meets its plane, and the share that meets it."""
+        board = self.board
+        plane_from_ray = np.linalg.inv(eye_from_board[:3, [0, 1, 3]]).astype(np.float32)
+        on_plane = rays @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]
+        in_squares = on_plane[..., :2] / (on_plane[..., 2:] * np.float32(board.square_m))
+        squares = np.asarray(in_squares + np.float32(1.0), dtype=np.float32)
+        counts = (board.columns + 1, board.rows + 1)
+        signs = []
+        inside = printed = np.ones(rays.shape[:2], dtype=np.float64)
+        for axis, count in enumerate(counts):
+            place = squares[..., axis]
+            rise = np.gradient(place)
+            width = np.hypot(rise[0], rise[1])
+            line = np.clip(np.rint(place), 1, count - 1)
+            flip = 1.0 - 2.0 * np.mod(line, 2.0)
+            signs.append(flip * np.clip(2.0 * (place - line) / width, -1.0, 1.0))
+            edge = np.minimum(place, count - place)
+            printed = printed * np.clip(0.5 + edge / width, 0.0, 1.0)
+            inside = inside * np.clip(0.5 + (edge + BORDER_SQUARES) / width, 0.0, 1.0)
+        ink = 0.5 * (1.0 + signs[0] * signs[1])
+        if self._markers is not None:
+            ink = np.maximum(ink, _marker_ink(squares, self._markers, self._marker_share()))
+        level = PAPER_LEVEL + (INK_LEVEL - PAPER_LEVEL) * ink * printed
+        return np.asarray(level * inside, np.float32), np.asarray(inside, np.float32)
+
+    def _marker_share(self) -> float:
+        assert self.board.marker_m is not None
+        return self.board.marker_m / self.board.square_m
+
+    def poses(self, count: int) -> list[Floats]:
+        """Poses `left_from_board` (4, 4) as a careful person would show the board.
+
+        Round the picture's middle, corners and edges, near and far, tilted to all sides; each as
+        far out as both views still see the whole board (of a ChArUco board, most of it).
+        """
+        board = self.board
+        middle = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
+        height_m = (board.rows + 1 + 2 * BORDER_SQUARES) * board.square_m
+        ways = [(0, 0), (-1, -1), (1, -1), (1, 1), (-1, 1), (-1, 0), (1, 0), (0, -1), (0, 1)]
+        nearer = 1.0 if board.kind == "chessboard" else CHARUCO_NEARER
+        poses: list[Floats] = []
+        for number in range(count):
+            share = nearer * SHARES_OF_HEIGHT[number % len(SHARES_OF_HEIGHT)]
+            tilt_rad = TILTS_RAD[number % len(TILTS_RAD)] + self._random.uniform(0.0, 0.1)
+            # The golden angle: no two tilts lean alike, however many there are.
+            towards = 2.399963 * number
+            turn = rotation_from_vector(
+                tilt_rad * np.array([np.cos(towards), np.sin(towards), 0.0])
+            ) @ rotation_from_vector([0.0, 0.0, self._random.uniform(-0.15, 0.15)])
+            depth_m = self.camera.left.fy_px * height_m / (share * self.camera.height_px)
+            way = np.array(ways[number % len(ways)], dtype=np.float64)
+            poses.append(self._placed(turn, depth_m, way, middle))
+        return poses
+
+    def _placed(self, turn: Floats, depth_m: float, way: Floats, middle: Floats) -> Floats:
+        """The board, so turned, pushed as far out as it may be; further away if it must be."""
+        between_m = -0.5 * float(self.camera.right_from_left[0, 3])
+        half = 0.5 * np.array([self.camera.width_px, self.camera.height_px])
+        reach = half / np.array([self.camera.left.fx_px, self.camera.left.fy_px])
+
+        def posed(shares: Floats) -> Floats:
+            centre = np.array([between_m, 0.0, depth_m])
+            centre[:2] += 1.2 * shares * depth_m * reach * way
+            return transform(turn, centre - turn @ np.array([*middle, 0.0]))
+
+        out = np.zeros(2)
+        while not self._shown(posed(out)):
+            depth_m *= 1.1
+        for axis in range(2):
+            tries = [np.where(np.arange(2) == axis, share, out) for share in np.linspace(0, 1, 41)]
+            out = [shares for shares in tries if self._shown(posed(shares))][-1]
+        return posed(out)
+
+    def _shown(self, left_from_board: Floats) -> bool:
+        """Whether enough of the board is in both pictures: all of its paper, or enough corners."""
+        whole = self.board.kind == "chessboard"
+        try:
+            views = self._views(left_from_board, self._outline())
+        except BoardError:
+            return False
+        if not whole:
+            views = list(self.corners(left_from_board))
+        size = np.array([self.camera.width_px, self.camera.height_px])
+        needed = 1.0 if whole else CHARUCO_SEEN
+        return all(
+            np.mean(((view >= MARGIN_PX) & (view <= size - 1 - MARGIN_PX)).all(axis=1)) >= needed
+            for view in views
+        )
+
+
+def _markers(board: Board) -> NDArray[np.bool_]:
+    """Which cells are black: (rows+1, columns+1, n, n), n cells a side with the black border.
+
+    Numbered row by row over the white squares, the first square being black, as OpenCV numbers
+    them.  Raises BoardError for a board without markers or with more than its dictionary holds.
+    """
+    if board.marker_m is None or board.dictionary is None:
+        raise BoardError("board: a ChArUco board needs marker_m and dictionary")
+    if not 0 < board.marker_m < board.square_m:
+        raise BoardError(
+            f"board.marker_m: {board.marker_m:g} m does not fit a square of {board.square_m:g} m"
+        )
+    number = getattr(cv2.aruco, board.dictionary, None)
+    if not isinstance(number, int) or not board.dictionary.startswith("DICT_"):
+        raise BoardError(f"board.dictionary: {board.dictionary}: OpenCV has none of that name")
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    cells = dictionary.markerSize + 2
+    squares = [
+        (row, column)
+        for row in range(board.rows + 1)
+        for column in range(board.columns + 1)
+        if (row + column) % 2
+    ]
+    if len(squares) > len(dictionary.bytesList):
+        raise BoardError(
+            f"board: {len(squares)} white squares, {board.dictionary} has only "
+            f"{len(dictionary.bytesList)} markers; choose a larger dictionary"
+        )
+    black = np.zeros((board.rows + 1, board.columns + 1, cells, cells), dtype=np.bool_)
+    for marker, (row, column) in enumerate(squares):
+        black[row, column] = cv2.aruco.generateImageMarker(dictionary, marker, cells) == 0
+    return black
+
+
+def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
+    """Ink (0 or 1) of the markers at places (..., 2) counted in squares; `share` of one is theirs.
+
+    Squares without a marker have none.
+    """
+    rows, columns, cells, _ = markers.shape
+    column = np.clip(np.floor(squares[..., 0]).astype(np.intp), 0, columns - 1)
+    row = np.clip(np.floor(squares[..., 1]).astype(np.intp), 0, rows - 1)
+    at = np.stack([squares[..., 0] - column, squares[..., 1] - row], axis=-1)
+    cell = np.floor((at - 0.5 * (1.0 - share)) * (cells / share)).astype(np.intp)
+    within = ((cell >= 0) & (cell < cells)).all(axis=-1)
+    cell = np.clip(cell, 0, cells - 1)
+    ink = markers[row, column, cell[..., 1], cell[..., 0]] & within
+    return np.asarray(ink, dtype=np.float32)

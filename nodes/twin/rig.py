@@ -1,0 +1,118 @@
+"""The stereo rig as it really stands, and how its lenses see.
+
+A scene's camera block is a data sheet.  The device itself differs from it, by amounts that belong
+to that one device: only a calibration tells them.  The projection is the twin's own, since the twin
+judges the camera model that the nodes use.
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Lens, StereoCamera
+from nodes.models.rigid import rotation_from_vector, transform
+
+Floats = NDArray[np.float64]
+
+FOCAL_DEVIATION = 0.005
+"""Standard deviation of a focal length, as a share of it: between the devices of one make."""
+
+ASPECT_DEVIATION = 0.0005
+"""Standard deviation of what tells fy from fx: square pixels, nearly."""
+
+CENTRE_DEVIATION_PX = 4.0
+"""Standard deviation of a principal point per 640 px of width: how a sensor sits behind a lens."""
+
+RADIAL = (-0.30, 0.11)
+RADIAL_DEVIATION = (0.015, 0.01)
+"""k1 and k2 of the lenses of such rigs (66 degrees across), which no data sheet tells."""
+
+TANGENTIAL_DEVIATION = 0.0004
+OFFSET_DEVIATION_M = 0.0001
+"""Standard deviation, per axis, of where the right camera is screwed on."""
+
+TURN_DEVIATION_RAD = 0.004
+"""Standard deviation, per axis, of how the right camera is turned: 0.23 degrees."""
+
+NEWTON_STEPS = 12
+
+
+def true_camera(camera: StereoCamera) -> StereoCamera:
+    """The rig behind a data sheet: the same for the same device name, another for any other.
+
+    Deviations are normal, cut at two standard deviations.  Where the left camera stands in the
+    world is as the scene says, and so are size, rate and exposure.
+    """
+    name = hashlib.sha256(camera.device.encode()).digest()
+    random = np.random.default_rng(np.frombuffer(name, dtype=np.uint32))
+
+    def deviation(*shape: int) -> Floats:
+        return np.clip(random.standard_normal(shape), -2.0, 2.0)
+
+    def built(lens: Lens) -> Lens:
+        focal, aspect, centre_x, centre_y, k1, k2, p1, p2 = deviation(8)
+        centre_px = CENTRE_DEVIATION_PX * camera.width_px / 640.0
+        added = (
+            RADIAL[0] + RADIAL_DEVIATION[0] * k1,
+            RADIAL[1] + RADIAL_DEVIATION[1] * k2,
+            TANGENTIAL_DEVIATION * p1,
+            TANGENTIAL_DEVIATION * p2,
+            0.0,
+        )
+        k = tuple(float(old + new) for old, new in zip(lens.distortion, added, strict=True))
+        fx_px = lens.fx_px * (1.0 + FOCAL_DEVIATION * focal)
+        fy_px = lens.fy_px * (1.0 + FOCAL_DEVIATION * focal + ASPECT_DEVIATION * aspect)
+        return Lens(
+            fx_px=float(fx_px),
+            fy_px=float(fy_px),
+            cx_px=float(lens.cx_px + centre_px * centre_x),
+            cy_px=float(lens.cy_px + centre_px * centre_y),
+            distortion=(k[0], k[1], k[2], k[3], k[4]),
+        )
+
+    left, right = built(camera.left), built(camera.right)
+    turn = rotation_from_vector(TURN_DEVIATION_RAD * deviation(3))
+    moved = transform(turn, OFFSET_DEVIATION_M * deviation(3))
+    return camera.model_copy(
+        update={"left": left, "right": right, "right_from_left": moved @ camera.right_from_left}
+    )
+
+
+def pixels_of(lens: Lens, slopes: Floats) -> Floats:
+    """Pixels (..., 2) of rays (x/z, y/z) (..., 2) through a lens, by Brown's distortion."""
+    u, v = slopes[..., 0], slopes[..., 1]
+    k1, k2, p1, p2, k3 = lens.distortion
+    r2 = u * u + v * v
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    x = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
+    y = v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v
+    return np.stack([lens.fx_px * x + lens.cx_px, lens.fy_px * y + lens.cy_px], axis=-1)
+
+
+def slopes_of(lens: Lens, pixels: Floats) -> Floats:
+    """Rays (x/z, y/z) (..., 2) behind pixels (..., 2): the inverse of `pixels_of`, by Newton.
+
+    Good wherever the distortion does not fold the picture over.
+    """
+    k1, k2, p1, p2, k3 = lens.distortion
+    focal = np.array([lens.fx_px, lens.fy_px])
+    slopes = np.asarray((pixels - np.array([lens.cx_px, lens.cy_px])) / focal, dtype=np.float64)
+    for _ in range(NEWTON_STEPS):
+        off = (pixels_of(lens, slopes) - pixels) / focal
+        u, v = slopes[..., 0], slopes[..., 1]
+        r2 = u * u + v * v
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+        xx = radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u
+        yy = radial + slope * v * v + 6.0 * p1 * v + 2.0 * p2 * u
+        xy = slope * u * v + 2.0 * p1 * u + 2.0 * p2 * v
+        determinant = xx * yy - xy * xy
+        step_u = (yy * off[..., 0] - xy * off[..., 1]) / determinant
+        step_v = (xx * off[..., 1] - xy * off[..., 0]) / determinant
+        slopes = slopes - np.stack([step_u, step_v], axis=-1)
+        if np.abs(off).max(initial=0.0) < 1e-12:
+            break
+    return slopes
