@@ -207,6 +207,9 @@ class Status(Message):
     plan_hash: str
 
 
+PathJoin = Literal["rounded_lines", "spline"]
+
+
 class FingerPath(Message):
     """A path for the twin's finger, from now on: it eases from where it is to the first point."""
 
@@ -215,6 +218,11 @@ class FingerPath(Message):
     positions_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))]
     wander_m: NonNegative = Field(description="standard deviation of slow human error")
     tremor_m: NonNegative = Field(description="amplitude of 8-12 Hz tremor")
+    joined_by: PathJoin = Field(
+        default="rounded_lines",
+        description="rounded_lines: the points are corners, rounded over +-40 ms; spline: they are "
+        "samples of a smooth motion that begins and ends at rest",
+    )
 
 
 class TwinFinger(Message):

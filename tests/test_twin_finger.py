@@ -19,8 +19,9 @@ from messages.clock import SystemClock, VirtualClock
 from messages.scene import Lens, Scene
 from messages.topics import Topic
 from messages.types import FingerPath, StereoPair, TwinFinger
-from nodes.twin.finger import FingerMotion, FingerPathError, recorded_path
+from nodes.twin.finger import FingerMotion, FingerPathError
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
+from nodes.twin.paths import recorded_path
 from nodes.twin.pixels import TwinCamera
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -184,6 +185,7 @@ def check_recorded(path: FingerPath, scene: Scene) -> None:
         wander_m=0.0,
         tremor_m=0.0,
         max_speed_m_per_s=scene.finger.max_speed_m_per_s,
+        joined_by=path.joined_by,
     )
 
 

@@ -19,7 +19,8 @@ from launch.experiments.run import (
 )
 from launch.plan import load_plan
 from messages.types import Correction, FingerPath
-from nodes.twin.finger import FingerPathError, recorded_path
+from nodes.twin.finger import FingerPathError
+from nodes.twin.paths import recorded_path
 
 METRES_PER_PX = 0.0007
 """The paper's; enough to look at, and four times as quick as what the experiments measure in."""

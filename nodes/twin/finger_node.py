@@ -85,6 +85,7 @@ class TwinFingerNode(Node):
             wander_m=path.wander_m,
             tremor_m=path.tremor_m,
             max_speed_m_per_s=self.max_speed_m_per_s,
+            joined_by=path.joined_by,
         )
         self.motion_from_ns, self.path_label = now_ns, path.label
 

@@ -1,0 +1,317 @@
+"""What a person's finger does to an object: gestures, each a function of the scene and a seed.
+
+What is known of such motions, and where it is from:
+
+- A reach has a bell-shaped speed that is the same for all distances and durations (Atkeson and
+  Hollerbach 1985, J. Neurosci. 5:2318), the one of least jerk (Flash and Hogan 1985, J. Neurosci.
+  5:1688): its peak is 1.875 of its mean, its greatest acceleration 5.77 distance / duration^2.
+- Unhurried reaches peak at 0.2-0.35 m/s (REACH+, which plans for them); hurried elbow flexions of
+  27-45 degrees take 100-160 ms (Wallace and Wright 1982, J. Motor Behav. 14:341), so the braking
+  half takes 50-80 ms.
+- A surface is explored at 77-86 mm/s on average (Smith, Gosselin and Houde 2002, Exp. Brain Res.
+  147:209).
+- Taps follow one another in 150-500 ms in typing (Angelaki and Soechting 1993, Exp. Brain Res.
+  95:319), in 170-200 ms, 50-60 in ten seconds, when hurried (finger tapping test of the Halstead
+  Reitan battery).  That contact takes 100-200 ms of an unhurried tap and about half of a hurried
+  one is taken here, without a source for soft objects.
+- A reach that is told to stop is called off after 206 ms on average (Mirabella, Pani, Pare and
+  Ferraina 2006, Exp. Brain Res. 174:240): a stop is sudden for who watches, not for who stops.
+- Ellipses and the like are drawn slower where they are more curved, as harmonic motions are
+  (Richardson and Flash 2002, J. Neurosci. 22:8201).
+- Physiological tremor peaks at 6-12 Hz (Lakie et al. 2015, J. Physiol. 593:4411).  Its amplitude is
+  0.03 mm with the hand at rest, twice that with the hand held out, 4 to 5 times with the arm held
+  out (Growdon et al. 2000, Electromyogr. Clin. Neurophysiol. 40:295).  Most of what a still finger
+  does is slower, 1-3.5 Hz and below (Carignan, Daneault and Duval 2009, Exp. Brain Res. 201:299):
+  the wander.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from messages.scene import Scene
+from messages.types import FingerPath
+from nodes.twin.finger import smoothstep
+from nodes.twin.paths import over_surface, placed_path, touchable
+
+Floats = NDArray[np.float64]
+Sampled = tuple[Floats, Floats]
+"""Times (n,) s from zero, and what a motion does at them: places (n, 3) m, or a way (n,) m."""
+
+SAMPLE_S = 0.004
+WANDER_M = 0.0005
+TREMOR_HAND_M = 0.00006
+TREMOR_ARM_M = 0.00013
+
+HOVER_M = 0.04
+APPROACH_S = 0.8
+REST_S = 0.3
+TOUCH_M = 0.001
+"""Depth of a light touch."""
+
+PRESS_M = 0.002
+"""Depth of a tap."""
+
+EXPLORE_M_PER_S = 0.086
+REACH_PEAK_M_PER_S = 0.35
+SHORTEST_REACH_S = 0.3
+BRAKE_S = 0.05
+PEAK_OF_MEAN = 1.875
+
+
+class Gesture(Protocol):
+    def __call__(self, scene: Scene, *, seed: int = 1) -> FingerPath: ...
+
+
+def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> Sampled:
+    """Reaches of least jerk from `start` through places (3,), each given with its duration (s).
+
+    A move to where the finger is, is a rest.
+    """
+    corners = np.array([start, *(place for _, place in moves)])
+    ends = np.cumsum([0.0, *(duration for duration, _ in moves)])
+    times = _sampled_times(float(ends[-1]))
+    move = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(moves) - 1)
+    s = (times - ends[move]) / (ends[move + 1] - ends[move])
+    share, _ = smoothstep(s[:, None])
+    return times, corners[move] + share * (corners[move + 1] - corners[move])
+
+
+def way_of_speeds(phases: Sequence[tuple[float, float]]) -> Sampled:
+    """The way (n,) m of a finger that changes its speed from rest: (duration s, speed m/s at end).
+
+    Speed goes over as a reach's position does, so acceleration is continuous.
+    """
+    durations = np.array([duration for duration, _ in phases])
+    speeds = np.array([0.0, *(speed for _, speed in phases)])
+    ends = np.concatenate([[0.0], np.cumsum(durations)])
+    ways = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]) * durations)])
+    times = _sampled_times(float(ends[-1]))
+    phase = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(phases) - 1)
+    s = (times - ends[phase]) / durations[phase]
+    gained = s**4 * (2.5 - 3.0 * s + s * s)  # the integral of the smooth step
+    change = speeds[phase + 1] - speeds[phase]
+    return times, ways[phase] + durations[phase] * (speeds[phase] * s + change * gained)
+
+
+def _sampled_times(duration_s: float) -> Floats:
+    return np.linspace(0.0, duration_s, int(np.ceil(duration_s / SAMPLE_S)) + 1)
+
+
+def touched(motion: Sampled) -> Sampled:
+    """A motion on the surface with its approach from above, a short rest, and the lift after."""
+    times, places = motion
+    first, last = places[0], places[-1]
+    above_first, above_last = (np.array([*place[:2], HOVER_M]) for place in (first, last))
+    before, approach = minimum_jerk(above_first, [(APPROACH_S, first), (REST_S, first)])
+    after, lift = minimum_jerk(last, [(REST_S, last), (APPROACH_S, above_last)])
+    begin = before[-1]
+    end = begin + times[-1]
+    return (
+        np.concatenate([before, begin + times[1:], end + after[1:]]),
+        np.concatenate([approach, places[1:], lift[1:]]),
+    )
+
+
+def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
+    """The path of a motion that touches: the hand is held out, and steadied by the object."""
+    times, places = touched(motion)
+    return placed_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
+
+
+def hold(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Touch lightly and hold still for 5 s.  Nothing of it is left to chance."""
+    touch = (0.0, 0.0, -TOUCH_M)
+    return _on_surface(scene, "hold", minimum_jerk(touch, [(5.0, touch)]))
+
+
+def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Hold still in the air for 5 s with the arm held out, where tremor is greatest."""
+    place = (0.0, 0.0, 0.5 * HOVER_M)
+    times, places = minimum_jerk(place, [(5.0, place)])
+    return placed_path(scene, "hover", times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
+
+
+def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed: int) -> FingerPath:
+    """Ten reaches, by turns to a place on the surface and to one in the air above it."""
+    generator = np.random.default_rng(seed)
+    along_m, arc_m = touchable(scene)
+    half = 0.5 * np.array([along_m, arc_m])
+    here = np.array([0.0, 0.0, HOVER_M])
+    start = here
+    moves: list[tuple[float, ArrayLike]] = []
+    for turn in range(10):
+        height = -TOUCH_M if turn % 2 == 0 else generator.uniform(0.03, 0.09)
+        place = np.array([*generator.uniform(-half, half), height])
+        ends = over_surface(scene, np.array([here, place]))
+        way_m = float(np.linalg.norm(ends[1] - ends[0]))
+        moves += [(max(SHORTEST_REACH_S, PEAK_OF_MEAN * way_m / peak_m_per_s), place)]
+        moves += [(rest_s, place)]
+        here = place
+    times, places = minimum_jerk(start, moves)
+    return placed_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
+
+
+def reach(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Unhurried reaches to and from the object, with rests."""
+    return _reaches(scene, "reach", REACH_PEAK_M_PER_S, 0.4, seed)
+
+
+def reach_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Hurried reaches to and from the object, with hardly a rest."""
+    return _reaches(scene, "reach-fast", 3.0 * REACH_PEAK_M_PER_S, 0.1, seed)
+
+
+def _taps(
+    scene: Scene,
+    label: str,
+    *,
+    count: int,
+    every_s: float,
+    contact_s: float,
+    lift_m: float,
+    seed: int,
+) -> FingerPath:
+    """Taps on about the same place; intervals vary by 5 %, places by 2 mm.
+
+    A tap is a reach from `lift_m` above the surface to PRESS_M below it, a rest there, and a reach
+    back.  The finger does not brake before it touches: it is below the surface for `contact_s`.
+    """
+    generator = np.random.default_rng(seed)
+    grid = np.linspace(0.0, 1.0, 1001)
+    touch = float(np.interp(lift_m / (lift_m + PRESS_M), smoothstep(grid)[0], grid))
+    reach_s = 0.5 * (every_s - contact_s) / touch
+    rest_s = every_s - 2.0 * reach_s
+    start = (0.0, 0.0, lift_m)
+    moves: list[tuple[float, ArrayLike]] = []
+    for _ in range(count):
+        pace = float(np.clip(generator.normal(1.0, 0.05), 0.85, 1.15))
+        along, arc = generator.normal(0.0, 0.002, 2)
+        pressed, above = (along, arc, -PRESS_M), (along, arc, lift_m)
+        moves += [(pace * reach_s, pressed), (pace * rest_s, pressed), (pace * reach_s, above)]
+    times, places = minimum_jerk(start, moves)
+    return placed_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
+
+
+def tap(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Three taps a second, each with 120 ms of contact."""
+    return _taps(scene, "tap", count=15, every_s=0.333, contact_s=0.12, lift_m=0.012, seed=seed)
+
+
+def tap_fast(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Taps as fast as people can, 5.4 a second, each with 85 ms of contact."""
+    return _taps(
+        scene, "tap-fast", count=25, every_s=0.185, contact_s=0.085, lift_m=0.006, seed=seed
+    )
+
+
+def _arc_run(scene: Scene) -> tuple[float, float]:
+    """End (m) of a stroke around the surface, half its way, and a speed (m/s) for it."""
+    half = 0.5 * touchable(scene)[1]
+    return half, min(scene.working_range.speed_m_per_s, half / 0.3)
+
+
+def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Strokes around the surface that stop suddenly, half way and at the end; three each way."""
+    half, speed = _arc_run(scene)
+    start_s, lag_s = 0.2, np.random.default_rng(seed).uniform(0.3, 0.6, 12)
+    even_s = half / speed - 0.5 * (start_s + BRAKE_S)
+    phases: list[tuple[float, float]] = []
+    for leg, rest_s in enumerate(lag_s):
+        signed = speed if leg % 4 < 2 else -speed
+        phases += [(start_s, signed), (even_s, signed), (BRAKE_S, 0.0), (float(rest_s), 0.0)]
+    times, way = way_of_speeds(phases)
+    return _on_surface(scene, "stop", (times, _pressing(way - half, TOUCH_M)))
+
+
+def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Strokes to and fro that turn around suddenly, at moments that cannot be foreseen."""
+    half, speed = _arc_run(scene)
+    generator = np.random.default_rng(seed)
+    turn_s = 2.0 * BRAKE_S
+    phases: list[tuple[float, float]] = [(turn_s, speed)]
+    here, signed = -0.5 * half + 0.5 * speed * turn_s, speed
+    for _ in range(14):
+        end = np.sign(signed) * generator.uniform(0.2, 0.9) * half
+        way = max(np.sign(signed) * (end - here), 0.0)
+        phases += [(way / speed + 1e-3, signed), (turn_s, -signed)]
+        here += signed * (way / speed + 1e-3)
+        signed = -signed
+    phases += [(turn_s, 0.0)]
+    times, way = way_of_speeds(phases)
+    return _on_surface(scene, "reverse", (times, _pressing(way - 0.5 * half, TOUCH_M)))
+
+
+def stroke_push(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Strokes to and fro around the surface while the finger pushes and eases, 0.7 times a second.
+
+    The deepest push is a tenth of the working range's.
+    """
+    half, speed = _arc_run(scene)
+    stroke_s = PEAK_OF_MEAN * 2.0 * half / speed
+    ends = [(0.0, half if stroke % 2 == 0 else -half, 0.0) for stroke in range(6)]
+    times, places = minimum_jerk((0.0, -half, 0.0), [(stroke_s, end) for end in ends])
+    pushes = round(0.7 * times[-1])
+    depth_m = 0.1 * scene.working_range.push_depth_m
+    phase = 2.0 * np.pi * pushes * times / times[-1]
+    places[:, 2] = -TOUCH_M - 0.5 * (depth_m - TOUCH_M) * (1.0 - np.cos(phase))
+    return _on_surface(scene, "stroke-push", (times, places))
+
+
+def _rounds(turns: int, turn_s: float) -> Sampled:
+    """The angle (n,) rad of so many turns, begun and ended at rest over a quarter of a turn."""
+    pace = 2.0 * np.pi / turn_s
+    ramp_s = 0.25 * turn_s
+    return way_of_speeds([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])
+
+
+def _drawing_m(scene: Scene) -> float:
+    """Radius (m) of a figure that is drawn on the surface."""
+    return min(0.02, *(0.5 * size for size in touchable(scene)))
+
+
+def circle(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Four circles on the surface, at the speed that people explore one with."""
+    radius = _drawing_m(scene)
+    times, angle = _rounds(4, 2.0 * np.pi * radius / EXPLORE_M_PER_S)
+    places = np.stack(
+        [radius * np.cos(angle), radius * np.sin(angle), np.full(len(angle), -TOUCH_M)], axis=1
+    )
+    return _on_surface(scene, "circle", (times, places))
+
+
+def eight(scene: Scene, *, seed: int = 1) -> FingerPath:
+    """Three figures of eight on the surface, slower in their bends."""
+    radius = _drawing_m(scene)
+    # Its length is 6.1 radii, by the integral of its speed below.
+    times, angle = _rounds(3, 6.1 * radius / EXPLORE_M_PER_S)
+    places = np.stack(
+        [radius * np.sin(angle), 0.5 * radius * np.sin(2.0 * angle), np.full(len(angle), -TOUCH_M)],
+        axis=1,
+    )
+    return _on_surface(scene, "eight", (times, places))
+
+
+def _pressing(arcs: Floats, depth_m: float) -> Floats:
+    """Places (n, 3) on arcs (n,) around the surface's middle, `depth_m` below it."""
+    return np.stack([np.zeros(len(arcs)), arcs, np.full(len(arcs), -depth_m)], axis=1)
+
+
+GESTURES: dict[str, Gesture] = {
+    "hold": hold,
+    "hover": hover,
+    "reach": reach,
+    "reach-fast": reach_fast,
+    "tap": tap,
+    "tap-fast": tap_fast,
+    "stop": stop,
+    "reverse": reverse,
+    "stroke-push": stroke_push,
+    "circle": circle,
+    "eight": eight,
+}
+"""By the name of their path."""
