@@ -1,69 +1,39 @@
-"""The camera node and its readers: real decoders, files that end, devices that fail."""
+"""The camera node: it plays, retries, refuses, cuts and tells; files are read by real decoders."""
 
 from __future__ import annotations
 
-import asyncio
 import threading
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from pydantic import ValidationError
-from ruamel.yaml import YAML
-
-from messages.base import Header, Message
-from messages.clock import SystemClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import StereoPair
-from nodes.camera.devices import (
-    DeviceError,
-    ImagesSource,
-    OpenCvSource,
-    Pictures,
-    ReaderThread,
-    VideoSource,
-    halves,
-    open_reader,
+from camera_bench import (
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    Bench,
+    load_scene,
+    picture,
+    running,
+    write_video,
 )
-from nodes.camera.node import Camera, CameraParameters
+from pydantic import ValidationError
 
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-WIDTH, HEIGHT, FRAMES = 160, 120, 6
-Image = NDArray[np.uint8]
+from messages.base import Header
+from messages.scene import Scene
+from messages.types import StereoPair
+from nodes.camera.devices import ReaderThread, open_reader
+from nodes.camera.node import CameraParameters
+from nodes.camera.pictures import DeviceError, Pictures, halves
+from nodes.camera.sources import ImagesSource, OpenCvSource, VideoSource
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """The paper's scene with a small camera."""
-    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
-    size = {"width_px": WIDTH, "height_px": HEIGHT}
-    return scene.model_copy(update={"camera": scene.camera.model_copy(update=size)})
-
-
-def picture(number: int, side: int, width: int = WIDTH) -> Image:
-    """An even picture whose level tells its number and side, as compression leaves it."""
-    return np.full((HEIGHT, width), 20 + 20 * number + 100 * side, np.uint8)
-
-
-def told(image: Image) -> int:
-    return round((float(image.mean()) - 20) / 20)
-
-
-def write_video(path: Path, frames: list[Image], rate_hz: float = 50.0) -> Path:
-    height, width = frames[0].shape
-    codec = cv2.VideoWriter.fourcc(*"MJPG")
-    writer = cv2.VideoWriter(str(path), codec, rate_hz, (width, height), True)
-    assert writer.isOpened()
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    return path
+    return load_scene()
 
 
 @pytest.fixture
@@ -85,44 +55,6 @@ def images(tmp_path: Path) -> dict[str, str]:
         colour = cv2.cvtColor(picture(number, 1), cv2.COLOR_GRAY2BGR)
         cv2.imwrite(str(tmp_path / f"right{number:02}.png"), colour)
     return {"left": str(tmp_path / "left*.png"), "right": str(tmp_path / "right*.png")}
-
-
-class Bench:
-    """A camera node that runs, and what it publishes."""
-
-    def __init__(self, **parameters: Any) -> None:
-        self.sent: list[tuple[StereoPair, Header]] = []
-        self.changed = asyncio.Event()
-        self.node = Camera(
-            CameraParameters.model_validate(parameters),
-            name="camera",
-            clock=SystemClock(),
-            send=self.keep,
-        )
-
-    def keep(self, topic: Topic, message: Message, header: Header) -> None:
-        assert isinstance(message, StereoPair)
-        self.sent.append((message, header))
-        self.changed.set()
-
-    async def until(self, true: Callable[[], bool]) -> None:
-        async with asyncio.timeout(20):
-            while not true():  # noqa: ASYNC110  # notes and errors come without an event
-                await asyncio.sleep(0.005)
-
-    def numbers(self) -> list[tuple[int, int]]:
-        return [(told(pair.left), told(pair.right) - 5) for pair, _ in self.sent]
-
-
-@asynccontextmanager
-async def running(scene: Scene, **parameters: Any) -> AsyncIterator[Bench]:
-    bench = Bench(**parameters)
-    await bench.node.setup()
-    await bench.node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
-    try:
-        yield bench
-    finally:
-        await bench.node.close()
 
 
 IN_ORDER = [(number, number) for number in range(FRAMES)]
@@ -221,7 +153,11 @@ async def test_the_twins_pictures_pass_with_their_time(scene: Scene) -> None:
         header = Header(1, 123_456, 130_000, "virtual", "twin", 1)
         await bench.node.step("twin__stereo", pair, header)
         passed, passed_header = bench.sent[0]
-        assert passed is pair
+        assert passed.left is pair.left
+        assert passed.right is pair.right
+        assert (passed.device, passed.exposure_s) == (pair.device, pair.exposure_s)
+        assert passed.dropped_frames == pair.dropped_frames
+        assert passed.left_origin_px == passed.right_origin_px == (0, 0)
         assert passed_header.source_ns == 123_456
         wrong = pair.model_copy(update={"right": picture(1, 1, 80)})
         await bench.node.step("twin__stereo", wrong, header)
@@ -281,20 +217,12 @@ def test_a_side_by_side_picture_of_odd_width_is_refused() -> None:
         halves(picture(0, 0, 161), "camera")
 
 
-def test_the_exposure_is_stamped_before_the_grab(scene: Scene, side_by_side: Path) -> None:
-    clock = iter(range(10**9, 2 * 10**9, 1_000_000))
-    late = OpenCvSource(kind="opencv", left=str(side_by_side), exposure_to_grab_s=0.02)
-    reader = open_reader(late, scene.camera, lambda: next(clock))
-    pictures = reader.read()
-    reader.close()
-    assert pictures is not None
-    assert pictures.exposure_ns == 10**9 - 20_000_000
-
-
 class StutteringReader:
     """Frames at 60 Hz, but for three that never came."""
 
-    rate_hz: float | None = None
+    paced = False
+    rate_hz: float | None = 60.0
+    warnings: tuple[str, ...] = ()
 
     def __init__(self) -> None:
         self.frames = iter([1, 2, 3, 7, 8])
@@ -304,6 +232,9 @@ class StutteringReader:
         if frame is None:
             return None
         return Pictures(picture(0, 0), picture(0, 1), round(frame * 1e9 / 60))
+
+    def interrupt(self) -> None:
+        """It does not wait."""
 
     def close(self) -> None:
         """Nothing to release."""
@@ -320,6 +251,7 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
         retry_s=1.0,
         deliver=lambda pictures, count: lost.append(count),
         fail=lambda error: pytest.fail(str(error)),
+        warn=pytest.fail,
         finish=lambda pairs: ended.set(),
     )
     thread.start()
@@ -351,6 +283,7 @@ def test_an_error_inside_opencv_is_a_device_error_and_tried_again(scene: Scene) 
         retry_s=0.001,
         deliver=lambda pictures, count: pytest.fail("nothing to deliver"),
         fail=fail,
+        warn=pytest.fail,
         finish=lambda pairs: pytest.fail("not finished"),
     )
     thread.start()

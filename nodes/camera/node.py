@@ -3,30 +3,43 @@
 from __future__ import annotations
 
 import asyncio
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, Literal
+
+from pydantic import Field
 
 from messages.base import Header
 from messages.scene import Positive, Scene, StereoCamera
 from messages.types import StereoPair
-from nodes.camera.devices import (
-    AnySource,
+from nodes.camera.devices import ReaderThread, open_reader
+from nodes.camera.pictures import (
     DeviceError,
     Pictures,
-    ReaderThread,
-    TwinSource,
+    Regions,
     check_size,
-    open_reader,
+    cut,
+    pair_of,
+    pictures_of,
+    too_skewed,
 )
+from nodes.camera.region import ExplicitRegions, wanted_regions
+from nodes.camera.sources import AnySource, TwinSource
 from nodes.node import Input, Node, NodeParameters, Output
 
 JOIN_S = 3.0
 
 
 class CameraParameters(NodeParameters):
-    """source: where pictures come from.  retry_s: first pause after a device failed."""
+    """Where pictures come from, and which of them are published."""
 
     source: AnySource = TwinSource()
-    retry_s: Positive = 1.0
+    retry_s: Positive = Field(default=1.0, description="first pause after a device failed")
+    max_skew_s: Positive | None = Field(
+        default=None, description="pairs further apart are refused; null: none"
+    )
+    region: Literal["full", "finger"] | ExplicitRegions = Field(
+        default="full", description="part of each view to publish; finger: where one can be"
+    )
 
 
 class Camera(Node):
@@ -39,67 +52,84 @@ class Camera(Node):
     twin__stereo: Input[StereoPair]
     stereo: Output[StereoPair]
 
+    camera: StereoCamera | None = None
+    regions: Regions | None = None
     reader: ReaderThread | None = None
     waiting: tuple[Pictures, int] | None = None
-    dropped = 0
+    warned: tuple[str, ...] = ()
+    superseded = refused = 0
 
     async def close(self) -> None:
         await self._stop_reading()
 
     async def on_scene(self, scene: Scene, header: Header) -> None:
+        await self._stop_reading()
+        self.camera, self.warned = None, ()
+        regions = self.regions = wanted_regions(self.parameters.region, scene)
+        camera = self.camera = scene.camera
         if self.parameters.source.kind == "twin":
             return
-        await self._stop_reading()
-        loop, camera = asyncio.get_running_loop(), scene.camera
+        loop = asyncio.get_running_loop()
+
+        def later(call: Callable[..., None], *arguments: object) -> None:
+            loop.call_soon_threadsafe(call, *arguments)
 
         def deliver(pictures: Pictures, lost: int) -> None:
             if self.waiting is not None:
-                self.dropped += 1
+                self.superseded += 1
             self.waiting = (pictures, lost)
-            loop.call_soon_threadsafe(self._publish_newest, camera)
+            later(self._publish_newest, camera)
 
         self.reader = ReaderThread(
-            lambda: open_reader(self.parameters.source, camera, self.clock.now_ns),
+            lambda: open_reader(self.parameters.source, camera, self.clock.now_ns, regions),
             camera=camera,
+            regions=regions,
             name=f"{self.name} {self.parameters.source.kind}",
             now=self.clock.now_ns,
             retry_s=self.parameters.retry_s,
             deliver=deliver,
-            fail=lambda error: self._tell(loop, error),
-            finish=lambda pairs: self._tell(loop, pairs),
+            fail=lambda error: later(self._tell_failure, error),
+            warn=lambda text: later(self._tell_warning, text),
+            finish=lambda pairs: later(setattr, self, "note", f"ended after {pairs} pairs"),
         )
         self.reader.start()
 
-    def _tell(self, loop: asyncio.AbstractEventLoop, news: DeviceError | int) -> None:
-        """From the reading thread: a failure, or the number of pairs after which they ended."""
-        if isinstance(news, DeviceError):
-            loop.call_soon_threadsafe(self.report_error, "source", news)
-            loop.call_soon_threadsafe(setattr, self, "note", f"no pictures: {news}")
-        else:
-            loop.call_soon_threadsafe(setattr, self, "note", f"ended after {news} pairs")
+    def _tell_failure(self, error: DeviceError) -> None:
+        self.report_error("source", error)
+        self.note = f"no pictures: {error}"
+
+    def _tell_warning(self, text: str) -> None:
+        """Once for each scene, however often the device is opened anew."""
+        if text not in self.warned:
+            self.warned = (*self.warned, text)
+            self.report_error("source", DeviceError(text))
 
     def _publish_newest(self, camera: StereoCamera) -> None:
         waiting, self.waiting = self.waiting, None
-        if waiting is None:
-            return
-        pictures, lost = waiting
-        pair = StereoPair(
-            device=camera.device,
-            exposure_s=camera.exposure_s,
-            dropped_frames=self.dropped + lost,
-            left=pictures.left,
-            right=pictures.right,
-        )
-        self.stereo.publish(pair, source_ns=pictures.exposure_ns)
-        self.note = f"{camera.device}, {pair.dropped_frames} frames lost"
+        if waiting is not None:
+            pictures, lost = waiting
+            self._publish(pictures, camera.device, camera.exposure_s, self.superseded + lost)
 
     def on_twin__stereo(self, pair: StereoPair, header: Header) -> None:
-        if self.parameters.source.kind != "twin" or self.scene.message is None:
+        if self.parameters.source.kind != "twin" or self.camera is None:
             return
-        pictures = Pictures(pair.left, pair.right, header.source_ns)
-        check_size(pictures, self.scene.message.camera, "twin/stereo")
-        self.stereo.publish(pair, source_ns=header.source_ns)
-        self.note = f"{pair.device}, {pair.dropped_frames} frames lost"
+        pictures = pictures_of(pair, header.source_ns)
+        check_size(pictures, self.camera, "twin/stereo")
+        if self.regions is not None:
+            pictures = cut(pictures, self.regions)
+        self._publish(pictures, pair.device, pair.exposure_s, pair.dropped_frames)
+
+    def _publish(self, pictures: Pictures, device: str, exposure_s: float, lost: int) -> None:
+        """exposure_s: where the device does not tell it.  lost: frames, beside those refused."""
+        limit_s = self.parameters.max_skew_s
+        if limit_s is not None and abs(pictures.skew_s) > limit_s:
+            self.refused += 1
+            self.note = f"{self.refused} pairs refused: {too_skewed(pictures.skew_s, limit_s)}"
+            return
+        pair = pair_of(pictures, device, exposure_s, lost + self.refused)
+        self.stereo.publish(pair, source_ns=pictures.exposure_ns)
+        facts = (device, f"{pair.dropped_frames} frames lost", *pictures.notes, *self.warned)
+        self.note = "; ".join(facts)
 
     async def _stop_reading(self) -> None:
         reader, self.reader = self.reader, None

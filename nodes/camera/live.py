@@ -1,0 +1,281 @@
+"""Live cameras: one thread each, so that each frame is stamped as it arrives."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+
+from messages.scene import StereoCamera
+from nodes.camera.pictures import (
+    DeviceError,
+    Image,
+    Now,
+    Pictures,
+    Region,
+    Regions,
+    gray,
+    halves,
+)
+from nodes.camera.settings import choose_backend, fix_settings, set_format, set_region
+from nodes.camera.sources import OpenCvSource
+from nodes.camera.stamps import Pairing, StampJudge
+
+WAITING = 4
+"""Frames that wait for their partner; a camera further ahead loses its oldest."""
+FIRST_S = 5.0
+"""The first frame may take longer than `silence_s`: cameras start their sensors then."""
+RELEASE_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One camera's picture and the middle of its exposure, ns, reckoned from the picture's arrival
+
+    and, where it is believed, from the driver's stamp.
+    """
+
+    image: Image
+    by_arrival_ns: int
+    by_stamp_ns: int | None
+
+
+def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
+    """Raises DeviceError for what OpenCV cannot open."""
+    capture = cv2.VideoCapture(device, api)
+    if not capture.isOpened():
+        capture.release()
+        raise DeviceError(
+            f"{device!r}: cannot be opened: not there, in use, or not a camera or video"
+        )
+    return capture
+
+
+class Stream(threading.Thread):
+    """Takes one camera's frames as they come; `changed` is notified of each, and of the end.
+
+    It owns the capture and releases it: OpenCV does not survive a release during a grab, and a grab
+    may hang.
+    """
+
+    def __init__(
+        self,
+        device: int | str,
+        source: OpenCvSource,
+        camera: StereoCamera,
+        *,
+        views: int,
+        wanted: Region | None,
+        now: Now,
+        changed: threading.Condition,
+    ) -> None:
+        """Opens the device and sets it up.  Raises DeviceError.
+
+        views: 2 where one picture holds both views.  wanted: what to read of the sensor.
+        """
+        super().__init__(name=f"camera {device}", daemon=True)
+        self.device = device
+        self.frames: deque[Frame] = deque(maxlen=WAITING)
+        self.count = 0
+        self.failure: Exception | None = None
+        self._now, self._changed = now, changed
+        self._stopping = threading.Event()
+        backend = choose_backend(device, source.api)
+        self._capture = open_capture(device, backend.api if backend else cv2.CAP_ANY)
+        try:
+            set_format(self._capture, backend, camera, views, source.pixel_format or "")
+            self.region = wanted and set_region(self._capture, backend, wanted, camera)
+            self.settings = fix_settings(self._capture, backend, camera, device)
+        except cv2.error:
+            self._capture.release()
+            raise
+        self.exposure_s = self.settings.exposure_s or camera.exposure_s
+        self._judge = StampJudge() if backend is not None and backend.clock else None
+        to_stamp_s, to_grab_s = (
+            0.5 * self.exposure_s if delay_s is None else delay_s
+            for delay_s in (source.exposure_to_stamp_s, source.exposure_to_grab_s)
+        )
+        self._to_stamp_ns, self._to_grab_ns = round(1e9 * to_stamp_s), round(1e9 * to_grab_s)
+
+    @property
+    def believed(self) -> bool:
+        """Whether the driver's stamps are."""
+        return self._judge is not None and self._judge.believed
+
+    def stop(self) -> None:
+        """Ask the thread to end after the frame that it waits for."""
+        self._stopping.set()
+        if self.ident is None:
+            self._capture.release()
+
+    def run(self) -> None:
+        try:
+            while not self._stopping.is_set():
+                frame = self._next()
+                if frame is not None:
+                    with self._changed:
+                        self.frames.append(frame)
+                        self.count += 1
+                        self._changed.notify_all()
+        except (DeviceError, cv2.error) as error:
+            with self._changed:
+                self.failure = error
+                self._changed.notify_all()
+        finally:
+            self._capture.release()
+
+    def _next(self) -> Frame | None:
+        """The next frame; None for one whose stamp is a lapse.  Raises DeviceError."""
+        grabbed = self._capture.grab()
+        arrival_ns = self._now()
+        stamp_ns = None
+        if grabbed and self._judge is not None and self._judge.believed:
+            stamp_ns = round(1e6 * self._capture.get(cv2.CAP_PROP_POS_MSEC))
+            if not self._judge.plausible(stamp_ns, arrival_ns):
+                if self._judge.believed:
+                    return None
+                stamp_ns = None
+        image = self._capture.retrieve()[1] if grabbed else None
+        if image is None:
+            raise DeviceError(f"{self.device!r}: gives no more pictures: unplugged, or at its end")
+        by_stamp_ns = None if stamp_ns is None else stamp_ns - self._to_stamp_ns
+        return Frame(gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
+
+
+class CameraReader:
+    """Two cameras that run freely, or one that gives both views side by side.
+
+    The middle of an exposure is the driver's stamp less `exposure_to_stamp_s`, where every camera's
+    driver gives believable stamps, otherwise the arrival less `exposure_to_grab_s`.
+    """
+
+    paced = False
+
+    def __init__(
+        self, source: OpenCvSource, camera: StereoCamera, now: Now, wanted: Regions | None = None
+    ) -> None:
+        self._source, self._now = source, now
+        self._changed = threading.Condition()
+        self._streams: list[Stream] = []
+        self._interrupted = False
+        devices = [device for device in (source.left, source.right) if device is not None]
+        alone = len(devices) == 1
+        try:
+            for index, device in enumerate(devices):
+                stream = Stream(
+                    device,
+                    source,
+                    camera,
+                    views=2 if alone else 1,
+                    # A picture that holds both views cannot begin at two places.
+                    wanted=None if wanted is None or alone else wanted[index],
+                    now=now,
+                    changed=self._changed,
+                )
+                self._streams.append(stream)
+        except (DeviceError, cv2.error):
+            self.close()
+            raise
+        settings = [stream.settings for stream in self._streams]
+        self.warnings: tuple[str, ...] = tuple(text for each in settings for text in each.warnings)
+        rate_hz = min(each.rate_hz for each in settings)
+        self.rate_hz: float | None = rate_hz
+        self._pairing = Pairing(1.0 / rate_hz)
+        self._regions: Regions | None = None
+        if any(stream.region is not None for stream in self._streams):
+            whole = Region(0, 0, camera.width_px, camera.height_px)
+            left, right = (stream.region or whole for stream in self._streams)
+            self._regions = left, right
+        self._wait_s = max(FIRST_S, source.silence_s)
+        for stream in self._streams:
+            stream.start()
+
+    def read(self) -> Pictures | None:
+        """See `Reader`."""
+        with self._changed:
+            counts = [stream.count for stream in self._streams]
+            limit_ns = self._now() + round(1e9 * self._wait_s)
+            while not self._interrupted:
+                frames = self._take()
+                if frames is not None:
+                    break
+                for stream in self._streams:
+                    if stream.failure is not None:
+                        raise stream.failure
+                left_s = (limit_ns - self._now()) * 1e-9
+                if left_s <= 0.0:
+                    raise DeviceError(self._silence(counts))
+                self._changed.wait(left_s)
+            else:
+                return None
+        self._wait_s = self._source.silence_s
+        return self._pictures(frames)
+
+    def _by_stamp(self) -> bool:
+        """Whether the drivers' stamps count: two cameras are compared by one kind of stamp only."""
+        return all(stream.believed for stream in self._streams)
+
+    def _moment_ns(self, frame: Frame) -> int:
+        if frame.by_stamp_ns is not None and self._by_stamp():
+            return frame.by_stamp_ns
+        return frame.by_arrival_ns
+
+    def _take(self) -> tuple[Frame, ...] | None:
+        """The next pair, or the next picture with both views; None until there is one."""
+        if len(self._streams) == 1:
+            frames = self._streams[0].frames
+            return (frames.popleft(),) if frames else None
+        left, right = self._streams
+        return self._pairing.take(left.frames, right.frames, self._moment_ns)
+
+    def _pictures(self, frames: tuple[Frame, ...]) -> Pictures:
+        moments_ns = [self._moment_ns(frame) for frame in frames]
+        notes = ["stamped by the driver" if self._by_stamp() else "stamped on arrival"]
+        if len(frames) == 1:
+            left, right = halves(frames[0].image, self._source.left)
+        else:
+            left, right = frames[0].image, frames[1].image
+            notes.append(f"{self._pairing.unpaired} frames without a partner")
+        return Pictures(
+            left,
+            right,
+            sum(moments_ns) // len(moments_ns),
+            exposure_s=max(stream.exposure_s for stream in self._streams),
+            skew_s=(moments_ns[-1] - moments_ns[0]) * 1e-9,
+            regions=self._regions,
+            notes=tuple(notes),
+        )
+
+    def _silence(self, counts: list[int]) -> str:
+        """What to say when no pair came; counts: each camera's frames when the wait began."""
+        silent = [
+            repr(stream.device)
+            for stream, count in zip(self._streams, counts, strict=True)
+            if stream.count == count
+        ]
+        if silent:
+            return (
+                f"{' and '.join(silent)}: no picture for {self._wait_s:g} s: it hangs, or its "
+                "cable or hub is overloaded"
+            )
+        return (
+            f"{self._source.left!r} and {self._source.right!r}: both give pictures, but none "
+            "within half a period of another: do both run at one rate?"
+        )
+
+    def interrupt(self) -> None:
+        """See `Reader`."""
+        with self._changed:
+            self._interrupted = True
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """A camera that hangs in a grab keeps its thread, which releases it when the grab ends."""
+        for stream in self._streams:
+            stream.stop()
+        for stream in self._streams:
+            if stream.ident is not None:
+                stream.join(RELEASE_S)
+        self._streams = []

@@ -1,0 +1,193 @@
+"""What every reader of stereo pictures gives: grey pairs with their time, and the errors.
+
+A reader is opened, read from in a thread that may block, and closed.  What goes wrong with a
+device is a `DeviceError`, which may pass when it is tried again; pictures that run out end with
+`None`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, NamedTuple, Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from messages.scene import StereoCamera
+from messages.types import StereoPair
+
+Image = NDArray[np.uint8]
+Now = Callable[[], int]
+
+
+class DeviceError(RuntimeError):
+    """A device or file that cannot be read; the message names it and what to do."""
+
+
+class Region(NamedTuple):
+    """A part of the sensor, in pixels; column and row of its first pixel count from zero."""
+
+    column: Annotated[int, Field(ge=0)]
+    row: Annotated[int, Field(ge=0)]
+    width: Annotated[int, Field(gt=0)]
+    height: Annotated[int, Field(gt=0)]
+
+    def holds(self, other: Region) -> bool:
+        return (
+            self.column <= other.column
+            and self.row <= other.row
+            and self.column + self.width >= other.column + other.width
+            and self.row + self.height >= other.row + other.height
+        )
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height} px at ({self.column}, {self.row})"
+
+
+Regions = tuple[Region, Region]
+"""Of the left view and of the right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """A pair and when it was taken: the middle between the middles of both exposures.
+
+    exposure_ns: by the clock that the reader was given; of a paced reader (files), by the file's
+    own time from its beginning.  exposure_s: as the device has it; None: not known.
+    skew_s: exposure of the right picture minus that of the left.
+    regions: parts of the sensors that the pictures show; None: all.
+    notes: how they were taken, for people.
+    """
+
+    left: Image
+    right: Image
+    exposure_ns: int
+    exposure_s: float | None = None
+    skew_s: float = 0.0
+    regions: Regions | None = None
+    notes: tuple[str, ...] = ()
+
+
+class Reader(Protocol):
+    """paced: the pictures come as fast as they are read, and are to be shown by their own time.
+
+    rate_hz: of a device, what its frames are counted against; files have none.
+    warnings: what the device does not do as the scene asks; known once it is open.
+    """
+
+    paced: bool
+    rate_hz: float | None
+    warnings: tuple[str, ...]
+
+    def read(self) -> Pictures | None:
+        """The next pair, waiting for it; None when there are no more.  Raises DeviceError."""
+        ...
+
+    def interrupt(self) -> None:
+        """From any thread: a `read` that waits, and each that follows, returns None soon."""
+        ...
+
+    def close(self) -> None: ...
+
+
+def pair_of(pictures: Pictures, device: str, exposure_s: float, dropped_frames: int) -> StereoPair:
+    """The message that tells of the pictures; exposure_s: where the device does not tell it."""
+    origins = [(region.column, region.row) for region in pictures.regions or ()] or [(0, 0)] * 2
+    return StereoPair(
+        device=device,
+        exposure_s=exposure_s if pictures.exposure_s is None else pictures.exposure_s,
+        skew_s=pictures.skew_s,
+        dropped_frames=dropped_frames,
+        left_origin_px=origins[0],
+        right_origin_px=origins[1],
+        left=pictures.left,
+        right=pictures.right,
+    )
+
+
+def pictures_of(pair: StereoPair, exposure_ns: int) -> Pictures:
+    """The pictures of a published pair."""
+    origins = (pair.left_origin_px, pair.right_origin_px)
+    left, right = (
+        Region(*origin, image.shape[1], image.shape[0])
+        for origin, image in zip(origins, (pair.left, pair.right), strict=True)
+    )
+    return Pictures(
+        pair.left,
+        pair.right,
+        exposure_ns,
+        exposure_s=pair.exposure_s,
+        skew_s=pair.skew_s,
+        regions=(left, right) if any(origin != (0, 0) for origin in origins) else None,
+    )
+
+
+def too_skewed(skew_s: float, limit_s: float) -> str:
+    """What to tell people of a pair that was refused."""
+    return (
+        f"skew {1e3 * skew_s:.1f} ms, at most {1e3 * limit_s:g} ms wanted; cameras that run freely "
+        "keep their skew until they are started anew, a common trigger has none"
+    )
+
+
+def gray(image: NDArray[Any]) -> Image:
+    """A decoded picture as grey (h, w): grey or luma first (h, w, 1 or 2), or blue-green-red."""
+    if image.ndim == 3:
+        image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    return np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def halves(image: Image, name: object) -> tuple[Image, Image]:
+    """Both views of a side-by-side picture (h, 2w); raises DeviceError for an odd width."""
+    if image.shape[1] % 2:
+        raise DeviceError(
+            f"{name}: side-by-side picture of odd width {image.shape[1]}; name the right device too"
+        )
+    middle = image.shape[1] // 2
+    return np.ascontiguousarray(image[:, :middle]), np.ascontiguousarray(image[:, middle:])
+
+
+def check_size(pictures: Pictures, camera: StereoCamera, name: object) -> None:
+    """Raises DeviceError unless each view has the size of its region, or of the scene's camera."""
+    whole = Region(0, 0, camera.width_px, camera.height_px)
+    regions = pictures.regions or (whole, whole)
+    views = (("left", pictures.left, regions[0]), ("right", pictures.right, regions[1]))
+    for side, image, region in views:
+        if image.shape != (region.height, region.width):
+            wanted = (
+                f"the scene's camera {camera.device} has {region.width}x{region.height} px"
+                if pictures.regions is None
+                else f"its region is {region}"
+            )
+            raise DeviceError(
+                f"{name}: {side} view of {image.shape[1]}x{image.shape[0]} px, {wanted}: correct "
+                "the scene or the source"
+            )
+
+
+def cut(pictures: Pictures, wanted: Regions) -> Pictures:
+    """The wanted regions of pictures that `check_size` has passed.
+
+    Raises DeviceError where the pictures do not show all of them.
+    """
+    if pictures.regions == wanted:
+        return pictures
+    images = []
+    shown = pictures.regions
+    for index, (image, region) in enumerate(
+        zip((pictures.left, pictures.right), wanted, strict=True)
+    ):
+        has = Region(0, 0, image.shape[1], image.shape[0]) if shown is None else shown[index]
+        if not has.holds(region):
+            side = ("left", "right")[index]
+            raise DeviceError(f"the {side} region is {region}, the picture only {has}: correct it")
+        row, column = region.row - has.row, region.column - has.column
+        part = image[row : row + region.height, column : column + region.width]
+        images.append(np.ascontiguousarray(part))
+    note = "regions cut from " + ("whole pictures" if shown is None else "what the device reads")
+    return replace(
+        pictures, left=images[0], right=images[1], regions=wanted, notes=(*pictures.notes, note)
+    )

@@ -1,0 +1,109 @@
+"""Which part of each sensor can show the finger: its volume as the scene's optics project it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from messages.scene import Lens, Scene
+from nodes.camera.pictures import DeviceError, Region, Regions
+from nodes.models import camera, rigid
+
+Floats = NDArray[np.float64]
+
+GRID = 17
+"""Points along each edge of the volume: a lens bends its image, but by little between two."""
+MARGIN_PX = 16.0
+"""For the blur of the mark and for a calibration that differs from the scene's optics."""
+ALIGN_PX = (16, 2)
+"""Columns and rows that sensors can begin a region at."""
+NEAREST_M = 1e-3
+
+
+class ExplicitRegions(BaseModel):
+    """Regions as a launch file gives them: [column, row, width, height] in pixels for each view."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    left: Region
+    right: Region
+
+
+def volume_points(low_m: Floats, high_m: Floats) -> Floats:
+    """A grid of points (n, 3) that fills the box between two corners (3,)."""
+    axes = [np.linspace(low, high, GRID) for low, high in zip(low_m, high_m, strict=True)]
+    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+
+
+def seen_region(points_camera: Floats, lens: Lens, width_px: int, height_px: int) -> Region | None:
+    """The part of a sensor that shows points (n, 3) of the camera's frame, m; None where none do.
+
+    Beyond the picture's corners a lens's polynomial means nothing and may fold back: points out
+    there are drawn in to the circle through the farthest corner, which changes nothing inside.  A
+    volume that reaches behind the camera fills the picture.
+    """
+    in_front = points_camera[points_camera[:, 2] > NEAREST_M]
+    if len(in_front) == 0:
+        return None
+    if len(in_front) < len(points_camera):
+        return Region(0, 0, width_px, height_px)
+    matrix = camera.camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
+    distortion = np.array(lens.distortion)
+    right, bottom = width_px - 1.0, height_px - 1.0
+    corners = np.array([[0.0, 0.0], [right, 0.0], [0.0, bottom], [right, bottom]])
+    radius = np.linalg.norm(camera.normalize(corners, matrix, distortion), axis=1).max()
+    rays = in_front / in_front[:, 2:]
+    lengths = np.linalg.norm(rays[:, :2], axis=1)
+    rays[:, :2] *= np.minimum(1.0, radius / np.maximum(lengths, 1e-12))[:, None]
+    pixels = camera.project(rays, matrix, distortion)
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    size = np.array([width_px, height_px])
+    if np.any(high < 0.0) or np.any(low > size - 1):
+        return None
+    align = np.array(ALIGN_PX)
+    begin = np.maximum(np.floor((low - MARGIN_PX) / align) * align, 0).astype(int)
+    end = np.minimum(np.ceil((high + MARGIN_PX + 1) / align) * align, size).astype(int)
+    return Region(int(begin[0]), int(begin[1]), int(end[0] - begin[0]), int(end[1] - begin[1]))
+
+
+def finger_regions(scene: Scene) -> Regions:
+    """Where each view can show a fingertip: the finger's volume, wider by its radius, and a margin.
+
+    Raises DeviceError for a view that sees none of it.
+    """
+    finger, rig = scene.finger, scene.camera
+    low = np.asarray(finger.volume_min_m) - finger.radius_m
+    high = np.asarray(finger.volume_max_m) + finger.radius_m
+    pose = rig.world_from_left
+    left_from_world = rigid.inverse(rigid.transform_from_rpy(pose.position_m, pose.rpy_rad))
+    in_left = rigid.apply(left_from_world, volume_points(low, high))
+    in_right = rigid.apply(np.asarray(rig.right_from_left), in_left)
+    found = []
+    for side, points, lens in (("left", in_left, rig.left), ("right", in_right, rig.right)):
+        region = seen_region(points, lens, rig.width_px, rig.height_px)
+        if region is None:
+            raise DeviceError(
+                f"the {side} view shows nothing of finger.volume: correct it or "
+                f"camera.world_from_left in the scene {scene.name}, or read the region full"
+            )
+        found.append(region)
+    return found[0], found[1]
+
+
+def wanted_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None:
+    """The regions to publish; None: all of both sensors.  Raises DeviceError.
+
+    asked: "full", "finger", or regions, which must lie on the sensor.
+    """
+    if asked == "full":
+        return None
+    if not isinstance(asked, ExplicitRegions):
+        return finger_regions(scene)
+    whole = Region(0, 0, scene.camera.width_px, scene.camera.height_px)
+    for side, region in (("left", asked.left), ("right", asked.right)):
+        if not whole.holds(region):
+            raise DeviceError(
+                f"region.{side}: {region} is not on the sensor of {whole.width}x{whole.height} px"
+            )
+    return asked.left, asked.right

@@ -1,0 +1,91 @@
+"""The parameter `source`: which device or files a camera node reads."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+from messages.scene import Finite, NonNegative, Positive
+
+
+class Source(BaseModel):
+    """A kind of device, as the parameter `source` names it."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class TwinSource(Source):
+    """The twin's pixels, from the topic twin/stereo."""
+
+    kind: Literal["twin"] = "twin"
+
+
+class OpenCvSource(Source):
+    """Cameras that OpenCV opens: by number, by path, or by a stream's address.
+
+    Two cameras without a common trigger see a moving finger at two times (`docs/camera.md`).  One
+    device that gives both views has no such trouble.
+    """
+
+    kind: Literal["opencv"]
+    left: int | str = Field(description="the left camera, or the one that gives both side by side")
+    right: int | str | None = Field(default=None, description="null: left gives both side by side")
+    api: Literal["v4l2", "ximea", "aravis", "any"] | None = Field(
+        default=None,
+        description="OpenCV's backend; null: v4l2 for numbers and paths under /dev, else any",
+    )
+    pixel_format: Annotated[str, Field(min_length=4, max_length=4)] | None = Field(
+        default=None, description='four characters, such as "MJPG"; null: as OpenCV chooses'
+    )
+    exposure_to_stamp_s: Finite | None = Field(
+        default=None,
+        description="from mid-exposure to the driver's stamp, negative where the driver stamps the "
+        "beginning of the exposure; null: half the exposure",
+    )
+    exposure_to_grab_s: NonNegative | None = Field(
+        default=None,
+        description="from mid-exposure to the picture's arrival, for devices whose driver gives no "
+        "usable stamps; null: half the exposure",
+    )
+    silence_s: Positive = Field(
+        default=1.0, description="without a pair for so long, the device is opened anew"
+    )
+
+
+class VideoSource(Source):
+    """One video file with both views side by side, or two."""
+
+    kind: Literal["video"]
+    left: Path
+    right: Path | None = Field(default=None, description="null: left holds both side by side")
+    rate_hz: Positive | None = Field(default=None, description="null: the files' own frame times")
+    loop: bool = False
+
+
+class ImagesSource(Source):
+    """Image files, in the order of their sorted names."""
+
+    kind: Literal["images"]
+    left: Path = Field(description="a pattern: pictures/left*.png")
+    right: Path
+    times: Path | None = Field(
+        default=None, description="CSV file with a column t_s, one row a pair; null: even times"
+    )
+    rate_hz: Positive | None = Field(
+        default=None, description="where there are no times; null: the scene's camera rate"
+    )
+    loop: bool = False
+
+
+def _kind_alone(source: object) -> object:
+    """Lets a launch file write `source: twin` for a source that needs nothing but its kind."""
+    return {"kind": source} if isinstance(source, str) else source
+
+
+AnySource = Annotated[
+    TwinSource | OpenCvSource | VideoSource | ImagesSource,
+    Field(discriminator="kind"),
+    BeforeValidator(_kind_alone),
+]
