@@ -189,15 +189,19 @@ DESIGNS = (
 IMAGES = np.random.default_rng(0).integers(0, 255, (2, 480, 640), np.uint8)
 POINT = np.array([0.01, 0.02, 0.03])
 COVARIANCE = np.eye(6)
+AHEAD = np.zeros((13, 3))
 
 
 def fingertip(number: int) -> Fingertip:
     return Fingertip(
         valid=True,
+        state="tracking",
         reason="ok",
         position_world_m=POINT,
         velocity_world_m_per_s=POINT,
         covariance=COVARIANCE,
+        ahead_world_m=AHEAD,
+        ahead_step_s=0.01,
         measured_world_m=POINT,
         reprojection_px=0.1,
     )

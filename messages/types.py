@@ -55,22 +55,46 @@ class StereoPair(Message):
 
 
 FingertipReason = Literal[
-    "ok", "no_mark", "mark_in_one_view", "two_marks", "outside_volume", "too_fast", "inconsistent"
+    "ok",
+    "no_mark",
+    "mark_in_one_view",
+    "two_marks",
+    "merged",
+    "blurred",
+    "saturated",
+    "outside_volume",
+    "inconsistent",
+    "too_fast",
+    "unconfirmed",
 ]
+"""Why a picture gave no fingertip: nothing like a mark in it; in one view only; several that could
+be it; a mark that runs into another light; too far out of focus; too bright to tell; beyond where a
+finger can be; two views that are not of one point; faster than a finger; not yet seen often enough
+to begin a track with."""
+
+FingertipState = Literal["lost", "acquiring", "tracking", "coasting"]
+"""Of the track: there is none; it is too young to be trusted; this picture confirmed it; this one
+did not, and it is carried on for a while."""
 
 
 class Fingertip(Message):
-    """Where the fingertip is, at the exposure.
+    """Where the fingertip is at the exposure, and where it will be.
 
-    When `valid` is false, `reason` says why and the tracked state is the last good one.
-    `measured_world_m` is this picture's triangulated point, without any filter.
+    When `valid` is false, `reason` says why and the tracked state is the last good one, carried on
+    while `state` is "coasting".  `measured_world_m` is this picture's triangulated point, without
+    any filter.
     """
 
     valid: bool
+    state: FingertipState
     reason: FingertipReason
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
     covariance: Matrix6 = Field(description="of (position, velocity), m and m/s")
+    ahead_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
+        description="where the finger is predicted to be at the exposure and every step after it"
+    )
+    ahead_step_s: Positive
     measured_world_m: Vector3
     reprojection_px: NonNegative
 

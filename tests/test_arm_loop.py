@@ -26,6 +26,7 @@ from nodes.models.sheet import sheet_from_edges
 from nodes.planner.node import Planner, PlannerParameters
 from nodes.twin.arms import STATE_MOVING, STATE_STOPPED
 from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
+from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -36,15 +37,7 @@ def paper_scene() -> Scene:
 
 
 def finger_at(position: Floats, velocity: Floats, *, valid: bool = True) -> Fingertip:
-    return Fingertip(
-        valid=valid,
-        reason="ok" if valid else "no_mark",
-        position_world_m=position,
-        velocity_world_m_per_s=velocity,
-        covariance=np.eye(6) * 1e-8,
-        measured_world_m=position,
-        reprojection_px=0.1,
-    )
+    return fingertip(position, velocity, reason="ok" if valid else "no_mark")
 
 
 @dataclass

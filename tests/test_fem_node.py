@@ -20,6 +20,7 @@ from messages.topics import Topic
 from messages.types import Fingertip, Skin, SoftBody
 from nodes.fem_solver import precompute
 from nodes.fem_solver.node import FemSolver, FemSolverParameters
+from tests.fingertips import fingertip as even_fingertip
 
 SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 
@@ -41,14 +42,10 @@ def fingertip(
     valid: bool = True,
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Fingertip:
-    return Fingertip(
-        valid=valid,
+    return even_fingertip(
+        np.array(position, dtype=np.float64),
+        np.array(velocity, dtype=np.float64),
         reason="ok" if valid else "no_mark",
-        position_world_m=np.array(position, dtype=np.float64),
-        velocity_world_m_per_s=np.array(velocity, dtype=np.float64),
-        covariance=np.eye(6),
-        measured_world_m=np.array(position, dtype=np.float64),
-        reprojection_px=0.1,
     )
 
 

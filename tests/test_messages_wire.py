@@ -21,6 +21,7 @@ from messages.scene import Scene
 from messages.topics import TOPICS, Topic
 from messages.types import EStop, Fingertip, Frame, PortStatus, Skin, Status, StereoPair
 from messages.wire import PROTOCOL, WireError, codec_of, decode, encode, size_of
+from tests.fingertips import fingertip
 
 HEADER = Header(3, 1_000, 2_000, "host-1234abcd", "triangulator", 77)
 SCENE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -36,10 +37,13 @@ def vectors(*shape: int) -> st.SearchStrategy[Any]:
 fingertips = st.builds(
     Fingertip,
     valid=st.booleans(),
+    state=st.sampled_from(["lost", "acquiring", "tracking", "coasting"]),
     reason=st.sampled_from(["ok", "no_mark", "too_fast"]),
     position_world_m=vectors(3),
     velocity_world_m_per_s=vectors(3),
     covariance=vectors(6, 6),
+    ahead_world_m=vectors(5, 3),
+    ahead_step_s=st.floats(1e-6, 10.0),
     measured_world_m=vectors(3),
     reprojection_px=positive,
 )
@@ -163,17 +167,9 @@ def test_large_arrays_are_not_copied() -> None:
 
 @pytest.mark.parametrize("inline_bytes", [0, 1024])
 def test_received_arrays_are_read_only_and_aligned(inline_bytes: int) -> None:
-    tip = Fingertip(
-        valid=True,
-        reason="ok",
-        position_world_m=np.ones(3),
-        velocity_world_m_per_s=np.ones(3),
-        covariance=np.eye(6),
-        measured_world_m=np.ones(3),
-        reprojection_px=0.0,
-    )
+    tip = fingertip(np.ones(3), np.ones(3))
     writable = [bytearray(frame) for frame in encode(tip, HEADER, inline_bytes=inline_bytes)]
-    back, _ = decode([memoryview(frame) for frame in writable], Fingertip)
+    back, _ = decode([memoryview(frame) for frame in writable], type(tip))
     for array in (back.position_world_m, back.covariance):
         assert array.flags.aligned
         with pytest.raises(ValueError, match="read-only"):
@@ -298,10 +294,13 @@ def test_causes_are_told_apart() -> None:
 def test_non_finite_arrays_are_refused(value: float) -> None:
     tip = Fingertip.model_construct(
         valid=True,
+        state="tracking",
         reason="ok",
         position_world_m=np.array([0.0, value, 0.0]),
         velocity_world_m_per_s=np.zeros(3),
         covariance=np.zeros((6, 6)),
+        ahead_world_m=np.zeros((2, 3)),
+        ahead_step_s=0.01,
         measured_world_m=np.zeros(3),
         reprojection_px=0.0,
     )

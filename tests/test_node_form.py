@@ -25,6 +25,7 @@ from nodes.node import (
     timers_of,
 )
 from nodes.runner import end_tasks, status_of
+from tests.fingertips import fingertip as even_fingertip
 
 
 class EchoParameters(NodeParameters):
@@ -66,15 +67,7 @@ class Echo(Node):
 
 
 def fingertip() -> Fingertip:
-    return Fingertip(
-        valid=True,
-        reason="ok",
-        position_world_m=np.zeros(3),
-        velocity_world_m_per_s=np.zeros(3),
-        covariance=np.eye(6),
-        measured_world_m=np.zeros(3),
-        reprojection_px=0.0,
-    )
+    return even_fingertip(np.zeros(3))
 
 
 def header(sequence: int, clock_id: str = "virtual") -> Header:

@@ -17,13 +17,14 @@ from messages.base import Header, Message
 from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
-from messages.types import Fingertip, FingertipReason, SheetTarget, SoftBody
+from messages.types import FingertipReason, SheetTarget, SoftBody
 from nodes.models.rigid import inverse, moved, transform_from_rpy, twist_between
 from nodes.models.shapes import CylinderShape
 from nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
 from nodes.planner.compliance import RESERVE, compliance_for, stretch_range
 from nodes.planner.node import Planner, PlannerParameters
 from nodes.planner.rolling import Encounter, Reach, sheet_on_cylinder, sheet_twist
+from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -80,15 +81,7 @@ class Table:
         age_ns: int = 5_000_000,
     ) -> SheetTarget:
         self.now_ns += after_ns
-        message = Fingertip(
-            valid=reason == "ok",
-            reason=reason,
-            position_world_m=position,
-            velocity_world_m_per_s=np.zeros(3) if velocity is None else velocity,
-            covariance=np.eye(6),
-            measured_world_m=position,
-            reprojection_px=0.0,
-        )
+        message = fingertip(position, velocity, reason=reason)
         await self.planner.step("fingertip", message, self.header(age_ns))
         assert self.planner.errors == 0, self.planner.last_error
         return self.sent[-1]
@@ -110,13 +103,9 @@ async def test_nothing_is_sent_before_the_scene() -> None:
     await desk.planner.setup()
     await desk.planner.step(
         "fingertip",
-        Fingertip(
-            valid=True, reason="ok", position_world_m=np.zeros(3),
-            velocity_world_m_per_s=np.zeros(3), covariance=np.eye(6),
-            measured_world_m=np.zeros(3), reprojection_px=0.0,
-        ),
+        fingertip(np.zeros(3)),
         desk.header(),
-    )  # fmt: skip
+    )
     assert desk.sent == []
 
 

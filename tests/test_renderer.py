@@ -14,7 +14,7 @@ from messages.base import Header, Message
 from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
-from messages.types import ArmState, Display, Fingertip, Frame, SheetTarget, Skin, SoftBody
+from messages.types import ArmState, Display, Frame, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses, flange_pose
 from nodes.renderer import gl
@@ -24,6 +24,7 @@ from nodes.renderer.node import Renderer, RendererParameters
 from nodes.renderer.output import pack
 from nodes.renderer.stage import Stage, sheet_between, transform_of
 from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
+from tests.fingertips import fingertip
 
 ROOT = Path(__file__).parents[1]
 MS = 1_000_000
@@ -306,15 +307,7 @@ class Bench:
             await self.step(f"arm_{side}", arm_state(side, flange), age_ms=age_ms)
 
     async def finger(self, *tip: float, age_ms: float = 4.0, valid: bool = True) -> None:
-        message = Fingertip(
-            valid=valid,
-            reason="ok" if valid else "no_mark",
-            position_world_m=np.array(tip),
-            velocity_world_m_per_s=np.zeros(3),
-            covariance=np.eye(6),
-            measured_world_m=np.array(tip),
-            reprojection_px=0.1,
-        )
+        message = fingertip(np.array(tip), reason="ok" if valid else "no_mark")
         await self.step("fingertip", message, age_ms=age_ms)
 
 

@@ -20,6 +20,7 @@ from nodes.fem_solver.contact import (
 )
 from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from nodes.models import rigid
+from nodes.models.prediction import path_at
 
 Floats = NDArray[np.float64]
 
@@ -144,4 +145,4 @@ def faded(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -
 
 def position_at(fingertip: Fingertip, lead_s: float) -> Floats:
     """Where the fingertip is expected `lead_s` after its exposure, m, world."""
-    return fingertip.position_world_m + lead_s * fingertip.velocity_world_m_per_s
+    return path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, lead_s)[0]

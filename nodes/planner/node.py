@@ -8,6 +8,7 @@ from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import Fingertip, SheetTarget, SoftBody
 from nodes.models.motion import SheetBounds
+from nodes.models.prediction import path_at
 from nodes.node import Input, Node, NodeParameters, Output
 from nodes.planner.compliance import compliance_for
 from nodes.planner.motion import Plan, Planned
@@ -96,9 +97,8 @@ class Planner(Node):
             planned = plan.hold(f"fingertip is {age_s * 1e3:.0f} ms old", step_s)
         else:
             lead_s = self.parameters.lead_s
-            velocity = fingertip.velocity_world_m_per_s
-            ahead = fingertip.position_world_m + velocity * lead_s
-            planned = plan.follow_finger(ahead, velocity, self._stretch_ratio, step_s)
+            point, velocity = path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, lead_s)
+            planned = plan.follow_finger(point, velocity, self._stretch_ratio, step_s)
         self._publish(planned, source_ns)
 
     def _publish(self, planned: Planned, source_ns: int) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.types import ArmState, Fingertip, SheetTarget
+from nodes.models.prediction import path_at
 from nodes.node import Input
 from nodes.renderer.stage import Sheet, Stage, sheet_between, transform_of
 
@@ -61,5 +62,5 @@ class SheetBelief:
         age_s = finger.age_s()
         if finger.message is None or not finger.message.valid or age_s > self._stale_s:
             return None
-        velocity = finger.message.velocity_world_m_per_s
-        return finger.message.position_world_m + (age_s + self._lead_s) * velocity
+        message, lead_s = finger.message, age_s + self._lead_s
+        return path_at(message.ahead_world_m, message.ahead_step_s, lead_s)[0]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from messages.types import FingertipReason
 from nodes.models import rigid
 from nodes.triangulator.mark import Centroid, MarkLooks, find_mark_near
-from nodes.triangulator.tracking import Track
+from nodes.triangulator.tracking import Expected
 from nodes.triangulator.triangulation import Measured, StereoGeometry, Triangulate, measure
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,7 @@ def locate(
     geometry: StereoGeometry,
     eyesight: Eyesight,
     volume: tuple[Floats, Floats],
-    expected: Track | None,
+    expected: Expected | None,
 ) -> tuple[FingertipReason, Measured | None]:
     """Where the mark is in a pair of pictures (height, width), or why that is not known.
 
@@ -47,8 +47,8 @@ def locate(
     is given where the rays meet at all, even when the reason is not "ok".
     """
     places: tuple[Floats | None, Floats | None] = (None, None)
-    if expected is not None and _in_front(geometry, expected.position):
-        places = geometry.project(expected.position)
+    if expected is not None and _in_front(geometry, expected.point):
+        places = geometry.project(expected.point)
     left_marks, right_marks = (
         find_mark_near(image, eyesight.looks, eyesight.centroid, place)
         for image, place in zip((left, right), places, strict=True)

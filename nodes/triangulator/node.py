@@ -11,16 +11,18 @@ from pydantic import Field
 
 from messages.base import Header
 from messages.calibration import StereoCalibration, load_calibration
-from messages.scene import NonNegative, Positive, Scene
+from messages.scene import Positive, Scene
 from messages.types import Fingertip, FingertipReason, StereoPair
 from nodes.node import Input, Node, NodeParameters, Output
+from nodes.triangulator.filters import TRACKING_METHODS
 from nodes.triangulator.fingertip import Eyesight, locate
 from nodes.triangulator.mark import MARK_METHODS, MarkLooks
-from nodes.triangulator.tracking import Tracker, TrackingSettings, with_tremor
+from nodes.triangulator.pairs import refuse_other_pictures
+from nodes.triangulator.tracking import Tracker, TrackingSettings
 from nodes.triangulator.triangulation import TRIANGULATION_METHODS, Measured, StereoGeometry
 
-UNKNOWN = np.diag([1.0] * 3 + [10.0] * 3)
-"""Covariance (m, m/s) before the finger was ever seen."""
+AHEAD_STEP_S = 0.01
+"""Between the points of the predicted path; a swing of 10 Hz is told ten times."""
 
 
 class TriangulatorParameters(NodeParameters):
@@ -39,17 +41,15 @@ class TriangulatorParameters(NodeParameters):
     mark_min_area_px: Annotated[int, Field(ge=1)] = 6
     mark_max_area_px: Annotated[int, Field(ge=1)] = 1500
     window_half_px: Annotated[int, Field(ge=8)] = 28
-    acceleration_noise: Positive = Field(
-        default=0.003, description="of a hand that goes evenly, m/s^2 per root hertz"
-    )
-    tremor_m: NonNegative = Field(
-        default=5e-5, description="standard deviation of a tremor, which the track leaves out"
-    )
-    largest_acceleration_noise: Positive = Field(
-        default=1.0, description="of a hand that starts, stops or turns"
+    tracking: Literal[
+        "none", "exponential", "one_euro", "constant_velocity", "constant_acceleration", "hand"
+    ] = "hand"
+    max_acceleration_m_per_s2: Positive = Field(
+        default=60.0, description="of a finger; marks that go sharper are not followed"
     )
     forget_after_s: Positive = 0.1
     confirm_frames: Annotated[int, Field(ge=1)] = 3
+    ahead_s: Positive = Field(default=0.12, description="how far ahead fingertips are predicted")
 
 
 class Triangulator(Node):
@@ -62,8 +62,8 @@ class Triangulator(Node):
 
     calibration: StereoCalibration | None = None
     geometry: StereoGeometry | None = None
-    newest: tuple[int, int] = (0, 0)
-    out_of_order = 0
+    epoch = 0
+    late = 0
 
     async def setup(self) -> None:
         if self.parameters.calibration is not None:
@@ -88,68 +88,60 @@ class Triangulator(Node):
             noise_px=p.mark_noise_px or method.noise_px,
             max_reprojection_px=p.max_reprojection_px,
         )
+        self.leads_s = np.arange(0.0, p.ahead_s + 1.5 * AHEAD_STEP_S, AHEAD_STEP_S)
         self.tracking = TrackingSettings(
-            acceleration_noise=p.acceleration_noise,
-            largest_acceleration_noise=p.largest_acceleration_noise,
             max_speed_m_per_s=scene.finger.max_speed_m_per_s,
+            max_acceleration_m_per_s2=p.max_acceleration_m_per_s2,
             forget_after_s=p.forget_after_s,
             confirm_frames=p.confirm_frames,
         )
-        self.tracker = Tracker(self.tracking)
+        self.tracker = self._new_tracker()
 
     def on_stereo(self, pair: StereoPair, header: Header) -> None:
         if self.geometry is None:
             return
-        self._refuse_other_pictures(pair, self.geometry)
-        if header.epoch != self.newest[0]:  # the camera was started anew, and its times with it
-            self.tracker = Tracker(self.tracking)
-        elif header.source_ns <= self.newest[1]:
-            self.out_of_order += 1
-            self._note()
-            return
-        self.newest = (header.epoch, header.source_ns)
+        refuse_other_pictures(pair, self.geometry)
+        at_ns = header.source_ns
+        if header.epoch != self.epoch:  # the camera was started anew, and its times with it
+            self.epoch, self.tracker = header.epoch, self._new_tracker()
         reason, measured = locate(
             pair.left,
             pair.right,
             geometry=self.geometry,
             eyesight=self.eyesight,
             volume=self.volume,
-            expected=self.tracker.expected(header.source_ns),
+            expected=self.tracker.expected(at_ns),
         )
-        if reason == "ok":
-            assert measured is not None
-            taken = self.tracker.take(header.source_ns, measured.point_world, measured.covariance)
-            reason = "ok" if taken else "too_fast"
-        self.reasons[reason] += 1
-        self.fingertip.publish(self._message(reason, measured), source_ns=header.source_ns)
+        is_late = self.tracker.is_late(at_ns)
+        if reason == "ok" and measured is not None:
+            reason = self.tracker.take(at_ns, measured.point_world, measured.covariance)
+        if is_late and reason != "ok":  # what it has to tell is in the track; a later one is out
+            self.late += 1
+        else:
+            self.reasons[reason] += 1
+            self.fingertip.publish(self._message(at_ns, reason, measured), source_ns=at_ns)
         self._note()
+
+    def _new_tracker(self) -> Tracker:
+        method = TRACKING_METHODS[self.parameters.tracking]
+        return Tracker(method(self.tracking.max_speed_m_per_s), self.tracking)
 
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
-        self.note = f"{counts}; {self.out_of_order} out of order"
+        self.note = f"{counts}; {self.late} late"
 
-    def _message(self, reason: FingertipReason, measured: Measured | None) -> Fingertip:
-        track = self.tracker.track
-        position = np.zeros(3) if track is None else track.position.copy()
+    def _message(self, at_ns: int, reason: FingertipReason, measured: Measured | None) -> Fingertip:
+        tracker = self.tracker
+        track = tracker.track_at(at_ns, self.leads_s)
         return Fingertip(
             valid=reason == "ok",
+            state=tracker.state(at_ns),
             reason=reason,
-            position_world_m=position,
-            velocity_world_m_per_s=np.zeros(3) if track is None else track.velocity.copy(),
-            covariance=UNKNOWN if track is None else with_tremor(track, self.parameters.tremor_m),
-            measured_world_m=position if measured is None else measured.point_world,
+            position_world_m=track.position,
+            velocity_world_m_per_s=track.velocity,
+            covariance=track.covariance,
+            ahead_world_m=track.ahead,
+            ahead_step_s=AHEAD_STEP_S,
+            measured_world_m=track.position if measured is None else measured.point_world,
             reprojection_px=0.0 if measured is None else measured.reprojection_px,
         )
-
-    def _refuse_other_pictures(self, pair: StereoPair, geometry: StereoGeometry) -> None:
-        if pair.device != geometry.device:
-            raise ValueError(
-                f'pictures of device "{pair.device}", the scene\'s is "{geometry.device}"'
-            )
-        wanted = (geometry.height_px, geometry.width_px)
-        for side, image in (("left", pair.left), ("right", pair.right)):
-            if image.shape != wanted:
-                raise ValueError(
-                    f"{side} picture of {image.shape[1]}x{image.shape[0]} px, "
-                    f"the scene's camera {pair.device} gives {wanted[1]}x{wanted[0]} px"
-                )

@@ -1,181 +1,212 @@
-"""Follows the fingertip from picture to picture: a Kalman filter of constant velocity, with a gate.
+"""Which measured points enter the track: the gate, late ones, loss and how a track begins.
 
-Its process noise is small while the hand goes evenly and grows when it starts, stops or turns.
-
-A state is (position, velocity), 6 numbers in the world frame, m and m/s, with a 6x6 covariance.
+What a track makes of its points is the filter's (`nodes.triangulator.filters`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from messages.types import FingertipState
+from nodes.triangulator.filters import Estimate, Filter
+
 Floats = NDArray[np.float64]
-
-POSITION, VELOCITY = np.arange(3), np.arange(3, 6)
-
-EVEN_MOTION = 12.0
-"""Mean square of the normalised innovation up to which a hand counts as going evenly."""
+Verdict = Literal["ok", "too_fast", "unconfirmed"]
+"""On a measured point: it is of the track; no finger moves so fast; it might begin a track, or came
+after a later one and mends what there is."""
 
 GATE_SIGMAS = 5.0
-"""Measurement noise that the gate forgives on top of a finger's fastest motion."""
-
-
-@dataclass(frozen=True, slots=True)
-class Track:
-    """The estimate at one time: state (6,), covariance (6, 6)."""
-
-    at_ns: int
-    state: Floats
-    covariance: Floats
-
-    @property
-    def position(self) -> Floats:
-        return self.state[:3]
-
-    @property
-    def velocity(self) -> Floats:
-        return self.state[3:]
+"""Errors of measurement and prediction that the gate forgives on top of a finger's motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """How a finger moves.
+    """How a finger moves, and when a track begins and ends.
 
-    acceleration_noise: root of the spectral density of a white acceleration, m/s^2 per root hertz,
-        of a hand that goes evenly.  Tremor is not to be followed: an arm cannot, and a velocity
-        that holds it predicts it the wrong way.
-    largest_acceleration_noise: the same of a hand that starts, stops or turns; see `agility`.
-    max_speed_m_per_s: faster is no finger.
-    forget_after_s: without a measurement for so long the next one starts a new track.
-    confirm_frames: measurements in a row that must agree with one another, but not with the track,
-        before they replace it.
+    max_speed_m_per_s, max_acceleration_m_per_s2: faster or sharper is no finger.
+    forget_after_s: without a point for so long the track is lost.
+    confirm_frames: points in a row that must agree with one another before they begin a track, or
+        take the place of one that they do not agree with.
+    remember_s: how far back a point that comes late can still be put in its place.
     """
 
-    acceleration_noise: float
-    largest_acceleration_noise: float
     max_speed_m_per_s: float
-    forget_after_s: float
-    confirm_frames: int
+    max_acceleration_m_per_s2: float = 60.0
+    forget_after_s: float = 0.1
+    confirm_frames: int = 3
+    remember_s: float = 0.25
 
 
-def started(at_ns: int, measured: Floats, covariance: Floats, max_speed: float) -> Track:
-    """A track from one measurement (3,): at rest, but its velocity as uncertain as a finger's."""
-    full = np.zeros((6, 6))
-    full[:3, :3] = covariance
-    full[3:, 3:] = np.eye(3) * (max_speed / 3.0) ** 2
-    return Track(at_ns, np.concatenate([measured, np.zeros(3)]), full)
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """A measured point (3,) with its covariance (3, 3)."""
+
+    at_ns: int
+    measured: Floats
+    covariance: Floats
+
+    def reaches(self, later: Fix, max_speed: float) -> bool:
+        """Whether a finger can get from this point to a later one, but for their noise."""
+        way = float(np.linalg.norm(later.measured - self.measured))
+        noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
+        return way <= max_speed * (later.at_ns - self.at_ns) * 1e-9 + GATE_SIGMAS * noise
 
 
-def predicted(track: Track, at_ns: int, acceleration_noise: float) -> Track:
-    """The track carried on at constant velocity to a later (or equal) time.
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Where the finger should be: a point (3,) m, and how far from it a finger can be."""
 
-    Process noise of a white acceleration, exact over the step (Bar-Shalom, Li, Kirubarajan,
-    Estimation with Applications to Tracking and Navigation, section 6.2.2).
+    point: Floats
+    reach_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """What is known of the finger at one time, and the path (n, 3) predicted from then on.
+
+    covariance: (6, 6) of position (3,) m and velocity (3,) m/s.
     """
-    dt = (at_ns - track.at_ns) * 1e-9
-    step = np.eye(6)
-    step[:3, 3:] = np.eye(3) * dt
-    density = acceleration_noise**2
-    full = step @ track.covariance @ step.T
-    full[POSITION, POSITION] += density * dt**3 / 3
-    full[POSITION, VELOCITY] += density * dt**2 / 2
-    full[VELOCITY, POSITION] += density * dt**2 / 2
-    full[VELOCITY, VELOCITY] += density * dt
-    return Track(at_ns, step @ track.state, full)
+
+    position: Floats
+    velocity: Floats
+    covariance: Floats
+    ahead: Floats
 
 
-def corrected(track: Track, measured: Floats, covariance: Floats) -> Track:
-    """The track after a measured position (3,) with covariance (3, 3) (Joseph's form)."""
-    gain = np.linalg.solve(track.covariance[:3, :3] + covariance, track.covariance[:3, :]).T
-    state = track.state + gain @ (measured - track.state[:3])
-    keep = np.eye(6)
-    keep[:, :3] -= gain
-    full = keep @ track.covariance @ keep.T + gain @ covariance @ gain.T
-    return Track(track.at_ns, state, 0.5 * (full + full.T))
-
-
-def agility(
-    track: Track, at_ns: int, measured: Floats, covariance: Floats, settings: TrackingSettings
-) -> float:
-    """The acceleration noise with which to carry a track on to a measured point (3,).
-
-    The settings' own while the point lies where an even motion leads, by the mean square of the
-    normalised innovation; else as much as its innovation speaks for, |v|^2 = 3 q^2 dt^3, up to the
-    largest (adaptive process noise: Bar-Shalom, Li, Kirubarajan, section 11.2).
-    """
-    calm = settings.acceleration_noise
-    ahead = predicted(track, at_ns, calm)
-    innovation = measured - ahead.position
-    spread = ahead.covariance[:3, :3] + covariance
-    if innovation @ np.linalg.solve(spread, innovation) <= 3.0 * EVEN_MOTION:
-        return calm
-    dt = (at_ns - track.at_ns) * 1e-9
-    wanted = float(np.linalg.norm(innovation)) / (np.sqrt(3.0) * dt**1.5)
-    return float(min(max(wanted, calm), settings.largest_acceleration_noise))
-
-
-def with_tremor(track: Track, tremor_m: float) -> Floats:
-    """Covariance (6, 6) of the finger itself about a track that leaves its tremor out."""
-    covariance = track.covariance.copy()
-    covariance[POSITION, POSITION] += tremor_m**2
-    return covariance
-
-
-def reachable(way: Floats, duration_ns: int, covariance: Floats, max_speed: float) -> bool:
-    """Whether a finger can go the way (3,) to a measured point in a time, but for its noise."""
-    slack_m = GATE_SIGMAS * float(np.sqrt(np.trace(covariance)))
-    return float(np.linalg.norm(way)) <= max_speed * duration_ns * 1e-9 + slack_m
+UNKNOWN = np.diag([1.0] * 3 + [10.0] * 3)
+"""Covariance (m, m/s) before the finger was ever seen."""
 
 
 class Tracker:
-    """A track, and the rule by which measurements enter it."""
+    """A track, and the rule by which measured points enter it."""
 
-    def __init__(self, settings: TrackingSettings) -> None:
-        self.settings = settings
-        self.track: Track | None = None
-        self._refused: tuple[int, Floats] | None = None
-        self._agreeing = 0
+    def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
+        self.filter, self.settings = filter_, settings
+        self._history: list[tuple[Fix, Estimate]] = []
+        self._challengers: list[Fix] = []
+        self._late: list[Fix] = []
 
-    def expected(self, at_ns: int) -> Track | None:
-        """Where the finger should be at a time; None without a track that is fresh enough."""
-        if self.track is None or self._forgotten(at_ns):
-            return None
-        return predicted(self.track, at_ns, self.settings.acceleration_noise)
+    @property
+    def estimate(self) -> Estimate | None:
+        """The newest; it stays when the track is lost."""
+        return self._history[-1][1] if self._history else None
 
-    def _forgotten(self, at_ns: int) -> bool:
-        assert self.track is not None
-        return (at_ns - self.track.at_ns) * 1e-9 > self.settings.forget_after_s
+    def is_late(self, at_ns: int) -> bool:
+        """Whether a point of that time would come after a later one."""
+        return self.estimate is not None and at_ns <= self.estimate.at_ns
 
-    def take(self, at_ns: int, measured: Floats, covariance: Floats) -> bool:
-        """Let a measurement (3,) with its covariance (3, 3) in; False if no finger moves so fast.
+    def state(self, at_ns: int) -> FingertipState:
+        """Of the track at a time not before its newest point."""
+        if not self._alive(at_ns):
+            return "acquiring" if self._challengers else "lost"
+        assert self.estimate is not None
+        return "tracking" if at_ns == self.estimate.at_ns else "coasting"
 
-        Times must increase.  A refused jump is not forgotten: when the following measurements
-        agree with it, the finger was there, and the track starts anew.
+    def expected(self, at_ns: int) -> Expected | None:
+        """Where the finger can be at a time after the newest point; None without a track.
+
+        Of the time before its newest point a track says nothing.
         """
-        settings, speed = self.settings, self.settings.max_speed_m_per_s
-        if self.track is None or self._forgotten(at_ns):
-            self._start(at_ns, measured, covariance)
-            return True
-        since_ns = at_ns - self.track.at_ns
-        if reachable(measured - self.track.position, since_ns, covariance, speed):
-            noise = agility(self.track, at_ns, measured, covariance, settings)
-            ahead = predicted(self.track, at_ns, noise)
-            self.track = corrected(ahead, measured, covariance)
-            self._refused, self._agreeing = None, 0
-            return True
-        agrees = self._refused is not None and reachable(
-            measured - self._refused[1], at_ns - self._refused[0], covariance, speed
-        )
-        self._agreeing = self._agreeing + 1 if agrees else 1
-        self._refused = (at_ns, measured)
-        if self._agreeing < settings.confirm_frames:
-            return False
-        self._start(at_ns, measured, covariance)
-        return True
+        if not self._alive(at_ns) or self.is_late(at_ns):
+            return None
+        fix, estimate = self._history[-1]
+        dt = (at_ns - estimate.at_ns) * 1e-9
+        point = self.filter.ahead(estimate, np.array([dt]))[0]
+        spread = self.filter.moments(estimate)[2]
+        sigma = np.sqrt(np.trace(spread[:3, :3]) + dt * dt * np.trace(spread[3:, 3:]))
+        turn_m = 0.5 * self.settings.max_acceleration_m_per_s2 * dt * dt
+        way_m = self.settings.max_speed_m_per_s * dt
+        away_m = float(np.linalg.norm(point - fix.measured))
+        # A finger is where its acceleration leads, and where its speed does: the smaller counts.
+        reach_m = min(turn_m + GATE_SIGMAS * float(sigma), way_m + away_m)
+        return Expected(point, reach_m + GATE_SIGMAS * float(np.sqrt(np.trace(fix.covariance))))
 
-    def _start(self, at_ns: int, measured: Floats, covariance: Floats) -> None:
-        self.track = started(at_ns, measured, covariance, self.settings.max_speed_m_per_s)
-        self._refused, self._agreeing = None, 0
+    def track_at(self, at_ns: int, leads_s: Floats) -> Track:
+        """The track at a time not before its newest point; a lost one stays where it was lost."""
+        estimate = self.estimate
+        if estimate is None:
+            return Track(np.zeros(3), np.zeros(3), UNKNOWN, np.zeros((len(leads_s), 3)))
+        position, velocity, covariance = self.filter.moments(estimate)
+        if not self._alive(at_ns):
+            return Track(position, np.zeros(3), covariance, np.tile(position, (len(leads_s), 1)))
+        since_s = (at_ns - estimate.at_ns) * 1e-9
+        ahead = self.filter.ahead(estimate, since_s + leads_s)
+        return Track(ahead[0], velocity, covariance, ahead)
+
+    def take(self, at_ns: int, measured: Floats, covariance: Floats) -> Verdict:
+        """Judge a measured point (3,) with its covariance (3, 3), and let it in if it may."""
+        fix = Fix(at_ns, measured, covariance)
+        if self.is_late(at_ns):
+            return self._take_late(fix)
+        self._late = []
+        expected = self.expected(at_ns)
+        if expected is None:
+            return self._challenge(fix, "unconfirmed")
+        noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(covariance)))
+        if float(np.linalg.norm(measured - expected.point)) > expected.reach_m + noise_m:
+            return self._challenge(fix, "too_fast")
+        self._challengers = []
+        self._append(fix)
+        return "ok"
+
+    def _alive(self, at_ns: int) -> bool:
+        newest = self.estimate
+        return newest is not None and (
+            (at_ns - newest.at_ns) * 1e-9 <= self.settings.forget_after_s
+        )
+
+    def _append(self, fix: Fix) -> None:
+        newest = self.estimate
+        estimate = (
+            self.filter.started(fix.at_ns, fix.measured, fix.covariance)
+            if newest is None
+            else self.filter.updated(newest, fix.at_ns, fix.measured, fix.covariance)
+        )
+        oldest_ns = fix.at_ns - round(self.settings.remember_s * 1e9)
+        self._history = [entry for entry in self._history if entry[0].at_ns >= oldest_ns]
+        self._history.append((fix, estimate))
+
+    def _challenge(self, fix: Fix, refusal: Verdict) -> Verdict:
+        """Count a point that is not of the track; with enough that agree a new one begins."""
+        self._challengers = self._agreeing(self._challengers, fix)
+        if len(self._challengers) < self.settings.confirm_frames:
+            return refusal
+        return self._begin(self._challengers)
+
+    def _agreeing(self, before: list[Fix], fix: Fix) -> list[Fix]:
+        """The points in a row that a finger can have been at, up to this one."""
+        last = before[-1] if before else None
+        if last is None or (fix.at_ns - last.at_ns) * 1e-9 > self.settings.forget_after_s:
+            return [fix]
+        follows = fix.at_ns > last.at_ns and last.reaches(fix, self.settings.max_speed_m_per_s)
+        return [*before, fix] if follows else [fix]
+
+    def _begin(self, fixes: list[Fix]) -> Verdict:
+        self._history, self._challengers, self._late = [], [], []
+        for fix in fixes:
+            self._append(fix)
+        return "ok"
+
+    def _take_late(self, fix: Fix) -> Verdict:
+        """Put a point in its place in time, and let the filter go over the later ones again.
+
+        Late points in a row, with none in between that is not, mean that the clock has stepped
+        back: the track begins anew with them.  What is older than all that is remembered, was known
+        already, or lies where no finger could have been is left out.
+        """
+        self._late = self._agreeing(self._late, fix)
+        if len(self._late) >= self.settings.confirm_frames:
+            return self._begin(self._late)
+        place = sum(entry[0].at_ns < fix.at_ns for entry in self._history)
+        again = [entry[0] for entry in self._history[place:]]
+        before = self._history[place - 1][0] if place else None
+        fits = before is not None and before.reaches(fix, self.settings.max_speed_m_per_s)
+        if fits and again[0].at_ns != fix.at_ns:
+            self._history = self._history[:place]
+            for entry in (fix, *again):
+                self._append(entry)
+        return "unconfirmed"
