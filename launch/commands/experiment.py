@@ -134,6 +134,55 @@ def _print_rows(rows: list[dict[str, Any]], bag: Path, *, as_json: bool) -> None
     words.print(f"bag: {bag}")
 
 
+@app.command()
+def gestures(
+    *,
+    names: Annotated[
+        str | None,
+        typer.Option("--names", metavar="NAME,...", help="Some of them only; default: all."),
+    ] = None,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """How well a fingertip is tracked that strokes, taps, reaches, stops and turns."""
+    from launch.experiments import gestures as experiment
+
+    wanted = experiment.chosen(names)
+    bag = _folder(output, "gestures") / "gestures.mcap"
+    with progress_words() as progress:
+        procedure = experiment.gestures_procedure(wanted, progress)
+        _record(launch_file, settings, bag, procedure, progress)
+        result = experiment.gestures_result(bag, wanted)
+    if as_json:
+        print_json(result)
+    else:
+        _print_gestures(result["gestures"])
+        words.print(f"bag: {bag}")
+
+
+def _print_gestures(results: list[dict[str, Any]]) -> None:
+    """A line for each gesture: errors in mm, lags in ms."""
+
+    def shown(value: float | None, form: str) -> str:
+        return "-" if value is None else format(value, form)
+
+    columns = ["gesture", "valid", "missing", "error rms", "99 %", "max", "jump, σ", "lag, ms"]
+    for each in results[0]["prediction"][1:]:
+        columns += [f"+{each['lead_ms']:.0f} ms rms", "lag, ms"]
+    rows = []
+    for result in results:
+        now, *ahead = result["prediction"]
+        row = [result["gesture"], shown(result["valid_ratio"], ".1%"), str(result["missing"])]
+        row += [shown(result["error_mm"][key], ".3f") for key in ("rms", "p99", "max")]
+        row += [shown(result["jump"]["max_sigmas"], ".1f"), shown(now["lag_ms"], ".1f")]
+        for each in ahead:
+            row += [shown(each["rms"], ".3f"), shown(each["lag_ms"], ".1f")]
+        rows.append(row)
+    print_table(columns, rows)
+
+
 def print_strokes(results: list[dict[str, Any]]) -> None:
     """Table I of the paper beside ours, mean and standard deviation."""
     from launch.experiments.stroke import PAPER_TABLE_1
@@ -158,17 +207,20 @@ def demo(
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     finger_path: Annotated[
-        Path | None,
+        str | None,
         typer.Option(
-            metavar="CSV", help="A recorded finger (t_s,x_mm,y_mm,z_mm) instead of the strokes."
+            metavar="NAME_OR_FILE",
+            help="A gesture by name, or a recorded finger (CSV with t_s,x_mm,y_mm,z_mm), instead "
+            "of the strokes.",
         ),
     ] = None,
     output: OutputOption = None,
 ) -> None:
     """Run the whole system on this machine: stroke, tilt and push the sheet; then pictures."""
-    from launch.experiments.demo import recorded_finger, run_demo
+    from launch.experiments.demo import run_demo
+    from launch.experiments.gestures import finger_path as path_of
 
-    path = None if finger_path is None else recorded_finger(launch_file, finger_path)
+    path = None if finger_path is None else path_of(launch_file, finger_path)
     folder = _folder(output, "demo")
     with progress_words() as progress:
         result = run_demo(launch_file, settings or (), folder, progress, path=path)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from launch.experiments import ExperimentError, image, stroke
+from launch.experiments import image, stroke
 from launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from launch.experiments.run import (
     Progress,
@@ -19,8 +19,6 @@ from launch.experiments.run import (
 )
 from launch.plan import load_plan
 from messages.types import Correction, FingerPath
-from nodes.twin.finger import FingerPathError
-from nodes.twin.paths import recorded_path
 
 METRES_PER_PX = 0.0007
 """The paper's; enough to look at, and four times as quick as what the experiments measure in."""
@@ -93,14 +91,3 @@ def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoRes
     ]
     (folder / "stroke.json").write_text(json.dumps(results, indent=1) + "\n")
     return DemoResult(folder=folder, bag=bag, strokes=results, pictures=pictures)
-
-
-def recorded_finger(launch_file: Path, csv: Path) -> FingerPath:
-    """The finger of a recording, brought into the launch file's scene."""
-    scene = load_plan(launch_file).scene_message()
-    if scene is None:
-        raise ExperimentError(f'{launch_file}: key "scene": the finger needs a scene; name one')
-    try:
-        return recorded_path(csv, scene)
-    except FingerPathError as error:
-        raise ExperimentError(str(error)) from None

@@ -1,0 +1,286 @@
+"""How well the fingertip is tracked through what people's fingers do, gesture by gesture."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+
+from launch.documents import did_you_mean
+from launch.experiments import ExperimentError, stroke
+from launch.experiments.driver import Driver
+from launch.experiments.lag import lag_s
+from launch.experiments.run import Procedure, Progress
+from launch.plan import load_plan
+from messages.bag import BagReader
+from messages.scene import Scene
+from messages.types import FingerPath, Fingertip, TwinFinger
+from nodes.models.prediction import path_at
+from nodes.twin import gestures as twin_gestures
+from nodes.twin.finger import FingerPathError
+from nodes.twin.paths import recorded_path
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+LEADS_S = (0.0, 0.02, 0.05)
+"""From the exposure: none, the way to the arm, and that with the arm's servo lag."""
+
+MAX_LAG_S = 0.08
+"""Below half the time of the quickest taps, so that no tap is taken for the one before."""
+
+FEWEST = 10
+GAP_PERIODS = 2.5
+SIGMAS = 3.0
+
+GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
+    "stroke-10": partial(stroke.stroke_path, seconds=10.0),
+    "stroke-30": partial(stroke.stroke_path, seconds=30.0),
+    **twin_gestures.GESTURES,
+}
+"""All that the finger can do by name: the paper's target-following, and what people do besides."""
+
+
+def gesture_path(name: str, scene: Scene) -> FingerPath:
+    """The path of a gesture on the scene's object, labelled with its name."""
+    try:
+        return GESTURES[name](scene).model_copy(update={"label": name})
+    except FingerPathError as error:
+        raise ExperimentError(f'scene "{scene.name}": {error}') from None
+
+
+def chosen(names: str | None) -> list[str]:
+    """The gestures of a list with commas, each once; all without a list."""
+    if names is None:
+        return list(GESTURES)
+    wanted = list(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
+    for name in wanted:
+        if name not in GESTURES:
+            raise ExperimentError(f'no gesture "{name}"; {did_you_mean(name, list(GESTURES))}')
+    if not wanted:
+        raise ExperimentError(f"no gesture is named; there are: {', '.join(GESTURES)}")
+    return wanted
+
+
+def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
+    """The path of a gesture, or of a recorded finger, in the launch file's scene."""
+    scene = load_plan(launch_file).scene_message()
+    if scene is None:
+        raise ExperimentError(f'{launch_file}: key "scene": the finger needs a scene; name one')
+    if name_or_file in GESTURES:
+        return gesture_path(name_or_file, scene)
+    file = Path(name_or_file)
+    if not file.suffix and not file.exists():
+        raise ExperimentError(
+            f'no gesture and no file "{name_or_file}"; '
+            f"{did_you_mean(name_or_file, list(GESTURES))} Or name a CSV file of a recorded finger"
+        )
+    try:
+        return recorded_path(file, scene)
+    except FingerPathError as error:
+        raise ExperimentError(str(error)) from None
+
+
+def gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
+    """Lead the finger through the gestures, one after another."""
+
+    async def procedure(driver: Driver, scene: Scene) -> None:
+        for i, name in enumerate(names):
+            path = gesture_path(name, scene)
+            progress(f"{name} ({path.times_s[-1]:.0f} s), {i + 1} of {len(names)}")
+            await driver.follow(path)
+
+    return procedure
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """The true finger at its exposures: times (n,) ns, positions and velocities (n, 3)."""
+
+    times_ns: Times
+    positions: Floats
+    velocities: Floats
+
+    def at(self, times_ns: Times) -> Floats:
+        """Positions (m, 3) at other times, by cubic Hermite interpolation.
+
+        At 60 Hz that is off by some 3 um in a tremor of 1 mm, by up to 40 um in the quickest taps.
+        NaN where frames were missed and before and after all exposures.
+        """
+        zero = self.times_ns[0]
+        seconds = (self.times_ns - zero) * 1e-9
+        asked = (times_ns - zero) * 1e-9
+        found = np.asarray(
+            CubicHermiteSpline(seconds, self.positions, self.velocities, extrapolate=False)(asked)
+        )
+        steps = np.diff(seconds)
+        piece = np.clip(np.searchsorted(seconds, asked, side="right") - 1, 0, len(steps) - 1)
+        exact = np.isin(times_ns, self.times_ns)
+        found[(steps[piece] > GAP_PERIODS * np.median(steps)) & ~exact] = np.nan
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What a bag has of the finger: the truth, all fingertips in the order of their exposures, and
+    when each gesture was done, in ns of the same clock."""
+
+    truth: Truth
+    times_ns: Times
+    fingertips: list[Fingertip]
+    windows_ns: dict[str, tuple[int, int]]
+
+
+def read_gestures(bag: Path) -> Recorded:
+    """Collect true finger and fingertips from a bag.
+
+    A gesture's window is the time on its path: neither the easing to its first point nor what
+    comes after its last, and so nothing of the graph's start.
+    """
+    truths: dict[int, TwinFinger] = {}
+    tips: dict[int, Fingertip] = {}
+    for _, message, header, _ in BagReader(bag, topics=["fingertip", "twin/finger"]):
+        match message:
+            case TwinFinger():
+                truths[header.source_ns] = message
+            case Fingertip():
+                tips[header.source_ns] = message
+            case _:
+                pass
+    if len(truths) < FEWEST:
+        raise ExperimentError(f"{bag}: {len(truths)} messages of twin/finger; a gesture needs more")
+    on_path: dict[str, list[int]] = {}
+    for at_ns in sorted(truths):
+        finger = truths[at_ns]
+        if finger.path_label and finger.path_time_s >= 0.0 and not finger.path_done:
+            on_path.setdefault(finger.path_label, []).append(at_ns)
+    times = sorted(truths)
+    tip_times = sorted(tips)
+    return Recorded(
+        truth=Truth(
+            np.array(times, dtype=np.int64),
+            np.array([truths[time].position_world_m for time in times]),
+            np.array([truths[time].velocity_world_m_per_s for time in times]),
+        ),
+        times_ns=np.array(tip_times, dtype=np.int64),
+        fingertips=[tips[time] for time in tip_times],
+        windows_ns={label: (at[0], at[-1]) for label, at in on_path.items()},
+    )
+
+
+def jump_sigmas(errors: Floats, covariances: Floats) -> Floats:
+    """How far the estimate jumps beyond the finger's own motion, in its sigmas (n-1,).
+
+    errors: (n, 3) m, of consecutive estimates against the truth.  covariances: (n, 3, 3) m^2, as
+    stated with them.  What the finger did itself drops out of the errors' difference; the sigma is
+    that of the difference along its own direction, both estimates taken as independent.
+    """
+    jumps = np.diff(errors, axis=0)
+    lengths = np.linalg.norm(jumps, axis=1)
+    along = jumps / np.maximum(lengths, 1e-300)[:, None]
+    both = covariances[1:] + covariances[:-1]
+    sigma = np.sqrt(np.einsum("ni,nij,nj->n", along, both, along))
+    return np.asarray(np.divide(lengths, sigma, out=np.zeros_like(lengths), where=lengths > 0.0))
+
+
+def error_mm(errors: Floats) -> dict[str, float | None]:
+    """rms, 99 % and max (mm) of errors (n, 3) m; None without any."""
+    if len(errors) == 0:
+        return {"rms": None, "p99": None, "max": None}
+    lengths = 1e3 * np.linalg.norm(errors, axis=1)
+    return {
+        "rms": float(np.sqrt((lengths**2).mean())),
+        "p99": float(np.quantile(lengths, 0.99)),
+        "max": float(lengths.max()),
+    }
+
+
+def predicted(tips: Sequence[Fingertip], lead_s: float) -> Floats:
+    """Where fingertips (n,) say that the finger is `lead_s` after their exposures (n, 3)."""
+    if lead_s == 0.0:
+        return _rows([tip.position_world_m for tip in tips])
+    return _rows([path_at(tip.ahead_world_m, tip.ahead_step_s, lead_s)[0] for tip in tips])
+
+
+def _rows(points: Sequence[Floats]) -> Floats:
+    """Points as rows (n, 3), also if there are none."""
+    return np.array(points, dtype=np.float64).reshape(len(points), 3)
+
+
+def gesture_result(recorded: Recorded, name: str) -> dict[str, Any]:
+    """The figures of one gesture; lengths in mm, times in ms, None where there is nothing to tell.
+
+    missing: exposures of which no fingertip came.  reasons: why fingertips that came were not
+    valid.  jump: between consecutive valid fingertips.
+    """
+    if name not in recorded.windows_ns:
+        have = ", ".join(recorded.windows_ns) or "none"
+        raise ExperimentError(f'the bag has no gesture "{name}"; it has: {have}')
+    begin_ns, end_ns = recorded.windows_ns[name]
+    exposures = recorded.truth.times_ns
+    exposed = exposures[(exposures >= begin_ns) & (exposures <= end_ns)]
+    inside = np.flatnonzero((recorded.times_ns >= begin_ns) & (recorded.times_ns <= end_ns))
+    tips = [recorded.fingertips[i] for i in inside]
+    velocities = recorded.truth.velocities[np.isin(exposures, exposed)]
+    truth = recorded.truth.at(recorded.times_ns[inside])
+    valid = np.array([tip.valid for tip in tips], dtype=np.bool_)
+    usable = np.flatnonzero(valid & np.isfinite(truth).all(axis=1))
+    good = [tips[i] for i in usable]
+    true, times = truth[usable], recorded.times_ns[inside][usable]
+    errors = predicted(good, 0.0) - true
+    return {
+        "gesture": name,
+        "seconds": float((end_ns - begin_ns) * 1e-9),
+        "peak_speed_m_per_s": float(np.linalg.norm(velocities, axis=1).max()),
+        "fingertips": len(tips),
+        "missing": len(np.setdiff1d(exposed, recorded.times_ns)),
+        "valid_ratio": float(valid.mean()) if tips else None,
+        "reasons": dict(Counter(tip.reason for tip in tips if not tip.valid)),
+        "error_mm": error_mm(errors),
+        "measured_error_mm": error_mm(_rows([tip.measured_world_m for tip in good]) - true),
+        "jump": _jump(errors, good),
+        "prediction": [_prediction(recorded.truth, times, good, lead) for lead in LEADS_S],
+    }
+
+
+def _jump(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
+    """The largest jump between consecutive fingertips (n,), and how many exceed SIGMAS."""
+    if len(tips) < 2:
+        return {"max_sigmas": None, "max_mm": None, "beyond_3_sigmas": 0}
+    sigmas = jump_sigmas(errors, np.array([tip.covariance[:3, :3] for tip in tips]))
+    return {
+        "max_sigmas": float(sigmas.max()),
+        "max_mm": float(1e3 * np.linalg.norm(np.diff(errors, axis=0), axis=1).max()),
+        "beyond_3_sigmas": int((sigmas > SIGMAS).sum()),
+    }
+
+
+def _prediction(
+    truth: Truth, times_ns: Times, tips: Sequence[Fingertip], lead_s: float
+) -> dict[str, Any]:
+    """Error and lag of what was predicted for `lead_s` after each exposure."""
+    ahead_ns = times_ns + round(lead_s * 1e9)
+    true = truth.at(ahead_ns)
+    known = np.isfinite(true).all(axis=1)
+    follower, leader, at_ns = predicted(tips, lead_s)[known], true[known], ahead_ns[known]
+    lag = None
+    if len(at_ns) >= FEWEST and (at_ns[-1] - at_ns[0]) * 1e-9 > 4.0 * MAX_LAG_S:
+        lag = lag_s((at_ns - at_ns[0]) * 1e-9, follower, leader, max_lag_s=MAX_LAG_S)
+    return {
+        "lead_ms": lead_s * 1e3,
+        **error_mm(follower - leader),
+        "lag_ms": None if lag is None else lag * 1e3,
+    }
+
+
+def gestures_result(bag: Path, names: Sequence[str]) -> dict[str, Any]:
+    """The figures of `experiment gestures --json`, from its bag."""
+    recorded = read_gestures(bag)
+    return {"gestures": [gesture_result(recorded, name) for name in names], "bag": str(bag)}
