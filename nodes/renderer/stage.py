@@ -182,7 +182,7 @@ class Stage:
     def surface_point(self, world_point: Floats) -> Floats:
         """The point (3,) of the undeformed object nearest to a world point, for the marks."""
         point = apply(inverse(self._world_from_object), world_point)
-        nearest = self._shape.closest(point, fallback_normal=np.array([0.0, 0.0, 1.0]))
+        nearest = self._shape.closest(point)
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> Sheet:

@@ -1,0 +1,53 @@
+"""Shapes of the virtual objects, see `surface` for what all of them answer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from nodes.models.shapes.smooth_mesh import SmoothMeshShape
+from nodes.models.shapes.solids import (
+    CylinderShape,
+    EllipsoidShape,
+    PlaneShape,
+    RoundedBoxShape,
+    SphereShape,
+)
+from nodes.models.shapes.surface import Nearest, Shape, foot_jacobian, principal_curvatures
+from nodes.models.shapes.triangles import MeshError
+
+SHAPES: dict[str, type[Shape]] = {
+    "cylinder": CylinderShape,
+    "sphere": SphereShape,
+    "plane": PlaneShape,
+    "ellipsoid": EllipsoidShape,
+    "rounded_box": RoundedBoxShape,
+    "mesh": SmoothMeshShape,
+}
+
+
+def make_shape(geometry: Mapping[str, Any]) -> Shape:
+    """The shape of a scene's geometry: `make_shape(dict(scene.object.geometry))`.
+
+    `shape` names it, the other keys are its measures, named as the class's; a key `origin` is for
+    people.  KeyError for another name, ValueError (MeshError) for measures that make no solid.
+    """
+    measures = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
+    return SHAPES[geometry["shape"]](**measures)
+
+
+__all__ = [
+    "SHAPES",
+    "CylinderShape",
+    "EllipsoidShape",
+    "MeshError",
+    "Nearest",
+    "PlaneShape",
+    "RoundedBoxShape",
+    "Shape",
+    "SmoothMeshShape",
+    "SphereShape",
+    "foot_jacobian",
+    "make_shape",
+    "principal_curvatures",
+]

@@ -1,0 +1,334 @@
+"""A closed triangle mesh as a smooth surface, for a sheet that must not rattle over facets.
+
+Two steps, the first when the shape is built.  `rho` is the length over which is smoothed.
+
+1. Osculating jets (Cazals and Pouget, Estimating Differential Quantities Using Polynomial Fitting
+   of Osculating Jets, 2005): about a choice of the mesh's vertices a quadratic is fitted to the
+   vertices around, by least squares.  Position, normal and shape operator A of each give the
+   signed distance to second order: s_i(x) = n_i d + d A_i d / 2 with d = x - p_i.
+2. Partition of unity (Ohtake et al., Multi-level Partition of Unity Implicits, 2003):
+   f(x) = sum w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and
+   w_i = 0 past t_i = 1.  The surface is f = 0.  Weights are three times continuously
+   differentiable, and so is f: along a path the normal has a continuous second derivative, which
+   facets, interpolated vertex normals and patches joined with a common tangent plane do not give.
+   Supports are half as thick along the normal as across it, so that the two sides of a thin part
+   do not see one another.
+
+Edges sharper than `rho` are rounded over about that length; how far that takes the surface from the
+mesh is measured (`deviation_m`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from nodes.models.shapes.surface import (
+    SAME_M,
+    Bools,
+    Feet,
+    Floats,
+    Nearest,
+    checked,
+    checked_previous,
+    descend,
+    positive,
+)
+from nodes.models.shapes.triangles import (
+    Indices,
+    MeshError,
+    check_mesh,
+    half_edges,
+    refined,
+    vertex_normals,
+)
+
+FLATNESS = 3.0
+"""Supports are 1 / sqrt(1 + FLATNESS) as thick along the normal as across it."""
+FIT_RATIO = 1.25
+"""A jet is fitted to the vertices within this many `rho`."""
+SPACING_RATIO = 1.0 / 3.0
+"""Jets of one side of the surface lie at least this many `rho` apart."""
+STEEPEST = 0.2
+"""Cosine of the steepest normal, against a jet's, of a vertex that it is fitted to."""
+TIGHTEST = 2.0
+"""Curvatures are bounded by this over `rho`; what is sharper is smoothed to it."""
+STRIDE_RATIO = 0.4
+"""A descent goes at most this many `rho` a step, so that it never leaves the supports."""
+MOST_DEVIATION = 0.35
+"""The surface stays within this many `rho` of the mesh, or `rho` is too long for it."""
+MOST_WAYS = 6
+"""So many separate places are tried for the nearest of all."""
+CHUNK = 2048
+
+_IDENTITY = np.eye(3)
+
+
+def usual_smoothing_m(vertices: Floats, triangles: Indices) -> float:
+    """A length to smooth over that hides the facets: two and a half usual edges, and no less than
+    the longest."""
+    run = half_edges(triangles)
+    length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
+    return max(2.5 * float(np.median(length)), 1.05 * float(length.max()))
+
+
+class SmoothMeshShape:
+    """A closed mesh, smoothed over `smoothing_m`; see the module's text."""
+
+    def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
+        """MeshError for a mesh that is no solid's surface; ValueError for a length that is not
+        positive."""
+        positive(smoothing_m=smoothing_m)
+        vertices = np.asarray(vertices_m, dtype=np.float64)
+        faces = np.asarray(triangles, dtype=np.int64)
+        check_mesh(vertices, faces)
+        self.smoothing_m = smoothing_m
+        used = np.unique(faces)
+        fine_vertices, fine = refined(vertices[used], np.searchsorted(used, faces), smoothing_m)
+        self._centre, self._normal, self._operator = _jets(fine_vertices, fine, smoothing_m)
+        self._tree = cKDTree(self._centre)
+        corners = fine_vertices[fine]
+        middles = 0.5 * (corners + np.roll(corners, 1, axis=1))
+        self._samples = np.concatenate(
+            [fine_vertices, middles.reshape(-1, 3), corners.mean(axis=1)]
+        )
+        # How far from a jet the points can be to which it is the nearest.
+        away, nearest = self._tree.query(self._samples)
+        cover = np.zeros(len(self._centre))
+        np.maximum.at(cover, nearest, away)
+        self._cover = 1.1 * float(cover.max())
+        self._table, self._counts = self._support_table(1.1 * cover)
+
+    def deviation_m(self) -> float:
+        """The largest distance of the mesh's vertices, edges' middles and triangles' centres from
+        the smooth surface; MeshError where it is more than `MOST_DEVIATION` of `smoothing_m`.
+
+        Takes as long as some thousand queries, so a shape does not ask it of itself.
+        """
+        deviation = float(np.abs(self.closest(self._samples).height_m).max())
+        if deviation > MOST_DEVIATION * self.smoothing_m:
+            raise MeshError(
+                f"smoothed over {self.smoothing_m * 1e3:.3g} mm the surface leaves the mesh by "
+                f"{deviation * 1e3:.3g} mm; smooth over a shorter length or refine the mesh"
+            )
+        return deviation
+
+    def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
+        """See `Shape`; undecided where two separate places are as near."""
+        queries = checked(points)
+        before = checked_previous(previous, queries)
+        flat = queries.reshape(-1, 3)
+        earlier = None if before is None else before.reshape(-1, 3)
+        point, normal, operator = (np.empty((len(flat), *end)) for end in ((3,), (3,), (3, 3)))
+        undecided = np.zeros(len(flat), dtype=bool)
+        for start in range(0, len(flat), CHUNK):
+            part = slice(start, start + CHUNK)
+            begun = None if earlier is None else earlier[part]
+            feet, undecided[part] = self._feet(flat[part], begun)
+            point[part], normal[part] = feet.point, feet.normal
+            operator[part] = feet.shape_operator
+        height = ((flat - point) * normal).sum(-1)
+        shape = queries.shape
+        return Nearest(
+            point.reshape(shape),
+            normal.reshape(shape),
+            height.reshape(shape[:-1]),
+            operator.reshape((*shape, 3)),
+            np.zeros(shape[:-1], dtype=bool),
+            undecided.reshape(shape[:-1]),
+        )
+
+    def signed_distance(self, points: ArrayLike) -> Floats:
+        """See `Shape`."""
+        return self.closest(points).height_m
+
+    def _feet(self, queries: Floats, before: Floats | None) -> tuple[Feet, Bools]:
+        """The feet of queries (n, 3), going on from those found before, and which are undecided."""
+        stride = STRIDE_RATIO * self.smoothing_m
+        if before is None:
+            return self._nearest_of_all(queries)
+        feet = descend(self._level, queries, before, stride_m=stride)
+        undecided = np.zeros(len(queries), dtype=bool)
+        lost = np.flatnonzero(~feet.is_nearest)
+        if len(lost):
+            anew, undecided[lost] = self._nearest_of_all(queries[lost])
+            _put(feet, lost, anew)
+        return feet, undecided
+
+    def _nearest_of_all(self, queries: Floats) -> tuple[Feet, Bools]:
+        """The nearest feet, whatever was found before.
+
+        A descent from the nearest jet ends at distance D.  Any nearer place has a jet within the
+        cover c of it, which by the bound on curvature is at most sqrt(D^2 + c^2 (1 + 4 D / rho))
+        away; descents are made from there as well, from one jet in each neighbourhood that no
+        descent has begun or ended in.
+        """
+        stride = STRIDE_RATIO * self.smoothing_m
+        start = self._centre[self._tree.query(queries)[1]]
+        feet = descend(self._level, queries, start, stride_m=stride)
+        way = np.linalg.norm(queries - feet.point, axis=1)
+        slack = self._cover**2 * (1.0 + 2.0 * TIGHTEST * way / self.smoothing_m)
+        near = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
+        undecided = np.zeros(len(queries), dtype=bool)
+        jets = [self._centre[one] for one in near]
+        for i, (jet, foot, first) in enumerate(zip(jets, feet.point, start, strict=True)):
+            jets[i] = self._away(self._away(jet, foot), first)
+        for _ in range(MOST_WAYS - 1):
+            rows = np.array([i for i, jet in enumerate(jets) if len(jet)], dtype=np.int64)
+            if not len(rows):
+                break
+            starts = np.array([self._first(jets[i], queries[i]) for i in rows])
+            other = descend(self._level, queries[rows], starts, stride_m=stride)
+            other_way = np.linalg.norm(queries[rows] - other.point, axis=1)
+            apart = np.linalg.norm(other.point - feet.point[rows], axis=1) > stride
+            valid = other.is_nearest
+            tied = valid & apart & (np.abs(other_way - way[rows]) < SAME_M)
+            nearer = valid & ((other_way < way[rows] - SAME_M) | ~feet.is_nearest[rows])
+            undecided[rows] = np.where(nearer, False, undecided[rows] | tied)
+            for i, foot, first in zip(rows, other.point, starts, strict=True):
+                jets[i] = self._away(self._away(jets[i], foot), first)
+            _put(feet, rows[nearer], other, nearer)
+            way[rows[nearer]] = other_way[nearer]
+        return feet, undecided | ~feet.is_nearest
+
+    def _away(self, jets: Floats, place: Floats) -> Floats:
+        """The jets (m, 3) that are not in the neighbourhood of a place (3,)."""
+        return jets[np.square(jets - place).sum(1) > self.smoothing_m**2] if len(jets) else jets
+
+    @staticmethod
+    def _first(jets: Floats, query: Floats) -> Floats:
+        return np.asarray(jets[np.square(jets - query).sum(1).argmin()])
+
+    def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
+        """For each jet those (padded with one that is infinitely far) whose supports reach the
+        points to which it is the nearest, within `cover` (j,) of it, and how many they are."""
+        reach = self.smoothing_m + cover + 0.1 * self.smoothing_m
+        lists = self._tree.query_ball_point(self._centre, reach)
+        counts = np.array([len(one) for one in lists])
+        table = np.full((len(lists), int(counts.max())), len(lists))
+        for row, members in zip(table, lists, strict=True):
+            row[: len(members)] = members
+        self._centre = np.concatenate([self._centre, np.full((1, 3), 1e9)])
+        self._normal = np.concatenate([self._normal, [[0.0, 0.0, 1.0]]])
+        self._operator = np.concatenate([self._operator, np.zeros((1, 3, 3))])
+        return table, counts
+
+    def _level(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """f with gradient and Hessian at points (n, 3) near the surface, see `LevelSet`."""
+        nearest = self._tree.query(points)[1]
+        members = self._table[nearest, : self._counts[nearest].max()]
+        normal, operator = self._normal[members], self._operator[members]
+        offset = points[:, None, :] - self._centre[members]
+        square = self.smoothing_m**2
+        height = np.einsum("nki,nki->nk", offset, normal)
+        inside = 1.0 - (np.einsum("nki,nki->nk", offset, offset) + FLATNESS * height**2) / square
+        inside = np.maximum(inside, 0.0)
+        weight = inside**4
+        total = weight.sum(1)
+        # Never on the way, by the stride; a start far off takes the nearest jet's alone.
+        alone = total < 1e-12
+        if alone.any():
+            weight[alone] = members[alone] == nearest[alone, None]
+            total[alone] = 1.0
+        bent = (operator @ offset[..., None])[..., 0]
+        distance = height + 0.5 * np.einsum("nki,nki->nk", offset, bent)
+        slope = normal + bent
+        # Derivatives of the weights: w' = -4 u^3 and w'' = 12 u^2 by t; dt = (2 / rho^2) lean.
+        lean = offset + FLATNESS * height[..., None] * normal
+        fall = (-8.0 / square) * inside**3
+        value = (weight * distance).sum(1) / total
+        excess = distance - value[:, None]
+        pull = fall * excess
+        gradient = (pull[:, None] @ lean + weight[:, None] @ slope)[:, 0] / total[:, None]
+        sweep = (fall[:, None] @ lean)[:, 0]
+        curl = (48.0 / square**2) * inside**2 * excess
+        lean_t, normal_t = np.swapaxes(lean, 1, 2), np.swapaxes(normal, 1, 2)
+        mixed = (lean_t * fall[:, None]) @ slope - gradient[:, :, None] * sweep[:, None, :]
+        hessian = (lean_t * curl[:, None]) @ lean + mixed + np.swapaxes(mixed, 1, 2)
+        hessian += pull.sum(1)[:, None, None] * _IDENTITY
+        hessian += FLATNESS * ((normal_t * pull[:, None]) @ normal)
+        count = len(points)
+        hessian += (weight[:, None] @ operator.reshape(count, -1, 9)).reshape(count, 3, 3)
+        return value, gradient, hessian / total[:, None, None]
+
+
+def _put(feet: Feet, rows: Indices, other: Feet, chosen: Bools | slice = slice(None)) -> None:
+    """Put the chosen of other feet into rows."""
+    feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
+    feet.shape_operator[rows] = other.shape_operator[chosen]
+    feet.is_nearest[rows] = other.is_nearest[chosen]
+
+
+def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
+    """Points (j, 3), normals (j, 3) and shape operators (j, 3, 3) fitted about chosen vertices."""
+    rough = vertex_normals(vertices, triangles)
+    tree = cKDTree(vertices)
+    run = half_edges(triangles)
+    order = np.argsort(run[:, 0], kind="stable")
+    ring = np.split(run[order, 1], np.cumsum(np.bincount(run[:, 0], minlength=len(vertices)))[:-1])
+    chosen = _thinned(vertices, rough, tree, SPACING_RATIO * rho)
+    points, normals, operators = np.empty((len(chosen), 3)), [], []
+    for row, vertex in enumerate(chosen):
+        ball = tree.query_ball_point(vertices[vertex], FIT_RATIO * rho)
+        level = [i for i in ball if rough[i] @ rough[vertex] > STEEPEST]
+        patch = _connected(int(vertex), set(level), ring)
+        points[row], normal, operator = _jet(vertices[vertex], rough[vertex], vertices[patch], rho)
+        normals.append(normal)
+        operators.append(operator)
+    return points, np.array(normals), np.array(operators)
+
+
+def _thinned(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
+    """Vertices of which no two that face the same way are nearer than `spacing`; every other vertex
+    has one of them so near."""
+    taken, covered = [], np.zeros(len(vertices), dtype=bool)
+    for vertex in range(len(vertices)):
+        if covered[vertex]:
+            continue
+        taken.append(vertex)
+        near = np.array(tree.query_ball_point(vertices[vertex], spacing))
+        covered[near[normals[near] @ normals[vertex] > 0.5]] = True
+    return taken
+
+
+def _connected(start: int, allowed: set[int], ring: list[Indices]) -> list[int]:
+    """The allowed vertices that edges join to `start` by way of allowed ones."""
+    found, edge = [start], [start]
+    left = allowed - {start}
+    while edge:
+        reached = left.intersection(*[{j for i in edge for j in ring[i].tolist()}])
+        left -= reached
+        edge = sorted(reached)
+        found += edge
+    return found
+
+
+def _jet(
+    origin: Floats, rough: Floats, around: Floats, rho: float
+) -> tuple[Floats, Floats, Floats]:
+    """Point, normal (3,), shape operator (3, 3) of the quadratic z(x, y) fitted to points (m, 3).
+
+    z is along the rough normal; lengths are scaled by the fit's radius.  Of too few points the
+    solution of least norm is taken.
+    """
+    reach = FIT_RATIO * rho
+    first = np.cross(rough, _IDENTITY[np.abs(rough).argmin()])
+    first /= np.linalg.norm(first)
+    frame = np.stack([first, np.cross(rough, first), rough], axis=1)
+    x, y, z = ((around - origin) @ frame).T / reach
+    weight = np.maximum(1.0 - (x * x + y * y + z * z), 0.0) + 0.03
+    terms = np.stack([np.ones_like(x), x, y, 0.5 * x * x, x * y, 0.5 * y * y], axis=1)
+    solution = np.linalg.lstsq(terms * weight[:, None], z * weight, rcond=1e-6)[0]
+    shift, slope_x, slope_y, xx, xy, yy = solution
+    gradient = np.array([-slope_x, -slope_y, 1.0])
+    steepness = float(np.linalg.norm(gradient))
+    normal = gradient / steepness
+    tangent = _IDENTITY - np.outer(normal, normal)
+    graph = np.zeros((3, 3))
+    graph[:2, :2] = -np.array([[xx, xy], [xy, yy]]) / (steepness * reach)
+    values, vectors = np.linalg.eigh(tangent @ graph @ tangent)
+    bound = TIGHTEST / rho
+    turned = frame @ vectors
+    operator = turned @ np.diag(np.clip(values, -bound, bound)) @ turned.T
+    return origin + shift * reach * rough, frame @ normal, operator

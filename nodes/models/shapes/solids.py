@@ -1,0 +1,334 @@
+"""The shapes that have a formula: cylinder, sphere, plane, ellipsoid, rounded box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nodes.models.shapes.surface import (
+    FRONT,
+    SAME_M,
+    Bools,
+    Floats,
+    Nearest,
+    checked,
+    checked_previous,
+    descend,
+    positive,
+)
+
+_IDENTITY = np.eye(3)
+
+
+@dataclass(frozen=True, slots=True)
+class CylinderShape:
+    """Circular cylinder about the x axis, centred on the origin.
+
+    Only its side is touchable: the sheet is held along x, so a finger beyond an end cap is given
+    the rim's nearest point of the side, flagged `on_edge`.
+    """
+
+    radius_m: float
+    length_m: float
+
+    def __post_init__(self) -> None:
+        positive(radius_m=self.radius_m, length_m=self.length_m)
+
+    def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
+        """See `Shape`; undecided on the axis."""
+        queries = checked(points)
+        radial = queries * np.array([0.0, 1.0, 1.0])
+        normal, radius, undecided = _directions(radial, previous, queries, across=(1, 2))
+        half = 0.5 * self.length_m
+        station = queries[..., 0]
+        point = normal * self.radius_m
+        point[..., 0] = np.clip(station, -half, half)
+        axis = np.array([1.0, 0.0, 0.0])
+        operator = (_IDENTITY - np.outer(axis, axis) - _outer(normal)) / self.radius_m
+        beyond = np.asarray(np.abs(station) > half)
+        return Nearest(point, normal, radius - self.radius_m, operator, beyond, undecided)
+
+    def signed_distance(self, points: ArrayLike) -> Floats:
+        """See `Shape`; of the solid with its end caps."""
+        queries = checked(points)
+        aside = np.hypot(queries[..., 1], queries[..., 2]) - self.radius_m
+        beyond = np.abs(queries[..., 0]) - 0.5 * self.length_m
+        outside = np.hypot(np.maximum(aside, 0.0), np.maximum(beyond, 0.0))
+        return np.asarray(outside + np.minimum(np.maximum(aside, beyond), 0.0))
+
+    def angle_rad(self, point: Floats) -> float:
+        """Angle of a point (3,) about the axis, 0 on +z, growing towards +y."""
+        return float(np.arctan2(point[1], point[2]))
+
+
+@dataclass(frozen=True, slots=True)
+class SphereShape:
+    """Sphere about the origin."""
+
+    radius_m: float
+
+    def __post_init__(self) -> None:
+        positive(radius_m=self.radius_m)
+
+    def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
+        """See `Shape`; undecided at the centre."""
+        queries = checked(points)
+        normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
+        operator = (_IDENTITY - _outer(normal)) / self.radius_m
+        nowhere = np.zeros(radius.shape, dtype=bool)
+        point = normal * self.radius_m
+        return Nearest(point, normal, radius - self.radius_m, operator, nowhere, undecided)
+
+    def signed_distance(self, points: ArrayLike) -> Floats:
+        """See `Shape`."""
+        return np.asarray(np.linalg.norm(checked(points), axis=-1) - self.radius_m)
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneShape:
+    """The half-space z <= 0, touchable on a rectangle of its face about the origin."""
+
+    width_m: float
+    height_m: float
+
+    def __post_init__(self) -> None:
+        positive(width_m=self.width_m, height_m=self.height_m)
+
+    def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
+        """See `Shape`; past the rectangle (x along the width, y along the height) `on_edge`."""
+        queries = checked(points)
+        checked_previous(previous, queries)
+        half = 0.5 * np.array([self.width_m, self.height_m, np.inf])
+        point = np.clip(queries, -half, half)
+        point[..., 2] = 0.0
+        normal = np.broadcast_to(FRONT, queries.shape).copy()
+        operator = np.zeros((*queries.shape, 3))
+        beyond = np.asarray((np.abs(queries) > half).any(axis=-1))
+        return Nearest(
+            point, normal, queries[..., 2].copy(), operator, beyond, np.zeros_like(beyond)
+        )
+
+    def signed_distance(self, points: ArrayLike) -> Floats:
+        """See `Shape`; of the whole half-space."""
+        return checked(points)[..., 2].copy()
+
+
+@dataclass(frozen=True, slots=True)
+class EllipsoidShape:
+    """Ellipsoid about the origin, its semi-axes along x, y, z."""
+
+    semi_axes_m: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        for axis, length in zip("xyz", self.semi_axes_m, strict=True):
+            positive(**{f"semi_axes_m ({axis})": length})
+
+    def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
+        """See `Shape`; undecided on the medial disc, across the shortest axis."""
+        queries = checked(points)
+        before = checked_previous(previous, queries)
+        flat = queries.reshape(-1, 3)
+        undecided = self._undecided(flat)
+        if before is None:
+            point = self._nearest(flat, np.broadcast_to(FRONT, flat.shape))
+        else:
+            starts = before.reshape(-1, 3)
+            # The centre, where the level set has no slope, tells no side.
+            blind = np.linalg.norm(starts, axis=-1, keepdims=True) < SAME_M
+            starts = np.where(blind, FRONT * self.semi_axes_m, starts)
+            feet = descend(self._level, flat, starts, stride_m=0.5 * min(self.semi_axes_m))
+            point = feet.point
+            lost = ~feet.is_nearest
+            if lost.any():
+                point[lost] = self._nearest(flat[lost], starts[lost])
+        gradient = point / np.square(self.semi_axes_m)
+        length = np.linalg.norm(gradient, axis=-1)
+        normal = gradient / length[:, None]
+        tangent = _IDENTITY - _outer(normal)
+        hessian = np.diag(1.0 / np.square(self.semi_axes_m))
+        operator = tangent @ hessian @ tangent / length[:, None, None]
+        height = ((flat - point) * normal).sum(-1)
+        shape = queries.shape
+        return Nearest(
+            point.reshape(shape),
+            normal.reshape(shape),
+            height.reshape(shape[:-1]),
+            operator.reshape((*shape, 3)),
+            np.zeros(shape[:-1], dtype=bool),
+            undecided.reshape(shape[:-1]),
+        )
+
+    def signed_distance(self, points: ArrayLike) -> Floats:
+        """See `Shape`."""
+        return self.closest(points).height_m
+
+    def _level(self, points: Floats) -> tuple[Floats, Floats, Floats]:
+        """The ellipsoid as a level set, see `LevelSet`."""
+        inverse = 1.0 / np.square(self.semi_axes_m)
+        gradient = points * inverse
+        value = 0.5 * ((points * gradient).sum(-1) - 1.0)
+        return value, gradient, np.broadcast_to(np.diag(inverse), (len(points), 3, 3))
+
+    def _undecided(self, queries: Floats) -> Bools:
+        """Whether queries lie where two surface points are as near: on a plane of symmetry, within
+        the centres of curvature of the other two directions."""
+        axes = np.array(self.semi_axes_m)
+        shortest = np.flatnonzero(axes <= axes.min() * (1.0 + 1e-9))
+        others = np.setdiff1d(np.arange(3), shortest)
+        focal = (axes[others] ** 2 - axes.min() ** 2) / axes[others]
+        inside = (np.square(queries[:, others] / focal).sum(-1)) < 1.0
+        on_plane = np.linalg.norm(queries[:, shortest], axis=-1) < SAME_M
+        return np.asarray(on_plane & inside)
+
+    def _nearest(self, queries: Floats, sides: Floats) -> Floats:
+        """The nearest of all surface points, (n, 3).
+
+        With e the semi-axes the foot is x_i = e_i^2 q_i / (t + e_i^2), where t is the largest root
+        of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to an Ellipsoid, 2013).
+        As a trust-region problem's, the root is found in the reciprocal norm, which is concave and
+        almost straight, so that Newton's method rises to it from the left and never passes it
+        (Conn, Gould, Toint, Trust-Region Methods, sec. 7.3).  A query on a plane of symmetry is
+        moved off it, towards `sides` (n, 3), by a billionth of the shortest axis: no pole is met.
+        """
+        axes = np.array(self.semi_axes_m)
+        nudge = 1e-9 * axes.min()
+        towards = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-300)
+        moved = np.where(np.abs(queries) < nudge, nudge * towards, queries)
+        # A side without a part across the shortest axis tells nothing: then the positive one.
+        moved = np.where(np.abs(moved) < 1e-3 * nudge, 1e-3 * nudge, moved)
+        size, squares = np.abs(moved) * axes, axes**2
+        root = (size - squares).max(axis=-1)
+        for _ in range(60):
+            below = root[:, None] + squares
+            share = np.square(size / below)
+            norm = np.sqrt(share.sum(-1))
+            step = (norm - 1.0) * norm**2 / (share / below).sum(-1)
+            root += step
+            if not (np.abs(step) > 1e-15 * (np.abs(root) + squares.min())).any():
+                break
+        foot = squares * moved / (root[:, None] + squares)
+        # On the surface to rounding, whatever the last step left.
+        return np.asarray(foot / np.linalg.norm(foot / axes, axis=-1, keepdims=True))
+
+
+@dataclass(frozen=True, slots=True)
+class RoundedBoxShape:
+    """Box about the origin whose edges and corners are rounded by a ball.
+
+    size_m: full extents along x, y, z, rounding included; edge_radius_m: at most half the least.
+    Its normal is continuous; its curvature steps between faces, edges (1/r once) and corners.
+    """
+
+    size_m: tuple[float, float, float]
+    edge_radius_m: float
+
+    def __post_init__(self) -> None:
+        for axis, length in zip("xyz", self.size_m, strict=True):
+            positive(**{f"size_m ({axis})": length})
+        positive(edge_radius_m=self.edge_radius_m)
+        if 2.0 * self.edge_radius_m > min(self.size_m):
+            raise ValueError(
+                f"edge_radius_m is {self.edge_radius_m}, more than half the least size "
+                f"{min(self.size_m)}"
+            )
+
+    def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
+        """See `Shape`; undecided inside where two faces are as near."""
+        queries = checked(points)
+        before = checked_previous(previous, queries)
+        flat = queries.reshape(-1, 3)
+        core = self._core()
+        nearest_core = np.clip(flat, -core, core)
+        normal = flat - nearest_core
+        away = np.linalg.norm(normal, axis=-1)
+        deep = away <= 1e-12
+        normal[~deep] /= away[~deep, None]
+        height = away - self.edge_radius_m
+        undecided = np.zeros(len(flat), dtype=bool)
+        if deep.any():
+            earlier = None if before is None else before.reshape(-1, 3)[deep]
+            axis, sign, margin, tied = self._nearest_face(flat[deep], earlier)
+            rows = np.flatnonzero(deep)
+            normal[rows] = 0.0
+            normal[rows, axis] = sign
+            nearest_core[rows, axis] = sign * core[axis]
+            height[rows] = -margin - self.edge_radius_m
+            undecided[rows] = tied
+        rounded = (np.abs(normal) > 0.0)[:, :, None] * _IDENTITY
+        flat_face = np.abs(normal).max(axis=-1) == 1.0
+        operator = (rounded - _outer(normal)) / self.edge_radius_m
+        operator[flat_face] = 0.0
+        shape = queries.shape
+        point = nearest_core + self.edge_radius_m * normal
+        return Nearest(
+            point.reshape(shape),
+            normal.reshape(shape),
+            height.reshape(shape[:-1]),
+            operator.reshape((*shape, 3)),
+            np.zeros(shape[:-1], dtype=bool),
+            undecided.reshape(shape[:-1]),
+        )
+
+    def signed_distance(self, points: ArrayLike) -> Floats:
+        """See `Shape`."""
+        away = np.abs(checked(points)) - self._core()
+        outside = np.linalg.norm(np.maximum(away, 0.0), axis=-1)
+        return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
+
+    def _core(self) -> Floats:
+        """Half extents (3,) of the box that the ball rolls on from inside."""
+        return 0.5 * np.array(self.size_m) - self.edge_radius_m
+
+    def _nearest_face(
+        self, queries: Floats, before: Floats | None
+    ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
+        """Axis, sign and depth below the core's face of the face to take, and whether it is tied.
+
+        With points found before, only faces that are theirs, or border on their rounded edge, are
+        taken.  Without, ties go to the last of -x, -y, -z, x, y, z: the front before all.
+        """
+        core = self._core()
+        # Columns z, y, x, -z, -y, -x, so that the first of equals is the front.
+        margins = np.concatenate([core - queries, core + queries], axis=1)[:, [2, 1, 0, 5, 4, 3]]
+        allowed = np.ones(margins.shape, dtype=bool)
+        if before is not None:
+            out = (before - np.clip(before, -core, core)) / self.edge_radius_m
+            allowed = np.concatenate([out, -out], axis=1)[:, [2, 1, 0, 5, 4, 3]] > 0.5
+            # A point that is not of the surface decides nothing.
+            allowed |= ~allowed.any(axis=1, keepdims=True)
+        first = margins.min(axis=1)
+        tied = (margins < first[:, None] + SAME_M).sum(axis=1) > 1
+        chosen = np.where(allowed, margins, np.inf)
+        # Rounding must not choose between equals.
+        face = (chosen <= chosen.min(axis=1, keepdims=True) + 1e-12).argmax(axis=1)
+        depth = margins[np.arange(len(face)), face]
+        return 2 - face % 3, np.where(face < 3, 1.0, -1.0), depth, tied
+
+
+def _outer(normal: Floats) -> Floats:
+    return normal[..., :, None] * normal[..., None, :]
+
+
+def _directions(
+    offsets: Floats, previous: ArrayLike | None, queries: Floats, *, across: tuple[int, ...]
+) -> tuple[Floats, Floats, Bools]:
+    """Unit directions of offsets from an axis or a centre, their lengths, and where undecided.
+
+    across: the coordinates that offsets have.  Undecided ones follow the points found before, or
+    `FRONT`.
+    """
+    before = checked_previous(previous, queries)
+    length = np.linalg.norm(offsets, axis=-1)
+    undecided = length < SAME_M
+    direction = offsets
+    if undecided.any():
+        kept = np.zeros(3)
+        kept[list(across)] = 1.0
+        sides = np.broadcast_to(FRONT, offsets.shape) if before is None else before * kept
+        blind = np.linalg.norm(sides, axis=-1) < SAME_M
+        sides = np.where(blind[..., None], FRONT, sides)
+        direction = np.where(undecided[..., None], sides, offsets)
+    unit = direction / np.linalg.norm(direction, axis=-1)[..., None]
+    return unit, np.asarray(length), np.asarray(undecided)

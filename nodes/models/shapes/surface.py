@@ -1,0 +1,195 @@
+"""What every shape answers: the nearest surface point, with its normal and curvature.
+
+Points are (3,) or (n, 3) arrays in the object's frame, lengths in metres; answers have the same
+leading shape.  Normals point out of the object.  Curvature is given as the shape operator W, a
+symmetric 3x3 matrix with W n = 0: along the surface the normal turns by dn = W dp, so that its two
+other eigenvalues are the principal curvatures, positive where the object is convex (do Carmo,
+Differential Geometry of Curves and Surfaces, ch. 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SAME_M = 1e-6
+"""Two ways to the surface that differ by less than this are equally long."""
+
+FARTHEST_M = 1e6
+"""A query farther from the origin than this is a mistake, not a place."""
+
+FRONT = np.array([0.0, 0.0, 1.0])
+"""Where all surface points are equally near and none was touched before, this side is taken: of an
+object that is not turned, it faces the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Nearest:
+    """The touchable surface points nearest to some queries; shapes as the queries', see above.
+
+    height_m: of the query above the tangent plane at `point`, negative below it.  It is the signed
+        distance wherever `on_edge` is false.
+    shape_operator: (..., 3, 3) at `point`, 1/m.
+    on_edge: the query lies past an end of the touchable surface; `point` is on its rim.
+    undecided: another point is as near; which one was taken follows from `previous` or `FRONT`.
+    """
+
+    point: Floats
+    normal: Floats
+    height_m: Floats
+    shape_operator: Floats
+    on_edge: Bools
+    undecided: Bools
+
+
+class Shape(Protocol):
+    """A solid with a touchable surface."""
+
+    def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
+        """The nearest touchable points.
+
+        previous: the surface points found just before, shaped as `points`.  The answer continues
+            from there: where several points are equally near, and inside the object also where a
+            nearer one has appeared elsewhere, the nearest point of the same neighbourhood is kept
+            as long as there is one.  Leave it out when a finger comes anew.
+
+        ValueError for NaN, infinity, another shape than (3,) or (n, 3), or beyond `FARTHEST_M`.
+        """
+        ...
+
+    def signed_distance(self, points: ArrayLike) -> Floats:
+        """Distance (m) to the whole solid's surface, negative inside; errors as `closest`."""
+        ...
+
+
+def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats, Floats]:
+    """Principal curvatures (..., 2), rising (1/m), and their directions (..., 2, 3).
+
+    The directions are unit tangents; at an umbilic (sphere, plane) any two at right angles.
+    """
+    # The normal's own eigenvalue, zero, is moved out of the way of the two that count.
+    bound = 1.0 + np.linalg.norm(shape_operator, axis=(-2, -1))
+    outer = normal[..., :, None] * normal[..., None, :]
+    values, vectors = np.linalg.eigh(shape_operator + 2.0 * bound[..., None, None] * outer)
+    return values[..., :2], np.swapaxes(vectors, -1, -2)[..., :2, :]
+
+
+def foot_jacobian(found: Nearest) -> Floats:
+    """d point / d query, (..., 3, 3): how the nearest point moves as the query does.
+
+    On a parallel surface at height h, W becomes W (I + h W)^-1; hence the foot moves by
+    P (I + h W)^-1, and the normal by W times that.  Inside, at a centre of curvature, I + h W is
+    singular: there the foot has no rate, and LinAlgError is raised.
+    """
+    normal, operator = found.normal, found.shape_operator
+    tangent = np.eye(3) - normal[..., :, None] * normal[..., None, :]
+    height = np.asarray(found.height_m)[..., None, None]
+    return np.asarray(np.linalg.solve(np.eye(3) + height * operator, tangent))
+
+
+def checked(points: ArrayLike, name: str = "points") -> Floats:
+    """`points` as floats (3,) or (n, 3); ValueError says what is wrong with them."""
+    array = np.asarray(points, dtype=np.float64)
+    if array.ndim not in (1, 2) or array.shape[-1] != 3:
+        raise ValueError(f"{name} of shape {array.shape}, wanted (3,) or (n, 3)")
+    # A comparison with NaN is false, hence the double negation.
+    if array.size and not (np.abs(array) <= FARTHEST_M).all():
+        raise ValueError(f"{name} hold NaN, infinity or places beyond {FARTHEST_M:g} m")
+    return array
+
+
+def checked_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
+    """`previous` as floats, shaped as `points`; ValueError otherwise."""
+    if previous is None:
+        return None
+    array = checked(previous, "previous")
+    if array.shape != points.shape:
+        raise ValueError(f"previous of shape {array.shape}, points of shape {points.shape}")
+    return array
+
+
+def positive(**lengths_m: float) -> None:
+    """ValueError unless every length is a positive number."""
+    for name, length in lengths_m.items():
+        if not (np.isfinite(length) and length > 0.0):
+            raise ValueError(f"{name} is {length}, wanted a positive length in metres")
+
+
+LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats]]
+"""Points (n, 3) to a function's values (n,), gradients (n, 3) and Hessians (n, 3, 3); the function
+is zero on the surface and grows outwards."""
+
+
+@dataclass(frozen=True, slots=True)
+class Feet:
+    """Where descents to the surface ended: points, normals (n, 3), shape operators (n, 3, 3).
+
+    is_nearest: (n,) the descent came to rest at a point that is nearest within its neighbourhood.
+    """
+
+    point: Floats
+    normal: Floats
+    shape_operator: Floats
+    is_nearest: Bools
+
+
+MOST_STEPS = 60
+AT_REST = 1e-6
+LEAST_BEND = 0.2
+"""Floor of the reduced Hessian's eigenvalues (1 on a flat surface): below it, within four fifths
+of a centre of curvature or past it, the full Newton step would be too long or go uphill."""
+
+
+def descend(level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float) -> Feet:
+    """From `starts` (n, 3) along the surface to the points nearest to `queries` (n, 3).
+
+    Newton's method for min |x - q|^2 on f(x) = 0 (Nocedal and Wright, Numerical Optimization,
+    ch. 18): each step goes back to the surface along the gradient, and along the surface by the
+    reduced system with the Lagrangian's Hessian I + lambda H, whose eigenvalues are kept positive
+    so that it always goes downhill.  No step is longer than `stride_m`, and one under a millionth
+    of it is the last: normals follow it to first order.
+    """
+    count = len(queries)
+    point = np.array(starts, dtype=np.float64)
+    normal, operator = np.empty((count, 3)), np.empty((count, 3, 3))
+    is_nearest = np.zeros(count, dtype=bool)
+    moving = np.arange(count)
+    for _ in range(MOST_STEPS):
+        x = point[moving]
+        value, gradient, hessian = level(x)
+        square = (gradient * gradient).sum(-1)
+        length = np.sqrt(square)
+        unit = gradient / length[:, None]
+        outward = unit[:, :, None] * unit[:, None, :]
+        tangent = _IDENTITY - outward
+        offset = queries[moving] - x
+        multiplier = (offset * gradient).sum(-1) / square
+        bend = _IDENTITY + multiplier[:, None, None] * hessian
+        fall = (-value / square)[:, None] * gradient
+        slope = tangent @ (offset[:, :, None] - bend @ fall[:, :, None])
+        values, vectors = np.linalg.eigh(tangent @ bend @ tangent + outward)
+        along = np.swapaxes(vectors, 1, 2) @ slope / np.maximum(values, LEAST_BEND)[:, :, None]
+        step = (vectors @ along)[:, :, 0] + fall
+        size = np.sqrt((step * step).sum(-1))
+        step *= np.minimum(1.0, stride_m / np.maximum(size, 1e-300))[:, None]
+        weingarten = tangent @ hessian @ tangent / length[:, None, None]
+        turned = unit + (weingarten @ step[:, :, None])[:, :, 0]
+        point[moving] = x + step
+        normal[moving] = turned / np.sqrt((turned * turned).sum(-1))[:, None]
+        operator[moving] = weingarten
+        resting = size <= AT_REST * stride_m
+        is_nearest[moving] = resting & (values[:, 0] > 0.0)
+        if resting.all():
+            break
+        moving = moving[~resting]
+    return Feet(point, normal, operator, is_nearest)
+
+
+_IDENTITY = np.eye(3)

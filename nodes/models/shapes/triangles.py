@@ -1,0 +1,320 @@
+"""Triangle meshes as they are: checks, normals, the nearest point of the facets.
+
+Vertices are (v, 3) m, triangles (t, 3) indices of vertices, counter-clockwise seen from outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+MOST_TRIANGLES = 100_000
+FLATTEST = 1e-6
+"""A triangle whose height is less than this share of its longest edge has no direction."""
+FOLDED_RAD = np.radians(175.0)
+"""Two neighbours that meet at a sharper angle than this lie on one another."""
+
+
+class MeshError(ValueError):
+    """A mesh that bounds no solid; the text says why, and what helps."""
+
+
+def check_mesh(vertices: Floats, triangles: Indices) -> None:
+    """Raise MeshError unless the mesh is the closed, consistently wound surface of a solid.
+
+    Refused: not finite, empty, larger than `MOST_TRIANGLES`, indices out of range, degenerate or
+    repeated triangles, holes, edges of more than two triangles, inconsistent winding, parts that
+    touch in one vertex only, triangles folded onto their neighbours, inside out.  Intersections of
+    triangles that are no neighbours are dearer to find: see `intersecting`.
+    """
+    if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
+        raise MeshError(f"arrays of shapes {vertices.shape} and {triangles.shape} are no mesh")
+    if len(triangles) < 4:
+        raise MeshError(f"a mesh of {len(triangles)} triangles bounds no solid")
+    if len(triangles) > MOST_TRIANGLES:
+        raise MeshError(
+            f"{len(triangles)} triangles, at most {MOST_TRIANGLES} are taken; decimate the mesh"
+        )
+    if triangles.min() < 0 or triangles.max() >= len(vertices):
+        raise MeshError(f"a triangle names a vertex that is not among the {len(vertices)}")
+    if not np.isfinite(vertices).all():
+        raise MeshError("a vertex is NaN or infinite")
+    flat = int(degenerate(vertices, triangles).sum())
+    if flat:
+        raise MeshError(f"{flat} triangles are degenerate (no area); remove them")
+    _check_edges(triangles)
+    _check_fans(triangles)
+    folded = int((dihedrals_rad(vertices, triangles)[1] > FOLDED_RAD).sum())
+    if folded:
+        raise MeshError(f"{folded} pairs of neighbouring triangles lie on one another; untangle it")
+    if volume_m3(vertices, triangles) <= 0.0:
+        raise MeshError("the mesh is inside out; reverse its triangles")
+
+
+def degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
+    """Which triangles (t,) have no direction: repeated vertices, or all three in a line."""
+    corners = vertices[triangles]
+    sides = np.roll(corners, -1, axis=1) - corners
+    longest = np.square(sides).sum(-1).max(-1)
+    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1)
+    return np.asarray(doubled <= FLATTEST * longest)
+
+
+def half_edges(triangles: Indices) -> Indices:
+    """(3 t, 2): the edges as each triangle runs along them, its first, second and third in turn."""
+    return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+
+
+def _check_edges(triangles: Indices) -> None:
+    """Every edge is run along once in each direction."""
+    run = half_edges(triangles)
+    edges, uses = np.unique(np.sort(run, axis=1), axis=0, return_counts=True)
+    open_edges, crowded = int((uses == 1).sum()), int((uses > 2).sum())
+    if open_edges:
+        raise MeshError(f"the surface is not closed: {open_edges} edges have one triangle; fill it")
+    if crowded:
+        raise MeshError(f"{crowded} edges have more than two triangles; separate the parts there")
+    twice = len(run) - len(np.unique(run, axis=0))
+    if twice:
+        raise MeshError(f"winding is inconsistent along {twice} of {len(edges)} edges; unify it")
+
+
+def _check_fans(triangles: Indices) -> None:
+    """The triangles about each vertex form one fan."""
+    count = len(triangles)
+    first, second = _neighbours(triangles)
+    # Corner c of triangle t has number c * count + t; across an edge the corners of both triangles
+    # at each of its two ends belong together.
+    ends = [(first, (second + count) % (3 * count)), ((first + count) % (3 * count), second)]
+    rows, columns = (np.concatenate(side) for side in zip(*ends, strict=True))
+    joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(3 * count, 3 * count))
+    fans = connected_components(joined, directed=False)[0]
+    pinched = fans - len(np.unique(triangles))
+    if pinched:
+        raise MeshError(f"parts of the surface touch in {pinched} single vertices; separate them")
+
+
+def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
+    """Pairs of half-edges (numbers of rows of `half_edges`) that run along one another."""
+    run = half_edges(triangles)
+    span = int(triangles.max()) + 1
+    forward, backward = run[:, 0] * span + run[:, 1], run[:, 1] * span + run[:, 0]
+    order = np.argsort(forward)
+    partner = order[np.searchsorted(forward, backward, sorter=order)]
+    first = np.flatnonzero(run[:, 0] < run[:, 1])
+    return first, partner[first]
+
+
+def triangle_normals(vertices: Floats, triangles: Indices) -> Floats:
+    """Unit normals (t, 3)."""
+    corners = vertices[triangles]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+
+
+def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
+    """Unit normals (v, 3): means of the triangles', weighted by their angle at the vertex (Thürmer
+    and Wüthrich 1998)."""
+    corners, normal = vertices[triangles], triangle_normals(vertices, triangles)
+    total = np.zeros_like(vertices)
+    for i in range(3):
+        ahead = corners[:, (i + 1) % 3] - corners[:, i]
+        back = corners[:, (i + 2) % 3] - corners[:, i]
+        sine = np.linalg.norm(np.cross(ahead, back), axis=1)
+        angle = np.arctan2(sine, (ahead * back).sum(1))
+        np.add.at(total, triangles[:, i], angle[:, None] * normal)
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300))
+
+
+def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
+    """Edges (e, 2) of a closed mesh, and the angles (e,) between the normals on their two sides."""
+    normal, count = triangle_normals(vertices, triangles), len(triangles)
+    first, second = _neighbours(triangles)
+    one, other = normal[first % count], normal[second % count]
+    sine = np.linalg.norm(np.cross(one, other), axis=1)
+    return half_edges(triangles)[first], np.arctan2(sine, (one * other).sum(1))
+
+
+def volume_m3(vertices: Floats, triangles: Indices) -> float:
+    """Enclosed volume, negative when the triangles run clockwise."""
+    corners = vertices[triangles] - vertices[triangles].mean(axis=(0, 1))
+    return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
+
+
+def refined(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
+    """The same facets in smaller triangles, no edge longer than `longest_m`.
+
+    Each long edge is halved in all triangles that have it, until none is left, so that a closed
+    mesh stays closed.  MeshError where that would take more than `MOST_TRIANGLES`.
+    """
+    while True:
+        run = np.sort(half_edges(triangles), axis=1)
+        edges, which = np.unique(run, axis=0, return_inverse=True)
+        which = which.reshape(3, -1).T
+        length = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
+        # An edge is halved where it is its triangle's longest, so that triangles keep their shape.
+        longest = which[np.arange(len(which)), length[which].argmax(axis=1)]
+        halved = np.zeros(len(edges), dtype=bool)
+        halved[longest[length[longest] > longest_m]] = True
+        if not halved.any():
+            return vertices, triangles
+        middle = np.full(len(edges), -1)
+        middle[halved] = len(vertices) + np.arange(int(halved.sum()))
+        vertices = np.concatenate([vertices, vertices[edges[halved]].mean(axis=1)])
+        triangles = np.concatenate(list(_split(triangles, middle[which])))
+        if len(triangles) > MOST_TRIANGLES:
+            raise MeshError(
+                f"edges up to {length.max():.3g} m cannot be cut down to {longest_m:.3g} m within "
+                f"{MOST_TRIANGLES} triangles; smooth over a longer distance"
+            )
+
+
+def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
+    """The triangles cut at the middles (t, 3) of their edges; -1 where an edge stays whole."""
+    cuts = (middle >= 0).sum(axis=1)
+    yield triangles[cuts == 0]
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        a, b, c = triangles[:, i], triangles[:, j], triangles[:, k]
+        ab, bc, ca = middle[:, i], middle[:, j], middle[:, k]
+        only = (cuts == 1) & (ab >= 0)
+        yield np.stack([a, ab, c], axis=1)[only]
+        yield np.stack([ab, b, c], axis=1)[only]
+        both = (cuts == 2) & (bc < 0)
+        yield np.stack([a, ab, ca], axis=1)[both]
+        yield np.stack([ab, b, ca], axis=1)[both]
+        yield np.stack([b, c, ca], axis=1)[both]
+    whole = cuts == 3
+    a, b, c = triangles[whole].T
+    ab, bc, ca = middle[whole].T
+    for one in ((a, ab, ca), (ab, b, bc), (bc, c, ca), (ab, bc, ca)):
+        yield np.stack(one, axis=1)
+
+
+def intersecting(vertices: Floats, triangles: Indices) -> int:
+    """How many pairs of triangles cut through one another.
+
+    Found: an edge of one passing through the inside of another with which it shares no vertex.  Not
+    found: triangles that only touch, or overlap in one plane.
+    """
+    corners = vertices[triangles]
+    centre = corners.mean(axis=1)
+    radius = np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1)
+    found = set()
+    for rows, columns in _close_pairs(centre, radius):
+        for one, other in ((rows, columns), (columns, rows)):
+            for i in range(3):
+                start, end = triangles[one, i], triangles[one, (i + 1) % 3]
+                target = triangles[other]
+                apart = ~((target == start[:, None]) | (target == end[:, None])).any(axis=1)
+                hit = np.flatnonzero(apart)[
+                    _passes(vertices[start[apart]], vertices[end[apart]], corners[other[apart]])
+                ]
+                found |= {
+                    (min(a, b), max(a, b))
+                    for a, b in zip(one[hit].tolist(), other[hit].tolist(), strict=True)
+                }
+    return len(found)
+
+
+def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
+    """Pairs of balls (rows, columns) that overlap, in portions; balls of like size are searched
+    together, so that one large triangle does not make all of them neighbours."""
+    octave = np.floor(np.log2(radius)).astype(int)
+    classes = [np.flatnonzero(octave == size) for size in np.unique(octave)]
+    for i, large in enumerate(classes):
+        for members in np.array_split(large, len(large) // 4096 + 1):
+            for small in classes[: i + 1]:
+                reach = radius[members] + radius[small].max()
+                lists = cKDTree(centre[small]).query_ball_point(centre[members], reach)
+                rows = np.repeat(members, [len(one) for one in lists])
+                columns = small[np.concatenate([np.array(one, dtype=int) for one in lists])]
+                keep = np.linalg.norm(centre[rows] - centre[columns], axis=1) <= (
+                    radius[rows] + radius[columns]
+                )
+                keep &= (rows < columns) if small is large else (rows != columns)
+                yield rows[keep], columns[keep]
+
+
+def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
+    """Which segments (n, 3) pass through the inside of their triangles (n, 3, 3) (Möller and
+    Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997)."""
+    along = end - start
+    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    across = np.cross(along, second)
+    determinant = (first * across).sum(1)
+    scale = np.linalg.norm(along, axis=1) * np.linalg.norm(np.cross(first, second), axis=1)
+    slanted = np.abs(determinant) > 1e-9 * scale
+    inverse = 1.0 / np.where(slanted, determinant, 1.0)
+    offset = start - corners[:, 0]
+    u = (offset * across).sum(1) * inverse
+    turned = np.cross(offset, first)
+    v = (along * turned).sum(1) * inverse
+    way = (second * turned).sum(1) * inverse
+    inside = (u > 1e-9) & (v > 1e-9) & (u + v < 1.0 - 1e-9)
+    return np.asarray(slanted & inside & (way > 1e-9) & (way < 1.0 - 1e-9))
+
+
+def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
+    """Barycentric coordinates (n, 3) of the nearest points of triangles (n, 3, 3) to points (n, 3)
+    (Ericson, Real-Time Collision Detection, sec. 5.1.5)."""
+    a = corners[:, 0]
+    first, second = corners[:, 1] - a, corners[:, 2] - a
+    offset = points - a
+    d11, d12, d22 = ((x * y).sum(1) for x, y in ((first, first), (first, second), (second, second)))
+    p1, p2 = (offset * first).sum(1), (offset * second).sum(1)
+    determinant = np.maximum(d11 * d22 - d12 * d12, 1e-300)
+    v, w = (d22 * p1 - d12 * p2) / determinant, (d11 * p2 - d12 * p1) / determinant
+    best = np.stack([1.0 - v - w, v, w], axis=1)
+    outside = np.asarray((best < 0.0).any(axis=1))
+    if np.any(outside):
+        candidates = []
+        for i in range(3):
+            j = (i + 1) % 3
+            edge = corners[:, j] - corners[:, i]
+            share = ((points - corners[:, i]) * edge).sum(1) / (edge * edge).sum(1)
+            share = np.clip(share, 0.0, 1.0)
+            weights = np.zeros((len(points), 3))
+            weights[:, i], weights[:, j] = 1.0 - share, share
+            candidates.append(weights)
+        every = np.stack(candidates, axis=1)
+        places = every @ corners
+        closest = np.square(places - points[:, None]).sum(2).argmin(axis=1)
+        chosen = every[np.arange(len(points)), closest]
+        best = np.where(outside[:, None], chosen, best)
+    return best
+
+
+class Facets:
+    """The facets of a mesh, to be asked for nearest points."""
+
+    def __init__(self, vertices: Floats, triangles: Indices) -> None:
+        """MeshError where the mesh has none."""
+        if not len(triangles):
+            raise MeshError("a mesh without triangles has no surface")
+        self.corners = vertices[triangles]
+        self._centre = self.corners.mean(axis=1)
+        self._reach = float(np.linalg.norm(self.corners - self._centre[:, None], axis=2).max())
+        self._tree = cKDTree(self._centre)
+
+    def nearest(self, points: Floats) -> tuple[Indices, Floats]:
+        """The triangles (n,) that hold the facets' points nearest to points (n, 3), and their
+        barycentric coordinates (n, 3) there."""
+        reach = self._tree.query(points)[0] + self._reach
+        lists = self._tree.query_ball_point(points, reach * (1.0 + 1e-12))
+        chosen, weights = np.empty(len(points), dtype=np.int64), np.empty((len(points), 3))
+        for i, (point, near) in enumerate(zip(points, lists, strict=True)):
+            corners = self.corners[near]
+            inside = nearest_in_triangles(np.broadcast_to(point, (len(near), 3)), corners)
+            offset = (inside[:, None, :] @ corners)[:, 0] - point
+            best = int((offset * offset).sum(1).argmin())
+            chosen[i], weights[i] = near[best], inside[best]
+        return chosen, weights
