@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import queue
+import threading
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +18,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from messages.base import Header, Message
-from messages.clock import SystemClock
+from messages.clock import Clock, SystemClock
 from messages.scene import Lens, Scene
 from messages.topics import Topic
 from messages.types import StereoPair
@@ -67,13 +71,13 @@ def write_video(path: Path, frames: list[Image], rate_hz: float = 50.0) -> Path:
 class Bench:
     """A camera node that runs, and what it publishes."""
 
-    def __init__(self, **parameters: Any) -> None:
+    def __init__(self, clock: Clock | None = None, **parameters: Any) -> None:
         self.sent: list[tuple[StereoPair, Header]] = []
         self.changed = asyncio.Event()
         self.node = Camera(
             CameraParameters.model_validate(parameters),
             name="camera",
-            clock=SystemClock(),
+            clock=clock or SystemClock(),
             send=self.keep,
         )
 
@@ -92,11 +96,146 @@ class Bench:
 
 
 @asynccontextmanager
-async def running(scene: Scene, **parameters: Any) -> AsyncIterator[Bench]:
-    bench = Bench(**parameters)
+async def running(
+    scene: Scene, *, clock: Clock | None = None, **parameters: Any
+) -> AsyncIterator[Bench]:
+    bench = Bench(clock, **parameters)
     await bench.node.setup()
     await bench.node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
     try:
         yield bench
     finally:
         await bench.node.close()
+
+
+@dataclass
+class Shot:
+    """What a fake camera delivers: when it arrives and what its driver stamps it with, ns."""
+
+    image: Image
+    arrival_ns: int
+    stamp_ns: int
+
+
+class FakeCamera:
+    """A device that can be plugged in, unplugged, and refuses or bends what it is told."""
+
+    def __init__(self, bag: CameraBag) -> None:
+        self.bag = bag
+        self.plugged = True
+        self.shots: queue.Queue[Shot | None] = queue.Queue()
+        self.properties: dict[int, float] = {}
+        self.fixed: set[int] = set()
+        self.bounds: dict[int, tuple[float, float]] = {}
+        self.calls: list[tuple[int, float]] = []
+        self.captures: list[FakeCapture] = []
+
+    def shoot(
+        self,
+        at_ns: int,
+        *,
+        number: int = 0,
+        side: int = 0,
+        stamp_ns: int | None = None,
+        image: Image | None = None,
+    ) -> None:
+        """A frame that the driver stamps `at_ns` (or otherwise) and that arrives 8 ms later."""
+        pixels = picture(number, side) if image is None else image
+        stamp = self.bag.base_ns + at_ns if stamp_ns is None else stamp_ns
+        self.shots.put(Shot(pixels, self.bag.base_ns + at_ns + 8_000_000, stamp))
+
+    def unplug(self) -> None:
+        self.plugged = False
+        self.shots.put(None)
+
+
+class FakeCapture:
+    """In the place of cv2.VideoCapture."""
+
+    def __init__(self, camera: FakeCamera | None) -> None:
+        self.camera = camera
+        self.grabbing = False
+        self.released = threading.Event()
+        self.shot: Shot | None = None
+
+    def isOpened(self) -> bool:
+        return self.camera is not None
+
+    def set(self, property_id: int, value: float) -> bool:
+        camera = self.camera
+        assert camera is not None
+        camera.calls.append((property_id, value))
+        if property_id in camera.fixed or property_id not in camera.properties:
+            return False
+        low, high = camera.bounds.get(property_id, (-np.inf, np.inf))
+        camera.properties[property_id] = float(np.clip(value, low, high))
+        return True
+
+    def get(self, property_id: int) -> float:
+        assert self.camera is not None
+        if property_id == cv2.CAP_PROP_POS_MSEC:
+            return self.shot.stamp_ns * 1e-6 if self.shot else 0.0
+        return self.camera.properties.get(property_id, -1.0)
+
+    def grab(self) -> bool:
+        assert self.camera is not None
+        self.grabbing = True
+        self.shot = self.camera.shots.get()
+        self.grabbing = False
+        if self.shot is None:
+            return False
+        self.camera.bag.arrived.ns = self.shot.arrival_ns
+        return True
+
+    def retrieve(self) -> tuple[bool, Image | None]:
+        return self.shot is not None, self.shot and self.shot.image
+
+    def release(self) -> None:
+        assert not self.grabbing, "released during a grab"
+        self.released.set()
+
+
+class CameraBag:
+    """All fake cameras, and a clock that each of their threads reads at its frame's arrival."""
+
+    def __init__(self) -> None:
+        self.base_ns = time.monotonic_ns()
+        self.arrived = threading.local()
+        self.cameras: dict[int | str, FakeCamera] = {}
+        self.id = "bag"
+
+    def now_ns(self) -> int:
+        return getattr(self.arrived, "ns", time.monotonic_ns())
+
+    def plug(self, device: int | str, **properties: float) -> FakeCamera:
+        """A UVC camera as V4L2 shows it; properties: by the names of OpenCV, less CAP_PROP_."""
+        camera = self.cameras[device] = FakeCamera(self)
+        usual = {
+            "BUFFERSIZE": 4,
+            "FOURCC": 0,
+            "FRAME_WIDTH": 640,
+            "FRAME_HEIGHT": 480,
+            "FPS": 30,
+            "MODE": 0,
+            "AUTO_EXPOSURE": 3,
+            "EXPOSURE": 157,
+            "GAIN": 64,
+            "AUTO_WB": 1,
+        }
+        for name, value in {**usual, **properties}.items():
+            camera.properties[getattr(cv2, f"CAP_PROP_{name}")] = float(value)
+        return camera
+
+    def open(self, device: int | str, api: int = cv2.CAP_ANY) -> FakeCapture:
+        camera = self.cameras.get(device)
+        if camera is None or not camera.plugged:
+            return FakeCapture(None)
+        capture = FakeCapture(camera)
+        camera.captures.append(capture)
+        return capture
+
+    def empty(self) -> None:
+        """Let every grab that still waits come to its end."""
+        for camera in self.cameras.values():
+            for _ in camera.captures:
+                camera.shots.put(None)
