@@ -9,18 +9,26 @@ import io
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from messages.arrays import Transform
-from messages.scene import Lens, NonNegative, Part, Positive
+from messages.arrays import ArraySpec, Transform
+from messages.scene import Lens, NonNegative, Part, Positive, StereoCamera
 
-CALIBRATION_VERSION = 1
+CALIBRATION_VERSION = 2
+
+Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", ("numbers", "numbers"))]
 
 
 class CalibrationFileError(ValueError):
     """A calibration file that cannot be used; the message names file, key and remedy."""
+
+
+class CalibrationMismatchError(ValueError):
+    """A calibration of another device or picture size than the scene's camera."""
 
 
 class Board(Part):
@@ -48,15 +56,37 @@ class PairResidual(Part):
     reason: str = Field(description="why the pair was left out; empty when used")
     left_rms_px: NonNegative | None
     right_rms_px: NonNegative | None
+    stray_corners: int = Field(
+        default=0, description="corners of both views that were left out of a used pair"
+    )
+
+
+class Uncertainty(Part):
+    """How well the rig is known, as standard deviations of a normal error.
+
+    It says by how much all fingertips are off together, not how much single ones scatter.
+    """
+
+    corner_sigma_px: NonNegative = Field(description="of one coordinate of a corner")
+    jackknife_ratio: NonNegative = Field(
+        description="what refits without some of the pairs scatter, over what the fit states; "
+        "above 1 the covariance was raised by its square"
+    )
+    working_distance_m: Positive = Field(description="depth at which the next two hold")
+    depth_std_m: NonNegative = Field(description="of a fingertip along the left camera's view")
+    lateral_std_m: NonNegative = Field(description="of a fingertip across it, x and y together")
+    parameters: tuple[str, ...] = Field(description="the covariance's rows and columns")
+    covariance: Covariance
 
 
 class StereoCalibration(Part):
     """A measured rig: both lenses and how they stand to each other."""
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     device: str
     date: str = Field(description="ISO 8601, UTC")
     code_version: str
+    opencv_version: str | None = Field(default=None, description="null: not made with OpenCV")
     width_px: Annotated[int, Field(gt=0)]
     height_px: Annotated[int, Field(gt=0)]
     left: Lens
@@ -64,16 +94,39 @@ class StereoCalibration(Part):
     right_from_left: Transform
     board: Board
     reprojection_rms_px: NonNegative
+    uncertainty: Uncertainty | None = Field(default=None, description="null: not known")
     pairs: tuple[PairResidual, ...]
 
 
-def save_calibration(calibration: StereoCalibration, path: Path) -> None:
-    """Write the file, replacing an older one only when the new one is complete."""
+def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) -> None:
+    """Raises CalibrationMismatchError unless the calibration is of this camera at this size."""
+    if calibration.device != camera.device:
+        raise CalibrationMismatchError(
+            f'calibration is of device "{calibration.device}", the scene\'s camera is '
+            f'"{camera.device}": name the right file in the parameter "calibration", or '
+            "calibrate this camera"
+        )
+    measured = (calibration.width_px, calibration.height_px)
+    wanted = (camera.width_px, camera.height_px)
+    if measured != wanted:
+        raise CalibrationMismatchError(
+            f"calibration of {calibration.device} is for {measured[0]}x{measured[1]} px, the "
+            f"scene's camera gives {wanted[0]}x{wanted[1]} px: calibrate at this size"
+        )
+
+
+def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
+    """Write the file, replacing an older one only when the new one is complete.
+
+    comment: a line more for its head, as the command that made it.
+    """
     yaml = YAML()
     yaml.default_flow_style = None
-    yaml.width = 200
+    yaml.width = 4096  # a row of the covariance a line
     text = io.StringIO()
     text.write(f"# Stereo calibration of {calibration.device}, {calibration.date}.\n")
+    if comment:
+        text.write(f"# {comment}\n")
     yaml.dump(calibration.model_dump(mode="json"), text)
     partial = path.with_name(path.name + ".partial")
     partial.write_text(text.getvalue())

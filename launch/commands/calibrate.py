@@ -1,60 +1,171 @@
-"""`flexsheet calibrate`: a stereo rig measured by pictures of a chessboard, and checked."""
+"""`flexsheet calibrate`: a stereo rig measured by pictures of a board, and checked."""
 
 from __future__ import annotations
 
 import glob
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, words
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    print_fields,
+    print_json,
+    print_table,
+    words,
+)
+
+if TYPE_CHECKING:
+    from messages.calibration import Board, StereoCalibration
+    from messages.scene import Scene
 
 app = typer.Typer(no_args_is_help=True, help="Calibration from pictures.")
 
 LeftOption = Annotated[str, typer.Option(metavar="GLOB", help="Left pictures, in name order.")]
 RightOption = Annotated[str, typer.Option(metavar="GLOB", help="Right pictures, in name order.")]
 BoardOption = Annotated[
-    str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the chessboard, as 9x6.")
+    str, typer.Option(metavar="COLUMNSxROWS", help="Inner corners of the board, as 9x6.")
 ]
 SquareOption = Annotated[float, typer.Option(help="Side of a square, mm.", min=1e-3)]
+MarkerOption = Annotated[
+    float | None,
+    typer.Option(help="Side of a marker, mm; with it the board is a ChArUco board.", min=1e-3),
+]
+DictionaryOption = Annotated[
+    str, typer.Option(help="OpenCV's dictionary of a ChArUco board's markers.")
+]
+FOUR_BITS = "DICT_4X4_50"
 
 
 @app.command()
 def stereo(
     *,
-    left: LeftOption,
-    right: RightOption,
     board: BoardOption,
     square_mm: SquareOption,
     output: Annotated[Path, typer.Option("-o", "--output", help="Calibration file to write.")],
-    device: Annotated[str, typer.Option(help="Name of the rig.")] = "stereo",
+    left: Annotated[
+        str | None, typer.Option(metavar="GLOB", help="Left pictures, in name order.")
+    ] = None,
+    right: Annotated[
+        str | None, typer.Option(metavar="GLOB", help="Right pictures, in name order.")
+    ] = None,
+    device_source: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SOURCE",
+            help="Take pictures live, from what a camera node's source describes: "
+            "'{kind: opencv, left: 0, right: 1}'.",
+        ),
+    ] = None,
+    scene_file: Annotated[
+        Path | None,
+        typer.Option("--scene", metavar="FILE", help="Scene of the live camera: size, exposure."),
+    ] = None,
+    twin: Annotated[
+        Path | None, typer.Option(metavar="SCENE", help="Take pictures from a scene's twin.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of the twin's poses and noise.")] = 1,
+    pairs: Annotated[int, typer.Option(help="Pairs to take live.", min=5)] = 20,
+    pictures: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="New folder for pictures taken live.")
+    ] = None,
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = FOUR_BITS,
+    device: Annotated[
+        str | None, typer.Option(help='Name of the rig; default: the scene\'s, or "stereo".')
+    ] = None,
+    distance_mm: Annotated[
+        float | None,
+        typer.Option(
+            help="Distance to state the uncertainty at; default: the scene's, or the boards'.",
+            min=1.0,
+        ),
+    ] = None,
+    report: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write a report with plots there.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Calibrate both cameras and how they stand to each other."""
+    """Calibrate both cameras and how they stand to each other.
+
+    From pictures (--left, --right), from a device (--device-source, --scene) or from the twin.
+    """
+    from launch.commands import capture
+    from launch.plan import load_scene
     from messages.calibration import save_calibration
-    from nodes.camera.calibration import CalibrationError, calibrate_stereo
+    from nodes.camera.calibration import calibrate_stereo
+    from nodes.camera.capture import Capture
+    from nodes.camera.corners import CalibrationError
 
     if not output.parent.is_dir():
         raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    _one_source(left, right, device_source, twin)
+    described = _board(board, square_mm, marker_mm, dictionary)
+    scene: Scene | None = None
+    made = ["flexsheet", "calibrate", "stereo"]
     try:
+        if left is not None and right is not None:
+            left_paths, right_paths = _pictures("--left", left), _pictures("--right", right)
+            made += ["--left", left, "--right", right]
+            scene = None if scene_file is None else load_scene(scene_file)
+        else:
+            chosen = twin or scene_file
+            if chosen is None:
+                raise CommandError("--device-source: name the scene with --scene too", BAD_INPUT)
+            scene = load_scene(chosen)
+            taking = Capture(
+                described,
+                lens=scene.camera.left,
+                size=(scene.camera.width_px, scene.camera.height_px),
+                pairs=pairs,
+                still_pictures=1 if device_source is None else 4,
+            )
+            if device_source is None:
+                shown = capture.twin_pictures(scene, described, pairs=pairs, seed=seed)
+                made += ["--twin", str(chosen), "--pairs", str(pairs), "--seed", str(seed)]
+            else:
+                shown = capture.device_pictures(device_source, scene)
+                made += ["--device-source", device_source, "--scene", str(chosen)]
+            folder = pictures or Path(f"runs/calibration-{datetime.now():%Y%m%d-%H%M%S}")
+            capture.take_pairs(shown, taking, folder)
+            left_paths = sorted(folder.glob("left*.png"))
+            right_paths = sorted(folder.glob("right*.png"))
+        made += ["--board", board, "--square-mm", f"{square_mm:g}"]
+        if marker_mm is not None:
+            made += ["--marker-mm", f"{marker_mm:g}", "--dictionary", dictionary]
+        made += ["-o", str(output)]
         with _progress("looking for the board") as progress:
-            calibration = calibrate_stereo(
-                _pictures("--left", left),
-                _pictures("--right", right),
-                board=_board(board),
-                square_m=square_mm * 1e-3,
-                device=device,
+            calibrated = calibrate_stereo(
+                left_paths,
+                right_paths,
+                board=described,
+                device=device or ("stereo" if scene is None else scene.camera.device),
+                working_distance_m=_working_distance_m(distance_mm, scene),
                 progress=progress,
             )
     except CalibrationError as error:
         raise CommandError(str(error), BAD_INPUT) from error
-    save_calibration(calibration, output)
+    save_calibration(calibrated.calibration, output, comment=shlex.join(made))
+    page: Path | None = None
+    if report is not None:
+        from nodes.camera.report import write_report
+
+        page = write_report(calibrated, report)
+    _tell(calibrated.calibration, output, page, as_json)
+
+
+def _tell(calibration: StereoCalibration, output: Path, page: Path | None, as_json: bool) -> None:
     used = sum(pair.used for pair in calibration.pairs)
     baseline_mm = float((calibration.right_from_left[:3, 3] ** 2).sum() ** 0.5) * 1e3
+    uncertainty = calibration.uncertainty
+    assert uncertainty is not None
     result = {
         "calibration": str(output),
         "pairs": used,
@@ -63,6 +174,13 @@ def stereo(
         "baseline_mm": baseline_mm,
         "left_f_px": calibration.left.fx_px,
         "right_f_px": calibration.right.fx_px,
+        "uncertainty": {
+            "working_distance_mm": 1e3 * uncertainty.working_distance_m,
+            "depth_std_mm": 1e3 * uncertainty.depth_std_m,
+            "lateral_std_mm": 1e3 * uncertainty.lateral_std_m,
+            "jackknife_ratio": uncertainty.jackknife_ratio,
+        },
+        "report": None if page is None else str(page),
     }
     if as_json:
         print_json(result)
@@ -74,6 +192,13 @@ def stereo(
             ("reprojection", f"{calibration.reprojection_rms_px:.3f} px rms"),
             ("baseline", f"{baseline_mm:.2f} mm"),
             ("focal lengths", f"{calibration.left.fx_px:.1f}, {calibration.right.fx_px:.1f} px"),
+            (
+                "uncertainty",
+                f"{1e3 * uncertainty.depth_std_m:.2f} mm in depth, "
+                f"{1e3 * uncertainty.lateral_std_m:.2f} mm across, "
+                f"at {1e3 * uncertainty.working_distance_m:.0f} mm",
+            ),
+            *([] if page is None else [("report", page)]),
         ]
     )
     for pair in calibration.pairs:
@@ -89,11 +214,14 @@ def check(
     right: RightOption,
     board: BoardOption,
     square_mm: SquareOption,
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = FOUR_BITS,
     as_json: JsonOption = False,
 ) -> None:
     """Measure a board of known size with a calibration, on pictures that did not make it."""
     from messages.calibration import CalibrationFileError, load_calibration
-    from nodes.camera.calibration import CalibrationError, check_stereo
+    from nodes.camera.check import check_stereo
+    from nodes.camera.corners import CalibrationError
 
     try:
         with _progress("measuring the board") as progress:
@@ -101,18 +229,111 @@ def check(
                 load_calibration(calibration),
                 _pictures("--left", left),
                 _pictures("--right", right),
-                board=_board(board),
-                square_m=square_mm * 1e-3,
+                board=_board(board, square_mm, marker_mm, dictionary),
                 progress=progress,
             )
     except (CalibrationError, CalibrationFileError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
+    again = result["used_to_calibrate"]
+    if isinstance(again, list) and again:
+        words.print(
+            f"pictures of the same names made this calibration, which flatters it: "
+            f"{', '.join(again)}; check on others",
+            markup=False,
+        )
     if as_json:
         print_json(result)
     else:
-        print_fields(
-            (name, value if isinstance(value, int) else f"{value:.4f}")
+        print_fields((name, _figure(value)) for name, value in result.items() if value != again)
+
+
+@app.command("cross-check")
+def cross_check(
+    *,
+    left: LeftOption,
+    right: RightOption,
+    board: BoardOption,
+    square_mm: SquareOption,
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = FOUR_BITS,
+    leave_out: Annotated[int, typer.Option(help="Pairs left out at a time.", min=1)] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Leave pairs out in turn, measure them with what the rest gives, beside plain OpenCV."""
+    from nodes.camera import check
+    from nodes.camera.corners import CalibrationError
+
+    try:
+        with _progress("leaving pairs out") as progress:
+            result = check.cross_check(
+                _pictures("--left", left),
+                _pictures("--right", right),
+                board=_board(board, square_mm, marker_mm, dictionary),
+                leave_out=leave_out,
+                progress=progress,
+            )
+    except CalibrationError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    if as_json:
+        print_json(result)
+        return
+    rows: Any = result.pop("rows")
+    plain: Any = result.pop("plain_opencv")
+    print_table(
+        ("pair", "distance, m", "rigid fit, mm", "plain OpenCV, mm"),
+        [[row["left"], *(_figure(value) for value in list(row.values())[1:])] for row in rows],
+    )
+    print_table(
+        ("all left-out pairs", "here", "plain OpenCV"),
+        [
+            (name, _figure(value), _figure(None if plain is None else plain[name]))
             for name, value in result.items()
+        ],
+    )
+
+
+@app.command("board")
+def print_board(
+    *,
+    board: BoardOption,
+    square_mm: SquareOption,
+    output: Annotated[Path, typer.Option("-o", "--output", help="File to write: .svg or .png.")],
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = FOUR_BITS,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a board to print at true size: a chessboard, or with --marker-mm a ChArUco board."""
+    from nodes.camera.corners import CalibrationError
+    from nodes.camera.printing import caption, write_board
+
+    if not output.parent.is_dir():
+        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    described = _board(board, square_mm, marker_mm, dictionary)
+    try:
+        write_board(described, output)
+    except CalibrationError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    if as_json:
+        print_json({"file": str(output), "board": described.model_dump(mode="json")})
+    else:
+        print_fields([("file", output), ("board", caption(described))])
+
+
+def _figure(value: object) -> str:
+    return "-" if value is None else f"{value:.4f}" if isinstance(value, float) else str(value)
+
+
+def _one_source(
+    left: str | None, right: str | None, device_source: str | None, twin: Path | None
+) -> None:
+    """Raises CommandError unless exactly one way to get pictures is chosen."""
+    files = left is not None or right is not None
+    chosen = [files, device_source is not None, twin is not None]
+    if sum(chosen) != 1 or (files and (left is None or right is None)):
+        raise CommandError(
+            "give pictures by --left and --right, or a device by --device-source and --scene, or "
+            "the twin by --twin; one of the three",
+            BAD_INPUT,
         )
 
 
@@ -123,13 +344,32 @@ def _pictures(option: str, pattern: str) -> list[Path]:
     return paths
 
 
-def _board(text: str) -> tuple[int, int]:
+def _board(text: str, square_mm: float, marker_mm: float | None, dictionary: str) -> Board:
+    from messages.calibration import Board
+
     columns, _, rows = text.lower().partition("x")
     if not (columns.isdigit() and rows.isdigit() and min(int(columns), int(rows)) >= 3):
         raise CommandError(
             f"--board {text}: give the inner corners along both sides, 3 or more, as 9x6", BAD_INPUT
         )
-    return int(columns), int(rows)
+    charuco = marker_mm is not None
+    return Board(
+        kind="charuco" if charuco else "chessboard",
+        columns=int(columns),
+        rows=int(rows),
+        square_m=1e-3 * square_mm,
+        marker_m=None if marker_mm is None else 1e-3 * marker_mm,
+        dictionary=dictionary if charuco else None,
+    )
+
+
+def _working_distance_m(distance_mm: float | None, scene: Scene | None) -> float | None:
+    """As asked for, else from the scene's left camera to the screen's centre, else None."""
+    if distance_mm is not None:
+        return 1e-3 * distance_mm
+    if scene is None:
+        return None
+    return float((scene.camera.world_from_left.position_m**2).sum() ** 0.5)
 
 
 @contextmanager
@@ -139,4 +379,6 @@ def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
 
     with Progress(console=words, transient=True) as bar:
         task = bar.add_task(what, total=None)
-        yield lambda done, total, _: bar.update(task, completed=done, total=total)
+        yield lambda done, total, now: bar.update(
+            task, completed=done, total=total, description=now
+        )

@@ -1,0 +1,161 @@
+"""Live capture for `flexsheet calibrate stereo`, from devices or the twin, with coverage shown."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from launch.commands.output import BAD_INPUT, CommandError, words
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+    from rich.console import RenderableType
+
+    from messages.calibration import Board
+    from messages.scene import Scene
+    from nodes.camera.capture import Capture
+
+    Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
+
+POSES_PER_PAIR = 3
+"""The twin shows so many poses for each pair wanted, in case not all add coverage."""
+
+
+def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
+    """Grey pairs from what a camera node's parameter `source` describes, in YAML."""
+    from pydantic import TypeAdapter, ValidationError
+    from ruamel.yaml.error import YAMLError
+
+    from launch.documents import parse_value
+    from nodes.camera.devices import open_reader
+    from nodes.camera.pictures import DeviceError, check_size
+    from nodes.camera.sources import AnySource
+
+    try:
+        described: Any = TypeAdapter(AnySource).validate_python(parse_value(source))
+    except (YAMLError, ValidationError) as error:
+        said = (
+            "; ".join(
+                f"{'.'.join(str(part) for part in one['loc'])}: {one['msg']}"
+                for one in error.errors()
+            )
+            if isinstance(error, ValidationError)
+            else str(error).splitlines()[0]
+        )
+        raise CommandError(
+            f"--device-source {source}: {said}; describe it as a camera node's source, as "
+            "'{kind: opencv, left: 0, right: 1}'",
+            BAD_INPUT,
+        ) from error
+    if described.kind == "twin":
+        raise CommandError(
+            "--device-source twin: the twin has no board in a graph; use --twin SCENE", BAD_INPUT
+        )
+    try:
+        with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
+            for warning in reader.warnings:
+                words.print(f"camera: {warning}", markup=False)
+            while (pictures := reader.read()) is not None:
+                check_size(pictures, scene.camera, source)
+                yield pictures.left, pictures.right
+    except DeviceError as error:
+        raise CommandError(str(error)) from error
+
+
+def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
+    """What the twin's true rig sees of a board, in one pose after the other."""
+    from nodes.twin.board import BoardError, TwinBoard
+    from nodes.twin.rig import true_camera
+
+    try:
+        shown = TwinBoard(true_camera(scene.camera), board, seed=seed)
+        for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
+            yield shown.pair(left_from_board)
+    except BoardError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+
+
+def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int:
+    """Keep the pairs that `capture` takes as left01.png, right01.png, ... in a new folder.
+
+    Ends when all is covered, when the pictures end, or at Ctrl-C; what is still missing is said.
+    Returns the number of pairs.
+    """
+    import cv2
+
+    try:
+        folder.mkdir(parents=True)
+    except OSError as error:
+        raise CommandError(
+            f"--pictures {folder}: cannot be made: {error.strerror}; name a new folder", BAD_INPUT
+        ) from error
+    taken = 0
+    try:
+        with _shown(capture) as show:
+            for left, right in pictures:
+                seen = capture.see(left, right)
+                if seen.taken:
+                    taken += 1
+                    for side, picture in (("left", left), ("right", right)):
+                        cv2.imwrite(str(folder / f"{side}{taken:02}.png"), picture)
+                show(seen.hint, seen.taken)
+                if capture.complete:
+                    break
+    except KeyboardInterrupt:
+        words.print("stopped; going on with what was taken")
+    missing = capture.missing()
+    if missing:
+        listed = ", ".join(f"{one.group} {one.name}".strip() for one in missing)
+        words.print(f"not covered: {listed}", markup=False)
+    words.print(f"{taken} pairs in {folder}", markup=False)
+    return taken
+
+
+@contextmanager
+def _shown(capture: Capture) -> Iterator[Any]:
+    """Calls with (hint, taken) update the view; a line per taken pair where it is no terminal."""
+    if not words.is_terminal:
+
+        def tell(hint: str, taken: bool) -> None:
+            if taken:
+                missing = len(capture.missing())
+                words.print(f"pair taken; {missing} things not covered yet", markup=False)
+
+        yield tell
+        return
+    from rich.live import Live
+
+    with Live(coverage_view(capture, "waiting for pictures"), console=words) as live:
+        yield lambda hint, taken: live.update(coverage_view(capture, hint))
+
+
+def coverage_view(capture: Capture, hint: str) -> RenderableType:
+    """Cells of both pictures, tilts, distances and pairs: how often seen of how often needed."""
+    from rich.columns import Columns
+    from rich.console import Group
+    from rich.table import Table
+    from rich.text import Text
+
+    from nodes.camera.capture import COLUMNS, DISTANCES, ROWS, TILTS, Bin
+
+    def count(one: Bin) -> Text:
+        have, often = capture.counts[one], capture.needed.get(one, 0)
+        style = "green" if have >= often else "yellow" if have else "red"
+        return Text(f"{have}/{often}" if often else f"{have}", style=style if often else "dim")
+
+    tables = []
+    for side in ("left", "right"):
+        cells = Table(title=f"{side} picture", show_header=False)
+        for row in range(ROWS):
+            cells.add_row(*(count(Bin(f"{side} cell", f"{x},{row}")) for x in range(COLUMNS)))
+        tables.append(cells)
+    for group, names in (("tilt", TILTS), ("distance", DISTANCES), ("pairs", ("",))):
+        table = Table(title=group, show_header=False)
+        for name in names:
+            table.add_row(name, count(Bin(group, name)))
+        tables.append(table)
+    return Group(Columns(tables), Text(hint, style="bold"))

@@ -1,0 +1,217 @@
+"""Live capture of board pairs: what has been covered, what is missing, and when to take one.
+
+A pair is taken by itself when the board holds still somewhere new and adds coverage: of the cells
+of each picture, of the ways a board can be tilted, of its distances, or of the number of pairs.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.calibration import Board
+from messages.scene import Lens
+from nodes.camera.bundle import board_pose, pose_transform
+from nodes.camera.corners import BoardPair, CornerFinder, board_points, pair_of
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+COLUMNS, ROWS = 4, 3
+"""Cells of a picture."""
+
+MIN_CELL_CORNERS = 2
+UPRIGHT_RAD = np.radians(12.0)
+STILL_PX = 0.5
+"""The board holds still when its corners move by less than that from picture to picture."""
+
+NEW_PLACE_PX = 12.0
+"""A pose of the board is new when its corners lie further off than that from any taken one's."""
+
+TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
+DISTANCES = ("near", "middle", "far")
+NEAR, FAR = 0.55, 0.35
+"""Share of the picture's diagonal that the board's diagonal takes, held upright."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bin:
+    """A thing to be covered: group ("left cell", "right cell", "tilt", "distance", "pairs"), name.
+
+    A cell's name is its column and row.
+    """
+
+    group: str
+    name: str
+
+
+def needed(pairs: int) -> dict[Bin, int]:
+    """How often each bin is to be covered when `pairs` pairs are wanted.
+
+    Cells that one camera alone sees at most distances (the left picture's left edge, the right
+    picture's right edge) are not required, and so not among them.
+    """
+    often = max(1, round(0.1 * pairs))
+    wanted = {Bin("pairs", ""): pairs}
+    for row in range(ROWS):
+        for column in range(COLUMNS):
+            if column > 0:
+                wanted[Bin("left cell", f"{column},{row}")] = often
+            if column < COLUMNS - 1:
+                wanted[Bin("right cell", f"{column},{row}")] = often
+    wanted.update({Bin("tilt", name): often for name in TILTS})
+    wanted.update({Bin("distance", name): often for name in DISTANCES})
+    return wanted
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What was made of one pair of pictures.
+
+    hint: what to do with the board, for the person who holds it.
+    """
+
+    taken: bool
+    hint: str
+
+
+class Capture:
+    """Watches pairs of pictures and says which to take."""
+
+    def __init__(
+        self,
+        board: Board,
+        *,
+        lens: Lens,
+        size: tuple[int, int],
+        pairs: int = 20,
+        still_pictures: int = 4,
+    ) -> None:
+        """lens: of the left camera, roughly.  still_pictures: in a row before a pair is taken."""
+        self.board = board
+        self.needed = needed(pairs)
+        self.counts: Counter[Bin] = Counter()
+        self._lens = np.array(
+            [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion[:4]]
+        )
+        self._size, self._still_pictures = size, still_pictures
+        self._finder = CornerFinder(board, quick=True)
+        self._points = board_points(board)
+        self._middle = self._points.mean(axis=0)
+        self._before: BoardPair | None = None
+        self._still = 0
+        self._taken: list[BoardPair] = []
+
+    @property
+    def complete(self) -> bool:
+        return not self.missing()
+
+    def missing(self) -> list[Bin]:
+        """What is not covered often enough, in the order in which it is asked for."""
+        return [one for one, often in self.needed.items() if self.counts[one] < often]
+
+    def see(self, left: Image, right: Image) -> Seen:
+        """Judge a pair of grey pictures (h, w); a taken one is counted."""
+        views = self._finder.find(left), self._finder.find(right)
+        pair = pair_of(*views, self.board, ("the left picture", "the right picture"))
+        if isinstance(pair, str):
+            self._before, self._still = None, 0
+            return Seen(False, pair)
+        moved_px = np.inf if self._before is None else _shift(pair, self._before)
+        self._before = pair
+        self._still = self._still + 1 if moved_px < STILL_PX else 1
+        if any(_shift(pair, one) < NEW_PLACE_PX for one in self._taken):
+            return Seen(False, self._advice("taken from here; "))
+        bins = self.bins_of(pair)
+        adds = [one for one in bins if self.counts[one] < self.needed.get(one, 0)]
+        if not adds:
+            return Seen(False, self._advice("nothing new here; "))
+        if self._still < self._still_pictures:
+            return Seen(False, "hold still")
+        self.counts.update(bins)
+        self._taken.append(pair)
+        return Seen(True, self._advice("taken; "))
+
+    def bins_of(self, pair: BoardPair) -> list[Bin]:
+        """What a pair covers."""
+        pose = board_pose(pair.left, self._points, self._lens)
+        bins = [Bin("pairs", ""), Bin("tilt", tilt_of(pose, self._middle))]
+        bins.append(Bin("distance", self._distance(pose)))
+        for group, view in (("left cell", pair.left), ("right cell", pair.right)):
+            cell = np.floor(view.pixels / self._size * [COLUMNS, ROWS]).astype(int)
+            cell = np.clip(cell, 0, [COLUMNS - 1, ROWS - 1])
+            counts = Counter((int(column), int(row)) for column, row in cell)
+            bins += [
+                Bin(group, f"{column},{row}")
+                for (column, row), corners in counts.items()
+                if corners >= MIN_CELL_CORNERS
+            ]
+        return bins
+
+    def _distance(self, pose: Floats) -> str:
+        middle = pose_transform(pose) @ [*self._middle, 1.0]
+        diagonal_m = self.board.square_m * np.hypot(self.board.columns + 1, self.board.rows + 1)
+        share = self._lens[0] * diagonal_m / middle[2] / np.hypot(*self._size)
+        return "near" if share > NEAR else "far" if share < FAR else "middle"
+
+    def _advice(self, before: str) -> str:
+        missing = self.missing()
+        if not missing:
+            return before + "all is covered"
+        groups = {one.group: one for one in reversed(missing)}
+        for group in ("tilt", "distance"):
+            if group in groups:
+                return f"{before}show the board {_as_order(groups[group])}"
+        for side in ("left", "right"):
+            if f"{side} cell" in groups:
+                return f"{before}show the board {place(groups[f'{side} cell'])} the {side} picture"
+        return before + "show the board somewhere else"
+
+
+def _as_order(one: Bin) -> str:
+    orders = {"upright": "straight on", "near": "nearer", "far": "further away"}
+    if one.name == "middle":
+        return "at middle distance"
+    return orders.get(one.name, f"with its {one.name.replace(' back', ' tilted back')}")
+
+
+def place(cell: Bin) -> str:
+    """Where a cell is, in words: "at the top left of"."""
+    column, row = (int(part) for part in cell.name.split(","))
+    height = ("top", "middle", "bottom")[row]
+    across = ("left", "centre left", "centre right", "right")[column]
+    return f"at the {height} {across} of"
+
+
+def tilt_of(pose: Floats, middle: Floats) -> str:
+    """How the board leans, of its pose (6,) in the left camera's frame: one of TILTS.
+
+    Judged by the board's normal, turned towards the camera, so that it does not matter how the
+    board is turned within its plane.  middle: of the board (3,), in its own frame.
+    """
+    transform = pose_transform(pose)
+    centre = transform[:3, :3] @ middle + transform[:3, 3]
+    normal = transform[:3, 2]
+    if normal @ centre > 0:
+        normal = -normal
+    sight = centre / np.linalg.norm(centre)
+    if np.arccos(np.clip(-normal @ sight, -1.0, 1.0)) < UPRIGHT_RAD:
+        return "upright"
+    aside = normal + (-normal @ sight) * sight
+    if abs(aside[0]) > abs(aside[1]):
+        return "left side back" if aside[0] < 0 else "right side back"
+    return "top back" if aside[1] < 0 else "bottom back"
+
+
+def _shift(pair: BoardPair, other: BoardPair) -> float:
+    """Median distance px by which the corners that both show have moved; infinite without any."""
+    _, here, there = np.intersect1d(
+        pair.left.ids, other.left.ids, assume_unique=True, return_indices=True
+    )
+    if not len(here):
+        return float("inf")
+    shifts = pair.left.pixels[here] - other.left.pixels[there]
+    return float(np.median(np.linalg.norm(shifts, axis=1)))

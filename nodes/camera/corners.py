@@ -1,0 +1,265 @@
+"""Corners of a calibration board in pictures: chessboards seen whole, ChArUco boards seen in part.
+
+A corner's id counts along the board's columns first, so that it is the row of `board_points`.  The
+same id is the same corner in every picture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.calibration import Board
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Ids = NDArray[np.int64]
+Progress = Callable[[int, int, str], None]
+"""Called with (steps done, steps in all, what was just done)."""
+
+MIN_CORNERS = 8
+"""Of a ChArUco board in a view; fewer say too little about the board's pose."""
+
+LARGEST_HALF_WINDOW_PX = 15
+LARGEST_MOVE_PX = 1.5
+"""A ChArUco corner that refinement takes further was drawn to another edge, and is left out."""
+
+CHESSBOARD_SMOOTHING_PX = 1.0
+CHARUCO_SMOOTHING_PX = 0.7
+"""Standard deviations; markers stand nearer to the corners than their neighbours do."""
+
+REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
+
+
+class CalibrationError(ValueError):
+    """Pictures that cannot be calibrated with; the message says which and what to do."""
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What one picture shows of the board: ids (n,), rising, and pixels (n, 2)."""
+
+    ids: Ids
+    pixels: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class BoardPair:
+    """One pose of the board in both pictures; of a ChArUco board each may show other corners."""
+
+    left: View
+    right: View
+
+    def common(self) -> tuple[Ids, Floats, Floats]:
+        """The corners that both views show: ids (n,), left and right pixels (n, 2)."""
+        ids, in_left, in_right = np.intersect1d(
+            self.left.ids, self.right.ids, assume_unique=True, return_indices=True
+        )
+        return ids, self.left.pixels[in_left], self.right.pixels[in_right]
+
+
+def ignore_progress(done: int, total: int, what: str) -> None:
+    """For callers that do not care."""
+
+
+def board_points(board: Board) -> Floats:
+    """Corners (rows*columns, 3) in the board's frame, metres: along the columns first."""
+    points = np.zeros((board.rows * board.columns, 3))
+    grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2)
+    points[:, :2] = grid * board.square_m
+    return points
+
+
+def describe(board: Board) -> str:
+    """The board in words: "chessboard of 9x6 inner corners"."""
+    name = {"chessboard": "chessboard", "charuco": "ChArUco board"}[board.kind]
+    return f"{name} of {board.columns}x{board.rows} inner corners"
+
+
+def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
+    """OpenCV's own board; raises CalibrationError for an unknown or too small dictionary."""
+    name = board.dictionary or ""
+    number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
+    if board.marker_m is None or number is None:
+        raise CalibrationError(
+            f"ChArUco board with markers of {board.marker_m} m from dictionary "
+            f"{board.dictionary!r}: give the markers' side and a name of OpenCV's, as DICT_4X4_50"
+        )
+    if board.marker_m >= board.square_m:
+        raise CalibrationError(
+            f"markers of {1e3 * board.marker_m:g} mm do not fit into squares of "
+            f"{1e3 * board.square_m:g} mm: measure both again"
+        )
+    dictionary = cv2.aruco.getPredefinedDictionary(number)
+    squares = (board.columns + 1, board.rows + 1)
+    needed, held = squares[0] * squares[1] // 2, len(dictionary.bytesList)
+    if needed > held:
+        raise CalibrationError(
+            f"a board of {squares[0]}x{squares[1]} squares needs {needed} markers, {name} holds "
+            f"{held}: take a larger dictionary"
+        )
+    return cv2.aruco.CharucoBoard(squares, board.square_m, board.marker_m, dictionary)
+
+
+class CornerFinder:
+    """Finds one kind of board in pictures; `quick`: gives up early on pictures without one."""
+
+    def __init__(self, board: Board, *, quick: bool = False) -> None:
+        self.board = board
+        self._detector = (
+            cv2.aruco.CharucoDetector(charuco_board(board)) if board.kind == "charuco" else None
+        )
+        self._flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
+        if quick:
+            self._flags |= cv2.CALIB_CB_FAST_CHECK
+
+    def find(self, image: Image) -> View | None:
+        """Sub-pixel corners of a grey picture (h, w), or None where too little is seen."""
+        if self._detector is not None:
+            return self._charuco(image)
+        return self._chessboard(image)
+
+    def _chessboard(self, image: Image) -> View | None:
+        board = self.board
+        found, corners = cv2.findChessboardCorners(
+            image, (board.columns, board.rows), flags=self._flags
+        )
+        if not found:
+            return None
+        start = np.asarray(corners.reshape(-1, 2), dtype=np.float64)
+        half_px = 0.4 * _nearest(start)
+        pixels = _refined(image, start, half_px, smoothing_px=CHESSBOARD_SMOOTHING_PX)
+        return View(np.arange(board.rows * board.columns), pixels)
+
+    def _charuco(self, image: Image) -> View | None:
+        assert self._detector is not None
+        assert self.board.marker_m is not None
+        corners, found, _, _ = self._detector.detectBoard(image)
+        if found is None or len(found) < MIN_CORNERS:
+            return None
+        order = np.argsort(found.ravel())
+        ids = found.ravel()[order].astype(np.int64)
+        start = np.asarray(corners.reshape(-1, 2)[order], dtype=np.float64)
+        rim = 0.5 * (1.0 - self.board.marker_m / self.board.square_m)
+        half_px = min(0.4, 0.7 * rim) * _nearest(start)
+        pixels = _refined(image, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)
+        last = np.array([image.shape[1], image.shape[0]]) - 1.0
+        clear = np.minimum(start, last - start).min(axis=1) > half_px + 2.0
+        sound = clear & (np.linalg.norm(pixels - start, axis=1) < LARGEST_MOVE_PX)
+        ids, pixels = ids[sound], pixels[sound]
+        columns, rows = np.unique(ids % self.board.columns), np.unique(ids // self.board.columns)
+        if len(ids) < MIN_CORNERS or min(len(columns), len(rows)) < 2:
+            return None  # corners in one line do not fix a pose
+        return View(ids, pixels)
+
+
+def _nearest(pixels: Floats) -> Floats:
+    """Distance (n,) of each corner to the nearest other one."""
+    distances = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    return np.asarray(distances.min(axis=1))
+
+
+def _refined(image: Image, start: Floats, half_px: Floats, *, smoothing_px: float) -> Floats:
+    """Corners (n, 2) at the saddle points of their neighbourhoods, half_px (n,) to each side.
+
+    A window must stay clear of the next edges (those of a neighbouring corner, or of a marker): a
+    larger one drags corners by pixels.  Smoothing takes noise from the gradients that the saddle
+    point is found by (and the blocks of JPEG).
+    """
+    smooth = cv2.GaussianBlur(image, (0, 0), smoothing_px)
+    halves = np.clip(half_px, 2, LARGEST_HALF_WINDOW_PX).astype(int)
+    refined = np.empty_like(start)
+    for half in np.unique(halves):
+        these = halves == half
+        corners = start[these].reshape(-1, 1, 2).astype(np.float32)
+        window = (int(half), int(half))
+        refined[these] = cv2.cornerSubPix(smooth, corners, window, (-1, -1), REFINEMENT)[:, 0]
+    return refined
+
+
+def same_order(left: Floats, right: Floats, board: Board) -> Floats:
+    """The right picture's corners, renumbered to start at the same board corner as the left's.
+
+    A detector may begin at either end of the board (at any corner of a square one).  The two
+    cameras of a rig stand nearly upright to each other, so that the right numbering is the one
+    whose axes point as the left's do.
+    """
+    grid = right.reshape(board.rows, board.columns, 2)
+    turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
+    numberings = [np.rot90(grid, turn, axes=(0, 1)).reshape(-1, 2) for turn in turns]
+
+    def axes(corners: Floats) -> Floats:
+        square = corners.reshape(board.rows, board.columns, 2)
+        directions = np.stack([square[0, -1] - square[0, 0], square[-1, 0] - square[0, 0]])
+        return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
+
+    wanted = axes(left)
+    return max(numberings, key=lambda corners: float(np.sum(axes(corners) * wanted)))
+
+
+def pair_of(
+    left: View | None, right: View | None, board: Board, names: tuple[str, str]
+) -> BoardPair | str:
+    """The board in a pair of views, or the reason why it cannot be used; names: of the pictures."""
+    if left is None or right is None:
+        missing = [name for name, seen in zip(names, (left, right), strict=True) if seen is None]
+        return f"no {describe(board)} in {' and '.join(missing)}"
+    if board.kind == "charuco":
+        pair = BoardPair(left, right)
+        shared = len(pair.common()[0])
+        if shared < MIN_CORNERS:
+            return f"{shared} corners are in both views, at least {MIN_CORNERS} are needed"
+        return pair
+    return BoardPair(left, View(right.ids, same_order(left.pixels, right.pixels, board)))
+
+
+def read_gray(path: Path) -> Image:
+    """A picture in grey; raises CalibrationError for what is not a readable picture."""
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
+    if image is None:
+        raise CalibrationError(f"{path}: not a picture that can be read")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def find_pairs(
+    left_paths: Sequence[Path],
+    right_paths: Sequence[Path],
+    board: Board,
+    progress: Progress = ignore_progress,
+) -> tuple[list[BoardPair | str], tuple[int, int]]:
+    """The board in each pair, or the reason why not, and the pictures' (width, height).
+
+    Raises CalibrationError for unequal counts, no pictures, unreadable ones, or mixed sizes.
+    """
+    if len(left_paths) != len(right_paths):
+        raise CalibrationError(
+            f"{len(left_paths)} left and {len(right_paths)} right pictures; give equally many, in "
+            "the same order"
+        )
+    if not left_paths:
+        raise CalibrationError("no pictures: the patterns match no file")
+    finder = CornerFinder(board)
+    results: list[BoardPair | str] = []
+    size: tuple[int, int] | None = None
+    for number, paths in enumerate(zip(left_paths, right_paths, strict=True), start=1):
+        views = []
+        for path in paths:
+            image = read_gray(path)
+            image_size = (image.shape[1], image.shape[0])
+            if size is not None and image_size != size:
+                raise CalibrationError(
+                    f"{path}: {image_size[0]}x{image_size[1]} px, the others {size[0]}x{size[1]}"
+                )
+            size = image_size
+            views.append(finder.find(image))
+        left, right = views
+        results.append(pair_of(left, right, board, (paths[0].name, paths[1].name)))
+        progress(number, len(left_paths), f"{paths[0].name}, {paths[1].name}")
+    assert size is not None
+    return results, size

@@ -1,0 +1,126 @@
+"""Boards to print, at true size: the black parts as rectangles, written as SVG or PNG.
+
+The first square is black, and of a ChArUco board the markers stand in the white squares, numbered
+row by row, as OpenCV's detector expects them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.calibration import Board
+from nodes.camera.corners import CalibrationError, charuco_board, describe
+
+Floats = NDArray[np.float64]
+
+BORDER_SQUARES = 1.0
+"""White around the squares: detectors need it."""
+
+CAPTION_MM = 8.0
+RULER_MM = 100.0
+PNG_DOTS_PER_INCH = 300
+
+
+def black_rectangles(board: Board) -> Floats:
+    """Black parts (n, 4): x, y, width, height in m from the outer corner of the first square.
+
+    Raises CalibrationError for markers that do not fit the board.
+    """
+    columns, rows, side = board.columns + 1, board.rows + 1, board.square_m
+    squares = [
+        (column * side, row * side, side, side)
+        for row in range(rows)
+        for column in range(columns)
+        if (row + column) % 2 == 0
+    ]
+    if board.kind == "chessboard":
+        return np.array(squares)
+    dictionary = charuco_board(board).getDictionary()
+    assert board.marker_m is not None
+    cells = dictionary.markerSize + 2
+    cell_m = board.marker_m / cells
+    rim_m = 0.5 * (side - board.marker_m)
+    white = [
+        (row, column) for row in range(rows) for column in range(columns) if (row + column) % 2
+    ]
+    for marker, (row, column) in enumerate(white):
+        picture = cv2.aruco.generateImageMarker(dictionary, marker, cells)
+        for y, x, width in _runs(np.asarray(picture) == 0):
+            left, top = column * side + rim_m + x * cell_m, row * side + rim_m + y * cell_m
+            squares.append((left, top, width * cell_m, cell_m))
+    return np.array(squares)
+
+
+def _runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
+    """(row, first column, length) of the black stretches of a marker's rows."""
+    runs = []
+    for y, row in enumerate(black):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
+        runs += [(y, int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return runs
+
+
+def caption(board: Board) -> str:
+    """What the board is, printed below it so that a print tells how to use it."""
+    text = f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"
+    if board.marker_m is not None:
+        text += f", markers of {1e3 * board.marker_m:g} mm, {board.dictionary}"
+    return f"{text}. Print at 100 %: the line is {RULER_MM:g} mm long."
+
+
+def svg(board: Board) -> str:
+    """The board as SVG in millimetres, with a caption and a line to measure the print by."""
+    border = 1e3 * BORDER_SQUARES * board.square_m
+    width = 1e3 * (board.columns + 1) * board.square_m + 2 * border
+    height = 1e3 * (board.rows + 1) * board.square_m + 2 * border
+    parts = [
+        f'<rect x="{border + 1e3 * x:.6g}" y="{border + 1e3 * y:.6g}" width="{1e3 * w:.6g}" '
+        f'height="{1e3 * h:.6g}"/>'
+        for x, y, w, h in black_rectangles(board)
+    ]
+    whole = height + 2 * CAPTION_MM
+    ruler_y = height + 1.4 * CAPTION_MM
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}mm" height="{whole:g}mm" '
+            f'viewBox="0 0 {width:g} {whole:g}">',
+            f'<rect width="{width:g}" height="{whole:g}" fill="white"/>',
+            *parts,
+            f'<text x="{border:g}" y="{height + 0.8 * CAPTION_MM:g}" font-size="4" '
+            f'font-family="sans-serif">{caption(board)}</text>',
+            f'<path d="M {border:g} {ruler_y:g} h {RULER_MM:g}" stroke="black" '
+            'stroke-width="0.3"/>',
+            "</svg>\n",
+        ]
+    )
+
+
+def raster(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
+    """The board as a picture (h, w), white 255; a dot is black where its centre is."""
+    border = BORDER_SQUARES * board.square_m
+    across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
+    width, height = np.ceil(across * dots_per_m).astype(int)
+    picture = np.full((height, width), 255, np.uint8)
+    for x, y, w, h in black_rectangles(board):
+        low = np.ceil((border + np.array([x, y])) * dots_per_m - 0.5).astype(int)
+        high = np.ceil((border + np.array([x + w, y + h])) * dots_per_m - 0.5).astype(int)
+        picture[low[1] : high[1], low[0] : high[0]] = 0
+    return picture
+
+
+def write_board(board: Board, path: Path) -> None:
+    """Write the board by the path's suffix; raises CalibrationError for one that is neither."""
+    suffix = path.suffix.lower()
+    if suffix == ".svg":
+        path.write_text(svg(board))
+    elif suffix == ".png":
+        import matplotlib.image  # only here: it is slow to import
+
+        picture = raster(board, PNG_DOTS_PER_INCH / 0.0254)
+        matplotlib.image.imsave(path, picture, cmap="gray", vmin=0, vmax=255, dpi=PNG_DOTS_PER_INCH)
+    else:
+        raise CalibrationError(f"{path}: write the board as .svg or .png")

@@ -1,0 +1,240 @@
+"""A calibration's report: where corners miss, which pairs fit, what was covered, how sure it is.
+
+One page that needs no other file, and its pictures beside it as PNG.
+"""
+
+from __future__ import annotations
+
+import base64
+import html
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.camera.bundle import PARAMETERS, pose_transform
+from nodes.camera.calibration import Calibrated
+from nodes.camera.check import Rig
+from nodes.camera.corners import board_points, describe
+from nodes.models import rigid
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+DOTS_PER_INCH = 110
+ARROW_PX = 40.0
+"""Length in the picture of the 95 % longest residual."""
+
+STYLE = """
+body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
+table { border-collapse: collapse; } td, th { padding: 0.15em 0.8em; text-align: right; }
+td:first-child, th:first-child { text-align: left; } tr:nth-child(even) { background: #f2f2f2; }
+img { max-width: 100%; } figcaption { color: #444; }
+"""
+
+
+def epipolar_distances(calibrated: Calibrated) -> tuple[Floats, Floats]:
+    """Right pixels (n, 2) of all common corners, and their signed distances (n,) px from the
+
+    epipolar lines of the left ones, both undistorted and in the right camera's pixels.
+    """
+    rig = Rig.of(calibrated.fit.rig)
+    rotation, position = rig.right_from_left[:3, :3], rig.right_from_left[:3, 3]
+    essential = rigid.skew(position) @ rotation
+    places, distances = [], []
+    for pair in calibrated.pairs.values():
+        _, left, right = pair.common()
+        rays = []
+        for pixels, matrix, distortion in zip(
+            (left, right), rig.matrices, rig.distortions, strict=True
+        ):
+            slopes = cv2.undistortPoints(pixels[:, None], matrix, distortion)[:, 0]
+            rays.append(np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1))
+        lines = rays[0] @ essential.T
+        off = (rays[1] * lines).sum(axis=1) / np.linalg.norm(lines[:, :2], axis=1)
+        distances.append(rig.matrices[1][1, 1] * off)
+        places.append(right)
+    return np.concatenate(places), np.concatenate(distances)
+
+
+def _residuals(calibrated: Calibrated) -> Figure:
+    figure, axes = _figure(1, 2, (13.0, 5.0))
+    lengths = np.concatenate(
+        [np.linalg.norm(view, axis=1) for views in calibrated.fit.residuals for view in views]
+    )
+    longest = float(np.percentile(lengths, 95.0))
+    for side, (axis, name) in enumerate(zip(axes, ("left", "right"), strict=True)):
+        views = [(pair.left, pair.right)[side] for pair in calibrated.pairs.values()]
+        places = np.concatenate([view.pixels for view in views])
+        shifts = np.concatenate([residual[side] for residual in calibrated.fit.residuals])
+        numbers = np.concatenate([[i] * len(view.ids) for i, view in enumerate(views)])
+        arrows = axis.quiver(
+            *places.T,
+            *shifts.T,
+            numbers,
+            cmap="turbo",
+            angles="xy",
+            scale_units="xy",
+            scale=longest / ARROW_PX,
+            width=0.0015,
+        )
+        axis.quiverkey(arrows, 0.85, 1.03, longest, f"{longest:.2g} px", labelpos="E")
+        _as_picture(axis, calibrated.size, f"{name}: seen minus drawn, a colour a pair")
+    return figure
+
+
+def _pairs(calibrated: Calibrated) -> Figure:
+    figure, (axis,) = _figure(1, 1, (13.0, 3.6))
+    pairs = calibrated.calibration.pairs
+    x = np.arange(len(pairs))
+    for shift, side, colour in ((-0.2, "left", "tab:blue"), (0.2, "right", "tab:orange")):
+        heights = [getattr(pair, f"{side}_rms_px") or 0.0 for pair in pairs]
+        axis.bar(x + shift, heights, 0.4, label=side, color=colour)
+    axis.axhline(calibrated.calibration.reprojection_rms_px, color="black", lw=0.8, label="all")
+    for i, pair in enumerate(pairs):
+        if not pair.used:
+            axis.axvspan(i - 0.5, i + 0.5, color="tab:red", alpha=0.2)
+    axis.set_xticks(x, [pair.left for pair in pairs], rotation=90, fontsize=7)
+    axis.set_ylabel("rms, px")
+    axis.legend()
+    return figure
+
+
+def _coverage(calibrated: Calibrated) -> Figure:
+    figure, axes = _figure(1, 3, (15.0, 4.2))
+    for axis, side in zip(axes[:2], ("left", "right"), strict=True):
+        for pair in calibrated.pairs.values():
+            axis.plot(*getattr(pair, side).pixels.T, ".", ms=2.5)
+        _as_picture(axis, calibrated.size, f"corners in the {side} picture")
+    middle = board_points(calibrated.calibration.board).mean(axis=0)
+    tilts, depths = [], []
+    for pose in calibrated.fit.poses:
+        transform = pose_transform(pose)
+        normal = transform[:3, 2] * np.sign(transform[2, 2])
+        tilts.append(np.degrees(np.arctan2(normal[:2], normal[2])))
+        depths.append((transform[:3, :3] @ middle + transform[:3, 3])[2])
+    about_y, about_x = np.transpose(tilts)
+    points = axes[2].scatter(about_y, about_x, c=np.array(depths) * 1e3, cmap="viridis")
+    figure.colorbar(points, ax=axes[2], label="distance, mm")
+    axes[2].set(xlabel="tilt about y, degrees", ylabel="tilt about x, degrees", title="poses")
+    axes[2].grid(alpha=0.3)
+    return figure
+
+
+def _epipolar(calibrated: Calibrated) -> Figure:
+    figure, axes = _figure(1, 2, (13.0, 4.6))
+    places, off = epipolar_distances(calibrated)
+    largest = float(np.percentile(np.abs(off), 98.0))
+    points = axes[0].scatter(
+        places[:, 0], places[:, 1], c=off, s=7, cmap="coolwarm", vmin=-largest, vmax=largest
+    )
+    figure.colorbar(points, ax=axes[0], label="px")
+    _as_picture(axes[0], calibrated.size, "right: distance from the epipolar line")
+    axes[1].hist(off, bins=60, range=(-2 * largest, 2 * largest))
+    rms = float(np.sqrt(np.mean(off**2)))
+    axes[1].set(xlabel="distance, px", ylabel="corners", title=f"rms {rms:.3f} px")
+    return figure
+
+
+def _figure(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Figure, list[Axes]]:
+    from matplotlib.figure import Figure  # only here: it is slow to import
+
+    figure = Figure(figsize=size_in, layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False)
+    return figure, list(axes.ravel())
+
+
+def _as_picture(axis: Axes, size: tuple[int, int], title: str) -> None:
+    axis.set(xlim=(0, size[0]), ylim=(size[1], 0), title=title)
+    axis.set_aspect("equal")
+
+
+def parameter_rows(calibrated: Calibrated) -> list[tuple[str, float, float]]:
+    """(name, value, standard deviation) of the rig's 22 numbers."""
+    uncertainty = calibrated.calibration.uncertainty
+    assert uncertainty is not None
+    deviations = np.sqrt(np.diag(uncertainty.covariance))
+    return [
+        (name, float(value), float(deviation))
+        for name, value, deviation in zip(PARAMETERS, calibrated.fit.rig, deviations, strict=True)
+    ]
+
+
+def write_report(calibrated: Calibrated, folder: Path) -> Path:
+    """Write `index.html` and the pictures into a folder, which is made; returns the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    calibration = calibrated.calibration
+    board, uncertainty = calibration.board, calibration.uncertainty
+    assert uncertainty is not None
+    drawn = {
+        "residuals": (_residuals, "Residuals. Arrows that flow together tell of a lens that the "
+                      "model does not know, or of a board that is not flat."),
+        "pairs": (_pairs, "Root mean square per pair; red: left out."),
+        "coverage": (_coverage, "Where the board was. Blank parts of a picture are guessed."),
+        "epipolar": (_epipolar, "Epipolar residuals: noise of the corners that no depth explains."),
+    }  # fmt: skip
+    figures = []
+    for name, (draw, text) in drawn.items():
+        picture = BytesIO()
+        draw(calibrated).savefig(picture, format="png", dpi=DOTS_PER_INCH)
+        (folder / f"{name}.png").write_bytes(picture.getvalue())
+        coded = base64.b64encode(picture.getvalue()).decode()
+        figures.append(
+            f'<figure><img alt="{name}" src="data:image/png;base64,{coded}">'
+            f"<figcaption>{text}</figcaption></figure>"
+        )
+    used = sum(pair.used for pair in calibration.pairs)
+    facts = [
+        ("device", calibration.device),
+        ("date", calibration.date),
+        ("board", f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"),
+        ("pictures", f"{calibration.width_px}x{calibration.height_px} px"),
+        ("pairs", f"{used} of {len(calibration.pairs)} used"),
+        ("reprojection", f"{calibration.reprojection_rms_px:.3f} px rms"),
+        ("corner noise", f"{uncertainty.corner_sigma_px:.3f} px a coordinate"),
+        (
+            "uncertainty of a fingertip",
+            f"{1e3 * uncertainty.depth_std_m:.3f} mm in depth, "
+            f"{1e3 * uncertainty.lateral_std_m:.3f} mm across (one standard deviation) at "
+            f"{1e3 * uncertainty.working_distance_m:.0f} mm",
+        ),
+        (
+            "refits without some pairs",
+            f"scatter {uncertainty.jackknife_ratio:.2f} times as much as the fit alone states"
+            + ("; the uncertainty was raised to that" if uncertainty.jackknife_ratio > 1 else ""),
+        ),
+        ("software", f"flexsheet {calibration.code_version}, OpenCV {calibration.opencv_version}"),
+    ]
+    left_out = [
+        f"<li>{html.escape(pair.left)}: {html.escape(pair.reason)}</li>"
+        for pair in calibration.pairs
+        if not pair.used
+    ]
+    page = "\n".join(
+        [
+            '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">',
+            f"<title>Calibration of {html.escape(calibration.device)}</title>",
+            f"<style>{STYLE}</style></head><body>",
+            f"<h1>Calibration of {html.escape(calibration.device)}</h1><table>",
+            *(f"<tr><td>{name}</td><td>{html.escape(str(text))}</td></tr>" for name, text in facts),
+            "</table>",
+            *(["<h2>Left out</h2><ul>", *left_out, "</ul>"] if left_out else []),
+            *figures,
+            "<h2>The rig's numbers</h2><table><tr><th>number</th><th>value</th><th>standard "
+            "deviation</th></tr>",
+            *(
+                f"<tr><td>{name}</td><td>{value:.6g}</td><td>{deviation:.2g}</td></tr>"
+                for name, value, deviation in parameter_rows(calibrated)
+            ),
+            "</table></body></html>\n",
+        ]
+    )
+    path = folder / "index.html"
+    path.write_text(page)
+    return path

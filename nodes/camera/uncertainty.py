@@ -1,0 +1,111 @@
+"""How far a measured fingertip is off because the rig is only known from pictures of a board.
+
+To first order, from the covariance of the rig's numbers; and from how much the rig changes when
+pairs are left out (jackknife), which sees what the first cannot: corners that err together, a board
+that is not flat, a lens that is not of the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.camera.bundle import (
+    LEFT,
+    PARAMETERS,
+    RIGHT,
+    STAND,
+    Fit,
+    fit_rig,
+    floats,
+    lens_arrays,
+    pose_transform,
+)
+from nodes.camera.corners import BoardPair, Progress, ignore_progress
+from nodes.models import rigid
+
+Floats = NDArray[np.float64]
+
+GROUPS = 20
+"""The most refits of the jackknife; of more pairs several are left out at a time."""
+
+
+def view_of_work(
+    rig: Floats, size: tuple[int, int], distance_m: float, *, across: int = 5
+) -> Floats:
+    """Points (n, 3) in the left camera's frame where a fingertip is measured, `distance_m` deep.
+
+    A grid over the middle half, each way, of the left picture, as far as the right one shows it.
+    """
+    matrix, distortion = lens_arrays(rig[LEFT])
+    width, height = size
+    shares = np.linspace(0.25, 0.75, across)
+    pixels = np.stack(np.meshgrid(shares * (width - 1), shares * (height - 1)), axis=-1)
+    slopes = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion)[:, 0]
+    points = distance_m * np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
+    seen, _ = cv2.projectPoints(points, rig[STAND][:3], rig[STAND][3:], *lens_arrays(rig[RIGHT]))
+    inside = ((seen[:, 0] >= 0) & (seen[:, 0] <= np.array([width, height]) - 1)).all(axis=1)
+    return points[inside] if inside.any() else points
+
+
+def position_slopes(rig: Floats, points: Floats) -> Floats:
+    """How triangulated positions (n, 3) move with the rig's numbers: (n, 3, 22).
+
+    A fingertip's pixels p = f(x, rig) are given.  The point of least squared image error then obeys
+    A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig, hence
+    dx/drig = -(A'A)^-1 A'B.
+    """
+    count = len(points)
+    by_point, by_rig = np.empty((count, 4, 3)), np.zeros((count, 4, len(PARAMETERS)))
+    still = np.zeros(3)
+    _, slope = cv2.projectPoints(points, still, still, *lens_arrays(rig[LEFT]))
+    slope = slope.reshape(count, 2, -1)
+    by_point[:, :2] = slope[..., 3:6]
+    by_rig[:, :2, LEFT] = slope[..., 6:14]
+    stand = rig[STAND]
+    _, slope = cv2.projectPoints(points, stand[:3], stand[3:], *lens_arrays(rig[RIGHT]))
+    slope = slope.reshape(count, 2, -1)
+    by_point[:, 2:] = slope[..., 3:6] @ pose_transform(stand)[:3, :3]
+    by_rig[:, 2:, RIGHT] = slope[..., 6:14]
+    by_rig[:, 2:, STAND] = slope[..., :6]
+    across = by_point.transpose(0, 2, 1)
+    return floats(-np.linalg.solve(across @ by_point, across @ by_rig))
+
+
+def position_spread(slopes: Floats, covariance: Floats) -> tuple[float, float]:
+    """Standard deviations (depth, lateral) m, root mean square over the points of `slopes`.
+
+    covariance: of the rig (22, 22).  Lateral: x and y together.
+    """
+    variances = np.einsum("nip,pq,niq->ni", slopes, covariance, slopes).mean(axis=0)
+    return float(np.sqrt(variances[2])), float(np.sqrt(variances[0] + variances[1]))
+
+
+def jackknife_covariance(
+    fit: Fit,
+    pairs: Sequence[BoardPair],
+    board: Floats,
+    progress: Progress = ignore_progress,
+) -> Floats:
+    """Covariance (22, 22) of the rig from refits without some of the pairs each.
+
+    The delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section 5.5):
+    (G - 1)/G times the scatter of the G refits about their mean.
+    """
+    groups = min(GROUPS, len(pairs))
+    rigs = []
+    for group in range(groups):
+        kept = [i for i in range(len(pairs)) if i % groups != group]
+        refit = fit_rig([pairs[i] for i in kept], board, rig=fit.rig, poses=fit.poses[kept])
+        rigs.append(refit.rig)
+        progress(group + 1, groups, "leaving pairs out")
+    scatter = np.array(rigs) - np.mean(rigs, axis=0)
+    return np.asarray((groups - 1) / groups * scatter.T @ scatter)
+
+
+def right_from_left_of(rig: Floats) -> Floats:
+    """The transform (4, 4) between the cameras of a rig (22,)."""
+    return rigid.transform(pose_transform(rig[STAND])[:3, :3], rig[STAND][3:])
