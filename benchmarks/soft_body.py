@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch.plan import load_scene
-from messages.scene import Scene
+from messages.scene import Scene, cylinder_of
 from nodes.fem_solver import body, contact, precompute
 
 Floats = NDArray[np.float64]
@@ -79,7 +79,7 @@ def slide(built: body.SceneBody, spec: precompute.SoftBodySpec, depth_m: float) 
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
     """Hertz's force of a sphere on a half-space bent like the cylinder, its patch taken round."""
     modulus, nu = scene.object.material.young_modulus_pa, scene.object.material.poisson_ratio
-    finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / scene.object.geometry.radius_m
+    finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / cylinder_of(scene).radius_m
     radius = 1.0 / np.sqrt(finger * (finger + cylinder))
     return float(4.0 / 3.0 * modulus / (1.0 - nu**2) * np.sqrt(radius) * depth_m**1.5)
 

@@ -27,6 +27,13 @@ from launch.documents import (
     read_document,
     validate,
 )
+from launch.meshes import scene_of
+from messages.calibration import (
+    CalibrationFileError,
+    CalibrationMismatchError,
+    load_calibration,
+    refuse_other_camera,
+)
 from messages.scene import Scene
 from messages.topics import TOPICS, Topic
 from nodes import NODES, UnknownNodeError, node_class
@@ -222,6 +229,7 @@ def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None =
     writers = _writers(spec, members, document, problems, has_scene=scene is not None)
     _resolve_further_inputs(members, writers, document, problems)
     _check_inputs(members, writers, document, problems)
+    _check_calibrations(members, scene, document, problems)
     if problems:
         raise BadInputError(problems)
 
@@ -254,7 +262,7 @@ def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None =
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file; raises BadInputError."""
-    return validate(Scene, read_document(path))
+    return scene_of(read_document(path))
 
 
 def is_loopback(address: str) -> bool:
@@ -350,7 +358,7 @@ def _load_scene(
         return None, None
     try:
         scene_document = read_document(path)
-        return scene_document, validate(Scene, scene_document)
+        return scene_document, scene_of(scene_document)
     except BadInputError as error:
         problems.extend(error.problems)
         return None, None
@@ -580,6 +588,25 @@ def _check_inputs(
                 )
 
 
+def _check_calibrations(
+    members: list[_Member], scene: Scene | None, document: Document, problems: list[Problem]
+) -> None:
+    """Parameters named `calibration` are files of the scene's camera, at its picture size."""
+    for member in members:
+        calibration = getattr(member.parameters, "calibration", None)
+        if not isinstance(calibration, Path):
+            continue
+        key = (*member.key, "parameters", "calibration")
+        path = Path(_absolute(calibration, _base(document, key)))
+        try:
+            measured = load_calibration(path)
+            if scene is not None:
+                refuse_other_camera(measured, scene.camera)
+        except (CalibrationFileError, CalibrationMismatchError) as error:
+            said = str(error) if str(path) in str(error) else f"{path}: {error}"
+            problems.append(document.problem(key, said))
+
+
 def _endpoints(
     members: list[_Member], writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
 ) -> dict[str, tuple[Writer, ...]]:
@@ -681,9 +708,14 @@ def _parameters(member: _Member, document: Document, *, resolve_paths: bool) -> 
         return values
     section = member.key if member.key == ("record",) else (*member.key, "parameters")
     for name in member.parameters.model_fields_set:
-        base = Path.cwd() if (*section, name) in document.overrides else document.path.parent
+        base = _base(document, (*section, name))
         values[name] = _with_absolute_paths(getattr(member.parameters, name), values[name], base)
     return values
+
+
+def _base(document: Document, key: Key) -> Path:
+    """What paths at `key` are relative to: the file, or where the command was given."""
+    return Path.cwd() if key in document.overrides else document.path.parent
 
 
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:

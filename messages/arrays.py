@@ -150,6 +150,7 @@ Matrix6 = Annotated[NDArray[np.float64], ArraySpec("<f8", (6, 6))]
 Transform = Annotated[NDArray[np.float64], ArraySpec("<f8", (4, 4))]
 """Homogeneous rigid transform ``a_from_b``: metres, row-major."""
 Points3 = Annotated[NDArray[np.float32], ArraySpec("<f4", ("points", 3))]
+Vertices = Annotated[NDArray[np.float64], ArraySpec("<f8", ("vertices", 3))]
 Triangles = Annotated[NDArray[np.int32], ArraySpec("<i4", ("triangles", 3))]
 GrayImage = Annotated[NDArray[np.uint8], ArraySpec("|u1", ("height", "width"))]
 ColorImage = Annotated[NDArray[np.uint8], ArraySpec("|u1", ("height", "width", 3))]

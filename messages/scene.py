@@ -1,17 +1,17 @@
 """The scene: what is shown, with which devices, over which range, and how well.
 
-A scene file (`launch/scenes/*.yaml`) holds exactly these fields.  Lengths are metres, angles
-radians, stresses pascals.  The world frame has its origin at the centre of the imaginary screen,
-x to the right, y up, z towards the user.
+A scene file (`launch/scenes/*.yaml`) holds exactly these fields (but a mesh is named by its file,
+see `launch/meshes.py`).  Lengths are metres, angles radians, stresses pascals.  The world frame has
+its origin at the centre of the imaginary screen, x to the right, y up, z towards the user.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from messages.arrays import Transform, Vector3
+from messages.arrays import Transform, Triangles, Vector3, Vertices
 from messages.base import Message
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -38,17 +38,80 @@ class Material(Part):
 
 
 class Cylinder(Part):
-    """Solid circular cylinder, axis along the object frame's x, centred on its origin."""
+    """Solid circular cylinder, axis along the object frame's x, centred on its origin.
+
+    Its side is touched, not its ends.
+    """
 
     shape: Literal["cylinder"] = "cylinder"
     radius_m: Positive
     length_m: Positive
 
 
+class Sphere(Part):
+    """Solid sphere about the object frame's origin."""
+
+    shape: Literal["sphere"] = "sphere"
+    radius_m: Positive
+
+
+class Ellipsoid(Part):
+    """Solid ellipsoid about the object frame's origin."""
+
+    shape: Literal["ellipsoid"] = "ellipsoid"
+    semi_axes_m: tuple[Positive, Positive, Positive] = Field(description="along x, y, z")
+
+
+class Plane(Part):
+    """The half-space below z = 0 of the object frame, touched on a rectangle about the origin."""
+
+    shape: Literal["plane"] = "plane"
+    width_m: Positive = Field(description="along x")
+    height_m: Positive = Field(description="along y")
+
+
+class RoundedBox(Part):
+    """Solid box about the object frame's origin, its edges and corners rounded by a ball."""
+
+    shape: Literal["rounded_box"] = "rounded_box"
+    size_m: tuple[Positive, Positive, Positive] = Field(
+        description="along x, y, z, rounding included"
+    )
+    edge_radius_m: Positive
+
+    @model_validator(mode="after")
+    def _rounding_fits(self) -> Self:
+        if 2.0 * self.edge_radius_m > min(self.size_m):
+            raise ValueError(
+                f"edge_radius_m: {self.edge_radius_m} is more than half of the least size_m, "
+                f"{min(self.size_m)}; round the edges less"
+            )
+        return self
+
+
+class Mesh(Part):
+    """The smooth solid that a closed triangle mesh stands for.
+
+    It travels with the scene, so that every node on every host has the same.  A scene file names
+    the mesh's file instead, as `shape: mesh_file`; see `launch/meshes.py`.
+    """
+
+    shape: Literal["mesh"] = "mesh"
+    vertices_m: Vertices
+    triangles: Triangles = Field(description="indices, counter-clockwise seen from outside")
+    smoothing_m: Positive = Field(description="what is finer is smoothed away; edges are rounded")
+    origin: str = Field(description="for people: where it comes from, what was repaired")
+
+
+Geometry = Annotated[
+    Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh, Field(discriminator="shape")
+]
+
+
 class VirtualObject(Part):
     """The soft object that is seen and touched."""
 
-    geometry: Cylinder
+    geometry: Geometry
     material: Material
     world_from_object: Pose
     support_angle_rad: Positive = Field(
@@ -174,3 +237,17 @@ class Scene(Message):
     finger: Finger
     working_range: WorkingRange
     tolerances: Tolerances
+
+
+class UnfitGeometryError(ValueError):
+    """A scene whose object has a shape that the asker cannot handle."""
+
+
+def cylinder_of(scene: Scene) -> Cylinder:
+    """The scene's geometry, for who can handle no other than a cylinder; UnfitGeometryError."""
+    geometry = scene.object.geometry
+    if not isinstance(geometry, Cylinder):
+        raise UnfitGeometryError(
+            f'object.geometry.shape: "{geometry.shape}" cannot be handled here; use "cylinder"'
+        )
+    return geometry

@@ -50,7 +50,8 @@ class Topic:
 _LATEST, _EVERY, _LATCHED = Delivery.LATEST, Delivery.EVERY, Delivery.LATCHED
 
 _ROWS = (
-    Topic("scene", scene.Scene, _LATCHED, None, True, "what is shown, where, how well"),
+    Topic("scene", scene.Scene, _LATCHED, None, True, "what is shown, where, how well",
+          max_bytes=16 << 20),
     Topic("stereo", types.StereoPair, _LATEST, (30, 130), False, "pictures of the finger",
           max_bytes=16 << 20),
     Topic("fingertip", types.Fingertip, _LATEST, (30, 130), True, "where the fingertip is"),

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from launch.experiments import ExperimentError
 from launch.experiments.stroke import object_pose
 from messages.bag import BagReader
-from messages.scene import Scene
+from messages.scene import Scene, cylinder_of
 from messages.types import Correction, FingerPath, TwinEye
 from nodes.models.rigid import apply
 from nodes.twin.eye import push_sizes, tilt_sizes
@@ -29,7 +29,7 @@ REACH_S = 1.5
 
 def reach_path(scene: Scene, label: str, points: Sequence[tuple[float, float]]) -> FingerPath:
     """Go straight from point to point, each (angle around the cylinder, height above its side)."""
-    radius = scene.object.geometry.radius_m
+    radius = cylinder_of(scene).radius_m
     local = [
         [0.0, (radius + height_m) * np.sin(angle_rad), (radius + height_m) * np.cos(angle_rad)]
         for angle_rad, height_m in points

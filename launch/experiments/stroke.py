@@ -12,7 +12,7 @@ from scipy.interpolate import make_smoothing_spline
 
 from launch.experiments import ExperimentError
 from messages.bag import BagReader
-from messages.scene import ArmSpec, Scene
+from messages.scene import ArmSpec, Scene, cylinder_of
 from messages.types import (
     ArmState,
     FingerPath,
@@ -51,7 +51,7 @@ def stroke_label(seconds: float) -> str:
 
 def stroke_path(scene: Scene, seconds: float) -> FingerPath:
     """Approach from above, touch, dwell, stroke 60 degrees in `seconds` at constant speed, lift."""
-    radius = scene.object.geometry.radius_m
+    radius = cylinder_of(scene).radius_m
     world_from_object = object_pose(scene)
     stroke_times = np.linspace(0.0, seconds, max(int(seconds * 20), 2))
     angles = np.concatenate(
@@ -282,7 +282,7 @@ def sheet_errors(
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.at(times_ns))
     angles = np.arctan2(points[:, 1], points[:, 2])
-    radius = scene.object.geometry.radius_m
+    radius = cylinder_of(scene).radius_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
     presented_points, presented_angles = presented(edges, world_from_object, times_ns, points[:, 0])
     delta_theta = (angles - presented_angles + np.pi) % (2 * np.pi) - np.pi
@@ -375,7 +375,7 @@ def tangential_distance(
     for array in (points, others):
         local = apply(object_from_world, array)
         angle = np.arctan2(local[:, 1], local[:, 2])
-        radius = scene.object.geometry.radius_m
+        radius = cylinder_of(scene).radius_m
         on_surface.append(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))
     return np.asarray(np.linalg.norm(on_surface[0] - on_surface[1], axis=1))
 

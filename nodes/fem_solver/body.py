@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
+from messages.scene import Scene, cylinder_of
 from messages.types import Fingertip, Skin, SoftBody
 from nodes.fem_solver.contact import (
     LinearSoftBody,
@@ -32,11 +32,11 @@ PAD_RATIO = 1.1
 
 def spec_of(scene: Scene, skin_spacing_m: float) -> SoftBodySpec:
     """What has to be precomputed for this scene's object."""
-    body = scene.object
+    body, cylinder = scene.object, cylinder_of(scene)
     free = np.pi - 0.5 * body.support_angle_rad
     return SoftBodySpec(
-        radius_m=body.geometry.radius_m,
-        length_m=body.geometry.length_m,
+        radius_m=cylinder.radius_m,
+        length_m=cylinder.length_m,
         support_angle_rad=body.support_angle_rad,
         touch_angle_rad=float(min(scene.working_range.tilt_rad + TOUCH_MARGIN_RAD, free)),
         skin_spacing_m=skin_spacing_m,

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
+from messages.scene import Scene, cylinder_of
 from messages.types import Phase
 from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, coast_sheet, follow_sheet
 from nodes.models.rigid import apply, inverse, transform_from_rpy
@@ -49,7 +49,7 @@ class Plan:
 
     def __init__(self, scene: Scene, *, bounds: SheetBounds, touch_m: float, release_m: float,
                  tilt_margin_rad: float) -> None:  # fmt: skip
-        cylinder, place = scene.object.geometry, scene.object.world_from_object
+        cylinder, place = cylinder_of(scene), scene.object.world_from_object
         self._shape = CylinderShape(cylinder.radius_m, cylinder.length_m)
         self._world_from_object = transform_from_rpy(place.position_m, place.rpy_rad)
         self._object_from_world = inverse(self._world_from_object)
@@ -119,7 +119,8 @@ class Plan:
 
     def _sheet_y_under(self, finger: Floats) -> float:
         """y of the sheet's point nearest to the surface point under the finger, as the sheet is."""
-        surface = self._shape.closest(finger, fallback_normal=normal_at(self._encounter.angle_rad))
+        shown = self._shape.radius_m * normal_at(self._encounter.angle_rad)
+        surface = self._shape.closest(finger, previous=shown)
         contact_world = apply(self._world_from_object, surface.point)
         return float(apply(inverse(self.motion.world_from_sheet), contact_world)[1])
 

@@ -14,7 +14,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
+from messages.scene import Scene, cylinder_of
 from messages.types import Correction
 from nodes.methods import Case, Family, Trial
 from nodes.models.rigid import rotation_from_vector, transform
@@ -81,7 +81,7 @@ def covers(method: Correction, *, tilt_deg: float, push_mm: float) -> bool:
 
 def rolled_on(scene: Scene, tilt_rad: float) -> Floats:
     """world_from_sheet tangent to the cylinder, rolled there without slip from the upright pose."""
-    radius = scene.object.geometry.radius_m
+    radius = cylinder_of(scene).radius_m
     axis = transform_of(scene.object.world_from_object)[:3, 3]
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
     return transform(rotation, axis + radius * (rotation[:, 2] + tilt_rad * rotation[:, 1]))
@@ -115,7 +115,7 @@ def _trial(
     case: Case,
     in_range: bool,
 ) -> Trial:
-    cylinder = scene.object.geometry
+    cylinder = cylinder_of(scene)
     surface = cylinder_surface(
         radius_m=cylinder.radius_m,
         length_m=cylinder.length_m,

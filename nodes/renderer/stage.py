@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from messages.scene import Pose, Scene
+from messages.scene import Pose, Scene, cylinder_of
 from messages.types import Correction, Display, Fingertip, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import apply, inverse, moved, transform, transform_from_rpy
 from nodes.models.shapes import CylinderShape
@@ -122,7 +122,7 @@ class Stage:
         samples: int = SAMPLES,
     ) -> None:
         """ValueError for a projector that no homography describes."""
-        projector, cylinder = scene.projector, scene.object.geometry
+        projector, cylinder = scene.projector, cylinder_of(scene)
         self.scene = scene
         self._world_from_projector = transform_of(projector.world_from_projector)
         self._world_from_object = transform_of(scene.object.world_from_object)

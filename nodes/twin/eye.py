@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
 from scipy.spatial import Delaunay
 
-from messages.scene import Projector, Scene
+from messages.scene import Projector, Scene, cylinder_of
 from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.twin.membrane import DeformedSheet, Rubber, solve
 
@@ -288,7 +288,7 @@ class TrueCylinder:
     """The scene's cylinder, at rest or moved as a skin is, on a mesh of its own."""
 
     def __init__(self, scene: Scene, *, around: int = 180, along: int = 48) -> None:
-        cylinder, pose = scene.object.geometry, scene.object.world_from_object
+        cylinder, pose = cylinder_of(scene), scene.object.world_from_object
         self._around, self._along = around, along
         self._unrolled: _Unrolled | None = None
         self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
+from messages.scene import Scene, cylinder_of
 from messages.types import FingerPath
 from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.twin.finger import FingerPathError, SmoothPath
@@ -29,7 +29,7 @@ PRESS_SHARE = 1.0 / 6.0
 
 def over_surface(scene: Scene, places: Floats) -> Floats:
     """World points (n, 3) of places (n, 3) on the scene's object."""
-    cylinder = scene.object.geometry
+    cylinder = cylinder_of(scene)
     angle = places[:, 1] / cylinder.radius_m
     radius = cylinder.radius_m + places[:, 2]
     in_object = np.stack([places[:, 0], radius * np.sin(angle), radius * np.cos(angle)], axis=1)
@@ -48,7 +48,7 @@ def touchable(scene: Scene) -> tuple[float, float]:
     0.8 of the object's length; the arc that the working range's tilt and the sheet's usable height
     allow.
     """
-    cylinder = scene.object.geometry
+    cylinder = cylinder_of(scene)
     arc_m = min(
         2.0 * scene.sheet.usable_half_height_m,
         2.0 * cylinder.radius_m * min(scene.working_range.tilt_rad, 0.5 * np.pi),
