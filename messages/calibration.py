@@ -138,7 +138,10 @@ def load_calibration(path: Path) -> StereoCalibration:
     try:
         content: Any = YAML(typ="safe").load(path.read_text())
     except OSError as error:
-        raise CalibrationFileError(f"{path}: cannot be read: {error.strerror}") from error
+        raise CalibrationFileError(
+            f"{path}: cannot be read: {error.strerror}; name a file that "
+            "`flexsheet calibrate stereo` wrote"
+        ) from error
     except (YAMLError, UnicodeDecodeError) as error:
         raise CalibrationFileError(f"{path}: not YAML: {error}") from error
     if not isinstance(content, dict) or "version" not in content:
