@@ -21,14 +21,16 @@ from messages.calibration import (
     save_calibration,
 )
 from messages.scene import Lens
-from nodes.camera.calibration import (
+from nodes.camera.calibration import calibrate_stereo, fit_pairs
+from nodes.camera.check import check_stereo, cross_check, rigid_fit_residuals
+from nodes.camera.corners import (
+    BoardPair,
     CalibrationError,
     board_points,
-    calibrate_stereo,
-    check_stereo,
-    rigid_fit_residuals,
+    find_pairs,
     same_order,
 )
+from nodes.camera.uncertainty import position_slopes, view_of_work
 from nodes.models import camera, rigid
 
 Floats = NDArray[np.float64]
@@ -109,8 +111,7 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> Pictures:
 
 
 def calibrate(left: list[Path], right: list[Path]) -> StereoCalibration:
-    board = (BOARD.columns, BOARD.rows)
-    return calibrate_stereo(left, right, board=board, square_m=BOARD.square_m, device="made")
+    return calibrate_stereo(left, right, board=BOARD, device="made").calibration
 
 
 @pytest.fixture(scope="module")
@@ -142,11 +143,11 @@ def test_held_out_pairs_are_measured_as_well_as_corners_are_found(
         calibration,
         rendered.left[9:],
         rendered.right[9:],
-        board=(BOARD.columns, BOARD.rows),
-        square_m=BOARD.square_m,
+        board=BOARD,
         progress=lambda *step: told.append(step),
     )
     assert result["pairs"] == 3
+    assert result["used_to_calibrate"] == []
     assert result["rigid_fit_rms_mm"] < 0.3  # 0.05 px in each view, 5 mm of depth a pixel
     assert result["square_rms_mm"] < 0.1
     assert result["diagonal_rms_mm"] < 0.3
@@ -156,8 +157,7 @@ def test_held_out_pairs_are_measured_as_well_as_corners_are_found(
         calibration,
         rendered.left[9:],
         rendered.right[9:],
-        board=(BOARD.columns, BOARD.rows),
-        square_m=BOARD.square_m * 0.99,
+        board=BOARD.model_copy(update={"square_m": 0.99 * BOARD.square_m}),
     )
     assert smaller["square_rms_mm"] == pytest.approx(0.01 * 1e3 * BOARD.square_m, rel=0.2)
 
@@ -174,12 +174,12 @@ def test_a_pair_without_a_board_is_left_out(rendered: Pictures, tmp_path: Path) 
     blank = tmp_path / "blank.png"
     cv2.imwrite(str(blank), np.full((SIZE[1], SIZE[0]), 90, np.uint8))
     calibration = calibrate([*rendered.left[:6], blank], rendered.right[:7])
-    assert calibration.pairs[6].reason == "no board of 7x5 inner corners in blank.png"
+    assert calibration.pairs[6].reason == "no chessboard of 7x5 inner corners in blank.png"
     assert calibration.pairs[6].left_rms_px is None
-    with pytest.raises(CalibrationError, match=r"4 usable pairs of 5.*\n  blank\.png: no board"):
+    with pytest.raises(CalibrationError, match=r"4 usable pairs of 5.*\n  blank\.png: no chess"):
         calibrate([*rendered.left[:4], blank], rendered.right[:5])
-    with pytest.raises(CalibrationError, match="no usable pair of 1: no board"):
-        check_stereo(calibration, [blank], [blank], board=(7, 5), square_m=0.03)
+    with pytest.raises(CalibrationError, match="no usable pair of 1: no chessboard"):
+        check_stereo(calibration, [blank], [blank], board=BOARD)
 
 
 def test_pictures_that_will_not_do_are_named(
@@ -200,7 +200,7 @@ def test_pictures_that_will_not_do_are_named(
             calibrate(bad_left, bad_right)
     other = calibration.model_copy(update={"width_px": 640})
     with pytest.raises(CalibrationError, match="480x360 px, calibration of made for 640x360"):
-        check_stereo(other, left[:1], right[:1], board=(7, 5), square_m=0.03)
+        check_stereo(other, left[:1], right[:1], board=BOARD)
 
 
 @pytest.mark.parametrize(("columns", "rows"), [(9, 6), (7, 7), (6, 9)])
@@ -243,8 +243,8 @@ def without(key: str) -> Callable[[str], str]:
     ("spoil", "said"),
     [
         (
-            lambda text: text.replace("version: 1", "version: 2", 1),
-            "version: 2, this program reads 1",
+            lambda text: text.replace("version: 2", "version: 1", 1),
+            "version: 1, this program reads 2; calibrate anew",
         ),
         (without("version"), 'no key "version"'),
         (without("device"), "device: Field required"),
@@ -275,14 +275,137 @@ def test_a_lens_file_needs_finite_numbers(tmp_path: Path, calibration: StereoCal
     assert isinstance(calibration.left, Lens)
 
 
+def found(pictures: Pictures) -> list[BoardPair]:
+    pairs, _ = find_pairs(pictures.left, pictures.right, BOARD)
+    return [pair for pair in pairs if isinstance(pair, BoardPair)]
+
+
+def test_the_joint_fit_is_the_least_squares_that_opencv_finds(rendered: Pictures) -> None:
+    pairs = found(rendered)
+    fit = fit_pairs(pairs, board_points(BOARD), SIZE)
+    points = [board_points(BOARD).astype(np.float32)] * len(pairs)
+    rms, left, left_d, right, right_d, _, position, *_ = cv2.stereoCalibrate(
+        points,
+        [pair.left.pixels.astype(np.float32) for pair in pairs],
+        [pair.right.pixels.astype(np.float32) for pair in pairs],
+        LEFT_MATRIX.copy(),  # starts, which OpenCV writes over
+        DISTORTION.copy(),
+        RIGHT_MATRIX.copy(),
+        DISTORTION.copy(),
+        SIZE,
+        flags=cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3,
+        criteria=(cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 200, 1e-10),
+    )
+    assert fit.rms_px() == pytest.approx(rms, rel=1e-4)
+    for numbers, matrix, distortion in (
+        (fit.rig[:8], left, left_d),
+        (fit.rig[8:16], right, right_d),
+    ):
+        theirs = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *distortion.ravel()[:4]]
+        assert numbers == pytest.approx(np.array(theirs), rel=1e-3, abs=1e-4)
+    assert fit.rig[19:22] == pytest.approx(position.ravel(), abs=1e-5)
+
+
+def test_single_corners_that_stray_are_left_out(
+    rendered: Pictures, calibration: StereoCalibration, tmp_path: Path
+) -> None:
+    """Three corners are painted over, so that they are found a pixel or more away."""
+    image = cv2.imread(str(rendered.left[2]), cv2.IMREAD_GRAYSCALE)
+    pair = found(rendered)[2]
+    for x, y in np.rint(pair.left.pixels[[8, 16, 24]]).astype(int):
+        image[y - 2 : y + 3, x + 1 : x + 4] = 120
+    spoilt = tmp_path / rendered.left[2].name
+    cv2.imwrite(str(spoilt), image)
+    left = [*rendered.left[:2], spoilt, *rendered.left[3:9]]
+    result = calibrate(left, rendered.right[:9])
+    assert result.pairs[2].used
+    assert 1 <= result.pairs[2].stray_corners <= 4
+    assert result.left.fx_px == pytest.approx(calibration.left.fx_px, rel=1e-3)
+
+
+def test_a_picture_given_twice_counts_once(rendered: Pictures) -> None:
+    order = [0, 1, 2, 3, 4, 5, 0, 1, 2]
+    calibration = calibrate([rendered.left[i] for i in order], [rendered.right[i] for i in order])
+    assert [pair.used for pair in calibration.pairs] == [True] * 6 + [False] * 3
+    assert calibration.pairs[7].reason == "shows the board where left01.png does"
+    with pytest.raises(CalibrationError, match=r"1 usable pairs of 6"):
+        calibrate([rendered.left[0]] * 6, [rendered.right[0]] * 6)
+
+
+def test_boards_that_are_never_tilted_do_not_determine_a_rig(tmp_path: Path) -> None:
+    """Straight on, focal length and distance cannot be told from each other."""
+    pictures = Pictures([], [])
+    middle = board_points(BOARD).mean(axis=0)
+    for number in range(6):
+        place = np.array([0.05 + 0.01 * (number % 3), 0.01 * (number % 2), 0.45]) - middle
+        for paths, matrix, camera_from_left in (
+            (pictures.left, LEFT_MATRIX, np.eye(4)),
+            (pictures.right, RIGHT_MATRIX, rigid.transform(np.eye(3), [-0.1, 0.0, 0.0])),
+        ):
+            paths.append(tmp_path / f"{len(paths)}{matrix[0, 0]:.0f}.png")
+            picture = render(rigid.transform(np.eye(3), place), rays_of(matrix), camera_from_left)
+            cv2.imwrite(str(paths[-1]), picture)
+    with pytest.raises(CalibrationError, match=r"do not determine the rig.*tilt the board"):
+        calibrate(pictures.left, pictures.right)
+
+
+def test_pictures_that_made_the_calibration_are_named_when_checked(
+    rendered: Pictures, calibration: StereoCalibration
+) -> None:
+    result = check_stereo(calibration, rendered.left[7:11], rendered.right[7:11], board=BOARD)
+    assert result["used_to_calibrate"] == ["left07.png", "left08.png"]
+
+
+def test_every_pair_is_left_out_once(rendered: Pictures) -> None:
+    result = cross_check(rendered.left[:9], rendered.right[:9], board=BOARD, leave_out=2)
+    rows, plain = result["rows"], result["plain_opencv"]
+    assert isinstance(rows, list)
+    assert isinstance(plain, dict)
+    assert [row["left"] for row in rows] == [path.name for path in rendered.left[:9]]
+    assert result["pairs"] == plain["pairs"] == 9
+    assert isinstance(result["rigid_fit_rms_mm"], float)
+    assert result["rigid_fit_rms_mm"] < 0.3
+    with pytest.raises(CalibrationError, match="at least 5 must remain"):
+        cross_check(rendered.left[:6], rendered.right[:6], board=BOARD, leave_out=2)
+
+
 @pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data is not here")
 def test_real_pairs_beat_plain_opencv_on_held_out_pairs() -> None:
     """OpenCV's plain calibration of these pairs leaves 0.56 mm on pairs it has not seen."""
     left, right = sorted(REAL.glob("left*.jpg")), sorted(REAL.glob("right*.jpg"))
-    calibration = calibrate_stereo(
-        left[::2], right[::2], board=(9, 6), square_m=0.02423, device="real"
-    )
-    result = check_stereo(calibration, left[1::2], right[1::2], board=(9, 6), square_m=0.02423)
+    board = Board(columns=9, rows=6, square_m=0.02423)
+    calibration = calibrate_stereo(left[::2], right[::2], board=board, device="real").calibration
+    result = check_stereo(calibration, left[1::2], right[1::2], board=board)
     assert result["pairs"] == 10
     assert np.linalg.norm(calibration.right_from_left[:3, 3]) == pytest.approx(0.094, abs=0.001)
-    assert result["rigid_fit_rms_mm"] <= 0.56
+    assert isinstance(result["rigid_fit_rms_mm"], float)
+    assert result["rigid_fit_rms_mm"] <= 0.5
+    in_turn = cross_check(left, right, board=board, leave_out=4)
+    plain = in_turn["plain_opencv"]
+    assert isinstance(plain, dict)
+    assert isinstance(in_turn["rigid_fit_rms_mm"], float)
+    assert in_turn["rigid_fit_rms_mm"] <= min(0.56, plain["rigid_fit_rms_mm"])
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="../shared/data is not here")
+def test_real_halves_differ_by_what_they_state() -> None:
+    """Two calibrations of one rig, from different pictures, place fingertips differently."""
+    left, right = sorted(REAL.glob("left*.jpg")), sorted(REAL.glob("right*.jpg"))
+    board = Board(columns=9, rows=6, square_m=0.02423)
+    halves = [
+        calibrate_stereo(
+            left[i::2], right[i::2], board=board, device="real", working_distance_m=0.4
+        )
+        for i in (0, 1)
+    ]
+    points = view_of_work(halves[0].fit.rig, halves[0].size, 0.4)
+    slopes = position_slopes(halves[0].fit.rig, points)
+    shift = slopes @ (halves[0].fit.rig - halves[1].fit.rig)
+    stated = [half.calibration.uncertainty for half in halves]
+    assert stated[0] is not None
+    assert stated[1] is not None
+    expected_m = np.hypot(stated[0].depth_std_m, stated[1].depth_std_m)
+    depth_m = np.sqrt(np.mean(shift[:, 2] ** 2))
+    assert 0.1 < depth_m / expected_m < 2.0
+    # The corners' noise alone would promise much more than it keeps.
+    assert min(one.jackknife_ratio for one in stated if one is not None) > 1.5

@@ -62,6 +62,12 @@ CORNER_RATIO = 6.0
 """A corner further off than this many standard deviations was drawn to something else."""
 
 CORNER_ROUNDS = 2
+REPEAT_PX = 1.0
+"""Two pairs whose corners lie nearer to each other than that show the board in one place."""
+
+LARGEST_DEPTH_SHARE = 0.05
+"""Of the working distance: a rig that tells depth no better is not determined."""
+
 LARGEST_STRAY_SHARE = 0.15
 """A pair with more stray corners than that is a bad pair, not a good one with strays."""
 
@@ -152,6 +158,36 @@ def without_stray_corners(fit: Fit, pairs: Sequence[BoardPair]) -> list[BoardPai
     ]
 
 
+def repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
+    """The pairs that show the board where an earlier one did: their numbers and the earlier one's.
+
+    They would count as evidence twice: what corners err by together is the same in both.
+    """
+    seen: dict[int, BoardPair] = {}
+    repeated: dict[int, int] = {}
+    for number, pair in enumerate(found):
+        if isinstance(pair, str):
+            continue
+        near = (i for i, other in seen.items() if _apart(pair, other) < REPEAT_PX)
+        before = next(near, None)
+        if before is None:
+            seen[number] = pair
+        else:
+            repeated[number] = before
+    return repeated
+
+
+def _apart(pair: BoardPair, other: BoardPair) -> float:
+    """Median distance px of the same corners in two pairs, of the view where it is larger."""
+    medians = []
+    for here, there in ((pair.left, other.left), (pair.right, other.right)):
+        _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
+        if not len(a):
+            return float("inf")
+        medians.append(np.median(np.linalg.norm(here.pixels[a] - there.pixels[b], axis=1)))
+    return float(max(medians))
+
+
 class _Selection:
     """Which pairs are still in, and why the others are not."""
 
@@ -160,6 +196,9 @@ class _Selection:
         self._names = names
         self.reasons = {i: pair for i, pair in enumerate(found) if isinstance(pair, str)}
         self.good = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}
+        for i, before in repeats(found).items():
+            self.reasons[i] = f"shows the board where {names[before]} does"
+            del self.good[i]
 
     def pairs(self) -> list[BoardPair]:
         """The pairs that are in; raises CalibrationError when they are too few."""
@@ -208,11 +247,13 @@ def calibrate_stereo(
 ) -> Calibrated:
     """Calibrate a rig from pairs of pictures of a board.
 
-    Left out, with the reason kept in the result: pairs without the board; pairs that contradict the
-    others grossly (`misfits`); single corners six standard deviations off; pairs whose residual
-    then exceeds three times the median and half a pixel.  working_distance_m: where the
-    uncertainty is stated; None: at the median distance of the boards.  Raises CalibrationError when
-    the pictures cannot be used or fewer than MIN_PAIRS pairs remain.
+    Left out, with the reason kept in the result: pairs without the board; pairs that repeat an
+    earlier one; pairs that contradict the others grossly (`misfits`); single corners six standard
+    deviations off; pairs whose residual then exceeds three times the median and half a pixel.
+
+    working_distance_m: where the uncertainty is stated; None: at the median distance of the boards.
+    Raises CalibrationError when the pictures cannot be used, fewer than MIN_PAIRS pairs remain, or
+    they do not determine the rig.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     selection = _Selection(found, [path.name for path in left_paths])
@@ -242,6 +283,11 @@ def calibrate_stereo(
             distance_m=working_distance_m,
             progress=progress,
         )
+        if uncertainty.depth_std_m > LARGEST_DEPTH_SHARE * uncertainty.working_distance_m:
+            raise NotDeterminedError(
+                f"depth at {1e3 * uncertainty.working_distance_m:.0f} mm is uncertain by "
+                f"{1e3 * uncertainty.depth_std_m:.0f} mm"
+            )
     except (cv2.error, NotDeterminedError) as error:
         said = error.err if isinstance(error, cv2.error) else str(error)
         raise CalibrationError(
