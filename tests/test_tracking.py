@@ -178,7 +178,7 @@ def test_tremor_is_predicted_by_the_hand_and_not_the_wrong_way_by_the_others() -
     def error_m(name: str) -> float:
         filter_ = method(name)
         errors = [
-            filter_.ahead(one, np.array([0.03]))[0, 0] - trembling(one.at_ns * 1e-9 + 0.03)[0]
+            filter_.ahead(one, np.array([0.02]))[0, 0] - trembling(one.at_ns * 1e-9 + 0.02)[0]
             for one in followed(filter_, trembling, 900)[200:]
         ]
         return float(np.sqrt(np.mean(np.square(errors))))

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from messages.base import Header
 from messages.types import SheetTarget
 from nodes.models.motion import SheetBounds, SheetMotion, extrapolated
 from nodes.models.rigid import vector_from_rotation
@@ -44,25 +45,35 @@ def goal_ahead(motion: SheetMotion, ahead_s: float, overdue_s: float, *, furthes
     return Goal(extrapolated(motion, carried_s), max(overdue_s, ahead_s - furthest_s))
 
 
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """servo_lag_s: how long after it is sent a command acts.  target_period_s: after its arrival
+    the next target is due.  furthest_s: how far a target may be carried on."""
+
+    servo_lag_s: float
+    target_period_s: float
+    furthest_s: float
+
+
 def goal_of(
     target: SheetTarget,
+    header: Header,
     *,
-    valid_at_ns: int,
     received_ns: int,
     now_ns: int,
-    servo_lag_s: float,
-    period_s: float,
-    furthest_s: float,
+    clock_id: str,
+    timing: Timing,
 ) -> Goal:
-    """A target's goal for a command that is sent now and acts `servo_lag_s` later.
+    """A target's goal for a command that is sent now, by the clock `clock_id`.
 
-    The stamps are on one clock; `period_s` after its arrival the next target is due.  A target
-    states no rate of stretch, which the arms therefore trail.
+    A target with another host's stamps counts as if it had arrived in no time.  It states no rate
+    of stretch, which the arms therefore trail.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
-    ahead_s = (now_ns - valid_at_ns) * 1e-9 + servo_lag_s
-    overdue_s = (now_ns - received_ns) * 1e-9 - period_s
-    return goal_ahead(motion, ahead_s, overdue_s, furthest_s=furthest_s)
+    foreign_ns = received_ns - header.publish_ns if header.clock_id != clock_id else 0
+    ahead_s = (now_ns - target.valid_at_ns - foreign_ns) * 1e-9 + timing.servo_lag_s
+    overdue_s = (now_ns - received_ns) * 1e-9 - timing.target_period_s
+    return goal_ahead(motion, ahead_s, overdue_s, furthest_s=timing.furthest_s)
 
 
 def pace(own_edge: Floats, other_edge: Floats, target: Floats) -> float:

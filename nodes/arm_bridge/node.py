@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import ClassVar
 
 from pydantic import Field
@@ -11,8 +12,10 @@ from messages.scene import NonNegative, Positive, Scene
 from messages.types import ArmState, EStop, SheetTarget, Side
 from nodes.arm_bridge.control import ArmControl, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.goal import Goal, goal_of
+from nodes.arm_bridge.goal import Goal, Timing, goal_of
 from nodes.arm_bridge.modbus import ArmLink, ArmLinkError, ArmSilentError
+from nodes.arm_bridge.pacing import Pace
+from nodes.arm_bridge.report import arm_state
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
 
@@ -54,39 +57,55 @@ class ArmBridge(Node):
         self._cycle_ns = self._sent_ns = self._measured_ns = 0
         self._used: tuple[Header | None, int] = (None, 0)
         self._exchange_s, self._failures = 0.0, 0
+        due_s, furthest_s = given.target_period_s, given.furthest_extrapolation_s
+        self._timing = Timing(given.servo_lag_s, due_s, furthest_s)
+        self._pace, self._cycling = Pace(1.0 / given.rate_hz, due_s), asyncio.Lock()
 
     async def close(self) -> None:
         """Bid the arm stop; if that fails, its own watchdog stops it."""
-        if self._control.last_measured_rad is not None:
-            joints_rad, now_ns = self._control.commanded_rad, self.clock.now_ns()
+        async with self._cycling:
+            self._geometry, joints_rad = None, self._control.commanded_rad
             try:
-                await self._link.exchange(mode="stop", joints_rad=joints_rad, now_ns=now_ns)
+                if self._control.last_measured_rad is not None:
+                    now_ns = self.clock.now_ns()
+                    await self._link.exchange(mode="stop", joints_rad=joints_rad, now_ns=now_ns)
             except ArmLinkError as error:
                 self.log.warning("arm not told to stop", problem=str(error))
-        self._link.close()
+            self._link.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         self._control.interrupt()
         self._geometry = ArmGeometry(scene, self.parameters.side)
 
     def on_estop(self, estop: EStop, header: Header) -> None:
-        refusal = self._control.take_estop(estop, (header.clock_id, header.source_ns))
-        if refusal is not None:
+        if refusal := self._control.take_estop(estop, (header.clock_id, header.source_ns)):
             self.log.warning("reset refused", reason=refusal)
+
+    async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
+        """A target is passed on when it comes: at the next beat it would be 7 ms older."""
+        async with self._cycling:
+            if self._used[0] is not header:
+                await asyncio.sleep(self._pace.wait_s(self.clock.now_ns(), self._cycle_ns))
+                await self._serve()
 
     @periodic("rate_hz")
     async def cycle(self) -> None:
+        """Between targets, and without any, the arm hears from us at this rate."""
+        now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
+        if self._pace.is_beat(now_ns, self._cycle_ns, target_ns) and not self._cycling.locked():
+            async with self._cycling:
+                await self._serve()
+
+    async def _serve(self) -> None:
         now_ns = self.clock.now_ns()
         if self._geometry is None:
             self.note = "waits for a scene"
             return
-        period_s = 1.0 / self.parameters.rate_hz
-        step_s = min(max((now_ns - self._cycle_ns) * 1e-9, 0.5 * period_s), 2.0 * period_s)
-        self._cycle_ns = now_ns
+        step_s, self._cycle_ns = self._pace.step_s(now_ns, self._cycle_ns), now_ns
         if self._link.due(now_ns):
             await self._exchange(self._geometry, step_s)
-        mode, reason = self._control.mode, self._control.reason
-        self.note = f"{mode} {reason}; {self._failures} failed exchanges"
+        what, why = self._control.mode, self._control.reason
+        self.note = f"{what} {why}; {self._failures} failed exchanges"
         self._publish(self._geometry)
 
     async def _exchange(self, geometry: ArmGeometry, step_s: float) -> None:
@@ -94,11 +113,10 @@ class ArmBridge(Node):
         command = control.step(geometry, self._goal(), self._other(), step_s)
         # A target that comes while the arm answers is not behind the command that it answers.
         self._used = (self.sheet_target.header, self.sheet_target.received_ns)
-        self._sent_ns = self.clock.now_ns()
+        mode, joints_rad, now_ns = command.mode, command.joints_rad, self.clock.now_ns()
+        self._sent_ns = now_ns
         try:
-            status = await self._link.exchange(
-                mode=command.mode, joints_rad=command.joints_rad, now_ns=self._sent_ns
-            )
+            status = await self._link.exchange(mode=mode, joints_rad=joints_rad, now_ns=now_ns)
         except ArmLinkError as error:
             self._failures += 1
             if control.fail_exchange(str(error), silent=isinstance(error, ArmSilentError)):
@@ -113,17 +131,13 @@ class ArmBridge(Node):
         target, header = self.sheet_target.message, self.sheet_target.header
         if target is None or header is None:
             return None
-        given, received_ns = self.parameters, self.sheet_target.received_ns
-        # Another host's clock: the target counts as if it had arrived in no time.
-        foreign = header.clock_id != self.clock.id
         return goal_of(
             target,
-            valid_at_ns=target.valid_at_ns + (received_ns - header.publish_ns if foreign else 0),
-            received_ns=received_ns,
+            header,
+            received_ns=self.sheet_target.received_ns,
             now_ns=self.clock.now_ns(),
-            servo_lag_s=given.servo_lag_s,
-            period_s=given.target_period_s,
-            furthest_s=given.furthest_extrapolation_s,
+            clock_id=self.clock.id,
+            timing=self._timing,
         )
 
     def _other(self) -> OtherArm | None:
@@ -132,29 +146,15 @@ class ArmBridge(Node):
         return None if state is None else OtherArm.from_state(state, age_s)
 
     def _publish(self, geometry: ArmGeometry) -> None:
-        control, other = self._control, self._other()
         header, received_ns = self._used
-        measured = control.last_measured_rad
-        if measured is None:
-            return
-        distance, force = geometry.sheet_state(
-            measured, None if other is None else other.world_from_flange
-        )
-        self.arm.publish(
-            ArmState(
-                side=self.parameters.side,
-                mode=control.mode,
-                faults=control.all_faults,
-                joints_rad=measured,
-                joints_commanded_rad=control.commanded_rad,
-                world_from_flange=geometry.world_from_flange(measured),
-                world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
-                command_age_s=(self.clock.now_ns() - received_ns) * 1e-9 if header else None,
+        if self._control.last_measured_rad is not None:
+            state = arm_state(
+                self._control,
+                geometry,
+                self._other(),
                 target_source_ns=header.source_ns if header else 0,
+                command_age_s=(self.clock.now_ns() - received_ns) * 1e-9 if header else None,
                 command_sent_ns=self._sent_ns,
-                edge_distance_m=distance,
-                edge_force_n=force,
                 cycle_s=self._exchange_s,
-            ),
-            source_ns=self._measured_ns,
-        )
+            )
+            self.arm.publish(state, source_ns=self._measured_ns)

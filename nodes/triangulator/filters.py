@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-CALM_INNOVATION = 12.0
+CALM_INNOVATION = 6.0
 """Mean square of the normalised innovation up to which a hand counts as going evenly."""
 
 
@@ -280,7 +280,7 @@ class Kalman:
         """The noise that an innovation (3,) speaks for: |v|^2 is 3 times its variance over dt."""
         variance = _white_noise(self.order, dt)[0, 0]
         wanted = float(np.linalg.norm(innovation)) / np.sqrt(3.0 * variance)
-        return min(max(wanted, self.noise), self.largest_noise)
+        return float(min(max(wanted, self.noise), self.largest_noise))
 
     def moments(self, estimate: Estimate) -> tuple[Floats, Floats, Floats]:
         pick = np.zeros((6, len(estimate.state)))
@@ -342,10 +342,10 @@ TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
         2, 0.005, 3.0, max_speed, unfollowed_m=2.0 * HAND_TREMOR_M
     ),
     "constant_acceleration": lambda max_speed: Kalman(
-        3, 0.06, 10.0, max_speed, forgetting_per_s=6.0, unfollowed_m=2.0 * HAND_TREMOR_M
+        3, 0.1, 10.0, max_speed, forgetting_per_s=10.0, unfollowed_m=2.0 * HAND_TREMOR_M
     ),
     "hand": lambda max_speed: Kalman(
-        3, 0.06, 10.0, max_speed, forgetting_per_s=6.0, tremor=Tremor(HAND_TREMOR_M)
+        3, 0.1, 10.0, max_speed, forgetting_per_s=10.0, tremor=Tremor(HAND_TREMOR_M)
     ),
 }
 """Filters by name, for a finger's greatest speed (m/s).  Their noises are those that predict a

@@ -1,0 +1,56 @@
+"""When an arm is sent its next command."""
+
+from __future__ import annotations
+
+import itertools
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from nodes.arm_bridge.pacing import Pace
+
+PACE = Pace(period_s=1 / 140, target_period_s=1 / 60)
+MS = 1_000_000
+
+
+@given(since_ns=st.integers(0, 10**10))
+def test_commands_are_never_nearer_than_half_a_beat(since_ns: int) -> None:
+    wait_s = PACE.wait_s(1 + since_ns, 1)
+    assert wait_s >= 0.0
+    assert since_ns * 1e-9 + wait_s >= 0.5 * PACE.period_s * (1 - 1e-12)
+
+
+@given(since_ns=st.integers(0, 10**12))
+def test_a_command_covers_no_less_than_its_least_distance_and_no_long_silence(
+    since_ns: int,
+) -> None:
+    step_s = PACE.step_s(1 + since_ns, 1)
+    assert 0.5 * PACE.period_s <= step_s <= 2.0 * PACE.period_s
+    if 4 * MS < since_ns < 14 * MS:
+        assert step_s == since_ns * 1e-9
+
+
+def test_the_beat_goes_on_between_targets_and_without_any() -> None:
+    assert PACE.is_beat(7 * MS, 1, 0)
+    assert PACE.is_beat(1, 0, 0), "nothing was sent yet"
+    assert PACE.is_beat(100 * MS, 90 * MS, 0), "targets have ceased"
+    assert not PACE.is_beat(3 * MS, 1, 0), "too soon after a command"
+
+
+def test_the_beat_makes_room_for_a_target_that_is_due() -> None:
+    assert not PACE.is_beat(15 * MS, 8 * MS, 0)
+    assert not PACE.is_beat(18 * MS, 8 * MS, 0)
+    assert PACE.is_beat(21 * MS, 14 * MS, 0), "it is late: the arm must hear"
+
+
+def test_in_steady_state_an_arm_hears_at_least_every_ten_milliseconds() -> None:
+    sent = [1]
+    for now_ns in range(0, 400 * MS, MS // 10):
+        target_ns = now_ns - now_ns % 16_700_000
+        arrives = now_ns == target_ns and now_ns > 0
+        if arrives or PACE.is_beat(now_ns, sent[-1], target_ns):
+            assert PACE.wait_s(now_ns, sent[-1]) == 0.0
+            sent.append(now_ns)
+    gaps_ms = [(b - a) / MS for a, b in itertools.pairwise(sent[1:])]
+    assert max(gaps_ms) < 13.0
+    assert min(gaps_ms) >= 3.5
