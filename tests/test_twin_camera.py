@@ -12,12 +12,29 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
-from scipy.special import erf
+from scipy.special import erf, ndtr
 
 from messages.calibration import Board
 from messages.scene import Lens, Scene, StereoCamera
 from nodes.models.rigid import transform, vector_from_rotation
 from nodes.twin.board import BoardError, TwinBoard
+from nodes.twin.bound import BoundError, fingertip_bound, pixel_information
+from nodes.twin.clutter import (
+    CLUTTER,
+    Clutter,
+    Highlight,
+    Moving,
+    Occluder,
+    SecondMark,
+    Sheet,
+    Still,
+    Swinging,
+    covered,
+    second_mark,
+    together,
+    touching_highlight,
+)
+from nodes.twin.pixels import Image, Sensor, TwinCamera, Window, disjoint
 from nodes.twin.rig import pixels_of, slopes_of, true_camera
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -195,3 +212,326 @@ def test_boards_that_cannot_be_drawn_are_refused(rig: StereoCamera, chessboard: 
             TwinBoard(rig, CHARUCO.model_copy(update=change), seed=1)
     with pytest.raises(BoardError, match="further away"):
         chessboard.pair(transform(np.eye(3), [0.0, 0.0, -0.3]))
+
+
+TIP = np.array([0.01, 0.02, 0.01])
+
+
+def still(_: float) -> Floats:
+    return TIP
+
+
+def looking(
+    rig: StereoCamera, clutter: Clutter | None = None, sensor: Sensor | None = None, seed: int = 1
+) -> TwinCamera:
+    return TwinCamera(rig, finger_radius_m=0.007, seed=seed, sensor=sensor, clutter=clutter)
+
+
+@pytest.fixture(scope="module")
+def plain(rig: StereoCamera) -> TwinCamera:
+    return looking(rig)
+
+
+def of_the_mark(camera: TwinCamera, time_s: float = 0.0) -> tuple[Floats, Floats]:
+    """The light (height, width) that the mark adds to each view."""
+    lit, unlit = (
+        camera.levels(still, exposure_s=0.004, mark=mark, time_s=time_s) for mark in (True, False)
+    )
+    left, right = (np.asarray(a, float) - b for a, b in zip(lit, unlit, strict=True))
+    return left, right
+
+
+def of_the_clutter(camera: TwinCamera, plain: TwinCamera, time_s: float = 0.0) -> list[Floats]:
+    """What clutter changes in each view of a camera whose background is the plain one's."""
+    return [
+        np.asarray(a, float) - b
+        for a, b in zip(
+            camera.levels(still, exposure_s=0.004, time_s=time_s),
+            plain.levels(still, exposure_s=0.004),
+            strict=True,
+        )
+    ]
+
+
+def centre_and_spread(light: Floats) -> tuple[Floats, Floats]:
+    """Centre (2,) and variance (2,) of a light in pixels."""
+    y, x = np.mgrid[: light.shape[0], : light.shape[1]]
+    centre = np.array([(light * x).sum(), (light * y).sum()]) / light.sum()
+    off = np.array([(light * (x - centre[0]) ** 2).sum(), (light * (y - centre[1]) ** 2).sum()])
+    return centre, off / light.sum()
+
+
+@given(offset=st.tuples(*[st.floats(-0.06, 0.06)] * 2))
+@settings(max_examples=10, deadline=None)
+def test_a_second_mark_is_where_it_was_asked_for(
+    rig: StereoCamera, plain: TwinCamera, offset: tuple[float, float]
+) -> None:
+    if np.hypot(*offset) < 0.015:
+        offset = (offset[0] + 0.03, offset[1])
+    camera = looking(rig, Clutter(marks=(SecondMark(Still((*offset, 0.0)), carried=True),)))
+    for eye, change in zip(camera.eyes, of_the_clutter(camera, plain), strict=True):
+        place = eye.see(TIP + np.array([*offset, 0.0]))[0]
+        y, x = np.unravel_index(np.argmax(change), change.shape)
+        assert np.abs(np.array([x, y]) - place).max() < 1.5
+        assert change.max() > 100
+
+
+@pytest.mark.parametrize("overlap", [-0.5, 0.0, 0.5])
+def test_a_highlight_touches_the_mark_by_as_much_as_asked(
+    rig: StereoCamera, plain: TwinCamera, overlap: float
+) -> None:
+    camera = looking(rig, touching_highlight(overlap, radius_m=0.0015))
+    for eye, light in zip(camera.eyes, of_the_clutter(camera, plain), strict=True):
+        centre, _ = centre_and_spread(light)
+        beside = TIP + np.array([0.0045 - overlap * 0.006, 0.0, 0.0])
+        assert np.abs(centre - eye.see(beside)[0]).max() < 0.02
+    left, _ = camera.picture(still, exposure_s=0.004)
+    assert left.max() == 255
+
+
+@given(share=st.floats(0.0, 1.0))
+@settings(max_examples=12, deadline=None)
+def test_an_occluder_hides_the_share_of_the_mark_that_was_asked_for(
+    rig: StereoCamera, plain: TwinCamera, share: float
+) -> None:
+    camera = looking(rig, covered(share, views="right"))
+    whole, seen = of_the_mark(plain), of_the_mark(camera)
+    assert seen[0].sum() == pytest.approx(whole[0].sum(), rel=1e-6)
+    # What is hidden lies on finger and room, whose levels differ: hence the tolerance.
+    assert seen[1].sum() / whole[1].sum() == pytest.approx(1.0 - share, abs=0.06)
+
+
+def test_a_wholly_covered_mark_leaves_nothing_in_that_view(rig: StereoCamera) -> None:
+    left, right = of_the_mark(looking(rig, covered(1.0, views="right")))
+    assert left.max() > 100
+    assert np.abs(right).max() < 0.1
+
+
+@given(defocus_px=st.floats(0.0, 4.0))
+@settings(max_examples=10, deadline=None)
+def test_out_of_focus_the_mark_spreads_as_optics_say_and_keeps_its_light(
+    rig: StereoCamera, plain: TwinCamera, defocus_px: float
+) -> None:
+    even = Sensor(finger_level=0.0, background_level=0.0, texture_level=0.0, aperture_m=0.03)
+    eye = plain.eyes[0]
+    _, depth_m = eye.see(TIP)
+    blurred = even.out_of_focus(defocus_px, depth_m, eye.lens.fx_px)
+    light = of_the_mark(looking(rig, sensor=blurred))[0]
+    sharp = of_the_mark(looking(rig, sensor=even.out_of_focus(0.0, depth_m, eye.lens.fx_px)))[0]
+    centre, variance = centre_and_spread(light)
+    assert np.abs(centre - eye.see(TIP)[0]).max() < 0.02
+    # Room and finger have no light here, but for the least level of the room.
+    assert light.sum() == pytest.approx(sharp.sum(), rel=0.02)
+    grown = variance - centre_and_spread(sharp)[1]
+    assert np.allclose(grown, defocus_px**2, rtol=0.05, atol=0.02)
+
+
+def test_a_defocus_beyond_infinity_is_refused() -> None:
+    with pytest.raises(ValueError, match="aperture_m above"):
+        Sensor(aperture_m=0.001).out_of_focus(3.0, 0.5, 540.0)
+
+
+def test_over_exposure_brightens_all_and_fills_the_mark(rig: StereoCamera) -> None:
+    lab = CLUTTER["lab"]
+    once, thrice = (
+        looking(rig, lab, Sensor(exposure=factor, background_level=40.0)) for factor in (1.0, 3.0)
+    )
+    for lit, over in zip(
+        once.levels(still, exposure_s=0.004), thrice.levels(still, exposure_s=0.004), strict=True
+    ):
+        assert np.allclose(3.0 * lit, over, rtol=1e-4)
+    counts = [
+        int((camera.picture(still, exposure_s=0.004)[0] == 255).sum()) for camera in (once, thrice)
+    ]
+    assert counts[0] == 0
+    assert counts[1] > 25
+
+
+def test_the_sheets_grain_lies_in_the_plane_of_the_world(rig: StereoCamera) -> None:
+    camera = looking(rig, Clutter(sheet=Sheet()))
+    generator = np.random.default_rng(1)
+    seen: list[list[float]] = [[], []]
+    for x, y in generator.uniform(-0.11, 0.11, (400, 2)):
+        for eye, levels in zip(camera.eyes, seen, strict=True):
+            column, row = eye.see(np.array([x, y, 0.0]))[0]
+            patch = cv2.getRectSubPix(eye.background, (1, 1), (float(column), float(row)))
+            levels.append(float(patch[0, 0]))
+    assert np.corrcoef(seen)[0, 1] > 0.9
+    assert np.mean(seen[0]) == pytest.approx(Sheet().level, rel=0.1)
+    column, row = camera.eyes[0].see(np.array([0.14, 0.0, 0.0]))[0].astype(int)
+    assert camera.eyes[0].background[row, column] < 0.8 * Sheet().level
+
+
+def test_a_lamps_image_may_stand_in_one_view_only(rig: StereoCamera, plain: TwinCamera) -> None:
+    place = (-0.09, 0.05, 0.0)
+    spot = Highlight(Still(place), 0.0015, 300.0, views="left")
+    camera = looking(rig, Clutter(highlights=(spot,)))
+    left, right = of_the_clutter(camera, plain)
+    assert np.abs(centre_and_spread(left)[0] - camera.eyes[0].see(np.array(place))[0]).max() < 0.02
+    assert np.abs(right).max() == 0.0
+
+
+def test_what_moves_is_where_its_path_is_at_that_time(rig: StereoCamera, plain: TwinCamera) -> None:
+    swinging = Swinging((0.0, 0.06, 0.0), (0.08, 0.0, 0.0), period_s=2.0)
+    moving = Moving((-0.1, -0.06, 0.0), (0.1, 0.0, 0.0))
+    assert np.allclose(swinging.at(0.5), [0.08, 0.06, 0.0])
+    for path in (swinging, moving):
+        camera = looking(rig, Clutter(highlights=(Highlight(path, 0.001, 200.0),)))
+        for time_s in (0.0, 0.5):
+            light = of_the_clutter(camera, plain, time_s)[1]
+            place = camera.eyes[1].see(path.at(time_s))[0]
+            assert np.abs(centre_and_spread(light)[0] - place).max() < 0.05
+
+
+def test_an_occluder_passes_before_the_mark_and_away_again(rig: StereoCamera) -> None:
+    ends = [Moving((-0.1, y, 0.05), (0.1, 0.0, 0.0)) for y in (-0.3, 0.3)]
+    camera = looking(rig, Clutter(occluders=(Occluder(ends[0], ends[1], 0.01),)))
+    light = [of_the_mark(camera, time_s)[0].max() for time_s in np.arange(0.0, 2.0, 0.1)]
+    assert light[0] > 100
+    assert light[-1] > 100
+    assert min(light) < 1.0
+
+
+@given(
+    corners=st.lists(
+        st.tuples(st.integers(0, 30), st.integers(0, 30), st.integers(1, 9), st.integers(1, 9)),
+        max_size=8,
+    )
+)
+def test_joined_windows_cover_each_pixel_once(corners: list[tuple[int, int, int, int]]) -> None:
+    windows: list[Window] = [
+        (slice(row, row + high), slice(column, column + wide))
+        for row, column, high, wide in corners
+    ]
+    touched, joined = np.zeros((40, 40), int), np.zeros((40, 40), int)
+    for window in windows:
+        touched[window] = 1
+    for window in disjoint(windows):
+        joined[window] += 1
+    assert joined.max(initial=0) <= 1
+    assert (joined >= touched).all()
+
+
+def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera) -> None:
+    def film(seed: int) -> list[tuple[Image, Image]]:
+        camera = looking(rig, CLUTTER["crowded"], seed=seed)
+        before = camera.levels(lambda _: np.array([9.0, 0.0, 0.0]), exposure_s=0.004)
+        frames = [camera.picture(still, exposure_s=0.004, time_s=time_s) for time_s in (0.0, 2.0)]
+        after = camera.levels(lambda _: np.array([9.0, 0.0, 0.0]), exposure_s=0.004)
+        assert np.array_equal(before, after)
+        return frames
+
+    assert np.array_equal(film(1), film(1))
+    assert not np.array_equal(film(1), film(2))
+
+
+def test_nothing_in_the_lab_looks_like_a_mark(rig: StereoCamera) -> None:
+    """Neither as bright over six pixels as half of the mark's height, nor as large."""
+    camera = looking(rig, CLUTTER["lab"])
+    for image in camera.picture(still, exposure_s=0.004, mark=False):
+        bright = (image > 140).astype(np.uint8)
+        sizes = cv2.connectedComponentsWithStats(bright)[2][1:, cv2.CC_STAT_AREA]
+        assert max(sizes.tolist(), default=0) < 6
+        assert (image > 60).sum() > 20_000
+
+
+def test_there_is_one_sheet() -> None:
+    with pytest.raises(ValueError, match="2 sheets"):
+        together(CLUTTER["lab"], CLUTTER["lab"])
+
+
+EVEN = Sensor(background_level=40.0, texture_level=0.0, noisy_backgrounds=1)
+
+
+BESIDE = np.array([0.05, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def disc(rig: StereoCamera) -> TwinCamera:
+    """A mark on even ground, beside the finger."""
+    return looking(rig, sensor=EVEN).altered(mark_offset_m=BESIDE)
+
+
+def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera) -> None:
+    """With even noise n, contrast C, radius r, blur s << r: variance 2 s n^2 / (sqrt(pi) r C^2).
+
+    The rim's gradient C g(d) n_x, squared, integrates over the rim to C^2 pi r / (2 sqrt(pi) s).
+    """
+    sensor = Sensor(
+        background_level=40.0, texture_level=0.0, photons_per_level=1e9, read_noise=3.0,
+        noisy_backgrounds=1, aperture_m=1e-6,
+    )  # fmt: skip
+    camera = looking(rig, sensor=sensor).altered(mark_radius_m=0.006, mark_offset_m=BESIDE)
+    bound = fingertip_bound(camera, still, exposure_s=0.0)
+    for eye, covariance in zip(camera.eyes, bound.views_px2, strict=True):
+        _, depth_m = eye.see(TIP + BESIDE)
+        radius_px = 0.006 * np.sqrt(eye.lens.fx_px * eye.lens.fy_px) / depth_m
+        noise_sq, spread_px = 9.0 + 1.0 / 12.0, np.sqrt(0.49 + 1.0 / 12.0)
+        rim = 2.0 * spread_px * noise_sq / (np.sqrt(np.pi) * radius_px * 175.0**2)
+        assert np.allclose(np.diag(covariance), rim, rtol=0.05)
+        assert abs(covariance[0, 1]) < 0.02 * rim
+
+
+def disc_misfit(p: Floats, image: Image, x0: int, y0: int) -> Floats:
+    """A smeared disc (x, y, radius, spread, ground, height) against the picture, in deviations."""
+    y, x = np.mgrid[y0 - 8 : y0 + 9, x0 - 8 : x0 + 9]
+    inside = (p[2] - np.hypot(x - p[0], y - p[1])) / p[3]
+    level = p[4] + p[5] * ndtr(inside)
+    return np.asarray(((image[y, x] - level) / EVEN.noise(level.astype(np.float32))).ravel())
+
+
+def test_a_most_likely_fit_reaches_the_bound_and_does_not_beat_it(disc: TwinCamera) -> None:
+    bound = fingertip_bound(disc, still, exposure_s=0.0)
+    place = disc.eyes[0].see(TIP + BESIDE)[0]
+    x0, y0 = np.rint(place).astype(int)
+    guess = np.array([*place, 3.2, 0.75, 40.0, 175.0])
+    found = []
+    for _ in range(300):
+        image, _ = disc.picture(still, exposure_s=0.0)
+        found.append(least_squares(disc_misfit, guess, args=(image, x0, y0)).x[:2] - place)
+    spread = np.mean(np.square(found - np.mean(found, axis=0)))
+    assert spread / np.mean(np.diag(bound.views_px2[0])) == pytest.approx(1.0, abs=0.15)
+
+
+def test_the_position_bound_follows_from_the_views(disc: TwinCamera) -> None:
+    """Along the view, depth errs by Z^2 / (f B) of the disparity's error."""
+    bound = fingertip_bound(disc, still, exposure_s=0.0)
+    eye = disc.eyes[0]
+    _, depth_m = eye.see(TIP + BESIDE)
+    along = eye.camera_from_world[2, :3]
+    disparity_px = np.sqrt(sum(view[0, 0] for view in bound.views_px2))
+    expected_m = depth_m**2 / (eye.lens.fx_px * 0.1205) * disparity_px
+    assert np.sqrt(along @ bound.position_m2 @ along) == pytest.approx(expected_m, rel=0.15)
+
+
+def test_the_bound_widens_with_defocus_speed_and_saturation(disc: TwinCamera) -> None:
+    def size(camera: TwinCamera, speed_m_per_s: float = 0.0) -> float:
+        way = np.array([speed_m_per_s, 0.0, 0.0])
+        bound = fingertip_bound(camera, lambda s: TIP + s * way, exposure_s=0.004)
+        return float(np.sqrt(np.trace(bound.position_m2)))
+
+    plain = size(disc)
+    blurred = Sensor(background_level=40.0, texture_level=0.0, blur_px=2.5)
+    assert size(disc.altered(sensor=blurred)) > 1.5 * plain
+    assert size(disc, 1.5) > 1.2 * plain
+    dim = Sensor(background_level=40.0, texture_level=0.0, mark_level=100.0)
+    assert size(disc.altered(sensor=dim)) > 2.0 * plain
+
+
+def test_a_full_pixel_tells_nothing_and_a_dark_one_all_that_its_noise_allows() -> None:
+    sensor = Sensor()
+    told = pixel_information(sensor, np.array([100.0, 230.0, 255.0, 300.0]))
+    noise_sq = np.array([100.0, 230.0, 255.0]) / 40.0 + 2.25 + 1.0 / 12.0
+    assert told[:2] == pytest.approx(1.0 / noise_sq[:2], rel=1e-6)
+    # At its mean, a cut normal keeps 1/2 + 1/pi of the information.
+    assert told[2] * noise_sq[2] == pytest.approx(0.5 + 1.0 / np.pi, rel=1e-6)
+    assert told[3] < 1e-12
+
+
+def test_there_is_no_bound_where_the_mark_cannot_be_seen(rig: StereoCamera) -> None:
+    for place, said in (([0.0, 0.25, 0.9], "behind"), ([0.6, 0.0, 0.0], "outside the")):
+        with pytest.raises(BoundError, match=said):
+            fingertip_bound(looking(rig), lambda _, p=place: np.array(p), exposure_s=0.004)
+    with pytest.raises(BoundError, match="right view"):
+        fingertip_bound(looking(rig, covered(1.0, views="right")), still, exposure_s=0.004)
+    assert fingertip_bound(looking(rig, second_mark((0.03, 0.0, 0.0))), still, exposure_s=0.004)

@@ -1,34 +1,67 @@
 """The twin's stereo camera: pixels of a fingertip with a bright mark, as a real rig would see it.
 
-Own optics: pinhole with Brown's distortion, written here anew, since the twin judges the camera
-model that the nodes use.  The fingertip is a tapered finger that ends in a small luminous bead, the
-mark, whose centre is the fingertip's point.  Edges are drawn as the pixel's own area and the lens's
-blur smear them, the exposure's motion is integrated, and photon and read noise are added.
+Own optics: pinhole with Brown's distortion (`rig.py`), since the twin judges the camera model that
+the nodes use.  The fingertip is a tapered finger that ends in a small luminous bead, the mark,
+whose centre is the fingertip's point; around it is what `clutter.py` describes.  All is drawn ray
+by ray: what a ray meets or misses, smeared by the lens, by what is out of focus, by the pixel's own
+area and by the exposure's motion.  Then photon and read noise, saturation, whole numbers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import copy
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
+from scipy.special import chndtr
 
 from messages.scene import Lens, StereoCamera
-from nodes.models.rigid import inverse, transform_from_rpy
+from messages.types import Side
+from nodes.models.rigid import apply, inverse, transform_from_rpy
+from nodes.twin.clutter import (
+    CLUTTER,
+    FINGER_DIRECTION,
+    FINGER_LENGTH_M,
+    MARK_RADIUS_M,
+    Clutter,
+    Highlight,
+    SecondMark,
+    Sheet,
+    Still,
+)
+from nodes.twin.rig import pixel_of, pixels_per_slope, slopes_of
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Image = NDArray[np.uint8]
+Window = tuple[slice, slice]
+"""Rows and columns of a part of a picture."""
 
-MARK_RADIUS_M = 0.003
-FINGER_LENGTH_M = 0.06
-FINGER_DIRECTION = np.array([0.0, -0.5, 0.866])
-"""World direction from the tip to the knuckle: up from below, out of the mark's sight."""
+Position = Callable[[float], Floats]
+"""The fingertip (3,) at so many seconds from the middle of the exposure."""
 
 MOTION_STEP_PX = 1.0
 """Motion within the exposure is summed at steps no longer than this; the blur closes the gaps."""
+
+LIGHT = np.array([-0.6, 0.7, 0.4])
+"""World direction towards the lamp, about a unit: from the upper left."""
+
+SHADE = 0.35
+"""How much darker skin is at a limb's flank than on its ridge."""
+
+SIDE_LIGHT = 0.2
+"""How much brighter than the ridge the flank towards the lamp is, and darker the other."""
+
+NEAREST_M = 0.02
+"""What comes nearer to a camera than this is not drawn."""
+
+GRAIN = 1 << 21
+"""Length of the roll of normal deviates that pictures cut their noise from, at random places."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +69,10 @@ class Sensor:
     """Levels in digital numbers (0..255), linear.
 
     photons_per_level: full-well photons over 255; the variance of a level L is L over it.
-    blur_px: standard deviation of the lens's point spread.
+    blur_px: standard deviation of the lens's point spread in focus.
+    aperture_m, focus_m: out of focus a point spreads to a disc of f * aperture * |1/z - 1/focus| px
+    across, drawn as a Gaussian of the same standard deviation, a quarter of that.
+    exposure: factor on all light; above 1 the mark saturates.
     """
 
     mark_level: float = 215.0
@@ -46,70 +82,315 @@ class Sensor:
     read_noise: float = 1.5
     photons_per_level: float = 40.0
     blur_px: float = 0.7
+    aperture_m: float = 0.002
+    focus_m: float = 0.5
+    exposure: float = 1.0
     noisy_backgrounds: int = 8
 
-    def noise(self, levels: NDArray[np.float32]) -> NDArray[np.float32]:
+    def noise(self, levels: Singles) -> Singles:
         """Standard deviation of each level."""
-        variance = levels / np.float32(self.photons_per_level) + np.float32(self.read_noise**2)
+        variance = levels * np.float32(1.0 / self.photons_per_level) + np.float32(
+            self.read_noise**2
+        )
         return np.asarray(np.sqrt(variance), dtype=np.float32)
+
+    def spread_px(self, depth_m: float, focal_px: float) -> float:
+        """Standard deviation of a point at a depth: lens, focus, and the pixel's own area."""
+        defocus_px = 0.25 * focal_px * self.aperture_m * abs(1.0 / depth_m - 1.0 / self.focus_m)
+        return float(np.sqrt(self.blur_px**2 + defocus_px**2 + 1.0 / 12.0))
+
+    def out_of_focus(self, defocus_px: float, depth_m: float, focal_px: float) -> Sensor:
+        """The same, focused so far behind a depth that a point there spreads by `defocus_px`."""
+        nearer = 4.0 * defocus_px / (focal_px * self.aperture_m)
+        focus = 1.0 / depth_m - nearer
+        if focus <= 0:
+            raise ValueError(
+                f"defocus of {defocus_px:g} px at {depth_m:g} m lies beyond infinity: needs an "
+                f"aperture_m above {4.0 * defocus_px * depth_m / focal_px:.3g}"
+            )
+        return replace(self, focus_m=1.0 / focus)
 
 
 @dataclass(frozen=True, slots=True)
 class Eye:
-    """One camera of the rig with its stack of noisy backgrounds."""
+    """One camera of the rig, the rays through its pixels, and its stack of noisy backgrounds.
 
+    slopes_x, slopes_y: x/z and y/z of each pixel's ray, in the camera.
+    canvas: where pictures are drawn; between pictures it equals the background.
+    """
+
+    side: Side
     lens: Lens
     camera_from_world: Floats
-    background: NDArray[np.float32]
+    slopes_x: Singles
+    slopes_y: Singles
+    background: Singles
+    canvas: Singles
     noisy: list[Image]
 
     def see(self, point_world: Floats) -> tuple[Floats, float]:
         """Pixel (2,) and depth (m) of a world point; the pixel is void when the depth is <= 0."""
-        x, y, z = self.camera_from_world[:3, :3] @ point_world + self.camera_from_world[:3, 3]
+        x, y, z = (
+            self.camera_from_world[:3, :3] @ point_world + self.camera_from_world[:3, 3]
+        ).tolist()
         if z <= 0:
-            return np.zeros(2), float(z)
-        u, v = x / z, y / z
-        k1, k2, p1, p2, k3 = self.lens.distortion
-        r2 = u * u + v * v
-        radial = 1.0 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-        du = 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
-        dv = p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v
-        return np.array(
-            [
-                self.lens.fx_px * (u * radial + du) + self.lens.cx_px,
-                self.lens.fy_px * (v * radial + dv) + self.lens.cy_px,
-            ]
-        ), float(z)
+            return np.zeros(2), z
+        return np.array(pixel_of(self.lens, x / z, y / z)), z
+
+    def window(self, pixels: Sequence[tuple[float, float]], reach_px: float) -> Window | None:
+        """The part of the picture within reach of some pixels; None: none of it."""
+        height, width = self.canvas.shape
+        rows = slice(
+            max(math.floor(min(y for _, y in pixels) - reach_px), 0),
+            min(math.ceil(max(y for _, y in pixels) + reach_px) + 1, height),
+        )
+        columns = slice(
+            max(math.floor(min(x for x, _ in pixels) - reach_px), 0),
+            min(math.ceil(max(x for x, _ in pixels) + reach_px) + 1, width),
+        )
+        return None if rows.start >= rows.stop or columns.start >= columns.stop else (rows, columns)
 
 
 class TwinCamera:
-    """Draws stereo pairs of a scene's camera; the noise comes from `seed`."""
+    """Draws stereo pairs of a rig, given as it really stands; the noise comes from `seed`."""
 
-    def __init__(self, camera: StereoCamera, *, finger_radius_m: float, seed: int) -> None:
+    def __init__(
+        self,
+        camera: StereoCamera,
+        *,
+        finger_radius_m: float,
+        seed: int,
+        sensor: Sensor | None = None,
+        clutter: Clutter | None = None,
+    ) -> None:
         self.camera = camera
         self.finger_radius_m = finger_radius_m
-        self.sensor = Sensor()
+        self.mark_radius_m = MARK_RADIUS_M
+        self.mark_offset_m = np.zeros(3)
+        self.sensor = Sensor() if sensor is None else sensor
+        self.clutter = CLUTTER["none"] if clutter is None else clutter
         self._random = np.random.default_rng(seed)
-        world_from_left = transform_from_rpy(
-            camera.world_from_left.position_m, camera.world_from_left.rpy_rad
+        self._grain = self._random.standard_normal(GRAIN, dtype=np.float32)
+        sheet = None if self.clutter.sheet is None else self._grained(self.clutter.sheet)
+        left_from_world = inverse(
+            transform_from_rpy(camera.world_from_left.position_m, camera.world_from_left.rpy_rad)
         )
-        left_from_world = inverse(world_from_left)
+        right_from_world = camera.right_from_left @ left_from_world
         self.eyes = (
-            self._eye(camera.left, left_from_world),
-            self._eye(camera.right, camera.right_from_left @ left_from_world),
+            self._eye("left", camera.left, left_from_world, sheet),
+            self._eye("right", camera.right, right_from_world, sheet),
         )
 
-    def _eye(self, lens: Lens, camera_from_world: Floats) -> Eye:
-        height, width = self.camera.height_px, self.camera.width_px
-        background = self._background(height, width)
-        deviation = self.sensor.noise(background)
-        noisy = []
-        for _ in range(self.sensor.noisy_backgrounds):
-            noise = self._random.standard_normal((height, width), dtype=np.float32)
-            noisy.append(quantized(background + deviation * noise))
-        return Eye(lens, camera_from_world, background, noisy)
+    def altered(
+        self,
+        *,
+        sensor: Sensor | None = None,
+        mark_radius_m: float | None = None,
+        mark_offset_m: Floats | None = None,
+    ) -> TwinCamera:
+        """The same camera before the same background, with another mark or sensor for the rest.
 
-    def _background(self, height: int, width: int) -> NDArray[np.float32]:
+        mark_offset_m: where the mark sits, from the fingertip, in the world's directions.
+        """
+        other = copy.copy(self)
+        other.sensor = self.sensor if sensor is None else sensor
+        other.mark_radius_m = self.mark_radius_m if mark_radius_m is None else mark_radius_m
+        other.mark_offset_m = self.mark_offset_m if mark_offset_m is None else mark_offset_m
+        return other
+
+    def picture(
+        self, position: Position, *, exposure_s: float, mark: bool = True, time_s: float = 0.0
+    ) -> tuple[Image, Image]:
+        """The left and right pictures of a fingertip at `position(seconds from mid-exposure)`.
+
+        mark: false draws a finger that wears none (rubbed off, or turned away).
+        time_s: where what moves of the clutter is at mid-exposure.
+        """
+        instants_s, tips = self._instants(position, exposure_s)
+        left, right = (
+            self._exposed(eye, self._draw(eye, tips, time_s + instants_s, mark=mark))
+            for eye in self.eyes
+        )
+        return left, right
+
+    def levels(
+        self, position: Position, *, exposure_s: float, mark: bool = True, time_s: float = 0.0
+    ) -> tuple[Singles, Singles]:
+        """Both pictures (height, width) as light: before noise, saturation and rounding."""
+        instants_s, tips = self._instants(position, exposure_s)
+        pictures = []
+        for eye in self.eyes:
+            windows = self._draw(eye, tips, time_s + instants_s, mark=mark)
+            pictures.append(eye.canvas.copy())
+            _wipe(eye, windows)
+        return pictures[0], pictures[1]
+
+    def _instants(self, position: Position, exposure_s: float) -> tuple[Floats, Floats]:
+        """Times (n,) from mid-exposure and fingertips (n, 3), close enough to sum motion over."""
+        ends = [position(share * exposure_s) for share in (-0.5, 0.5)]
+        travel_px = 0.0
+        for eye in self.eyes:
+            (first, first_depth), (last, last_depth) = (eye.see(end) for end in ends)
+            if min(first_depth, last_depth) > NEAREST_M:
+                travel_px = max(travel_px, float(np.linalg.norm(last - first)))
+        steps = 1 + int(np.ceil(travel_px / MOTION_STEP_PX))
+        instants_s = exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
+        return instants_s, np.stack([position(float(instant)) for instant in instants_s])
+
+    def _exposed(self, eye: Eye, windows: list[Window]) -> Image:
+        """The picture of what was drawn: a noisy background, the touched windows new on it."""
+        image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
+        for window in disjoint(windows):
+            image[window] = self._read_out(eye.canvas[window])
+        _wipe(eye, windows)
+        return image
+
+    def _read_out(self, levels: Singles) -> Image:
+        start = int(self._random.integers(GRAIN - levels.size))
+        noise = self._grain[start : start + levels.size].reshape(levels.shape)
+        return quantized(levels + self.sensor.noise(levels) * noise)
+
+    def _draw(self, eye: Eye, tips: Floats, times_s: Floats, *, mark: bool) -> list[Window]:
+        """Draw all that is not background on the eye's canvas; gives the windows it touches.
+
+        tips: (n, 3) over the exposure, times_s: (n,).
+        """
+        clutter, sensor = self.clutter, self.sensor
+        time_s, tip = float(times_s.mean()), tips.mean(axis=0)
+        way = tips[-1] - tips[0]
+        windows = []
+        for limb in clutter.limbs:
+            ends = np.stack([limb.start.at(time_s), limb.end.at(time_s)])
+            if limb.carried:
+                ends += tip
+            radii_m = (limb.start_radius_m, limb.end_radius_m)
+            moved = way if limb.carried else np.zeros(3)
+            windows.append(self._limb(eye, ends, radii_m, limb.level, moved, lit=True))
+        ends = np.stack([tip, tip + FINGER_LENGTH_M * np.array(FINGER_DIRECTION)])
+        radii_m = (self.finger_radius_m, 1.2 * self.finger_radius_m)
+        windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, way, lit=True))
+        if mark:
+            at = tips + self.mark_offset_m
+            windows.append(self._disc(eye, at, self.mark_radius_m, sensor.mark_level))
+        for thing in _spots(clutter, eye.side):
+            if not _is_static(thing):
+                places = np.stack([thing.path.at(float(instant)) for instant in times_s])
+                windows.append(self._spot(eye, thing, places + tips if thing.carried else places))
+        for occluder in clutter.occluders:
+            if occluder.views in ("both", eye.side):
+                ends = np.stack([occluder.start.at(time_s), occluder.end.at(time_s)])
+                if occluder.carried:
+                    ends += tip
+                radii_m = (occluder.radius_m, occluder.radius_m)
+                moved = way if occluder.carried else np.zeros(3)
+                windows.append(self._limb(eye, ends, radii_m, occluder.level, moved, lit=False))
+        return [window for window in windows if window is not None]
+
+    def _spot(self, eye: Eye, thing: SecondMark | Highlight, places: Floats) -> Window | None:
+        adds = isinstance(thing, Highlight)
+        return self._disc(eye, places, thing.radius_m, thing.level, adds=adds)
+
+    def _limb(
+        self,
+        eye: Eye,
+        ends: Floats,
+        radii_m: tuple[float, float],
+        level: float,
+        way: Floats,
+        *,
+        lit: bool,
+    ) -> Window | None:
+        """A tapered capsule between two world points (2, 3); None where it is not to be seen.
+
+        lit: by the lamp from its side; otherwise evenly.  Its motion over the exposure, `way` (m),
+        widens its edges; their profile is a cubic, within 2 % of the normal distribution.  Not for
+        what is thinner than its own edges.
+        """
+        (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
+        if min(z0, z1) <= NEAREST_M:
+            return None
+        u0, v0, u1, v1 = x0 / z0, y0 / z0, x1 / z1, y1 / z1
+        width0, width1 = radii_m[0] / z0, radii_m[1] / z1
+        scale = pixels_per_slope(eye.lens, u0, v0)
+        travel_px = scale / z0 * math.hypot(*way.tolist())
+        spread_px = math.hypot(self.sensor.spread_px(z0, eye.lens.fx_px), travel_px / math.sqrt(12))
+        pixels = [pixel_of(eye.lens, u0, v0), pixel_of(eye.lens, u1, v1)]
+        window = eye.window(pixels, scale * max(width0, width1) + 3.0 * spread_px)
+        if window is None:
+            return None
+        single = np.float32
+        length = max(math.hypot(u1 - u0, v1 - v0), 1e-6)
+        along_x, along_y = single((u1 - u0) / length), single((v1 - v0) / length)
+        dx, dy = eye.slopes_x[window] - single(u0), eye.slopes_y[window] - single(v0)
+        along = dx * along_x + dy * along_y
+        across = dx * along_y - dy * along_x
+        within = np.minimum(np.maximum(along, single(0.0)), single(length))
+        off = cv2.magnitude(across, along - within)
+        width = within * single((width1 - width0) / length) + single(width0)
+        # A cubic from 0 to 1 over +-2.2 standard deviations.
+        edge = (width - off) * single(scale / (4.4 * spread_px)) + single(0.5)
+        edge = np.minimum(np.maximum(edge, single(0.0)), single(1.0))
+        cover = edge * edge * (single(3.0) - single(2.0) * edge)
+        light: Singles | np.float32 = single(level * self.sensor.exposure)
+        if lit:
+            lamp = (eye.camera_from_world[:2, :3] @ LIGHT).tolist()
+            side = SIDE_LIGHT * (lamp[0] * float(along_y) - lamp[1] * float(along_x))
+            aside = np.minimum(np.maximum(across / width, single(-1.0)), single(1.0))
+            light = light + light * aside * (single(side) - single(SHADE) * aside)
+        canvas = eye.canvas[window]
+        canvas += cover * (light - canvas)
+        return window
+
+    def _disc(
+        self, eye: Eye, places: Floats, radius_m: float, level: float, *, adds: bool = False
+    ) -> Window | None:
+        """A luminous ball at world points (n, 3) over the exposure; None: not to be seen.
+
+        adds: its light adds to what is there, instead of hiding it.
+        """
+        in_camera = apply(eye.camera_from_world, places)
+        if in_camera[:, 2].min() <= NEAREST_M:
+            return None
+        x, y, z = in_camera.mean(axis=0).tolist()
+        spread_px = self.sensor.spread_px(z, eye.lens.fx_px)
+        reach_px = pixels_per_slope(eye.lens, x / z, y / z) * radius_m / z + 4.0 * spread_px
+        pixels = [pixel_of(eye.lens, x / z, y / z) for x, y, z in in_camera.tolist()]
+        window = eye.window(pixels, reach_px)
+        if window is None:
+            return None
+        cover = ball_cover(eye, in_camera, radius_m, spread_px, window)
+        canvas = eye.canvas[window]
+        light = np.float32(level * self.sensor.exposure)
+        canvas += cover * (light if adds else light - canvas)
+        return window
+
+    def _eye(self, side: Side, lens: Lens, camera_from_world: Floats, sheet: Singles | None) -> Eye:
+        """One camera with all that never moves drawn into its background."""
+        height, width = self.camera.height_px, self.camera.width_px
+        slopes = _slopes(lens, width, height)
+        canvas = self._room(height, width)
+        if self.clutter.sheet is not None and sheet is not None:
+            self._lay(self.clutter.sheet, sheet, canvas, slopes, camera_from_world)
+        canvas *= np.float32(self.sensor.exposure)
+        eye = Eye(
+            side=side,
+            lens=lens,
+            camera_from_world=camera_from_world,
+            slopes_x=np.ascontiguousarray(slopes[..., 0], dtype=np.float32),
+            slopes_y=np.ascontiguousarray(slopes[..., 1], dtype=np.float32),
+            background=canvas.copy(),
+            canvas=canvas,
+            noisy=[],
+        )
+        for thing in _spots(self.clutter, side):
+            if _is_static(thing):
+                self._spot(eye, thing, thing.path.at(0.0)[None])
+        eye.background[:] = canvas
+        for _ in range(self.sensor.noisy_backgrounds):
+            eye.noisy.append(self._read_out(canvas))
+        return eye
+
+    def _room(self, height: int, width: int) -> Singles:
         """A dim, blotchy backdrop: two octaves of smooth noise, always well below the mark."""
         texture = np.zeros((height, width), dtype=np.float32)
         for cells, share in ((24, 0.7), (96, 0.3)):
@@ -118,97 +399,111 @@ class TwinCamera:
         level = self.sensor.background_level + self.sensor.texture_level * texture
         return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.mark_level), dtype=np.float32)
 
-    def picture(
-        self, position: Callable[[float], Floats], *, exposure_s: float, mark: bool = True
-    ) -> tuple[Image, Image]:
-        """The left and right pictures of a fingertip at `position(seconds from mid-exposure)`.
+    def _grained(self, sheet: Sheet) -> Singles:
+        """The sheet's levels, one per half grain: fine grain, blotches, one side lit more."""
+        size = [
+            2 + int(np.ceil(4.0 * half_m / sheet.grain_m))
+            for half_m in (sheet.half_height_m, sheet.half_width_m)
+        ]
+        fine = cv2.GaussianBlur(self._random.standard_normal(size, np.float32), (0, 0), 1.0)
+        blotches = self._random.standard_normal((6, 6), dtype=np.float32)
+        wide = cv2.resize(blotches, (size[1], size[0]), interpolation=cv2.INTER_CUBIC)
+        grain = 0.8 * fine / fine.std() + 0.6 * wide / wide.std()
+        lit = np.linspace(1.08, 0.92, size[1], dtype=np.float32)
+        return np.asarray((sheet.level + sheet.contrast * grain) * lit, dtype=np.float32)
 
-        mark: false draws a finger that wears none (rubbed off, or turned away).
-        """
-        left, right = (self._draw(eye, position, exposure_s, mark) for eye in self.eyes)
-        return left, right
-
-    def _draw(
-        self, eye: Eye, position: Callable[[float], Floats], exposure_s: float, mark: bool
-    ) -> Image:
-        """One picture: a noisy background with the finger drawn into its own window."""
-        image = eye.noisy[int(self._random.integers(len(eye.noisy)))].copy()
-        ends = [eye.see(position(share * exposure_s)) for share in (-0.5, 0.5)]
-        if min(depth for _, depth in ends) <= 0:
-            return image
-        travel_px = float(np.linalg.norm(ends[1][0] - ends[0][0]))
-        steps = 1 + int(np.ceil(travel_px / MOTION_STEP_PX))
-        instants = (np.arange(steps) + 0.5) / steps - 0.5
-        tips = [position(float(instant) * exposure_s) for instant in instants]
-        window = self._window(eye, tips)
-        if window is None:
-            return image
-        rows, columns = window
-        levels = np.zeros((rows.stop - rows.start, columns.stop - columns.start), np.float32)
-        for tip in tips:
-            levels += self._exposed(eye, tip, window, mark)
-        levels /= steps
-        noise = self._random.standard_normal(levels.shape, dtype=np.float32)
-        image[window] = quantized(levels + self.sensor.noise(levels) * noise)
-        return image
-
-    def _window(self, eye: Eye, tips: list[Floats]) -> tuple[slice, slice] | None:
-        """Rows and columns that the finger touches during exposure; None: not in the picture."""
-        height, width = eye.background.shape
-        centres, reach_px = [], 0.0
-        for tip in (tips[0], tips[-1]):
-            knuckle, depth = eye.see(tip + FINGER_LENGTH_M * FINGER_DIRECTION)
-            if depth <= 0:
-                return None
-            centres += [eye.see(tip)[0], knuckle]
-            scale = eye.lens.fx_px / min(depth, eye.see(tip)[1])
-            reach_px = max(reach_px, 1.2 * scale * self.finger_radius_m)
-        margin = reach_px + 5.0 * self.sensor.blur_px
-        low = np.floor(np.min(centres, axis=0) - margin).astype(int)
-        high = np.ceil(np.max(centres, axis=0) + margin).astype(int) + 1
-        rows = slice(max(low[1], 0), min(high[1], height))
-        columns = slice(max(low[0], 0), min(high[0], width))
-        empty = rows.start >= rows.stop or columns.start >= columns.stop
-        return None if empty else (rows, columns)
-
-    def _exposed(
-        self, eye: Eye, tip: Floats, window: tuple[slice, slice], mark: bool
-    ) -> NDArray[np.float32]:
-        """Noise-free levels of a window with the fingertip at `tip`.
-
-        An edge seen through pixel area and blur is the normal distribution of the signed distance
-        to it, its variance blur^2 + 1/12; the window's pixels are taken at their centres.
-        """
-        y, x = np.mgrid[window].astype(np.float32)
-        backdrop = eye.background[window]
-        smear = np.float32(np.hypot(self.sensor.blur_px, np.sqrt(1.0 / 12.0)))
-        centre, depth = eye.see(tip)
-        knuckle, knuckle_depth = eye.see(tip + FINGER_LENGTH_M * FINGER_DIRECTION)
-        radius = eye.lens.fx_px * self.finger_radius_m / depth
-        knuckle_radius = 1.2 * eye.lens.fx_px * self.finger_radius_m / knuckle_depth
-        axis = knuckle - centre
-        dx, dy = x - np.float32(centre[0]), y - np.float32(centre[1])
-        length_sq = max(float(axis @ axis), 1e-6)
-        along = np.clip((dx * axis[0] + dy * axis[1]) / length_sq, 0.0, 1.0).astype(np.float32)
-        off = np.hypot(dx - along * np.float32(axis[0]), dy - along * np.float32(axis[1]))
-        width = np.float32(radius) + along * np.float32(knuckle_radius - radius)
-        finger = _smeared((width - off) / smear)
-        shade = np.float32(self.sensor.finger_level) * (
-            1.0 - 0.35 * np.square(np.minimum(off / width, 1.0))
+    def _lay(
+        self, sheet: Sheet, grain: Singles, canvas: Singles, slopes: Floats, pose: Floats
+    ) -> None:
+        """Draw the sheet, in the plane z = 0, where the rays of slopes (h, w, 2) meet it."""
+        plane_from_ray = np.linalg.inv(pose[:3, [0, 1, 3]])
+        on_plane = slopes @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]
+        before = on_plane[..., 2] > 0
+        place = on_plane[..., :2] / np.where(before, on_plane[..., 2], 1.0)[..., None]
+        half = np.array([sheet.half_width_m, sheet.half_height_m])
+        cells = ((place + half) * (2.0 / sheet.grain_m)).astype(np.float32)
+        level = cv2.remap(
+            grain, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
-        levels = backdrop + finger * (shade - backdrop)
-        if mark:
-            mark_radius = np.float32(eye.lens.fx_px * MARK_RADIUS_M / depth)
-            covered = _smeared((mark_radius - np.hypot(dx, dy)) / smear)
-            levels += covered * (np.float32(self.sensor.mark_level) - levels)
-        return np.asarray(levels, dtype=np.float32)
+        px_m = np.hypot(*np.gradient(place[..., 0])) + np.hypot(*np.gradient(place[..., 1]))
+        inside_m = (half - np.abs(place)).min(axis=-1)
+        cover = before * np.clip(0.5 + inside_m / px_m, 0.0, 1.0)
+        canvas += (cover * (level - canvas)).astype(np.float32)
 
 
-def _smeared(distance: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Share of a smeared edge's light at a signed distance in standard deviations."""
-    return np.asarray(ndtr(distance), dtype=np.float32)
+@lru_cache(maxsize=4)
+def _slopes(lens: Lens, width: int, height: int) -> Floats:
+    """Slopes (height, width, 2) of the rays through all pixels; kept, since they take a while."""
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+    slopes = slopes_of(lens, pixels.astype(np.float64))
+    slopes.setflags(write=False)
+    return slopes
 
 
-def quantized(levels: NDArray[np.float32]) -> Image:
+def ball_cover(
+    eye: Eye, centres: Floats, radius_m: float, spread_px: float, window: Window
+) -> Singles:
+    """Share of each pixel's light that comes from a ball, the mean over its centres (n, 3).
+
+    Centres are in the camera's frame.  A ray passes one at distance |ray x centre| / |ray|.  A disc
+    of radius r smeared by a Gaussian s gives, at distance d, the light that a point displaced from
+    there finds inside: the non-central chi-square distribution of (d/s)^2 at (r/s)^2 with two
+    degrees of freedom.
+    """
+    single = np.float32
+    u, v = eye.slopes_x[window], eye.slopes_y[window]
+    ray_sq = u * u + v * v + single(1.0)
+    cover = np.zeros_like(u)
+    for a, b, c in centres.tolist():
+        x, y = a / c, b / c
+        # Pixels per metre across the ray, alike for the spread and the distance.
+        scale = pixels_per_slope(eye.lens, x, y) * (1.0 + x * x + y * y) ** 0.25 / c
+        spread_sq = (spread_px / scale) ** 2
+        du, dv = u - single(x), v - single(y)
+        turn = du * single(y) - dv * single(x)
+        distance_sq = (du * du + dv * dv + turn * turn) * single(c * c / spread_sq) / ray_sq
+        cover += chndtr(single(radius_m**2 / spread_sq), single(2.0), distance_sq)
+    return np.asarray(cover / single(len(centres)), dtype=np.float32)
+
+
+def quantized(levels: Singles) -> Image:
     """Digital numbers as the converter gives them: rounded, clipped at 0 and 255."""
-    return np.clip(np.rint(levels), 0, 255).astype(np.uint8)
+    return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
+
+
+def _spots(clutter: Clutter, side: Side) -> list[SecondMark | Highlight]:
+    """The marks and highlights that one camera sees."""
+    spots: list[SecondMark | Highlight] = [*clutter.marks, *clutter.highlights]
+    return [spot for spot in spots if spot.views in ("both", side)]
+
+
+def _is_static(thing: SecondMark | Highlight) -> bool:
+    return isinstance(thing.path, Still) and not thing.carried
+
+
+def _wipe(eye: Eye, windows: list[Window]) -> None:
+    for window in windows:
+        eye.canvas[window] = eye.background[window]
+
+
+def disjoint(windows: list[Window]) -> list[Window]:
+    """Windows that cover the same pixels and do not overlap: those that do become one."""
+    apart: list[Window] = []
+    for window in windows:
+        one = window
+        while touching := [other for other in apart if _overlap(one, other)]:
+            apart = [other for other in apart if not _overlap(one, other)]
+            parts = [one, *touching]
+            one = (
+                slice(min(rows.start for rows, _ in parts), max(rows.stop for rows, _ in parts)),
+                slice(min(cols.start for _, cols in parts), max(cols.stop for _, cols in parts)),
+            )
+        apart.append(one)
+    return apart
+
+
+def _overlap(a: Window, b: Window) -> bool:
+    return all(
+        first.start < second.stop and second.start < first.stop
+        for first, second in zip(a, b, strict=True)
+    )

@@ -8,6 +8,8 @@ judges the camera model that the nodes use.
 from __future__ import annotations
 
 import hashlib
+import math
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +18,7 @@ from messages.scene import Lens, StereoCamera
 from nodes.models.rigid import rotation_from_vector, transform
 
 Floats = NDArray[np.float64]
+T = TypeVar("T", float, Floats)
 
 FOCAL_DEVIATION = 0.005
 """Standard deviation of a focal length, as a share of it: between the devices of one make."""
@@ -83,13 +86,38 @@ def true_camera(camera: StereoCamera) -> StereoCamera:
 
 def pixels_of(lens: Lens, slopes: Floats) -> Floats:
     """Pixels (..., 2) of rays (x/z, y/z) (..., 2) through a lens, by Brown's distortion."""
-    u, v = slopes[..., 0], slopes[..., 1]
+    return np.stack(_seen(lens, slopes[..., 0], slopes[..., 1]), axis=-1)
+
+
+def pixel_of(lens: Lens, slope_x: float, slope_y: float) -> tuple[float, float]:
+    """As `pixels_of` for one ray, many times faster."""
+    return _seen(lens, slope_x, slope_y)
+
+
+def _seen(lens: Lens, u: T, v: T) -> tuple[T, T]:
     k1, k2, p1, p2, k3 = lens.distortion
     r2 = u * u + v * v
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     x = u * radial + 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
     y = v * radial + p1 * (r2 + 2.0 * v * v) + 2.0 * p2 * u * v
-    return np.stack([lens.fx_px * x + lens.cx_px, lens.fy_px * y + lens.cy_px], axis=-1)
+    return lens.fx_px * x + lens.cx_px, lens.fy_px * y + lens.cy_px
+
+
+def _slopes_of_distortion(lens: Lens, u: T, v: T) -> tuple[T, T, T]:
+    """d(x, y)/d(u, v) of Brown's distortion, which is symmetric: its xx, xy, yy."""
+    k1, k2, p1, p2, k3 = lens.distortion
+    r2 = u * u + v * v
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
+    xx = radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u
+    yy = radial + slope * v * v + 6.0 * p1 * v + 2.0 * p2 * u
+    return xx, slope * u * v + 2.0 * p1 * u + 2.0 * p2 * v, yy
+
+
+def pixels_per_slope(lens: Lens, slope_x: float, slope_y: float) -> float:
+    """Pixels per unit of slope about a ray, the geometric mean over all directions."""
+    xx, xy, yy = _slopes_of_distortion(lens, slope_x, slope_y)
+    return math.sqrt(lens.fx_px * lens.fy_px * abs(xx * yy - xy * xy))
 
 
 def slopes_of(lens: Lens, pixels: Floats) -> Floats:
@@ -97,18 +125,11 @@ def slopes_of(lens: Lens, pixels: Floats) -> Floats:
 
     Good wherever the distortion does not fold the picture over.
     """
-    k1, k2, p1, p2, k3 = lens.distortion
     focal = np.array([lens.fx_px, lens.fy_px])
     slopes = np.asarray((pixels - np.array([lens.cx_px, lens.cy_px])) / focal, dtype=np.float64)
     for _ in range(NEWTON_STEPS):
         off = (pixels_of(lens, slopes) - pixels) / focal
-        u, v = slopes[..., 0], slopes[..., 1]
-        r2 = u * u + v * v
-        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2.0 * (k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3))
-        xx = radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u
-        yy = radial + slope * v * v + 6.0 * p1 * v + 2.0 * p2 * u
-        xy = slope * u * v + 2.0 * p1 * u + 2.0 * p2 * v
+        xx, xy, yy = _slopes_of_distortion(lens, slopes[..., 0], slopes[..., 1])
         determinant = xx * yy - xy * xy
         step_u = (yy * off[..., 0] - xy * off[..., 1]) / determinant
         step_v = (xx * off[..., 1] - xy * off[..., 0]) / determinant

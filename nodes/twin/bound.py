@@ -1,0 +1,179 @@
+"""How well the fingertip can be known at best from the twin's pixels: the Cramer-Rao bound.
+
+No unbiased estimate has a smaller covariance than the inverse of the Fisher information (Kay,
+Fundamentals of Statistical Signal Processing: Estimation Theory, 1993, chapter 3).  Each pixel
+about the mark is normal about its noise-free level, with the sensor's noise and that of rounding;
+what the levels tell through their variance is a ten-thousandth of that, and left out.  Only the
+mark moves with the position: the finger under it counts as ground, since no detector knows a
+finger's outline.  What a detector cannot know is estimated along, in each view by itself: the
+levels of mark and ground, the mark's radius, and the blur.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, ndtr
+
+from nodes.twin.pixels import Eye, Position, Sensor, TwinCamera, Window
+from nodes.twin.rig import pixels_per_slope
+
+Floats = NDArray[np.float64]
+
+STEP_PX = 0.02
+"""Half the step of the numeric derivatives by place, radius and blur."""
+
+ROUNDING_VARIANCE = 1.0 / 12.0
+FULL_LEVEL = 255.0
+NUISANCES = 4
+WORST_CONDITION = 1e10
+"""Of the information with its diagonal scaled to one; beyond it, something cannot be told."""
+
+
+class BoundError(ValueError):
+    """There is no bound: the mark is not in both pictures, or its pixels do not tell its place."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """Least covariances of any unbiased estimate.
+
+    position_m2: (3, 3) of the fingertip in the world, from both views.
+    views_px2: (2, 2) of the mark's place in the left and in the right view alone.
+    """
+
+    position_m2: Floats
+    views_px2: tuple[Floats, Floats]
+
+
+def fingertip_bound(
+    camera: TwinCamera,
+    position: Position,
+    *,
+    exposure_s: float,
+    time_s: float = 0.0,
+    margin_px: float = 2.0,
+) -> Bound:
+    """The bound for a mark as `TwinCamera.picture` draws it, at mid-exposure.
+
+    margin_px: width of the ground around the mark and its blur that counts.  Raises BoundError
+    where the mark is outside a picture, or so hidden or saturated that its place cannot be told.
+    """
+
+    def drawn(changed: TwinCamera) -> tuple[Floats, Floats]:
+        left, right = changed.levels(position, exposure_s=exposure_s, time_s=time_s)
+        return left.astype(np.float64), right.astype(np.float64)
+
+    def slope(less: TwinCamera, more: TwinCamera, span: float) -> tuple[Floats, Floats]:
+        lower, upper = drawn(less), drawn(more)
+        return (upper[0] - lower[0]) / span, (upper[1] - lower[1]) / span
+
+    sensor, radius_m, offset_m = camera.sensor, camera.mark_radius_m, camera.mark_offset_m
+    left_eye = camera.eyes[0]
+    step_m = STEP_PX * left_eye.see(position(0.0))[1] / left_eye.lens.fx_px
+    if step_m <= 0:
+        raise BoundError("the fingertip is behind the camera")
+    by_place = [
+        slope(
+            camera.altered(mark_offset_m=offset_m - step_m * axis),
+            camera.altered(mark_offset_m=offset_m + step_m * axis),
+            2.0 * step_m,
+        )
+        for axis in np.eye(3)
+    ]
+    by_level = slope(
+        camera, camera.altered(sensor=replace(sensor, mark_level=sensor.mark_level + 1.0)), 1.0
+    )
+    by_radius = slope(
+        camera.altered(mark_radius_m=radius_m - step_m),
+        camera.altered(mark_radius_m=radius_m + step_m),
+        2.0 * step_m,
+    )
+    by_blur = slope(
+        camera.altered(sensor=replace(sensor, blur_px=sensor.blur_px - STEP_PX)),
+        camera.altered(sensor=replace(sensor, blur_px=sensor.blur_px + STEP_PX)),
+        2.0 * STEP_PX,
+    )
+    seen = drawn(camera)
+
+    total = np.zeros((3 + 2 * NUISANCES, 3 + 2 * NUISANCES))
+    views_px2 = []
+    for view, eye in enumerate(camera.eyes):
+        window = _about_the_mark(camera, eye, position, exposure_s, margin_px)
+        weight = pixel_information(sensor, seen[view][window]).ravel()
+        placed = np.stack([by_axis[view][window].ravel() for by_axis in by_place])
+        others = np.stack(
+            [
+                np.ones_like(weight),
+                *(each[view][window].ravel() for each in (by_level, by_radius, by_blur)),
+            ]
+        )
+        # A move of a pixel is one of the mark across its ray.
+        world_from_pixel = np.linalg.pinv(_pixel_from_world(eye, position(0.0) + offset_m))
+        alone = np.concatenate([world_from_pixel.T @ placed, others])
+        place_px2 = _covariance((alone * weight) @ alone.T, eye.side)[:2, :2]
+        if np.sqrt(np.trace(place_px2)) > window[0].stop - window[0].start:
+            raise BoundError(f"{eye.side} view: the mark cannot be told from its ground")
+        views_px2.append(place_px2)
+        both = np.zeros((len(total), len(weight)))
+        both[:3] = placed
+        both[3 + view * NUISANCES : 3 + (view + 1) * NUISANCES] = others
+        total += (both * weight) @ both.T
+    return Bound(_covariance(total, "two")[:3, :3], (views_px2[0], views_px2[1]))
+
+
+def pixel_information(sensor: Sensor, levels: Floats) -> Floats:
+    """What each pixel tells of its level: the inverse of its variance while it is not full.
+
+    A full pixel only says that its level is above `FULL_LEVEL`: the information of a normal variate
+    cut at z deviations above its mean is Phi(z) - z phi(z) + phi(z)^2 / Phi(-z) of the uncut one's.
+    """
+    variance = levels / sensor.photons_per_level + sensor.read_noise**2 + ROUNDING_VARIANCE
+    z = (FULL_LEVEL - levels) / np.sqrt(variance)
+    log_density = -0.5 * z * z - 0.5 * np.log(2.0 * np.pi)
+    cut = np.exp(2.0 * log_density - log_ndtr(-z))
+    return np.asarray((ndtr(z) - z * np.exp(log_density) + cut) / variance)
+
+
+def _about_the_mark(
+    camera: TwinCamera, eye: Eye, position: Position, exposure_s: float, margin_px: float
+) -> Window:
+    """The part of a picture that the mark lights during the exposure, and the margin round it."""
+    pixels, reach_px = [], 0.0
+    for share in (-0.5, 0.0, 0.5):
+        tip = position(share * exposure_s) + camera.mark_offset_m
+        pixel, depth = eye.see(tip)
+        if depth <= 0:
+            raise BoundError(f"the mark is behind the {eye.side} camera")
+        pixels.append((float(pixel[0]), float(pixel[1])))
+        x, y, z = (eye.camera_from_world[:3, :3] @ tip + eye.camera_from_world[:3, 3]).tolist()
+        radius_px = pixels_per_slope(eye.lens, x / z, y / z) * camera.mark_radius_m / z
+        spread_px = camera.sensor.spread_px(z, eye.lens.fx_px)
+        reach_px = max(reach_px, radius_px + 3.0 * spread_px + margin_px)
+    window = eye.window(pixels, reach_px)
+    if window is None:
+        raise BoundError(f"the mark is outside the {eye.side} picture")
+    return window
+
+
+def _pixel_from_world(eye: Eye, point: Floats) -> Floats:
+    """d(pixel)/d(world) (2, 3) at a world point."""
+    step_m = 1e-6
+    columns = [
+        (eye.see(point + step_m * axis)[0] - eye.see(point - step_m * axis)[0]) / (2.0 * step_m)
+        for axis in np.eye(3)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def _covariance(information: Floats, views: str) -> Floats:
+    """The inverse of an information matrix, its diagonal first scaled to one."""
+    scale = np.sqrt(np.diag(information))
+    if not (scale > 0).all():
+        raise BoundError(f"{views} view: no pixel tells the mark's place, size or level")
+    scaled = information / np.outer(scale, scale)
+    if np.linalg.cond(scaled) > WORST_CONDITION:
+        raise BoundError(f"{views} view: the pixels do not tell the mark's place from its looks")
+    return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
