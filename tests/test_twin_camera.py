@@ -56,7 +56,8 @@ def scene() -> Scene:
 def sheet(scene: Scene) -> StereoCamera:
     """A data sheet: ideal lenses, straight rig."""
     lens = Lens(fx_px=540.0, fy_px=540.0, cx_px=319.5, cy_px=239.5)
-    return scene.camera.model_copy(update={"left": lens, "right": lens})
+    assert scene.camera.left == scene.camera.right == lens
+    return scene.camera
 
 
 @pytest.fixture(scope="module")

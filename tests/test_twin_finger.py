@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from messages.base import Header, Message
@@ -23,6 +24,7 @@ from nodes.twin.finger import FingerMotion, FingerPathError
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from nodes.twin.paths import recorded_path
 from nodes.twin.pixels import TwinCamera
+from nodes.twin.rig import true_camera
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDING = ROOT.parent / "shared" / "data" / "finger" / "reach_and_grip.csv"
@@ -342,8 +344,22 @@ async def test_truth_and_pixels_are_of_the_same_instant(scene: Scene) -> None:
     assert truth.path_label == "there"
     assert np.array_equal(truth.position_world_m, node.truth(at_ns).position)
     assert node.camera is not None
+    # The rig as it stands, not as its data sheet says.
+    assert node.camera.camera.left == true_camera(scene.camera).left
     place = node.camera.eyes[0].see(truth.position_world_m)[0]
     assert np.abs(light_centre(pair.left, place) - place).max() < 0.3
+
+
+async def test_the_node_draws_the_clutter_that_it_is_asked_for(scene: Scene) -> None:
+    levels: list[float] = []
+    for clutter in ("none", "lab"):
+        parameters = TwinFingerParameters.model_validate({"clutter": clutter})
+        node = TwinFingerNode(parameters, name="finger", clock=VirtualClock(), send=lambda *_: None)
+        await node.step("scene", scene, header())
+        levels.append(float(node.expose(10**9).left.mean()))
+    assert levels[1] > 1.15 * levels[0]
+    with pytest.raises(ValidationError, match="crowded"):
+        TwinFingerParameters.model_validate({"clutter": "street"})
 
 
 async def test_a_bad_path_changes_nothing_and_is_reported(scene: Scene) -> None:

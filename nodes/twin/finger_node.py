@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,8 +13,10 @@ from messages.base import Header
 from messages.scene import NonNegative, Scene
 from messages.types import FingerPath, StereoPair, TwinFinger
 from nodes.node import Input, Node, NodeParameters, Output
+from nodes.twin.clutter import CLUTTER
 from nodes.twin.finger import FingerMotion, FingerState
 from nodes.twin.pixels import TwinCamera
+from nodes.twin.rig import true_camera
 
 
 class TwinFingerParameters(NodeParameters):
@@ -24,6 +27,11 @@ class TwinFingerParameters(NodeParameters):
         default=(0.0, 0.0, 0.08), description="where the finger is before the first path"
     )
     transfer_s: NonNegative = Field(default=0.004, description="read-out, from end of exposure")
+    clutter: Literal["none", "lab", "crowded"] = Field(
+        default="lab",
+        description="what else the camera sees: none: a dim room; lab: the sheet, the rest of the "
+        "hand, small glints; crowded: also a second mark, wandering highlights and passing cables",
+    )
 
 
 class TwinFingerNode(Node):
@@ -39,6 +47,7 @@ class TwinFingerNode(Node):
     filming: asyncio.Task[None] | None = None
     motion: FingerMotion
     motion_from_ns = 0
+    first_scene_ns = 0
     path_label = ""
     missed_frames = 0
 
@@ -60,9 +69,12 @@ class TwinFingerNode(Node):
         if first:
             rest = np.array(self.parameters.rest_world_m)
             self.motion = FingerMotion.resting(rest, seed=self.parameters.seed)
-            self.motion_from_ns = self.clock.now_ns()
+            self.motion_from_ns = self.first_scene_ns = self.clock.now_ns()
         self.camera = TwinCamera(
-            scene.camera, finger_radius_m=scene.finger.radius_m, seed=self.parameters.seed
+            true_camera(scene.camera),
+            finger_radius_m=scene.finger.radius_m,
+            seed=self.parameters.seed,
+            clutter=CLUTTER[self.parameters.clutter],
         )
         self.max_speed_m_per_s = scene.finger.max_speed_m_per_s
         self.period_ns = round(1e9 / scene.camera.rate_hz)
@@ -113,6 +125,7 @@ class TwinFingerNode(Node):
         left, right = self.camera.picture(
             lambda offset_s: self.truth(middle_ns + round(offset_s * 1e9)).position,
             exposure_s=self.exposure_ns * 1e-9,
+            time_s=(middle_ns - self.first_scene_ns) * 1e-9,
         )
         return StereoPair(
             device=self.camera.camera.device,
