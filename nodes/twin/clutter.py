@@ -249,4 +249,4 @@ CLUTTER = {
     "lab": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS),
     "crowded": together(Clutter(sheet=Sheet()), HAND, NAIL, CLAMPS, PASSING),
 }
-"""What a launch file may ask for by name."""
+"""What a launch file may ask for by name; what moves here swings, so that any time will do."""

@@ -29,8 +29,7 @@ class TwinFingerParameters(NodeParameters):
     transfer_s: NonNegative = Field(default=0.004, description="read-out, from end of exposure")
     clutter: Literal["none", "lab", "crowded"] = Field(
         default="lab",
-        description="what else the camera sees: none: a dim room; lab: the sheet, the rest of the "
-        "hand, small glints; crowded: also a second mark, wandering highlights and passing cables",
+        description="lab: sheet, hand, small glints; crowded: also a second mark, highlights, cables",
     )
 
 
@@ -47,7 +46,6 @@ class TwinFingerNode(Node):
     filming: asyncio.Task[None] | None = None
     motion: FingerMotion
     motion_from_ns = 0
-    first_scene_ns = 0
     path_label = ""
     missed_frames = 0
 
@@ -69,13 +67,10 @@ class TwinFingerNode(Node):
         if first:
             rest = np.array(self.parameters.rest_world_m)
             self.motion = FingerMotion.resting(rest, seed=self.parameters.seed)
-            self.motion_from_ns = self.first_scene_ns = self.clock.now_ns()
-        self.camera = TwinCamera(
-            true_camera(scene.camera),
-            finger_radius_m=scene.finger.radius_m,
-            seed=self.parameters.seed,
-            clutter=CLUTTER[self.parameters.clutter],
-        )
+            self.motion_from_ns = self.clock.now_ns()
+        rig, clutter = true_camera(scene.camera), CLUTTER[self.parameters.clutter]
+        radius_m, seed = scene.finger.radius_m, self.parameters.seed
+        self.camera = TwinCamera(rig, finger_radius_m=radius_m, seed=seed, clutter=clutter)
         self.max_speed_m_per_s = scene.finger.max_speed_m_per_s
         self.period_ns = round(1e9 / scene.camera.rate_hz)
         self.exposure_ns = round(1e9 * scene.camera.exposure_s)
@@ -125,7 +120,7 @@ class TwinFingerNode(Node):
         left, right = self.camera.picture(
             lambda offset_s: self.truth(middle_ns + round(offset_s * 1e9)).position,
             exposure_s=self.exposure_ns * 1e-9,
-            time_s=(middle_ns - self.first_scene_ns) * 1e-9,
+            time_s=middle_ns * 1e-9,
         )
         return StereoPair(
             device=self.camera.camera.device,
