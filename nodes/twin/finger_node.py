@@ -29,7 +29,7 @@ class TwinFingerParameters(NodeParameters):
     transfer_s: NonNegative = Field(default=0.004, description="read-out, from end of exposure")
     clutter: Literal["none", "lab", "crowded"] = Field(
         default="lab",
-        description="lab: sheet, hand, small glints; crowded: also a second mark, highlights, cables",
+        description="lab: sheet, hand, glints; crowded: also a second mark, highlights, cables",
     )
 
 
