@@ -11,7 +11,7 @@ from nodes.models.motion import SheetBounds
 from nodes.models.prediction import path_at
 from nodes.node import Input, Node, NodeParameters, Output
 from nodes.planner.compliance import compliance_for
-from nodes.planner.motion import Plan, Planned
+from nodes.planner.motion import Plan, Planned, PlanSettings
 
 
 class PlannerParameters(NodeParameters):
@@ -23,6 +23,9 @@ class PlannerParameters(NodeParameters):
     oldest_s: Positive = Field(default=0.1, description="an older fingertip is not followed")
     tilt_margin_rad: NonNegative = Field(
         default=0.14, description="how far past the scene's tilt the sheet still follows"
+    )
+    largest_spin_rad: Positive = Field(
+        default=0.35, description="most that rolling may turn the sheet about its normal"
     )
     speed_m_per_s: Positive = 0.18
     acceleration_m_per_s2: Positive = 2.0
@@ -51,9 +54,8 @@ class Planner(Node):
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         given = self.parameters
-        self._plan = Plan(
-            scene,
-            bounds=SheetBounds(
+        settings = PlanSettings(
+            SheetBounds(
                 given.speed_m_per_s,
                 given.acceleration_m_per_s2,
                 given.turn_rad_per_s,
@@ -64,7 +66,9 @@ class Planner(Node):
             touch_m=given.touch_m,
             release_m=given.release_m,
             tilt_margin_rad=given.tilt_margin_rad,
+            spin_rad=given.largest_spin_rad,
         )
+        self._plan = Plan(scene, settings)
         self._stretch_ratio = scene.sheet.min_stretch_ratio
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._last_source_ns = None

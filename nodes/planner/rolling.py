@@ -1,210 +1,192 @@
-"""Where the sheet touches the cylinder: approach (the paper's Fig. 7a), rolling (7b), holding.
+"""A flat sheet on a smooth object: tangent, rolling without slip or spin, never turned too far.
 
-All in the object's frame, the axis along x.  A place around the axis is an angle, 0 on +z and
-growing towards +y (`CylinderShape.angle_rad`).  A place on the sheet along its height is `y`, seen
-in the sheet's frame, 0 at its middle line.
+All in the object's frame.  The sheet's frame has x from the left edge to the right, y along the
+edges and z out of the object; a place on the sheet is (x, y) in it.  Rolling carries the sheet's
+axes along the contact's path by parallel transport, and the contact's way on the sheet is the
+path's development: the arc AB on the object is as long as A'B on the sheet (the paper's Fig. 7b,
+for any smooth shape; do Carmo, Differential Geometry of Curves and Surfaces, section 4-4).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import cos, pi, sin
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import Phase
-from nodes.models.rigid import transform
-from nodes.models.shapes import CylinderShape
+from nodes.models.rigid import angle_between, transform, twist_between
+from nodes.models.shapes import Nearest, Shape
 
 Floats = NDArray[np.float64]
 
-BEYOND_TILT = "finger beyond the tilt that the arms present"
+RATE_STEP_S = 1e-3
+"""Half the time over which twists are taken as differences: finer than any motion of a hand."""
 
+SEARCH_POINTS = 9
+SEARCH_ROUNDS = 3
+"""The last place within the tilt is found to 1/512 of the way."""
 
-SHALLOW, DEEP = 0.15, 0.5
-"""Depths over the radius: up to the first the finger's own angle counts, from the second on not."""
-
-
-@dataclass(frozen=True, slots=True)
-class Reach:
-    """How far the sheet can go, and when the finger counts as touching.
-
-    front_rad, tilt_rad: the sheet is presented at angles within `tilt_rad` of `front_rad`.
-    half_height_m: largest |y| at which the sheet can be touched.
-    touch_m, release_m: distances from the object (m) at which contact begins and ends.
-    axis_m: a finger nearer to the axis than this, or beyond it, leaves the direction undecided.
-    """
-
-    front_rad: float
-    tilt_rad: float
-    half_height_m: float
-    touch_m: float
-    release_m: float
-    axis_m: float
+RIM_RADII_M = (0.012, 0.03)
+RIM_POINTS = 12
+"""Where it is looked whether the object rises above its own tangent plane."""
 
 
 @dataclass(frozen=True, slots=True)
-class Presentation:
-    """What to present: the tangent plane at an angle, and which line of the sheet touches there.
+class Contact:
+    """Where the sheet touches: a surface point with its normal and shape operator, and the sheet.
 
-    angle_rad, angle_rate: where around the axis (rad, rad/s).  y_m: the line on the sheet.
-     rolling: whether `y_m` follows the angle (contact) or stays (approach).
+    axes: (3, 3), the sheet's as columns, the third the normal.
+    on_sheet: (x, y) m of the touching point on the sheet.
+    lift_m: how far the plane stands off the point, where the object is hollow there.
     """
 
-    phase: Phase
-    reason: str
-    angle_rad: float
-    y_m: float
-    angle_rate: float
-    rolling: bool
-    push_depth_m: float
-
-
-class Encounter:
-    """The finger's dealings with the cylinder: away, in touch, and back.
-
-    While in touch, the contact began at `_anchor_angle` with the sheet's point `_anchor_y` there
-    (A and A' of the paper); the arc from there equals the way on the sheet.
-    """
-
-    def __init__(self, shape: CylinderShape, reach: Reach) -> None:
-        self._shape, self._reach = shape, reach
-        self._touching = False
-        self._anchor_angle = self._anchor_y = 0.0
-        self._angle = reach.front_rad
-        self._finger = np.zeros(3)
+    point: Floats
+    normal: Floats
+    shape_operator: Floats
+    axes: Floats
+    on_sheet: Floats
+    lift_m: float = 0.0
 
     @property
-    def angle_rad(self) -> float:
-        """The angle presented last."""
-        return self._angle
+    def object_from_sheet(self) -> Floats:
+        """The sheet's pose (4, 4), its frame at its middle."""
+        off_plane = np.append(self.on_sheet, -self.lift_m)
+        return transform(self.axes, self.point - self.axes @ off_plane)
 
-    def step(self, finger: Floats, velocity: Floats, sheet_y_at: float) -> Presentation:
-        """What to present to a finger (3,) m that moves with `velocity` (3,) m/s.
-
-        sheet_y_at: y of the sheet's point that lies nearest to the surface point under the finger
-            now; used as A' when this step begins a contact.
-        """
-        if self._touching and self._above_sheet(finger) > self._reach.release_m:
-            self._touching = False
-        if self._touching:
-            return self._roll(finger, velocity)
-        height = float(np.hypot(finger[1], finger[2])) - self._shape.radius_m
-        if height + self._shape.radius_m < self._reach.axis_m:
-            return self._hold("finger on the object's axis", self._shape.radius_m)
-        angle, limited = self._reachable(self._shape.angle_rad(finger))
-        self._angle = angle
-        beyond = abs(finger[0]) - 0.5 * self._shape.length_m
-        if height <= self._reach.touch_m and beyond <= 0.0 and not limited:
-            half = self._reach.half_height_m
-            self._touching = True
-            self._anchor_angle, self._anchor_y = angle, min(max(sheet_y_at, -half), half)
-            self._finger = finger
-            return self._roll(finger, velocity)
-        rate = 0.0 if limited else _angle_rate(finger, velocity)
-        return Presentation(
-            "approach", BEYOND_TILT if limited else "", angle, 0.0, rate, False, 0.0
-        )
-
-    def _roll(self, finger: Floats, velocity: Floats) -> Presentation:
-        """In touch: roll to the finger, or say what keeps the sheet from it."""
-        depth = max(0.0, -self._above_sheet(finger))
-        before, self._finger = self._finger, finger
-        if abs(finger[0]) > 0.5 * self._shape.length_m:
-            return self._hold("finger past the object's end", depth)
-        if depth > 2.0 * self._shape.radius_m:
-            return self._hold("finger through the object", depth)
-        carried, rate = self._carried(finger, finger - before, velocity, depth)
-        angle, limited = self._reachable(carried)
-        y, half = self._sheet_y(angle), self._reach.half_height_m
-        if abs(y) > half:
-            edge_y = half if y > 0 else -half
-            self._angle = self._anchor_angle + (edge_y - self._anchor_y) / self._shape.radius_m
-            return self._hold("finger past the sheet's usable height", depth)
-        self._angle = angle
-        if limited:
-            return self._hold(BEYOND_TILT, depth)
-        return Presentation("contact", "", angle, y, rate, True, depth)
-
-    def _carried(
-        self, finger: Floats, moved: Floats, velocity: Floats, depth: float
-    ) -> tuple[float, float]:
-        """Angle (rad) and rate (rad/s) to which a finger in touch carries the sheet.
-
-        On the surface it is the finger's own angle about the axis.  Deep inside that angle means
-        little (at the axis every side is as near), and what the finger feels is the dented sheet;
-        there the sheet rolls by how far the finger moves along it.  In between the two are blended,
-        so that stroking while pushing makes no step.
-        """
-        shallow, deep = SHALLOW * self._shape.radius_m, DEEP * self._shape.radius_m
-        share = min(max((deep - depth) / (deep - shallow), 0.0), 1.0)
-        along = np.array([0.0, cos(self._angle), -sin(self._angle)])
-        angle = self._angle + (1.0 - share) * float(moved @ along) / self._shape.radius_m
-        rate = (1.0 - share) * float(velocity @ along) / self._shape.radius_m
-        if share > 0.0:
-            aside = self._shape.angle_rad(finger) - self._angle
-            angle += share * ((aside + pi) % (2.0 * pi) - pi)
-            rate += share * _angle_rate(finger, velocity)
-        return angle, rate
-
-    def _above_sheet(self, finger: Floats) -> float:
-        """Height (m) of a finger over the plane presented last; negative when it pushes."""
-        return float(finger @ normal_at(self._angle)) - self._shape.radius_m
-
-    def _hold(self, reason: str, depth: float) -> Presentation:
-        y = self._sheet_y(self._angle) if self._touching else 0.0
-        return Presentation("hold", reason, self._angle, y, 0.0, self._touching, depth)
-
-    def _sheet_y(self, angle: float) -> float:
-        """Arc AB equals A'B: the sheet's y at the contact, rolled without slipping."""
-        return self._anchor_y + self._shape.radius_m * (angle - self._anchor_angle)
-
-    def _reachable(self, angle: float) -> tuple[float, bool]:
-        """The angle within the tilt that can be presented, and whether it had to be limited.
-
-        Angles count from the front, -pi..pi; behind the object the side presented last is kept.
-        """
-        front, most = self._reach.front_rad, self._reach.tilt_rad
-        aside = (angle - front + pi) % (2.0 * pi) - pi
-        if abs(aside) <= most:
-            return front + aside, False
-        if abs(aside - (self._angle - front)) > pi:
-            aside = -aside
-        return front + (most if aside > 0 else -most), True
+    def height_m(self, finger: Floats) -> float:
+        """Of a point (3,) over the sheet's plane; negative behind it."""
+        return float((finger - self.point) @ self.normal) - self.lift_m
 
 
-def normal_at(angle_rad: float) -> Floats:
-    """Outward normal (3,) of the cylinder at an angle."""
-    return np.array([0.0, sin(angle_rad), cos(angle_rad)])
+def turned(axes: Floats, normal: Floats) -> Floats:
+    """Axes (3, 3) after the least rotation that takes their third to `normal`, exactly orthogonal.
 
-
-def sheet_on_cylinder(shape: CylinderShape, angle_rad: float, y_m: float) -> Floats:
-    """object_from_sheet: tangent at the angle, with the sheet's line at `y_m` on the contact line.
-
-    The sheet's x axis is the cylinder's; its middle stays over the object's.
+    That is parallel transport along the shorter arc between both normals; opposite ones have none.
     """
-    normal = normal_at(angle_rad)
-    along = np.array([0.0, cos(angle_rad), -sin(angle_rad)])
-    rotation = np.column_stack([[1.0, 0.0, 0.0], along, normal])
-    return transform(rotation, shape.radius_m * normal - y_m * along)
+    both = axes[:, 2] + normal
+    # A reflection that takes minus the third axis to the normal; with the one across the third
+    # axis before it, which leaves the others alone, it is the least rotation (Householder).
+    result = axes - np.outer(both, both @ axes) * (2.0 / (both @ both))
+    result[:, 2] = normal
+    return result
 
 
-def sheet_twist(
-    shape: CylinderShape, angle_rad: float, y_m: float, angle_rate: float, *, rolling: bool
-) -> Floats:
-    """Twist (6,) of the sheet's centre in the object's frame as the angle changes.
+def rolled(contact: Contact, found: Nearest) -> Contact:
+    """The contact after the sheet has rolled to another surface point, a short step away.
 
-    With c = R n(a) - y t(a), n' = t, t' = -n: rolling has y' = R, so that the centre moves along
-    the normal only, a' y n; in approach y stays, and it moves with a' (R t + y n).
+    The way on the sheet is the chord, seen half way between both tangent planes and stretched from
+    chord to arc: exact on circles, and of third order in the angle rolled elsewhere.
     """
-    normal = normal_at(angle_rad)
-    along = np.array([0.0, cos(angle_rad), -sin(angle_rad)])
-    linear = y_m * normal if rolling else shape.radius_m * along + y_m * normal
-    return angle_rate * np.concatenate([linear, [-1.0, 0.0, 0.0]])
+    axes = turned(contact.axes, found.normal)
+    middle = turned(contact.axes, _unit(contact.normal + found.normal))
+    chord = found.point - contact.point
+    half_angle = 0.5 * angle_between(contact.normal, found.normal)
+    arc_of_chord = 1.0 if half_angle < 1e-9 else half_angle / np.sin(half_angle)
+    way = arc_of_chord * (chord @ middle[:, :2])
+    return Contact(
+        found.point,
+        found.normal,
+        found.shape_operator,
+        axes,
+        contact.on_sheet + way,
+        contact.lift_m,
+    )
 
 
-def _angle_rate(finger: Floats, velocity: Floats) -> float:
-    """Rate (rad/s) of a moving point's angle about the axis, off which it lies."""
-    across = velocity[1] * finger[2] - velocity[2] * finger[1]
-    return float(across / (finger[1] ** 2 + finger[2] ** 2))
+def tangent(home: Floats, found: Nearest, half_width_m: float) -> Contact:
+    """The sheet held ready at a surface point, its axes as little turned from `home` as can be.
+
+    The finger will meet the sheet's middle line; along x the sheet's middle stays over the
+    object's, as far as the sheet reaches.
+    """
+    axes = turned(home, found.normal)
+    x = float(np.clip(axes[:, 0] @ found.point, -half_width_m, half_width_m))
+    return Contact(found.point, found.normal, found.shape_operator, axes, np.array([x, 0.0]))
+
+
+def moved_along(contact: Contact, rate: Floats, duration_s: float) -> Nearest:
+    """The surface point to first order `duration_s` later, when it moves at `rate` (3,) m/s."""
+    point = contact.point + duration_s * rate
+    normal = _unit(contact.normal + duration_s * (contact.shape_operator @ rate))
+    nowhere = np.zeros((), dtype=bool)
+    return Nearest(point, normal, np.zeros(()), contact.shape_operator, nowhere, nowhere)
+
+
+def rolling_twist(contact: Contact, rate: Floats) -> Floats:
+    """Twist (6,) of the rolling sheet's middle while the contact moves at `rate` (3,) m/s."""
+    before, after = (
+        rolled(contact, moved_along(contact, rate, time_s)).object_from_sheet
+        for time_s in (-RATE_STEP_S, RATE_STEP_S)
+    )
+    return twist_between(before, after, 2.0 * RATE_STEP_S)
+
+
+def tangent_twist(contact: Contact, rate: Floats, home: Floats, half_width_m: float) -> Floats:
+    """Twist (6,) of the sheet held ready while the point under the finger moves at `rate`."""
+    before, after = (
+        replace(
+            tangent(home, moved_along(contact, rate, time_s), half_width_m), lift_m=contact.lift_m
+        ).object_from_sheet
+        for time_s in (-RATE_STEP_S, RATE_STEP_S)
+    )
+    return twist_between(before, after, 2.0 * RATE_STEP_S)
+
+
+def spin_rad(axes: Floats, home: Floats) -> float:
+    """How far the sheet is turned about its normal from how it would be held ready there."""
+    ready = turned(home, axes[:, 2])
+    return float(np.arctan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0]))
+
+
+def within_tilt(
+    shape: Shape, start: Floats, found: Nearest, front: Floats, tilt_rad: float
+) -> tuple[Nearest, bool]:
+    """The last point towards `found` whose normal is within the tilt, and whether it is another.
+
+    start: surface point (3,) to come from, itself within the tilt.  The way is looked at along the
+    straight line from there, point by point, so that the side is kept on which the sheet is.
+    """
+    most = np.cos(tilt_rad)
+    if found.normal @ front >= most:
+        return found, False
+    begin, end = 0.0, 1.0
+    best = shape.closest(start, previous=start)
+    for _ in range(SEARCH_ROUNDS):
+        shares = np.linspace(begin, end, SEARCH_POINTS)[1:]
+        places = start + shares[:, None] * (found.point - start)
+        there = shape.closest(places, previous=np.tile(start, (len(places), 1)))
+        outside = ~(there.normal @ front >= most)
+        inside = int(np.argmax(outside)) if outside.any() else len(shares)
+        if inside:
+            best = _pick(there, inside - 1)
+        step = (end - begin) / (SEARCH_POINTS - 1)
+        begin = begin + inside * step
+        end = min(begin + step, 1.0)
+    return best, True
+
+
+def rim_lift_m(shape: Shape, contact: Contact) -> float:
+    """How far the tangent plane must stand off its point to clear the object around it (m).
+
+    0 where the object is not hollow.  Looked at on two rings about the point, as wide as the part
+    of the sheet that a finger pulls down with it.
+    """
+    turns = np.arange(RIM_POINTS) * (2.0 * np.pi / RIM_POINTS)
+    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    places = np.concatenate([radius * ring for radius in RIM_RADII_M]) @ contact.axes[:, :2].T
+    return max(0.0, -float(shape.signed_distance(contact.point + places).min()))
+
+
+def _pick(found: Nearest, index: int) -> Nearest:
+    return Nearest(
+        found.point[index],
+        found.normal[index],
+        found.height_m[index],
+        found.shape_operator[index],
+        found.on_edge[index],
+        found.undecided[index],
+    )
+
+
+def _unit(vector: Floats) -> Floats:
+    return np.asarray(vector / np.linalg.norm(vector))

@@ -1,0 +1,216 @@
+"""The finger's dealings with the object: away (the paper's Fig. 7a), in touch (7b), and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.types import Phase
+from nodes.models.rigid import inverse
+from nodes.models.shapes import Nearest, Shape, foot_jacobian, principal_curvatures
+from nodes.planner.rolling import (
+    Contact,
+    rim_lift_m,
+    rolled,
+    rolling_twist,
+    spin_rad,
+    tangent,
+    tangent_twist,
+    turned,
+    within_tilt,
+)
+
+Floats = NDArray[np.float64]
+
+BEYOND_TILT = "finger beyond the tilt that the arms present"
+BEYOND_SPIN = "sheet turned too far about its normal; lift the finger"
+HOLLOW = "hollow place: the flat sheet rests on its rim"
+
+SHALLOW, DEEP = 0.15, 0.5
+"""Depths over the radius of curvature: up to the first the surface point nearest to the finger
+counts, from the second on how far the finger moves along the sheet."""
+
+INNERMOST = 0.15
+"""A finger nearer to a centre of curvature than this share of the radius is on no side of it."""
+
+FLATTEST_PER_M = 1e-3
+HOLLOW_M = 2e-4
+"""Rims lower than this are left to the sheet's own give."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """How far the sheet can go, and when the finger counts as touching.
+
+    front: unit normal (3,) of the side that is presented; tilt_rad: most that a normal leans off.
+    spin_rad: most that the sheet may be turned about its normal by rolling.
+    half_width_m, half_height_m: largest |x| and |y| at which the sheet can be touched.
+    touch_m, release_m: distances from the sheet (m) at which contact begins and ends.
+    deepest_m: a finger deeper than this has gone through the object.
+    """
+
+    front: Floats
+    tilt_rad: float
+    spin_rad: float
+    half_width_m: float
+    half_height_m: float
+    touch_m: float
+    release_m: float
+    deepest_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Presentation:
+    """What to present: the sheet at a contact, and how it moves there.
+
+    twist: (6,) of the sheet's middle in the object's frame.
+    """
+
+    phase: Phase
+    reason: str
+    contact: Contact
+    twist: Floats
+    push_depth_m: float
+
+
+class Encounter:
+    """What the sheet presents to one finger, step by step."""
+
+    def __init__(self, shape: Shape, home: Floats, reach: Reach) -> None:
+        """home: the sheet's axes (3, 3) when it waits, the third near `reach.front`."""
+        self._shape, self._home, self._reach = shape, home, reach
+        far = 10.0 * reach.front
+        first, _ = within_tilt(
+            shape, shape.closest(far).point, shape.closest(far), reach.front, reach.tilt_rad
+        )
+        self.contact = tangent(home, first, reach.half_width_m)
+        self._touching = False
+        self._finger = np.zeros(3)
+        self._looked_at: Floats | None = None
+
+    def step(self, finger: Floats, velocity: Floats, object_from_sheet: Floats) -> Presentation:
+        """What to present to a finger (3,) m that moves with `velocity` (3,) m/s.
+
+        object_from_sheet: where the sheet is now; a contact that begins takes it as it is.
+        """
+        if self._touching and self.contact.height_m(finger) > self._reach.release_m:
+            self._touching = False
+        if self._touching:
+            return self._roll(finger, velocity)
+        found = self._shape.closest(finger, previous=self.contact.point)
+        if found.undecided or self._too_deep(found):
+            return self._hold("finger inside the object, on no side of it", float(-found.height_m))
+        rate = _foot_rate(found, velocity)
+        allowed, limited = within_tilt(
+            self._shape, self.contact.point, found, self._reach.front, self._reach.tilt_rad
+        )
+        self.contact = self._lifted(tangent(self._home, allowed, self._reach.half_width_m))
+        near = self.contact.height_m(finger) <= self._reach.touch_m
+        if near and not limited and not found.on_edge:
+            self.contact = self._begun(self.contact, object_from_sheet)
+            self._touching, self._finger = True, finger
+            return self._roll(finger, velocity)
+        twist = (
+            np.zeros(6)
+            if limited
+            else tangent_twist(self.contact, rate, self._home, self._reach.half_width_m)
+        )
+        reason = BEYOND_TILT if limited else self._hollow()
+        return Presentation("approach", reason, self.contact, twist, 0.0)
+
+    def _begun(self, contact: Contact, object_from_sheet: Floats) -> Contact:
+        """The contact with the sheet as it is now: which of its points is there, how it is turned.
+
+        A sheet on its way to the finger is met where it is; it neither slips nor spins from then.
+        """
+        most = np.array([self._reach.half_width_m, self._reach.half_height_m])
+        place = inverse(object_from_sheet) @ np.append(contact.point, 1.0)
+        axes = turned(object_from_sheet[:3, :3], contact.normal)
+        return replace(contact, axes=axes, on_sheet=np.clip(place[:2], -most, most))
+
+    def _roll(self, finger: Floats, velocity: Floats) -> Presentation:
+        """In touch: roll to the finger, or say what keeps the sheet from it."""
+        contact = self.contact
+        depth = max(0.0, -contact.height_m(finger))
+        moved, self._finger = finger - self._finger, finger
+        if depth > self._reach.deepest_m:
+            return self._hold("finger through the object", depth)
+        found = self._shape.closest(finger, previous=contact.point)
+        if found.on_edge:
+            return self._hold("finger past the object's edge", depth)
+        found, rate = self._carried(found, moved, velocity, depth)
+        allowed, limited = within_tilt(
+            self._shape, contact.point, found, self._reach.front, self._reach.tilt_rad
+        )
+        there, past = self._on_sheet(contact, allowed)
+        if abs(spin_rad(there.axes, self._home)) > self._reach.spin_rad:
+            return self._hold(BEYOND_SPIN, depth)
+        self.contact = self._lifted(there)
+        if past or limited:
+            return self._hold(past or BEYOND_TILT, depth)
+        twist = rolling_twist(self.contact, rate)
+        return Presentation("contact", self._hollow(), self.contact, twist, depth)
+
+    def _carried(
+        self, found: Nearest, moved: Floats, velocity: Floats, depth: float
+    ) -> tuple[Nearest, Floats]:
+        """Where a finger in touch carries the contact, and at what rate (3,) m/s.
+
+        On the surface that is the nearest point.  Deep inside, which point is nearest means little
+        (at the axis every side is as near), and what the finger feels is the dented sheet; there
+        the sheet rolls by how far the finger moves along it.  In between the two are blended, so
+        that stroking while pushing makes no step.
+        """
+        normal = self.contact.normal
+        along = np.eye(3) - np.outer(normal, normal)
+        bent = principal_curvatures(self.contact.shape_operator, normal)[0].max()
+        share = (DEEP - depth * max(float(bent), FLATTEST_PER_M)) / (DEEP - SHALLOW)
+        share = min(max(share, 0.0), 1.0)
+        rate = (1.0 - share) * (along @ velocity)
+        if share > 0.0:
+            rate = rate + share * _foot_rate(found, velocity)
+        if share == 1.0:
+            return found, rate
+        dragged = self.contact.point + along @ moved
+        place = share * found.point + (1.0 - share) * dragged
+        return self._shape.closest(place, previous=self.contact.point), rate
+
+    def _on_sheet(self, contact: Contact, found: Nearest) -> tuple[Contact, str]:
+        """The sheet rolled to a point, or as far as it reaches there and what ends it."""
+        there = rolled(contact, found)
+        most = np.array([self._reach.half_width_m, self._reach.half_height_m])
+        over = np.abs(there.on_sheet) - most
+        if (over <= 0.0).all():
+            return there, ""
+        axis = int(np.argmax(over))
+        before, after = contact.on_sheet[axis], there.on_sheet[axis]
+        share = (np.copysign(most[axis], after) - before) / (after - before)
+        place = contact.point + share * (found.point - contact.point)
+        there = rolled(contact, self._shape.closest(place, previous=contact.point))
+        there = replace(there, on_sheet=np.clip(there.on_sheet, -most, most))
+        return there, f"finger past the sheet's usable {('width', 'height')[axis]}"
+
+    def _too_deep(self, found: Nearest) -> bool:
+        """Whether a finger that comes anew is so far inside that it is on no side."""
+        bent = principal_curvatures(found.shape_operator, found.normal)[0].max()
+        return bool(1.0 + found.height_m * bent < INNERMOST)
+
+    def _lifted(self, contact: Contact) -> Contact:
+        """The contact standing off by as much as the object rises around it."""
+        return replace(contact, lift_m=rim_lift_m(self._shape, contact))
+
+    def _hollow(self) -> str:
+        return HOLLOW if self.contact.lift_m > HOLLOW_M else ""
+
+    def _hold(self, reason: str, depth: float) -> Presentation:
+        return Presentation("hold", reason, self.contact, np.zeros(6), max(0.0, depth))
+
+
+def _foot_rate(found: Nearest, velocity: Floats) -> Floats:
+    """Rate (3,) m/s of the nearest point; none at a centre of curvature, where it would leap."""
+    try:
+        return np.asarray(foot_jacobian(found) @ velocity)
+    except np.linalg.LinAlgError:
+        return np.zeros(3)
