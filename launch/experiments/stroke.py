@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
 from launch.experiments import ExperimentError
+from launch.experiments.lag import lag_s
 from messages.bag import BagReader
 from messages.scene import ArmSpec, Scene, cylinder_of
 from messages.types import (
@@ -321,7 +322,10 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """The stroke's errors over time: seconds (n,) since the stroke began, metres, radians."""
+    """The stroke's errors over time: seconds (n,) since the stroke began, metres, radians.
+
+    arcs_m: (n, 2), how far around the object the true sheet and the true finger are.
+    """
 
     seconds: Floats
     delta_d_m: Floats
@@ -330,6 +334,7 @@ class StrokeErrors:
     true_delta_theta_rad: Floats
     smoother_m: Floats
     fingertip_m: Floats
+    arcs_m: Floats
 
 
 def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
@@ -363,7 +368,22 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
         true_delta_theta_rad=true_theta,
         smoother_m=tangential_distance(scene, world_from_object, smooth.at(times), true_points),
         fingertip_m=np.linalg.norm(recording.fingertip.at(times) - true_points, axis=1),
+        arcs_m=arcs(scene, recording.true_edges, times, true_points),
     )
+
+
+def arcs(
+    scene: Scene,
+    edges: tuple[Track, Track],
+    times_ns: NDArray[np.int64],
+    points: Floats,
+) -> Floats:
+    """Ways (n, 2) m around the cylinder: of the line that the sheet presents, of the points."""
+    world_from_object = object_pose(scene)
+    local = apply(inverse(world_from_object), points)
+    _, angles = presented(edges, world_from_object, times_ns, local[:, 0])
+    both = np.stack([angles, np.arctan2(local[:, 1], local[:, 2])], axis=1)
+    return np.asarray(cylinder_of(scene).radius_m * both)
 
 
 def tangential_distance(
@@ -383,7 +403,11 @@ def tangential_distance(
 def stroke_result(
     recording: Recording, errors: StrokeErrors, seconds: float, bag: Path
 ) -> dict[str, Any]:
-    """The figures of `experiment stroke --json`; lengths in mm, angles in degrees, times in ms."""
+    """The figures of `experiment stroke --json`; lengths in mm, angles in degrees, times in ms.
+
+    lag_ms: of the true sheet behind the true finger, by cross-correlation of the hand's wander.
+    """
+    lag = lag_s(errors.seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
     return {
         "seconds": seconds,
         "delta_d_mm": summary(errors.delta_d_m, 1e3),
@@ -391,6 +415,8 @@ def stroke_result(
         "true_delta_d_mm": summary(errors.true_delta_d_m, 1e3),
         "true_delta_theta_deg": summary(errors.true_delta_theta_rad, np.degrees(1.0)),
         "smoother_mm": summary(errors.smoother_m, 1e3),
+        "true_over_smoother": float(errors.true_delta_d_m.mean() / errors.smoother_m.mean()),
+        "lag_ms": None if lag is None else 1e3 * lag,
         "fingertip_mm": summary(errors.fingertip_m, 1e3),
         "latency_ms": {
             "exposure_to_arm": percentiles_ms(recording.arm_delays_s()),
