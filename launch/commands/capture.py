@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from messages.calibration import Board
     from messages.scene import Scene
     from nodes.camera.capture import Capture
+    from nodes.camera.sources import AnySource
 
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
@@ -31,21 +32,15 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
     from ruamel.yaml.error import YAMLError
 
     from launch.documents import parse_value
-    from nodes.camera.devices import open_reader
-    from nodes.camera.pictures import DeviceError, check_size
     from nodes.camera.sources import AnySource
 
     try:
         described: Any = TypeAdapter(AnySource).validate_python(parse_value(source))
     except (YAMLError, ValidationError) as error:
-        said = (
-            "; ".join(
-                f"{'.'.join(str(part) for part in one['loc'])}: {one['msg']}"
-                for one in error.errors()
-            )
-            if isinstance(error, ValidationError)
-            else str(error).splitlines()[0]
-        )
+        said = str(error).splitlines()[0]
+        if isinstance(error, ValidationError):
+            mistakes = [(".".join(map(str, one["loc"])), one["msg"]) for one in error.errors()]
+            said = "; ".join(f"{where}: {what}" for where, what in mistakes)
         raise CommandError(
             f"--device-source {source}: {said}; describe it as a camera node's source, as "
             "'{kind: opencv, left: 0, right: 1}'",
@@ -55,6 +50,13 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
         raise CommandError(
             "--device-source twin: the twin has no board in a graph; use --twin SCENE", BAD_INPUT
         )
+    return _read(described, source, scene)
+
+
+def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
+    from nodes.camera.devices import open_reader
+    from nodes.camera.pictures import DeviceError, check_size
+
     try:
         with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
             for warning in reader.warnings:
@@ -83,16 +85,12 @@ def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int
     """Keep the pairs that `capture` takes as left01.png, right01.png, ... in a new folder.
 
     Ends when all is covered, when the pictures end, or at Ctrl-C; what is still missing is said.
-    Returns the number of pairs.
+    Returns the number of pairs, at least one.
     """
     import cv2
 
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise CommandError(
-            f"--pictures {folder}: cannot be made: {error.strerror}; name a new folder", BAD_INPUT
-        ) from error
+    if folder.exists():
+        raise CommandError(f"--pictures {folder}: exists already; name a new folder", BAD_INPUT)
     taken = 0
     try:
         with _shown(capture) as show:
@@ -100,6 +98,7 @@ def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int
                 seen = capture.see(left, right)
                 if seen.taken:
                     taken += 1
+                    folder.mkdir(parents=True, exist_ok=True)
                     for side, picture in (("left", left), ("right", right)):
                         cv2.imwrite(str(folder / f"{side}{taken:02}.png"), picture)
                 show(seen.hint, seen.taken)
@@ -111,6 +110,8 @@ def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int
     if missing:
         listed = ", ".join(f"{one.group} {one.name}".strip() for one in missing)
         words.print(f"not covered: {listed}", markup=False)
+    if not taken:
+        raise CommandError("no pair was taken: the board was never seen at rest in both pictures")
     words.print(f"{taken} pairs in {folder}", markup=False)
     return taken
 

@@ -107,7 +107,7 @@ def _composed(pose: Floats, stand: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 @dataclass(frozen=True, slots=True)
-class _Pair:
+class Linearized:
     """A pair at the present estimate: shifts (m,) px, slopes (m, 22) by the rig, (m, 6) by pose."""
 
     shifts: Floats
@@ -115,7 +115,8 @@ class _Pair:
     by_pose: Floats
 
 
-def _linearized(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> _Pair:
+def linearized(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Linearized:
+    """A pair's corners at a rig (22,) and a pose (6,); board: its corners (n, 3) m."""
     left_points, right_points = board[pair.left.ids], board[pair.right.ids]
     left, left_by_pose, left_by_lens = _drawn(left_points, pose, rig[LEFT])
     in_right, by_pose, by_stand = _composed(pose, rig[STAND])
@@ -125,7 +126,7 @@ def _linearized(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> _P
     by_rig[:split, LEFT] = left_by_lens
     by_rig[split:, RIGHT] = right_by_lens
     by_rig[split:, STAND] = right_by_pose @ by_stand
-    return _Pair(
+    return Linearized(
         shifts=np.concatenate(
             [(pair.left.pixels - left).ravel(), (pair.right.pixels - right).ravel()]
         ),
@@ -146,7 +147,7 @@ class _Reduced:
     poses: list[tuple[Floats, Floats, Floats]]
 
 
-def _reduced(pairs: Sequence[_Pair], damping: float) -> _Reduced:
+def _reduced(pairs: Sequence[Linearized], damping: float) -> _Reduced:
     """Levenberg's and Marquardt's equations: the diagonal is raised by the share `damping`."""
     matrix, side = np.zeros((22, 22)), np.zeros(22)
     poses = []
@@ -185,17 +186,17 @@ def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Fl
     """
     rig, poses = rig.copy(), poses.copy()
 
-    def linearized(rig: Floats, poses: Floats) -> list[_Pair]:
-        return [_linearized(one, board, rig, pose) for one, pose in zip(pairs, poses, strict=True)]
+    def at(rig: Floats, poses: Floats) -> list[Linearized]:
+        return [linearized(one, board, rig, pose) for one, pose in zip(pairs, poses, strict=True)]
 
-    present = linearized(rig, poses)
+    present = at(rig, poses)
     cost = sum(float(pair.shifts @ pair.shifts) for pair in present)
     damping = 1e-4
     for _ in range(STEPS):
         reduced = _reduced(present, damping)
         step = _scaled_inverse(reduced.matrix) @ reduced.side
         moves = np.array([i @ (slope - c.T @ step) for i, slope, c in reduced.poses])
-        tried = linearized(rig + step, poses + moves)
+        tried = at(rig + step, poses + moves)
         tried_cost = sum(float(pair.shifts @ pair.shifts) for pair in tried)
         if not tried_cost < cost:
             if damping > 1e6 or tried_cost - cost < SETTLED * cost:
@@ -221,7 +222,7 @@ def fit_rig(pairs: Sequence[BoardPair], board: Floats, *, rig: Floats, poses: Fl
     )
 
 
-def _by_view(present: _Pair, pair: BoardPair) -> tuple[Floats, Floats]:
+def _by_view(present: Linearized, pair: BoardPair) -> tuple[Floats, Floats]:
     shifts = present.shifts.reshape(-1, 2)
     split = len(pair.left.ids)
     return shifts[:split], shifts[split:]

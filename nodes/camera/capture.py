@@ -124,16 +124,16 @@ class Capture:
         self._before = pair
         self._still = self._still + 1 if moved_px < STILL_PX else 1
         if any(_shift(pair, one) < NEW_PLACE_PX for one in self._taken):
-            return Seen(False, self._advice("taken from here; "))
+            return Seen(False, self.advice("taken from here; "))
         bins = self.bins_of(pair)
         adds = [one for one in bins if self.counts[one] < self.needed.get(one, 0)]
         if not adds:
-            return Seen(False, self._advice("nothing new here; "))
+            return Seen(False, self.advice("nothing new here; "))
         if self._still < self._still_pictures:
             return Seen(False, "hold still")
         self.counts.update(bins)
         self._taken.append(pair)
-        return Seen(True, self._advice("taken; "))
+        return Seen(True, self.advice("taken; "))
 
     def bins_of(self, pair: BoardPair) -> list[Bin]:
         """What a pair covers."""
@@ -157,7 +157,8 @@ class Capture:
         share = self._lens[0] * diagonal_m / middle[2] / np.hypot(*self._size)
         return "near" if share > NEAR else "far" if share < FAR else "middle"
 
-    def _advice(self, before: str) -> str:
+    def advice(self, before: str) -> str:
+        """What to do with the board next, after the words `before`."""
         missing = self.missing()
         if not missing:
             return before + "all is covered"

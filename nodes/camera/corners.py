@@ -22,11 +22,14 @@ Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
 """Called with (steps done, steps in all, what was just done)."""
 
+CHARUCO_SCALE = 2
+"""Markers are looked for in an enlarged picture: small ones are found, and found more exactly."""
+
 MIN_CORNERS = 8
 """Of a ChArUco board in a view; fewer say too little about the board's pose."""
 
 LARGEST_HALF_WINDOW_PX = 15
-LARGEST_MOVE_PX = 1.5
+LARGEST_MOVE_PX = 1.0
 """A ChArUco corner that refinement takes further was drawn to another edge, and is left out."""
 
 CHESSBOARD_SMOOTHING_PX = 1.0
@@ -106,14 +109,22 @@ def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
     return cv2.aruco.CharucoBoard(squares, board.square_m, board.marker_m, dictionary)
 
 
+def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
+    """A corner may be found from one marker beside it; what it gets wrong is refined or left out.
+
+    With OpenCV's two markers a quarter fewer corners are found, most at the picture's edge.
+    """
+    parameters = cv2.aruco.CharucoParameters()
+    parameters.minMarkers = 1
+    return cv2.aruco.CharucoDetector(charuco_board(board), parameters)
+
+
 class CornerFinder:
     """Finds one kind of board in pictures; `quick`: gives up early on pictures without one."""
 
     def __init__(self, board: Board, *, quick: bool = False) -> None:
         self.board = board
-        self._detector = (
-            cv2.aruco.CharucoDetector(charuco_board(board)) if board.kind == "charuco" else None
-        )
+        self._detector = _charuco_detector(board) if board.kind == "charuco" else None
         self._flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
         if quick:
             self._flags |= cv2.CALIB_CB_FAST_CHECK
@@ -139,12 +150,16 @@ class CornerFinder:
     def _charuco(self, image: Image) -> View | None:
         assert self._detector is not None
         assert self.board.marker_m is not None
-        corners, found, _, _ = self._detector.detectBoard(image)
+        larger = cv2.resize(
+            image, None, fx=CHARUCO_SCALE, fy=CHARUCO_SCALE, interpolation=cv2.INTER_CUBIC
+        )
+        corners, found, _, _ = self._detector.detectBoard(larger)
         if found is None or len(found) < MIN_CORNERS:
             return None
         order = np.argsort(found.ravel())
         ids = found.ravel()[order].astype(np.int64)
-        start = np.asarray(corners.reshape(-1, 2)[order], dtype=np.float64)
+        in_larger = np.asarray(corners.reshape(-1, 2)[order], dtype=np.float64)
+        start = (in_larger + 0.5) / CHARUCO_SCALE - 0.5
         rim = 0.5 * (1.0 - self.board.marker_m / self.board.square_m)
         half_px = min(0.4, 0.7 * rim) * _nearest(start)
         pixels = _refined(image, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)

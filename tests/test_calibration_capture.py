@@ -1,0 +1,454 @@
+"""Boards of both kinds, printed and seen; live capture; and the commands around them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from rich.console import Console
+from ruamel.yaml import YAML
+
+from launch import cli
+from launch.commands.capture import coverage_view, take_pairs
+from launch.documents import BadInputError
+from launch.plan import load_plan
+from messages.calibration import Board, load_calibration
+from messages.scene import Scene, StereoCamera
+from nodes.camera.bundle import pose_vector
+from nodes.camera.calibration import calibrate_stereo
+from nodes.camera.capture import TILTS, Bin, Capture, needed, place, tilt_of
+from nodes.camera.check import check_stereo
+from nodes.camera.corners import (
+    BoardPair,
+    CalibrationError,
+    CornerFinder,
+    board_points,
+    pair_of,
+)
+from nodes.camera.printing import raster, svg, write_board
+from nodes.models import rigid
+from nodes.twin.board import TwinBoard
+from nodes.twin.rig import true_camera
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+ROOT = Path(__file__).resolve().parent.parent
+CHESSBOARD = Board(columns=7, rows=5, square_m=0.03)
+CHARUCO = Board(
+    kind="charuco", columns=6, rows=4, square_m=0.04, marker_m=0.025, dictionary="DICT_4X4_50"
+)
+BOARDS = [CHESSBOARD, CHARUCO]
+
+
+def small_scene() -> dict[str, Any]:
+    """The paper's scene with a camera of a quarter of the pixels."""
+    scene: dict[str, Any] = YAML(typ="safe").load(
+        (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
+    )
+    camera = scene["camera"]
+    camera["width_px"], camera["height_px"] = 400, 300
+    for side in ("left", "right"):
+        for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
+            camera[side][key] *= 400 / 640
+    return scene
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("scene") / "small.yaml"
+    with path.open("w") as file:
+        YAML(typ="safe").dump(small_scene(), file)
+    return path
+
+
+@pytest.fixture(scope="module")
+def camera() -> StereoCamera:
+    return Scene.model_validate(small_scene()).camera
+
+
+@pytest.mark.parametrize("board", BOARDS, ids=["chessboard", "charuco"])
+def test_a_printed_board_is_found_where_it_was_printed(board: Board) -> None:
+    dots_per_m = 1500.0
+    picture = raster(board, dots_per_m)
+    squares = np.array([board.rows + 3, board.columns + 3])
+    assert picture.shape == pytest.approx(tuple(squares * board.square_m * dots_per_m), abs=1)
+    view = CornerFinder(board).find(cv2.GaussianBlur(picture, (0, 0), 0.8))
+    assert view is not None
+    assert np.array_equal(view.ids, np.arange(board.columns * board.rows))
+    expected = (board_points(board)[:, :2] + 2 * board.square_m) * dots_per_m - 0.5
+    if board.kind == "chessboard" and np.linalg.norm(view.pixels[0] - expected[0]) > 100:
+        expected = expected[::-1]  # a chessboard tells its two ends apart by nothing
+    assert np.abs(view.pixels - expected).max() < 0.1
+
+
+def test_the_printed_markers_are_those_that_opencv_draws() -> None:
+    ours = raster(CHARUCO, 2000.0)
+    side = round(2000.0 * CHARUCO.square_m)
+    inner = ours[side:-side, side:-side]
+    theirs = cv2.aruco.CharucoBoard(
+        (7, 5), 0.04, 0.025, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    ).generateImage((inner.shape[1], inner.shape[0]))
+    assert np.mean((inner > 127) != (theirs > 127)) < 0.01
+
+
+def test_a_board_file_states_its_true_size(tmp_path: Path) -> None:
+    drawing = svg(CHARUCO)
+    assert 'width="360mm" height="296mm" viewBox="0 0 360 296"' in drawing
+    assert "markers of 25 mm, DICT_4X4_50" in drawing
+    write_board(CHESSBOARD, tmp_path / "board.png")
+    stored = (tmp_path / "board.png").read_bytes()
+    dots_per_m = int.from_bytes(stored[stored.index(b"pHYs") + 4 :][:4], "big")
+    assert dots_per_m == pytest.approx(300 / 0.0254, rel=1e-3)
+    with pytest.raises(CalibrationError, match=r"board\.pdf: write the board as \.svg or \.png"):
+        write_board(CHESSBOARD, tmp_path / "board.pdf")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"marker_m": 0.04}, "markers of 40 mm do not fit into squares of 40 mm"),
+        ({"dictionary": "DICT_9X9"}, "a name of OpenCV's, as DICT_4X4_50"),
+        ({"marker_m": None}, "give the markers' side"),
+        ({"columns": 14, "rows": 10}, "needs 82 markers, DICT_4X4_50 holds 50"),
+    ],
+)
+def test_charuco_boards_that_cannot_be_are_refused(change: dict[str, Any], said: str) -> None:
+    with pytest.raises(CalibrationError, match=said):
+        CornerFinder(CHARUCO.model_copy(update=change))
+
+
+def shown(
+    board: Board, camera: StereoCamera, count: int, *, seed: int
+) -> list[tuple[Image, Image]]:
+    twin = TwinBoard(true_camera(camera), board, seed=seed)
+    return [twin.pair(pose) for pose in twin.poses(count)]
+
+
+def written(pictures: list[tuple[Image, Image]], folder: Path) -> tuple[list[Path], list[Path]]:
+    paths: tuple[list[Path], list[Path]] = ([], [])
+    for number, views in enumerate(pictures):
+        for side, name, picture in zip(paths, ("left", "right"), views, strict=True):
+            side.append(folder / f"{name}{number:02}.png")
+            cv2.imwrite(str(side[-1]), picture)
+    return paths
+
+
+def test_charuco_boards_seen_in_part_calibrate_a_rig(camera: StereoCamera, tmp_path: Path) -> None:
+    left, right = written(shown(CHARUCO, camera, 12, seed=4), tmp_path)
+    calibrated = calibrate_stereo(left[:9], right[:9], board=CHARUCO, device="made")
+    seen = [len(pair.left.ids) for pair in calibrated.pairs.values()]
+    assert min(seen) < 24
+    true = true_camera(camera)
+    calibration = calibrated.calibration
+    assert calibration.left.fx_px == pytest.approx(true.left.fx_px, rel=4e-3)
+    assert calibration.right_from_left[:3, 3] == pytest.approx(
+        true.right_from_left[:3, 3], abs=3e-4
+    )
+    result = check_stereo(calibration, left[9:], right[9:], board=CHARUCO)
+    assert result["pairs"] == 3
+    assert isinstance(result["rigid_fit_rms_mm"], float)
+    assert result["rigid_fit_rms_mm"] < 0.5
+
+
+def test_the_same_corner_has_the_same_number_in_both_views(camera: StereoCamera) -> None:
+    twin = TwinBoard(true_camera(camera), CHARUCO, seed=2)
+    finder = CornerFinder(CHARUCO)
+    compared = 0
+    for pose in twin.poses(4):
+        left, right = twin.pair(pose)
+        pair = pair_of(finder.find(left), finder.find(right), CHARUCO, ("l", "r"))
+        if not isinstance(pair, BoardPair):
+            continue  # too little of it is seen
+        compared += 1
+        true_left, true_right = twin.corners(pose)
+        assert np.abs(pair.left.pixels - true_left[pair.left.ids]).max() < 0.5
+        assert np.abs(pair.right.pixels - true_right[pair.right.ids]).max() < 0.5
+        ids, in_left, in_right = pair.common()
+        assert len(ids) == len(in_left) == len(in_right) >= 8
+    assert compared >= 2
+
+
+def posed(turn: list[float]) -> Floats:
+    """The pose (6,) of a board so turned, its middle straight ahead."""
+    middle = board_points(CHESSBOARD).mean(axis=0)
+    rotation = rigid.rotation_from_vector(turn)
+    return pose_vector(rigid.transform(rotation, np.array([0.0, 0.0, 0.5]) - rotation @ middle))
+
+
+@pytest.mark.parametrize(
+    ("turn", "tilt"),
+    [
+        ([0.0, 0.0, 0.2], "upright"),
+        ([0.0, 0.5, 0.0], "left side back"),
+        ([0.0, -0.5, 0.0], "right side back"),
+        ([0.5, 0.0, 0.0], "bottom back"),
+        ([-0.5, 0.0, 0.0], "top back"),
+    ],
+)
+def test_tilts_have_the_names_that_people_would_give_them(turn: list[float], tilt: str) -> None:
+    pose = posed(turn)
+    middle = board_points(CHESSBOARD).mean(axis=0)
+    assert tilt_of(pose, middle) == tilt
+    # A board held upside down leans as it did.
+    about = rigid.transform(rigid.rotation_from_vector([0.0, 0.0, np.pi]), 2 * middle)
+    flipped = rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:]) @ about
+    assert tilt_of(pose_vector(flipped), middle) == tilt
+    depths = rigid.apply(
+        rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:]), board_points(CHESSBOARD)
+    )
+    furthest = depths[np.argmax(depths[:, 2])]
+    if tilt != "upright":
+        axis, sign = {"left": (0, -1), "right": (0, 1), "top": (1, -1), "bottom": (1, 1)}[
+            tilt.split(" ", maxsplit=1)[0]
+        ]
+        assert np.sign(furthest[axis]) == sign
+
+
+def watching(camera: StereoCamera, *, pairs: int, still_pictures: int) -> Capture:
+    return Capture(
+        CHESSBOARD,
+        lens=camera.left,
+        size=(camera.width_px, camera.height_px),
+        pairs=pairs,
+        still_pictures=still_pictures,
+    )
+
+
+def test_a_pair_is_taken_when_the_board_holds_still_somewhere_new(camera: StereoCamera) -> None:
+    first, second = shown(CHESSBOARD, camera, 2, seed=6)
+    blank = (np.full_like(first[0], 60), np.full_like(first[1], 60))
+    capture = watching(camera, pairs=8, still_pictures=3)
+    seen = capture.see(*blank)
+    assert not seen.taken
+    assert "no chessboard of 7x5 inner corners in the left picture and the right" in seen.hint
+    hints = [capture.see(*picture) for picture in (first, first, second, second, second)]
+    assert [one.taken for one in hints] == [False, False, False, False, True]
+    assert hints[0].hint == "hold still"
+    assert capture.counts[Bin("pairs", "")] == 1
+    assert not capture.see(*second).taken
+    assert capture.see(*second).hint.startswith("taken from here; show the board")
+    assert [capture.see(*first).taken for _ in range(3)] == [False, False, True]
+    assert capture.counts[Bin("pairs", "")] == 2
+    assert not capture.complete
+
+
+def test_what_is_missing_is_asked_for(camera: StereoCamera) -> None:
+    capture = watching(camera, pairs=8, still_pictures=1)
+    wanted = needed(8)
+    assert {one.name for one in wanted if one.group == "tilt"} == set(TILTS)
+    assert Bin("left cell", "0,0") not in wanted
+    capture.counts.update(dict.fromkeys(wanted, 8))
+    assert capture.complete
+    for one, said in (
+        (Bin("tilt", "left side back"), "with its left side tilted back"),
+        (Bin("tilt", "upright"), "straight on"),
+        (Bin("distance", "far"), "further away"),
+        (Bin("left cell", "3,2"), "at the bottom right of the left picture"),
+        (Bin("pairs", ""), "somewhere else"),
+    ):
+        capture.counts[one] = 0
+        assert capture.missing() == [one]
+        (picture,) = shown(CHESSBOARD, camera, 1, seed=6)
+        assert said in capture.advice("")
+        capture.counts[one] = 8
+        assert picture[0].shape == (camera.height_px, camera.width_px)
+    assert place(Bin("right cell", "0,0")) == "at the top left of"
+
+
+def test_coverage_is_drawn_with_what_is_missing(camera: StereoCamera) -> None:
+    capture = watching(camera, pairs=20, still_pictures=1)
+    (picture,) = shown(CHESSBOARD, camera, 1, seed=6)
+    assert capture.see(*picture).taken
+    console = Console(width=160, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(coverage_view(capture, "tilt it"))
+    drawn = console.export_text()
+    assert "1/20" in drawn
+    assert "1/2" in drawn
+    assert "left side back" in drawn
+    assert "tilt it" in drawn
+    console.file.close()
+
+
+def test_ctrl_c_keeps_what_was_taken(camera: StereoCamera, tmp_path: Path) -> None:
+    pictures = shown(CHESSBOARD, camera, 3, seed=6)
+
+    def until_interrupted() -> Iterator[tuple[Image, Image]]:
+        yield from pictures
+        raise KeyboardInterrupt
+
+    folder = tmp_path / "taken"
+    capture = watching(camera, pairs=8, still_pictures=1)
+    assert take_pairs(until_interrupted(), capture, folder) == 3
+    assert sorted(path.name for path in folder.iterdir()) == [
+        f"{side}{number:02}.png" for side in ("left", "right") for number in (1, 2, 3)
+    ]
+    kept = cv2.imread(str(folder / "right02.png"), cv2.IMREAD_GRAYSCALE)
+    assert np.array_equal(kept, pictures[1][1])
+
+
+Flexsheet = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def flexsheet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Flexsheet:
+    """Runs the command in this process: exit code, stdout, stderr."""
+
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        out, err = capsys.readouterr()
+        code = ended.value.code
+        return (code if isinstance(code, int) else 0), out, err
+
+    return run
+
+
+GIVEN = ("--board", "7x5", "--square-mm", "30")
+
+
+def test_the_twin_is_calibrated_by_the_command(
+    flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
+) -> None:
+    """From live capture to the file, the report, and a check on pictures taken otherwise."""
+    taken, report, output = tmp_path / "taken", tmp_path / "report", tmp_path / "rig.yaml"
+    code, out, err = flexsheet(
+        "calibrate", "stereo", "--twin", scene_file, *GIVEN, "--pairs", 8, "--pictures", taken,
+        "--report", report, "-o", output, "--json",
+    )  # fmt: skip
+    assert code == 0, err
+    result = json.loads(out)
+    assert result["pairs"] >= 8
+    assert result["uncertainty"]["working_distance_mm"] == pytest.approx(503.6, abs=0.1)
+    assert 0.01 < result["uncertainty"]["depth_std_mm"] < 2.0
+    calibration = load_calibration(output)
+    assert calibration.device == camera.device
+    assert calibration.opencv_version == cv2.__version__
+    assert "# flexsheet calibrate stereo --twin" in output.read_text()
+    assert calibration.left.fx_px == pytest.approx(true_camera(camera).left.fx_px, rel=5e-3)
+
+    page = (report / "index.html").read_text()
+    for word in ("Calibration of twin-bumblebee", "right_from_left.tx_m", "mm in depth"):
+        assert word in page
+    assert page.count("data:image/png;base64,") == 4
+    assert 'src="http' not in page
+    assert {path.name for path in report.glob("*.png")} == {
+        "residuals.png", "pairs.png", "coverage.png", "epipolar.png",
+    }  # fmt: skip
+
+    left, right = written(shown(CHESSBOARD, camera, 3, seed=91), tmp_path)
+    given = ("--left", tmp_path / "left0*.png", "--right", tmp_path / "right0*.png", *GIVEN)
+    code, out, err = flexsheet("calibrate", "check", "--calibration", output, *given, "--json")
+    assert code == 0, err
+    checked = json.loads(out)
+    assert checked["pairs"] == len(left) == len(right)
+    assert checked["rigid_fit_rms_mm"] < 1.0
+    assert checked["used_to_calibrate"] == ["left01.png", "left02.png"]
+    assert "pictures of the same names made this calibration" in err
+
+    given = ("--left", taken / "left*.png", "--right", taken / "right*.png", *GIVEN)
+    code, out, err = flexsheet("calibrate", "cross-check", *given, "--leave-out", 2, "--json")
+    assert code == 0, err
+    crossed = json.loads(out)
+    assert crossed["rigid_fit_rms_mm"] < 1.0
+    assert crossed["plain_opencv"]["pairs"] == crossed["pairs"] == len(crossed["rows"])
+    code, out, err = flexsheet("calibrate", "cross-check", *given, "--leave-out", 2)
+    assert code == 0, err
+    assert "rigid_fit_rms_mm" in out
+
+
+def test_pictures_are_taken_from_what_a_camera_source_describes(
+    flexsheet: Flexsheet, scene_file: Path, camera: StereoCamera, tmp_path: Path
+) -> None:
+    """Image files stand in for cameras; each picture comes four times, as of a board held still."""
+    for number, views in enumerate(shown(CHESSBOARD, camera, 6, seed=3)):
+        for again in range(4):
+            for side, picture in zip(("l", "r"), views, strict=True):
+                cv2.imwrite(str(tmp_path / f"{side}{number}{again}.png"), picture)
+    source = f"{{kind: images, left: {tmp_path}/l*.png, right: {tmp_path}/r*.png}}"
+    code, out, err = flexsheet(
+        "calibrate", "stereo", "--device-source", source, "--scene", scene_file, *GIVEN,
+        "--pairs", 6, "--pictures", tmp_path / "taken", "-o", tmp_path / "rig.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "not covered: " in err
+    taken = len(list((tmp_path / "taken").glob("left*.png")))
+    assert taken >= 5
+    assert f"{taken} pairs in" in err
+    assert f"pairs used     {taken} of {taken}" in out
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ((), "one of the three"),
+        (("--left", "a*.png"), "one of the three"),
+        (("--twin", "SCENE", "--left", "a", "--right", "b"), "one of the three"),
+        (("--device-source", "{kind: opencv, left: 0}"), "name the scene with --scene"),
+        (("--device-source", "{kind: opencv}", "--scene", "SCENE"), "opencv.left: Field required"),
+        (("--device-source", "twin", "--scene", "SCENE"), "use --twin SCENE"),
+        (("--device-source", "[1,", "--scene", "SCENE"), "describe it as a camera node's source"),
+        (("--twin", "SCENE", "--pictures", "."), "name a new folder"),
+        (("--twin", "SCENE", "--marker-mm", "40"), "do not fit"),
+        (("--twin", "nowhere.yaml"), "cannot be read"),
+    ],
+)
+def test_what_cannot_be_done_is_said_with_a_remedy(
+    flexsheet: Flexsheet, scene_file: Path, tmp_path: Path, given: tuple[str, ...], said: str
+) -> None:
+    words = [str(scene_file) if word == "SCENE" else word for word in given]
+    code, _, err = flexsheet("calibrate", "stereo", *words, *GIVEN, "-o", tmp_path / "c.yaml")
+    assert code == 2
+    assert said in err
+
+
+def test_a_board_to_print_is_written(flexsheet: Flexsheet, tmp_path: Path) -> None:
+    path = tmp_path / "board.svg"
+    code, out, err = flexsheet(
+        "calibrate", "board", *GIVEN, "--marker-mm", 18, "-o", path, "--json"
+    )
+    assert code == 0, err
+    assert json.loads(out)["board"]["kind"] == "charuco"
+    assert path.read_text().startswith("<svg")
+    code, _, err = flexsheet("calibrate", "board", *GIVEN, "-o", tmp_path / "board.txt")
+    assert code == 2
+    assert "write the board as .svg or .png" in err
+
+
+def launch_file(folder: Path, calibration: Path) -> Path:
+    path = folder / "graph.yaml"
+    path.write_text(
+        f"scene: {ROOT}/launch/scenes/cylinder.yaml\n"
+        "nodes:\n"
+        f"  triangulator: {{type: triangulator, parameters: {{calibration: {calibration}}}}}\n"
+        "from_tools: [stereo]\n"
+    )
+    return path
+
+
+def test_a_plan_refuses_a_calibration_that_does_not_belong(tmp_path: Path) -> None:
+    shipped = (ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml").read_text()
+    (tmp_path / "own.yaml").write_text(shipped)
+    plan = load_plan(launch_file(tmp_path, Path("own.yaml")))
+    assert plan.nodes["triangulator"].parameters["calibration"] == str(tmp_path / "own.yaml")
+    for old, new, said in (
+        ("device: twin-bumblebee", "device: other", 'is of device "other", the scene\'s camera'),
+        ("width_px: 640", "width_px: 320", "is for 320x480 px"),
+        ("version: 2", "version: 1", "this program reads 2; calibrate anew"),
+    ):
+        (tmp_path / "foreign.yaml").write_text(shipped.replace(old, new))
+        with pytest.raises(BadInputError, match=said) as refused:
+            load_plan(launch_file(tmp_path, Path("foreign.yaml")))
+        (problem,) = refused.value.problems
+        assert problem.where == f"{tmp_path / 'graph.yaml'}:3"
+        assert problem.key == ("nodes", "triangulator", "parameters", "calibration")
+        assert str(tmp_path / "foreign.yaml") in problem.what
+    with pytest.raises(BadInputError, match=r"absent\.yaml: cannot be read"):
+        load_plan(launch_file(tmp_path, Path("absent.yaml")))

@@ -1,0 +1,284 @@
+"""What a calibration says of its own error: slopes, covariance, jackknife, and is it true?"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+from scipy.optimize import least_squares
+
+from launch.plan import load_plan
+from messages.calibration import Board, StereoCalibration, load_calibration
+from messages.scene import Lens, Scene, StereoCamera
+from nodes.camera import bundle
+from nodes.camera.calibration import fit_pairs, state_uncertainty
+from nodes.camera.check import Rig, triangulated
+from nodes.camera.corners import BoardPair, CornerFinder, View, board_points, pair_of
+from nodes.camera.uncertainty import (
+    jackknife_covariance,
+    position_slopes,
+    position_spread,
+    view_of_work,
+)
+from nodes.models import rigid
+from nodes.twin.board import TwinBoard
+from nodes.twin.rig import true_camera
+
+Floats = NDArray[np.float64]
+ROOT = Path(__file__).resolve().parent.parent
+SHIPPED = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
+BOARD = Board(columns=9, rows=6, square_m=0.025)
+POINTS = board_points(BOARD)
+
+
+@cache
+def scene_camera() -> StereoCamera:
+    scene_file = ROOT / "launch" / "scenes" / "cylinder.yaml"
+    return Scene.model_validate(YAML(typ="safe").load(scene_file.read_text())).camera
+
+
+def half(lens: Lens) -> Lens:
+    return lens.model_copy(
+        update={
+            "fx_px": 0.5 * lens.fx_px,
+            "fy_px": 0.5 * lens.fy_px,
+            "cx_px": 0.5 * (lens.cx_px + 0.5) - 0.5,
+            "cy_px": 0.5 * (lens.cy_px + 0.5) - 0.5,
+        }
+    )
+
+
+@cache
+def small_camera() -> StereoCamera:
+    """The true rig with half as many pixels each way: four times as quick to draw."""
+    camera = true_camera(scene_camera())
+    return camera.model_copy(
+        update={
+            "width_px": 320,
+            "height_px": 240,
+            "left": half(camera.left),
+            "right": half(camera.right),
+        }
+    )
+
+
+def numbers_of(camera: StereoCamera | StereoCalibration) -> Floats:
+    lenses = [
+        [lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px, *lens.distortion[:4]]
+        for lens in (camera.left, camera.right)
+    ]
+    return np.concatenate([*lenses, bundle.pose_vector(camera.right_from_left)])
+
+
+def photographed(camera: StereoCamera, *, seed: int, count: int) -> list[BoardPair]:
+    """What is found in the twin's pictures of a board."""
+    board, finder = TwinBoard(camera, BOARD, seed=seed), CornerFinder(BOARD)
+    pairs = []
+    for left_from_board in board.poses(count):
+        left, right = board.pair(left_from_board)
+        pair = pair_of(finder.find(left), finder.find(right), BOARD, ("left", "right"))
+        if isinstance(pair, BoardPair):  # small pictures of a far, tilted board may be too coarse
+            pairs.append(pair)
+    assert len(pairs) >= 0.75 * count
+    return pairs
+
+
+@cache
+def exact_corners(count: int) -> tuple[tuple[Floats, Floats], ...]:
+    """Corners of the board in many poses, without any noise."""
+    board = TwinBoard(true_camera(scene_camera()), BOARD, seed=5)
+    return tuple(board.corners(pose) for pose in board.poses(count))
+
+
+def noisy(*, seed: int, sigma_px: float, count: int = 12) -> list[BoardPair]:
+    random = np.random.default_rng(seed)
+    ids = np.arange(len(POINTS))
+    return [
+        BoardPair(
+            View(ids, left + random.normal(0.0, sigma_px, left.shape)),
+            View(ids, right + random.normal(0.0, sigma_px, right.shape)),
+        )
+        for left, right in exact_corners(count)
+    ]
+
+
+def test_slopes_of_corners_are_those_of_differences() -> None:
+    rig = numbers_of(true_camera(scene_camera()))
+    pose = np.array([0.3, -0.4, 0.1, -0.05, -0.04, 0.45])
+    (pair,) = noisy(seed=1, sigma_px=0.1, count=1)
+    pair = BoardPair(
+        View(pair.left.ids[:40], pair.left.pixels[:40]),
+        View(pair.right.ids[9:], pair.right.pixels[9:]),
+    )
+    here = bundle.linearized(pair, POINTS, rig, pose)
+    for slopes, base, of in (
+        (here.by_rig, rig, lambda rig: bundle.linearized(pair, POINTS, rig, pose)),
+        (here.by_pose, pose, lambda pose: bundle.linearized(pair, POINTS, rig, pose)),
+    ):
+        for index in range(len(base)):
+            step = np.zeros(len(base))
+            step[index] = 1e-6 * max(1.0, abs(base[index]))
+            change = (of(base - step).shifts - of(base + step).shifts) / (2.0 * step[index])
+            assert slopes[:, index] == pytest.approx(change, rel=1e-4, abs=1e-3)
+
+
+def best_points(rig: Floats, start: Floats, left: Floats, right: Floats) -> Floats:
+    """The points (n, 3) whose pixels in both views are nearest to those seen."""
+
+    def misses(point: Floats, number: int) -> Floats:
+        seen = drawn(rig, point[None])
+        return np.concatenate([seen[0][0] - left[number], seen[1][0] - right[number]])
+
+    return np.array(
+        [
+            least_squares(
+                misses, point, args=(i,), x_scale=1e-3, xtol=1e-15, ftol=1e-15, gtol=1e-15
+            ).x
+            for i, point in enumerate(start)
+        ]
+    )
+
+
+def test_slopes_of_positions_are_those_of_differences() -> None:
+    rig = numbers_of(true_camera(scene_camera()))
+    grid = view_of_work(rig, (640, 480), 0.5)
+    assert grid[:, 2] == pytest.approx(0.5)
+    points = grid[[0, 12]]
+    slopes = position_slopes(rig, points)
+    left, right = drawn(rig, points)
+    for index in range(len(rig)):
+        step = np.zeros(len(rig))
+        step[index] = 1e-5 * max(1.0, abs(rig[index]))
+        ends = [best_points(rig + sign * step, points, left, right) for sign in (1.0, -1.0)]
+        change = (ends[0] - ends[1]) / (2.0 * step[index])
+        scale = np.abs(change).max()
+        assert slopes[..., index] == pytest.approx(change, rel=1e-3, abs=1e-4 * scale)
+
+
+def drawn(rig: Floats, points: Floats) -> tuple[Floats, Floats]:
+    """Pixels of points (n, 3) of the left camera's frame in both views."""
+    still = np.zeros(3)
+    left = cv2.projectPoints(points, still, still, *bundle.lens_arrays(rig[:8]))[0][:, 0]
+    right = cv2.projectPoints(points, rig[16:19], rig[19:], *bundle.lens_arrays(rig[8:16]))[0]
+    return np.asarray(left), np.asarray(right[:, 0])
+
+
+def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
+    """Corners with independent noise: the errors of 40 fits scatter as each of them states."""
+    true = numbers_of(true_camera(scene_camera()))
+    slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
+    scores, shifts, stated = [], [], []
+    for seed in range(40):
+        pairs = noisy(seed=seed, sigma_px=0.05)
+        fit = fit_pairs(pairs, POINTS, (640, 480))
+        off = fit.rig - true
+        scores.append(off @ np.linalg.solve(fit.covariance, off))
+        shifts.append(slopes @ off)
+        stated.append(position_spread(slopes, fit.covariance))
+        assert fit.sigma_px == pytest.approx(0.05, rel=0.1)
+    assert np.mean(scores) == pytest.approx(22.0, rel=0.2)
+    variances = np.mean(np.square(shifts), axis=(0, 1))
+    depth_m, lateral_m = np.mean(stated, axis=0)
+    assert np.sqrt(variances[2]) == pytest.approx(depth_m, rel=0.3)
+    assert np.sqrt(variances[0] + variances[1]) == pytest.approx(lateral_m, rel=0.3)
+
+
+def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
+    true = numbers_of(true_camera(scene_camera()))
+    slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
+    pairs = noisy(seed=3, sigma_px=0.05, count=20)
+    fit = fit_pairs(pairs, POINTS, (640, 480))
+    told: list[tuple[int, int]] = []
+    refits = jackknife_covariance(
+        fit, pairs, POINTS, lambda done, total, _: told.append((done, total))
+    )
+    assert told == [(number, 20) for number in range(1, 21)]
+    ratio = np.hypot(*position_spread(slopes, refits)) / np.hypot(
+        *position_spread(slopes, fit.covariance)
+    )
+    assert 0.6 < ratio < 1.6
+
+
+def test_boards_that_bend_are_told_by_the_jackknife_alone() -> None:
+    """Corners that err together: the fit believes in many small errors, refits tell better."""
+    camera = true_camera(scene_camera())
+    true = numbers_of(camera)
+    random = np.random.default_rng(8)
+    board = TwinBoard(camera, BOARD, seed=5)
+    pairs = []
+    for pose in board.poses(12):
+        bent = POINTS.copy()
+        bent[:, 2] = random.normal(0.0, 2e-3) * np.cos(np.pi * POINTS[:, 0] / 0.2)
+        left, right = drawn(true, rigid.apply(pose, bent))
+        pairs.append(
+            BoardPair(
+                View(np.arange(len(left)), left + random.normal(0.0, 0.02, left.shape)),
+                View(np.arange(len(right)), right + random.normal(0.0, 0.02, right.shape)),
+            )
+        )
+    fit = fit_pairs(pairs, POINTS, (640, 480))
+    uncertainty = state_uncertainty(fit, pairs, POINTS, size=(640, 480), distance_m=0.5)
+    assert uncertainty.jackknife_ratio > 1.3
+    slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), 0.5))
+    alone = position_spread(slopes, fit.covariance)
+    stated = (uncertainty.depth_std_m, uncertainty.lateral_std_m)
+    assert np.divide(stated, alone) == pytest.approx(uncertainty.jackknife_ratio, rel=1e-6)
+
+
+def test_fingertips_err_as_the_calibrations_state() -> None:
+    """Six calibrations from pictures, each of other poses and noise, judged by the true rig."""
+    camera = small_camera()
+    true = numbers_of(camera)
+    points = view_of_work(true, (320, 240), 0.5)
+    left, right = drawn(true, points)
+    errors, stated = [], []
+    for seed in range(6):
+        pairs = photographed(camera, seed=seed, count=12)
+        fit = fit_pairs(pairs, POINTS, (320, 240))
+        uncertainty = state_uncertainty(fit, pairs, POINTS, size=(320, 240), distance_m=0.5)
+        errors.append(triangulated(Rig.of(fit.rig), left, right) - points)
+        stated.append((uncertainty.depth_std_m, uncertainty.lateral_std_m))
+    variances = np.mean(np.square(errors), axis=(0, 1))
+    depth_m, lateral_m = np.sqrt(np.mean(np.square(stated), axis=0))
+    assert 1 / 1.5 < np.sqrt(variances[2]) / depth_m < 1.5
+    assert 1 / 1.5 < np.sqrt(variances[0] + variances[1]) / lateral_m < 1.5
+
+
+def test_the_shipped_calibration_is_true_within_what_it_states() -> None:
+    shipped = load_calibration(SHIPPED)
+    assert shipped.uncertainty is not None
+    true, measured = numbers_of(true_camera(scene_camera())), numbers_of(shipped)
+    off = measured - true
+    score = off @ np.linalg.solve(shipped.uncertainty.covariance, off)
+    assert score < 22 + 3 * np.sqrt(2 * 22)
+    points = view_of_work(true, (640, 480), shipped.uncertainty.working_distance_m)
+    errors = triangulated(Rig.of(measured), *drawn(true, points)) - points
+    assert np.sqrt(np.mean(errors[:, 2] ** 2)) < 2.5 * shipped.uncertainty.depth_std_m
+    # And good enough to reach 0.3 mm near the sheet with what marks add.
+    assert np.linalg.norm(errors, axis=1).max() < 2.5e-4
+
+
+def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
+    """Fewer pairs, other poses, other noise."""
+    shipped = load_calibration(SHIPPED)
+    assert shipped.uncertainty is not None
+    pairs = photographed(true_camera(scene_camera()), seed=77, count=10)
+    fit = fit_pairs(pairs, POINTS, (640, 480))
+    distance_m = shipped.uncertainty.working_distance_m
+    anew = state_uncertainty(fit, pairs, POINTS, size=(640, 480), distance_m=distance_m)
+    slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), distance_m))
+    shifts = slopes @ (fit.rig - numbers_of(shipped))
+    depth_m = np.hypot(anew.depth_std_m, shipped.uncertainty.depth_std_m)
+    lateral_m = np.hypot(anew.lateral_std_m, shipped.uncertainty.lateral_std_m)
+    assert np.sqrt(np.mean(shifts[:, 2] ** 2)) < 2.5 * depth_m
+    assert np.sqrt(np.mean(np.sum(shifts[:, :2] ** 2, axis=1))) < 2.5 * lateral_m
+
+
+def test_the_demo_measures_with_the_shipped_file() -> None:
+    plan = load_plan(ROOT / "launch" / "demo.yaml")
+    assert plan.nodes["triangulator"].parameters["calibration"] == str(SHIPPED)
