@@ -196,6 +196,20 @@ async def test_the_prediction_is_for_the_moment_that_it_names() -> None:
     assert math.degrees(math.atan2(normal[1], normal[2])) == pytest.approx(ahead_deg, abs=0.01)
 
 
+async def test_the_lead_grows_with_the_fingertips_age_and_steps_stay_even() -> None:
+    desk = await table(arrival_s=0.03)
+    for _ in range(200):
+        target = await desk.see(in_world(on_cylinder(0.0, -0.001)), age_ns=12_000_000)
+    assert (target.valid_at_ns - desk.now_ns) * 1e-9 == pytest.approx(0.042, abs=1e-4)
+    leads_s = []
+    for _ in range(200):
+        target = await desk.see(in_world(on_cylinder(0.0, -0.001)), age_ns=45_000_000)
+        leads_s.append((target.valid_at_ns - desk.now_ns) * 1e-9)
+    assert leads_s[-1] == pytest.approx(0.075, abs=1e-4)
+    assert np.diff(leads_s).min() >= 0.0
+    assert np.diff(leads_s).max() < 0.5 * FRAME_NS * 1e-9
+
+
 async def test_contact_has_hysteresis() -> None:
     desk = await table(lead_s=0.0)
     phases = []

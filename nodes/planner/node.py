@@ -11,12 +11,20 @@ from nodes.models.motion import SheetBounds
 from nodes.models.prediction import path_at
 from nodes.node import Input, Node, NodeParameters, Output
 from nodes.planner.compliance import compliance_for
+from nodes.planner.lead import next_lead_s
 from nodes.planner.motion import Plan, Planned, PlanSettings
+
+FIRST_LEAD_S = 0.05
 
 
 class PlannerParameters(NodeParameters):
-    lead_s: NonNegative = Field(
-        default=0.05, description="how far ahead of the exposure the sheet is planned"
+    lead_s: NonNegative | None = Field(
+        default=None,
+        description="how far ahead of the exposure the sheet is planned; "
+        "null: as long as fingertips take, and arrival_s",
+    )
+    arrival_s: NonNegative = Field(
+        default=0.038, description="from a fingertip's publication until the sheet gets there"
     )
     touch_m: float = Field(default=0.0005, description="contact begins this near to the object")
     release_m: Positive = Field(default=0.003, description="contact ends this far from the object")
@@ -50,6 +58,8 @@ class Planner(Node):
         self._last_source_ns: int | None = None
         self._writer = ("", 0)
         self._first_step_s = 0.0
+        given = self.parameters
+        self._lead_s = FIRST_LEAD_S if given.lead_s is None else given.lead_s
         self._late = 0
 
     def on_scene(self, scene: Scene, header: Header) -> None:
@@ -100,8 +110,11 @@ class Planner(Node):
         elif age_s > self.parameters.oldest_s:
             planned = plan.hold(f"fingertip is {age_s * 1e3:.0f} ms old", step_s)
         else:
-            lead_s = self.parameters.lead_s
-            point, velocity = path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, lead_s)
+            if self.parameters.lead_s is None:
+                before_s = self._lead_s
+                self._lead_s = next_lead_s(before_s, age_s, self.parameters.arrival_s)
+                step_s += self._lead_s - before_s
+            point, velocity = path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, self._lead_s)
             planned = plan.follow_finger(point, velocity, self._stretch_ratio, step_s)
         self._publish(planned, source_ns)
 
@@ -111,7 +124,7 @@ class Planner(Node):
             SheetTarget(
                 phase=shown.phase,
                 reason=shown.reason,
-                valid_at_ns=source_ns + round(self.parameters.lead_s * 1e9),
+                valid_at_ns=source_ns + round(self._lead_s * 1e9),
                 world_from_sheet=planned.motion.world_from_sheet,
                 twist_world=planned.motion.twist_world,
                 stretch_ratio=planned.motion.stretch_ratio,
