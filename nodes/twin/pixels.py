@@ -60,6 +60,12 @@ SIDE_LIGHT = 0.2
 NEAREST_M = 0.02
 """What comes nearer to a camera than this is not drawn."""
 
+ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
+"""Where along a limb its place in the picture is looked up to find the window that holds it."""
+
+EMPTY_SHARE = 1.2
+"""Overlapping windows are joined if that takes no more than so many times their pixels."""
+
 GRAIN = 1 << 21
 """Length of the roll of normal deviates that pictures cut their noise from, at random places."""
 
@@ -314,7 +320,10 @@ class TwinCamera:
         scale = pixels_per_slope(eye.lens, u0, v0)
         travel_px = scale / z0 * math.hypot(*way.tolist())
         spread_px = math.hypot(self.sensor.spread_px(z0, eye.lens.fx_px), travel_px / math.sqrt(12))
-        pixels = [pixel_of(eye.lens, u0, v0), pixel_of(eye.lens, u1, v1)]
+        # A lens bends straight things: their middle may bulge out of the box of their ends.
+        pixels = [
+            pixel_of(eye.lens, u0 + share * (u1 - u0), v0 + share * (v1 - v0)) for share in ALONG
+        ]
         window = eye.window(pixels, scale * max(width0, width1) + 3.0 * spread_px)
         if window is None:
             return None
@@ -487,19 +496,33 @@ def _wipe(eye: Eye, windows: list[Window]) -> None:
 
 
 def disjoint(windows: list[Window]) -> list[Window]:
-    """Windows that cover the same pixels and do not overlap: those that do become one."""
+    """Windows that cover the same pixels and do not overlap.
+
+    Two that do become one, or where that would be mostly empty, the one is cut along the other.
+    """
     apart: list[Window] = []
-    for window in windows:
-        one = window
-        while touching := [other for other in apart if _overlap(one, other)]:
-            apart = [other for other in apart if not _overlap(one, other)]
-            parts = [one, *touching]
-            one = (
-                slice(min(rows.start for rows, _ in parts), max(rows.stop for rows, _ in parts)),
-                slice(min(cols.start for _, cols in parts), max(cols.stop for _, cols in parts)),
-            )
-        apart.append(one)
+    pending = list(windows)
+    while pending:
+        one = pending.pop()
+        other = next((each for each in apart if _overlap(one, each)), None)
+        if other is None:
+            apart.append(one)
+            continue
+        both = (
+            slice(min(one[0].start, other[0].start), max(one[0].stop, other[0].stop)),
+            slice(min(one[1].start, other[1].start), max(one[1].stop, other[1].stop)),
+        )
+        if _area(both) <= EMPTY_SHARE * (_area(one) + _area(other)):
+            apart.remove(other)
+            pending.append(both)
+        else:
+            pending.extend(_beyond(one, other))
     return apart
+
+
+def _area(window: Window) -> int:
+    rows, columns = window
+    return int(rows.stop - rows.start) * int(columns.stop - columns.start)
 
 
 def _overlap(a: Window, b: Window) -> bool:
@@ -507,3 +530,16 @@ def _overlap(a: Window, b: Window) -> bool:
         first.start < second.stop and second.start < first.stop
         for first, second in zip(a, b, strict=True)
     )
+
+
+def _beyond(one: Window, other: Window) -> list[Window]:
+    """What of a window is not in another that it overlaps: above, below, left and right of it."""
+    (rows, columns), (cut_rows, cut_columns) = one, other
+    between = slice(max(rows.start, cut_rows.start), min(rows.stop, cut_rows.stop))
+    parts = [
+        (slice(rows.start, between.start), columns),
+        (slice(between.stop, rows.stop), columns),
+        (between, slice(columns.start, max(columns.start, cut_columns.start))),
+        (between, slice(min(columns.stop, cut_columns.stop), columns.stop)),
+    ]
+    return [part for part in parts if _area(part) > 0]
