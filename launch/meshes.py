@@ -20,7 +20,14 @@ from launch.documents import BadInputError, Document, Key, did_you_mean, validat
 from messages.scene import Mesh, Positive, Scene
 from nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape
 from nodes.models.shapes.smooth_mesh import usual_smoothing_m
-from nodes.models.shapes.triangles import MOST_TRIANGLES, check_mesh, degenerate, intersecting
+from nodes.models.shapes.triangles import (
+    MOST_TRIANGLES,
+    check_mesh,
+    degenerate,
+    intersecting,
+    volume_m3,
+    wound_alike,
+)
 
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
@@ -162,12 +169,12 @@ def _repaired(
     if not len(mesh.faces):
         raise MeshError("all its triangles are degenerate")
     mesh.remove_unreferenced_vertices()
-    before = np.array(mesh.faces)
-    if mesh.is_watertight:
-        # Winding has a meaning only where every edge has two triangles.
-        mesh.fix_normals()
-    turned = int((before != mesh.faces).any(axis=1).sum())
+    vertices = np.array(mesh.vertices, dtype=np.float64) * metres_per_unit
+    before = np.array(mesh.faces, dtype=np.int64)
+    triangles = wound_alike(before)
+    if volume_m3(vertices, triangles) < 0.0:
+        triangles = triangles[:, ::-1]
+    turned = int((before != triangles).any(axis=1).sum())
     if turned:
         repairs.append(f"{turned} triangles turned over")
-    vertices = np.array(mesh.vertices, dtype=np.float64) * metres_per_unit
-    return vertices, np.array(mesh.faces, dtype=np.int64), repairs
+    return vertices, np.ascontiguousarray(triangles), repairs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
@@ -50,6 +50,7 @@ def where_smooth(found: Nearest) -> NDArray[np.bool_]:
 
 
 @solids
+@settings(max_examples=40)
 @given(point=places)
 def test_the_nearest_point_is_on_the_surface_along_the_normal(shape: Shape, point: Floats) -> None:
     found = shape.closest(point)
@@ -67,6 +68,7 @@ def test_the_nearest_point_is_on_the_surface_along_the_normal(shape: Shape, poin
 
 
 @solids
+@settings(max_examples=40)
 @given(one=places, other=places)
 def test_the_signed_distance_is_one_lipschitz(shape: Shape, one: Floats, other: Floats) -> None:
     apart = float(np.linalg.norm(one - other))

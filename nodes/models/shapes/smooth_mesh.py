@@ -54,10 +54,23 @@ STEEPEST = 0.2
 """Cosine of the steepest normal, against a jet's, of a vertex that it is fitted to."""
 TIGHTEST = 2.0
 """Curvatures are bounded by this over `rho`; what is sharper is smoothed to it."""
+EDGE = 1.5
+"""A curvature so many times the tightest of a jet comes of jets that face apart: an edge."""
+OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
+"""f is nearly a distance, its gradient's length nearly one.  Where that is off by more than the
+first, jets that face apart pull at f: an edge.  By more than the second: f = 0 beyond the rim of a
+thin part, which is no surface."""
+LEAST_SUPPORT = 0.1
+"""On the mesh the weights add up to several times this; less is beyond such a rim as well."""
 STRIDE_RATIO = 0.4
 """A descent goes at most this many `rho` a step, so that it never leaves the supports."""
-MOST_DEVIATION = 0.35
+REST_RATIO = 2e-4
+"""A step under this many `rho` is a descent's last; it leaves some 1e-8 `rho`."""
+APART_RATIO = 0.4
+"""Nearest points that far apart, in `rho`, are two."""
+MOST_DEVIATION = 0.22
 """The surface stays within this many `rho` of the mesh, or `rho` is too long for it."""
+MOST_OF_EXTENT = 1.0 / 3.0
 MOST_WAYS = 6
 """So many separate places are tried for the nearest of all."""
 CHUNK = 2048
@@ -66,23 +79,32 @@ _IDENTITY = np.eye(3)
 
 
 def usual_smoothing_m(vertices: Floats, triangles: Indices) -> float:
-    """A length to smooth over that hides the facets: two and a half usual edges, and no less than
-    the longest."""
+    """A length to smooth over that hides the facets and keeps the form: 1.75 usual edges.
+
+    Shorter ones let facets through, longer ones flatten what is curved over a few edges; see
+    docs/shapes.md for figures.
+    """
     run = half_edges(triangles)
     length = np.linalg.norm(vertices[run[:, 0]] - vertices[run[:, 1]], axis=1)
-    return max(2.5 * float(np.median(length)), 1.05 * float(length.max()))
+    return 1.75 * float(np.median(length))
 
 
 class SmoothMeshShape:
     """A closed mesh, smoothed over `smoothing_m`; see the module's text."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
-        """MeshError for a mesh that is no solid's surface; ValueError for a length that is not
-        positive."""
+        """MeshError for a mesh that is no solid's surface or too small to be smoothed so;
+        ValueError for a length that is not positive."""
         positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
         faces = np.asarray(triangles, dtype=np.int64)
         check_mesh(vertices, faces)
+        extent = float(np.ptp(vertices[faces], axis=(0, 1)).max())
+        if smoothing_m > MOST_OF_EXTENT * extent:
+            raise MeshError(
+                f"smoothed over {smoothing_m * 1e3:.3g} mm little would be left of an object of "
+                f"{extent * 1e3:.3g} mm; smooth over a shorter length"
+            )
         self.smoothing_m = smoothing_m
         used = np.unique(faces)
         fine_vertices, fine = refined(vertices[used], np.searchsorted(used, faces), smoothing_m)
@@ -115,27 +137,37 @@ class SmoothMeshShape:
         return deviation
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; undecided where two separate places are as near."""
+        """See `Shape`; undecided where two separate places are as near.
+
+        `on_edge` where the surface is more sharply curved than `EDGE * TIGHTEST / smoothing_m`: at
+        rims thinner than `smoothing_m` and at rounded edges, which a sheet cannot roll over.
+        """
         queries = checked(points)
         before = checked_previous(previous, queries)
         flat = queries.reshape(-1, 3)
         earlier = None if before is None else before.reshape(-1, 3)
         point, normal, operator = (np.empty((len(flat), *end)) for end in ((3,), (3,), (3, 3)))
+        steepness, support = np.empty(len(flat)), np.empty(len(flat))
         undecided = np.zeros(len(flat), dtype=bool)
         for start in range(0, len(flat), CHUNK):
             part = slice(start, start + CHUNK)
             begun = None if earlier is None else earlier[part]
             feet, undecided[part] = self._feet(flat[part], begun)
             point[part], normal[part] = feet.point, feet.normal
-            operator[part] = feet.shape_operator
+            operator[part], steepness[part] = feet.shape_operator, feet.steepness
+            support[part] = feet.support
         height = ((flat - point) * normal).sum(-1)
+        # The Frobenius norm, one to root two times the larger curvature: no eigenvalues needed.
+        sharpness = np.sqrt(np.square(operator).sum((1, 2)))
+        on_edge = sharpness > EDGE * TIGHTEST / self.smoothing_m
+        on_edge |= (np.abs(steepness - 1.0) > OFF_ONE) | (support < LEAST_SUPPORT)
         shape = queries.shape
         return Nearest(
             point.reshape(shape),
             normal.reshape(shape),
             height.reshape(shape[:-1]),
             operator.reshape((*shape, 3)),
-            np.zeros(shape[:-1], dtype=bool),
+            on_edge.reshape(shape[:-1]),
             undecided.reshape(shape[:-1]),
         )
 
@@ -145,10 +177,9 @@ class SmoothMeshShape:
 
     def _feet(self, queries: Floats, before: Floats | None) -> tuple[Feet, Bools]:
         """The feet of queries (n, 3), going on from those found before, and which are undecided."""
-        stride = STRIDE_RATIO * self.smoothing_m
         if before is None:
             return self._nearest_of_all(queries)
-        feet = descend(self._level, queries, before, stride_m=stride)
+        feet = self._descend(queries, before)
         undecided = np.zeros(len(queries), dtype=bool)
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
@@ -164,13 +195,13 @@ class SmoothMeshShape:
         away; descents are made from there as well, from one jet in each neighbourhood that no
         descent has begun or ended in.
         """
-        stride = STRIDE_RATIO * self.smoothing_m
-        start = self._centre[self._tree.query(queries)[1]]
-        feet = descend(self._level, queries, start, stride_m=stride)
+        nearest = self._tree.query(queries)[1]
+        start = self._centre[nearest]
+        feet = self._descend(queries, self._on_jet(queries, nearest))
         way = np.linalg.norm(queries - feet.point, axis=1)
         slack = self._cover**2 * (1.0 + 2.0 * TIGHTEST * way / self.smoothing_m)
         near = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
-        undecided = np.zeros(len(queries), dtype=bool)
+        undecided, rho = np.zeros(len(queries), dtype=bool), self.smoothing_m
         jets = [self._centre[one] for one in near]
         for i, (jet, foot, first) in enumerate(zip(jets, feet.point, start, strict=True)):
             jets[i] = self._away(self._away(jet, foot), first)
@@ -179,9 +210,9 @@ class SmoothMeshShape:
             if not len(rows):
                 break
             starts = np.array([self._first(jets[i], queries[i]) for i in rows])
-            other = descend(self._level, queries[rows], starts, stride_m=stride)
+            other = self._descend(queries[rows], starts)
             other_way = np.linalg.norm(queries[rows] - other.point, axis=1)
-            apart = np.linalg.norm(other.point - feet.point[rows], axis=1) > stride
+            apart = np.linalg.norm(other.point - feet.point[rows], axis=1) > APART_RATIO * rho
             valid = other.is_nearest
             tied = valid & apart & (np.abs(other_way - way[rows]) < SAME_M)
             nearer = valid & ((other_way < way[rows] - SAME_M) | ~feet.is_nearest[rows])
@@ -190,7 +221,36 @@ class SmoothMeshShape:
                 jets[i] = self._away(self._away(jets[i], foot), first)
             _put(feet, rows[nearer], other, nearer)
             way[rows[nearer]] = other_way[nearer]
-        return feet, undecided | ~feet.is_nearest
+        lost = np.flatnonzero(~feet.is_nearest)
+        if len(lost):
+            # At a rim that the jets do not close: the nearest jet itself.
+            feet.point[lost], feet.normal[lost] = start[lost], self._normal[nearest[lost]]
+            feet.shape_operator[lost] = self._operator[nearest[lost]]
+            feet.support[lost] = 0.0
+        return feet, undecided
+
+    def _descend(self, queries: Floats, starts: Floats) -> Feet:
+        rho = self.smoothing_m
+        feet = descend(
+            self._level, queries, starts, stride_m=STRIDE_RATIO * rho, rest_m=REST_RATIO * rho
+        )
+        beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
+        feet.is_nearest[beyond_rim | (feet.support < LEAST_SUPPORT)] = False
+        return feet
+
+    def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
+        """Roughly the points (n, 3) nearest to queries of the quadratics of single jets (n,)."""
+        normal, operator = self._normal[jet], self._operator[jet]
+        offset = queries - self._centre[jet]
+        height = (offset * normal).sum(1)[:, None]
+        across = offset - height * normal
+        # The first two terms of (I + h A)^-1, as long as it is a small correction.
+        near = np.clip(height, -0.25 * self.smoothing_m, 0.25 * self.smoothing_m)
+        along = across - near * (operator @ across[:, :, None])[:, :, 0]
+        length = np.linalg.norm(along, axis=1, keepdims=True)
+        along *= np.minimum(1.0, STRIDE_RATIO * self.smoothing_m / np.maximum(length, 1e-300))
+        sag = 0.5 * np.einsum("ni,nij,nj->n", along, operator, along)
+        return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
 
     def _away(self, jets: Floats, place: Floats) -> Floats:
         """The jets (m, 3) that are not in the neighbourhood of a place (3,)."""
@@ -214,8 +274,9 @@ class SmoothMeshShape:
         self._operator = np.concatenate([self._operator, np.zeros((1, 3, 3))])
         return table, counts
 
-    def _level(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """f with gradient and Hessian at points (n, 3) near the surface, see `LevelSet`."""
+    def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """f with its derivatives at points (n, 3) near the surface, see `LevelSet`; its support is
+        the sum of the weights."""
         nearest = self._tree.query(points)[1]
         members = self._table[nearest, : self._counts[nearest].max()]
         normal, operator = self._normal[members], self._operator[members]
@@ -250,13 +311,14 @@ class SmoothMeshShape:
         hessian += FLATNESS * ((normal_t * pull[:, None]) @ normal)
         count = len(points)
         hessian += (weight[:, None] @ operator.reshape(count, -1, 9)).reshape(count, 3, 3)
-        return value, gradient, hessian / total[:, None, None]
+        return value, gradient, hessian / total[:, None, None], total
 
 
 def _put(feet: Feet, rows: Indices, other: Feet, chosen: Bools | slice = slice(None)) -> None:
     """Put the chosen of other feet into rows."""
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]
+    feet.steepness[rows], feet.support[rows] = other.steepness[chosen], other.support[chosen]
     feet.is_nearest[rows] = other.is_nearest[chosen]
 
 
@@ -329,6 +391,14 @@ def _jet(
     graph[:2, :2] = -np.array([[xx, xy], [xy, yy]]) / (steepness * reach)
     values, vectors = np.linalg.eigh(tangent @ graph @ tangent)
     bound = TIGHTEST / rho
+    bounded = np.clip(values, -bound, bound)
     turned = frame @ vectors
-    operator = turned @ np.diag(np.clip(values, -bound, bound)) @ turned.T
-    return origin + shift * reach * rough, frame @ normal, operator
+    operator = turned @ np.diag(bounded) @ turned.T
+    normal = frame @ normal
+    point = origin + shift * reach * rough
+    if (bounded != values).any():
+        # A blunter quadratic through the same point would bulge out of the edge: move it back in.
+        offset = around - point
+        distance = offset @ normal + 0.5 * np.einsum("mi,ij,mj->m", offset, operator, offset)
+        point = point + (distance @ weight / weight.sum()) * normal
+    return point, normal, operator

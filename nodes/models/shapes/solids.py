@@ -138,7 +138,8 @@ class EllipsoidShape:
             # The centre, where the level set has no slope, tells no side.
             blind = np.linalg.norm(starts, axis=-1, keepdims=True) < SAME_M
             starts = np.where(blind, FRONT * self.semi_axes_m, starts)
-            feet = descend(self._level, flat, starts, stride_m=0.5 * min(self.semi_axes_m))
+            least = min(self.semi_axes_m)
+            feet = descend(self._level, flat, starts, stride_m=0.5 * least, rest_m=1e-7 * least)
             point = feet.point
             lost = ~feet.is_nearest
             if lost.any():
@@ -164,12 +165,13 @@ class EllipsoidShape:
         """See `Shape`."""
         return self.closest(points).height_m
 
-    def _level(self, points: Floats) -> tuple[Floats, Floats, Floats]:
-        """The ellipsoid as a level set, see `LevelSet`."""
+    def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """The ellipsoid as a level set, see `LevelSet`; supported everywhere."""
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
-        return value, gradient, np.broadcast_to(np.diag(inverse), (len(points), 3, 3))
+        hessian = np.broadcast_to(np.diag(inverse), (len(points), 3, 3))
+        return value, gradient, hessian, np.ones(len(points))
 
     def _undecided(self, queries: Floats) -> Bools:
         """Whether queries lie where two surface points are as near: on a plane of symmetry, within

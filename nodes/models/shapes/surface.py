@@ -35,9 +35,10 @@ class Nearest:
     """The touchable surface points nearest to some queries; shapes as the queries', see above.
 
     height_m: of the query above the tangent plane at `point`, negative below it.  It is the signed
-        distance wherever `on_edge` is false.
+        distance, but past an end.
     shape_operator: (..., 3, 3) at `point`, 1/m.
-    on_edge: the query lies past an end of the touchable surface; `point` is on its rim.
+    on_edge: the query lies past an end of the touchable surface, `point` is on its rim; or `point`
+        is on an edge of a mesh.  There a sheet can be presented, but not rolled on.
     undecided: another point is as near; which one was taken follows from `previous` or `FRONT`.
     """
 
@@ -122,48 +123,53 @@ def positive(**lengths_m: float) -> None:
             raise ValueError(f"{name} is {length}, wanted a positive length in metres")
 
 
-LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats]]
-"""Points (n, 3) to a function's values (n,), gradients (n, 3) and Hessians (n, 3, 3); the function
-is zero on the surface and grows outwards."""
+LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats, Floats]]
+"""Points (n, 3) to a function's values (n,), gradients (n, 3) and Hessians (n, 3, 3), and to how
+well it is supported there (n,), in its own measure.  It is zero on the surface, grows outwards."""
 
 
 @dataclass(frozen=True, slots=True)
 class Feet:
     """Where descents to the surface ended: points, normals (n, 3), shape operators (n, 3, 3).
 
+    steepness, support: (n,) length of the level set's gradient, and its support.
     is_nearest: (n,) the descent came to rest at a point that is nearest within its neighbourhood.
     """
 
     point: Floats
     normal: Floats
     shape_operator: Floats
+    steepness: Floats
+    support: Floats
     is_nearest: Bools
 
 
 MOST_STEPS = 60
-AT_REST = 1e-6
 LEAST_BEND = 0.2
 """Floor of the reduced Hessian's eigenvalues (1 on a flat surface): below it, within four fifths
 of a centre of curvature or past it, the full Newton step would be too long or go uphill."""
 
 
-def descend(level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float) -> Feet:
+def descend(
+    level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float, rest_m: float
+) -> Feet:
     """From `starts` (n, 3) along the surface to the points nearest to `queries` (n, 3).
 
     Newton's method for min |x - q|^2 on f(x) = 0 (Nocedal and Wright, Numerical Optimization,
     ch. 18): each step goes back to the surface along the gradient, and along the surface by the
     reduced system with the Lagrangian's Hessian I + lambda H, whose eigenvalues are kept positive
-    so that it always goes downhill.  No step is longer than `stride_m`, and one under a millionth
-    of it is the last: normals follow it to first order.
+    so that it always goes downhill.  No step is longer than `stride_m`, and one under `rest_m` is
+    the last: what it leaves is of second order in it, of the normal too.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)
     normal, operator = np.empty((count, 3)), np.empty((count, 3, 3))
+    steepness, support = np.empty(count), np.empty(count)
     is_nearest = np.zeros(count, dtype=bool)
     moving = np.arange(count)
     for _ in range(MOST_STEPS):
         x = point[moving]
-        value, gradient, hessian = level(x)
+        value, gradient, hessian, known = level(x)
         square = (gradient * gradient).sum(-1)
         length = np.sqrt(square)
         unit = gradient / length[:, None]
@@ -184,12 +190,13 @@ def descend(level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float
         point[moving] = x + step
         normal[moving] = turned / np.sqrt((turned * turned).sum(-1))[:, None]
         operator[moving] = weingarten
-        resting = size <= AT_REST * stride_m
+        resting = size <= rest_m
+        steepness[moving], support[moving] = length, known
         is_nearest[moving] = resting & (values[:, 0] > 0.0)
         if resting.all():
             break
         moving = moving[~resting]
-    return Feet(point, normal, operator, is_nearest)
+    return Feet(point, normal, operator, steepness, support, is_nearest)
 
 
 _IDENTITY = np.eye(3)

@@ -102,6 +102,42 @@ def _check_fans(triangles: Indices) -> None:
         raise MeshError(f"parts of the surface touch in {pinched} single vertices; separate them")
 
 
+def wound_alike(triangles: Indices) -> Indices:
+    """The triangles (t, 3), some turned over, so that neighbours across edges of two triangles run
+    alike; in each connected part those are turned that are fewer.  Where that cannot be, as on a
+    Möbius strip, `check_mesh` will find the seam."""
+    count = len(triangles)
+    run = half_edges(triangles)
+    _, which, uses = np.unique(
+        np.sort(run, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    order = np.argsort(which.ravel(), kind="stable")
+    first = np.cumsum(uses) - uses
+    shared = first[uses == 2]
+    one, other = order[shared], order[shared + 1]
+    against = (run[one] == run[other]).all(axis=1)
+    beside: list[list[tuple[int, bool]]] = [[] for _ in range(count)]
+    for a, b, turn in zip(
+        (one % count).tolist(), (other % count).tolist(), against.tolist(), strict=True
+    ):
+        beside[a].append((b, turn))
+        beside[b].append((a, turn))
+    turned = np.zeros(count, dtype=bool)
+    seen = np.zeros(count, dtype=bool)
+    for start in range(count):
+        if seen[start]:
+            continue
+        seen[start], part = True, [start]
+        for triangle in part:
+            for near, turn in beside[triangle]:
+                if not seen[near]:
+                    seen[near], turned[near] = True, turned[triangle] ^ turn
+                    part.append(near)
+        if turned[part].sum() > 0.5 * len(part):
+            turned[part] = ~turned[part]
+    return np.where(turned[:, None], triangles[:, ::-1], triangles)
+
+
 def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
     """Pairs of half-edges (numbers of rows of `half_edges`) that run along one another."""
     run = half_edges(triangles)
