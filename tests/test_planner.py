@@ -422,6 +422,8 @@ async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
     assert turn.max() <= given.turn_rad_per_s * (1 + 1e-6)
     changes = np.linalg.norm(np.diff(steps[:, :3], axis=0), axis=1) / step_s
     assert changes.max() <= given.acceleration_m_per_s2 * (1 + 1e-6)
+    jerks = np.linalg.norm(np.diff(steps[:, :3], n=2, axis=0), axis=1) / step_s**2
+    assert jerks.max() <= given.jerk_m_per_s3 * (1 + 1e-6)
     rates = np.diff([target.stretch_ratio for target in sent]) / step_s
     assert np.abs(rates).max() <= given.stretch_rate_per_s * (1 + 1e-6)
 

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from messages.types import Phase
-from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, coast_sheet, follow_sheet
+from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
 from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.models.shapes import make_shape
+from nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
 from nodes.planner.encounter import Encounter, Presentation, Reach
 
 Floats = NDArray[np.float64]
@@ -50,6 +51,7 @@ class PlanSettings:
     spin_rad: most that the sheet may be turned about its normal by rolling."""
 
     bounds: SheetBounds
+    jerks: JerkBounds
     touch_m: float
     release_m: float
     tilt_margin_rad: float
@@ -64,7 +66,7 @@ class Plan:
         self._world_from_object = transform_from_rpy(place.position_m, place.rpy_rad)
         self._object_from_world = inverse(self._world_from_object)
         self._turn = np.kron(np.eye(2), self._world_from_object[:3, :3])
-        self._bounds = settings.bounds
+        self._settings = settings
         self._edges = EdgeBound(
             PLANNED_EDGE_SPEED * scene.arms.max_tool_speed_m_per_s, 0.5 * sheet.height_m
         )
@@ -85,7 +87,9 @@ class Plan:
         contact = self._encounter.contact
         self._presented = Presentation("wait", "", contact, np.zeros(6), 0.0)
         home = self._world_from_object @ contact.object_from_sheet
-        self.motion = SheetMotion(home, np.zeros(6), sheet.min_stretch_ratio, 0.0)
+        self._eased = EasedMotion.at_rest(
+            SheetMotion(home, np.zeros(6), sheet.min_stretch_ratio, 0.0)
+        )
 
     def follow_finger(
         self, position_world: Floats, velocity_world: Floats, stretch_ratio: float, step_s: float
@@ -102,29 +106,34 @@ class Plan:
             stretch_ratio,
             0.0,
         )
-        self.motion = follow_sheet(
-            self._before(step_s),
-            target,
-            bounds=self._bounds,
-            edges=self._edges,
-            step_s=min(step_s, LONGEST_STEP_S),
-        )
+        self._go_on(target, step_s)
         return self._planned(shown)
 
     def hold(self, reason: str, step_s: float) -> Planned:
         """The sheet `step_s` later when nothing is known of the finger: it comes to rest."""
-        self.motion = coast_sheet(
-            self._before(step_s), bounds=self._bounds, step_s=min(step_s, LONGEST_STEP_S)
-        )
+        self._go_on(None, step_s)
         phase: Phase = "wait" if self._presented.phase == "wait" else "hold"
         return self._planned(
             replace(self._presented, phase=phase, reason=reason, twist=np.zeros(6))
         )
 
-    def _before(self, step_s: float) -> SheetMotion:
-        if step_s <= LONGEST_STEP_S:
-            return self.motion
-        return replace(self.motion, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
+    def _go_on(self, target: SheetMotion | None, step_s: float) -> None:
+        """Let the sheet go on for a step; after a long gap it begins anew from where it was."""
+        if step_s > LONGEST_STEP_S:
+            self._eased = EasedMotion.at_rest(self.motion)
+        self._eased = ease_sheet(
+            self._eased,
+            target,
+            bounds=self._settings.bounds,
+            jerks=self._settings.jerks,
+            edges=self._edges,
+            step_s=min(step_s, LONGEST_STEP_S),
+        )
+
+    @property
+    def motion(self) -> SheetMotion:
+        """Where the sheet is planned to be, and how it moves there."""
+        return self._eased.sheet
 
     def _planned(self, shown: Presentation) -> Planned:
         contact_world = apply(self._world_from_object, shown.contact.point)

@@ -11,6 +11,7 @@ from nodes.models.motion import SheetBounds
 from nodes.models.prediction import path_at
 from nodes.node import Input, Node, NodeParameters, Output
 from nodes.planner.compliance import compliance_for
+from nodes.planner.easing import JerkBounds
 from nodes.planner.lead import next_lead_s
 from nodes.planner.motion import Plan, Planned, PlanSettings
 
@@ -41,6 +42,9 @@ class PlannerParameters(NodeParameters):
     turn_acceleration_rad_per_s2: Positive = 10.0
     stretch_rate_per_s: Positive = 0.03
     stretch_acceleration_per_s2: Positive = 0.3
+    jerk_m_per_s3: Positive = 60.0
+    turn_jerk_rad_per_s3: Positive = 300.0
+    stretch_jerk_per_s3: Positive = 9.0
 
 
 class Planner(Node):
@@ -73,6 +77,7 @@ class Planner(Node):
                 given.stretch_rate_per_s,
                 given.stretch_acceleration_per_s2,
             ),
+            JerkBounds(given.jerk_m_per_s3, given.turn_jerk_rad_per_s3, given.stretch_jerk_per_s3),
             touch_m=given.touch_m,
             release_m=given.release_m,
             tilt_margin_rad=given.tilt_margin_rad,
