@@ -1,4 +1,4 @@
-"""Pixels to fingertip: the mark, the node, and all the ways in which there is no fingertip."""
+"""The triangulator as a node: pictures in, fingertips out, and every reason why there is none."""
 
 from __future__ import annotations
 
@@ -8,33 +8,26 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from messages.base import Header, Message
 from messages.calibration import Board, CalibrationFileError, StereoCalibration, save_calibration
 from messages.clock import VirtualClock
-from messages.scene import Scene
+from messages.scene import Scene, StereoCamera
 from messages.topics import Topic
 from messages.types import FingerPath, Fingertip, StereoPair, TwinFinger
-from nodes.triangulator.mark import (
-    MARK_METHODS,
-    MarkLooks,
-    find_mark_near,
-    find_marks,
-    window_around,
-)
 from nodes.triangulator.node import Triangulator, TriangulatorParameters
+from nodes.twin.clutter import touching_highlight
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
-from nodes.twin.pixels import TwinCamera
+from nodes.twin.pixels import Sensor, TwinCamera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
-SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+LAUNCH = Path(__file__).resolve().parent.parent / "launch"
+SCENE_FILE = LAUNCH / "scenes" / "cylinder.yaml"
+CALIBRATION = LAUNCH / "calibrations" / "twin-bumblebee.yaml"
 FRAME_NS = round(1e9 / 60)
-LOOKS = MarkLooks()
 
 
 @pytest.fixture(scope="module")
@@ -45,64 +38,6 @@ def scene() -> Scene:
 @pytest.fixture(scope="module")
 def camera(scene: Scene) -> TwinCamera:
     return TwinCamera(scene.camera, finger_radius_m=scene.finger.radius_m, seed=4)
-
-
-def disc(
-    centre: tuple[float, float], *, radius: float = 4.0, level: float = 200.0, ground: float = 30.0
-) -> Image:
-    """A disc on an even ground, every pixel lit by the share of it that is covered."""
-    y, x = np.mgrid[0 : 100 * 8, 0 : 120 * 8] / 8.0 - 0.4375
-    covered = np.hypot(x - centre[0], y - centre[1]) < radius
-    share = covered.reshape(100, 8, 120, 8).mean(axis=(1, 3))
-    return np.rint(ground + share * (level - ground)).astype(np.uint8)
-
-
-@given(x=st.floats(20, 100), y=st.floats(20, 80), radius=st.floats(2.5, 8))
-@settings(max_examples=40, deadline=None)
-def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: float) -> None:
-    """Without a lens's blur the least mark is hardest: the grid's worst place, not its mean."""
-    image = disc((x, y), radius=radius)
-    for name, limit_px in (("moments", 0.35), ("weighted_centroid", 0.06)):
-        marks = find_marks(image, LOOKS, MARK_METHODS[name].centroid)
-        assert len(marks) == 1
-        assert np.linalg.norm(marks[0] - [x, y]) < limit_px
-
-
-@pytest.mark.parametrize("name", sorted(MARK_METHODS))
-def test_a_window_gives_the_same_centre_as_the_whole_picture(name: str) -> None:
-    image, centroid = disc((61.3, 40.7)), MARK_METHODS[name].centroid
-    whole = find_marks(image, LOOKS, centroid)[0]
-    near = find_mark_near(image, LOOKS, centroid, np.array([65.0, 45.0]))[0]
-    lost = find_mark_near(image, LOOKS, centroid, np.array([5.0, 90.0]))[0]
-    outside = find_mark_near(image, LOOKS, centroid, np.array([-500.0, np.nan]))[0]
-    for found in (near, lost, outside):
-        assert np.allclose(found, whole, atol=0.02)
-
-
-def test_a_window_keeps_inside_the_picture() -> None:
-    assert window_around(np.array([2.0, 3.0]), (480, 640), 10) == (slice(0, 14), slice(0, 13))
-    assert window_around(np.array([-50.0, 3.0]), (480, 640), 10) is None
-    assert window_around(np.array([np.inf, 3.0]), (480, 640), 10) is None
-
-
-@pytest.mark.parametrize(
-    "image",
-    [
-        np.zeros((100, 120), np.uint8),
-        np.full((100, 120), 255, np.uint8),
-        np.full((100, 120), 128, np.uint8),
-        disc((60, 40), level=70),
-        disc((60, 40), radius=0.9),
-        disc((60, 40), radius=30),
-        disc((60, 1)),
-        disc((118, 40)),
-        np.random.default_rng(0).integers(0, 256, (100, 120)).astype(np.uint8),
-    ],
-    ids=["black", "saturated", "grey", "dim", "speck", "lamp", "cut top", "cut right", "chaos"],
-)
-def test_what_is_no_mark_is_not_found(image: Image) -> None:
-    marks = find_marks(image, LOOKS, MARK_METHODS["weighted_centroid"].centroid)
-    assert len(marks) != 1
 
 
 class Bench:
@@ -130,15 +65,23 @@ class Bench:
         return self
 
     async def show(
-        self, left: Image, right: Image, *, frames: int = 1, epoch: int = 1
+        self,
+        left: Image,
+        right: Image,
+        *,
+        frames: int = 1,
+        epoch: int = 1,
+        origins: tuple[tuple[int, int], tuple[int, int]] = ((0, 0), (0, 0)),
     ) -> Fingertip:
         self.frame += frames
         pair = StereoPair(
             device=self.camera.camera.device,
             exposure_s=0.004,
             dropped_frames=0,
-            left=left,
-            right=right,
+            left=np.ascontiguousarray(left),
+            right=np.ascontiguousarray(right),
+            left_origin_px=origins[0],
+            right_origin_px=origins[1],
         )
         header = Header(self.frame, self.stamp_ns(), self.stamp_ns(), "virtual", "camera", epoch)
         await self.node.step("stereo", pair, header)
@@ -162,89 +105,120 @@ async def test_each_reason_and_back_again(scene: Scene, camera: TwinCamera) -> N
     bench = await Bench(camera).start(scene)
     empty, here = bench.pictures(), bench.pictures(HERE)
     black, white = np.zeros_like(here[0]), np.full_like(here[0], 255)
-    behind = bench.pictures((0.0, 0.0, -0.16))
     crossed = here[0], np.roll(here[1], 12, axis=0)
+    touched, soft = (
+        TwinCamera(scene.camera, finger_radius_m=0.007, seed=4, **changes)
+        for changes in (
+            {"clutter": touching_highlight(0.3)},
+            {"sensor": Sensor(aperture_m=0.05).out_of_focus(3.0, 0.46, 540.0)},
+        )
+    )
 
     async def reason(pictures: tuple[Image, Image]) -> str:
         return (await bench.show(*pictures)).reason
 
+    assert await reason(bench.pictures((0.0, 0.0, -0.16))) == "outside_volume"
     before_any = await bench.show(*empty)
-    assert (before_any.valid, before_any.reason) == (False, "no_mark")
+    assert (before_any.valid, before_any.reason, before_any.state) == (False, "no_mark", "lost")
     assert np.linalg.eigvalsh(before_any.covariance).min() >= 1.0
 
-    first = await bench.show(*here)
-    assert (first.valid, first.reason) == (True, "ok")
+    assert [await reason(here) for _ in range(3)] == ["unconfirmed", "unconfirmed", "ok"]
+    first = bench.sent[-1]
+    assert (first.valid, first.state) == (True, "tracking")
     assert np.linalg.norm(first.position_world_m - HERE) < 3e-4
 
     cases = {
-        "no_mark": [empty, (black, black), (white, white)],
+        "no_mark": [empty, (black, black), bench.pictures(FAR)],
+        "saturated": [(white, white), (here[0], white)],
         "mark_in_one_view": [(here[0], empty[1]), (empty[0], here[1])],
-        "two_marks": [bench.pictures(HERE, (0.03, 0.0, 0.02))],
+        "merged": [Bench(touched).pictures(HERE)],
+        "blurred": [Bench(soft).pictures(HERE)],
         "inconsistent": [crossed],
-        "outside_volume": [behind],
-        "too_fast": [bench.pictures(FAR)],
     }
     for expected, all_pictures in cases.items():
         for pictures in all_pictures:
-            last_good = (await bench.show(*here)).position_world_m
-            shown = await bench.show(*pictures)
-            assert (shown.valid, shown.reason) == (False, expected)
-            assert np.array_equal(shown.position_world_m, last_good)
             assert await reason(here) == "ok"
+            shown = await bench.show(*pictures)
+            assert (shown.valid, shown.reason, shown.state) == (False, expected, "coasting")
+            assert np.linalg.norm(shown.position_world_m - HERE) < 3e-4
 
 
 async def test_a_second_mark_far_from_a_followed_one_does_not_disturb(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
-    await bench.show(*bench.pictures(HERE))
+    for _ in range(3):
+        await bench.show(*bench.pictures(HERE))
     assert (await bench.show(*bench.pictures(HERE, FAR))).valid
     # Lost for longer than a track is kept, there is no telling which of the two is the finger.
     lost = await bench.show(*bench.pictures(HERE, FAR), frames=60)
     assert lost.reason == "two_marks"
 
 
-async def test_a_finger_that_reappears_elsewhere_is_taken_after_confirmation(
+async def test_another_mark_is_not_followed_before_a_finger_can_be_there(
     scene: Scene, camera: TwinCamera
 ) -> None:
-    bench = await Bench(camera, confirm_frames=3).start(scene)
+    bench = await Bench(camera).start(scene)
     for _ in range(3):
         await bench.show(*bench.pictures(HERE))
-    reasons = [(await bench.show(*bench.pictures(FAR))).reason for _ in range(4)]
-    assert reasons == ["too_fast", "too_fast", "ok", "ok"]
-    assert np.linalg.norm(bench.sent[-1].position_world_m - FAR) < 3e-4
+    shown = [await bench.show(*bench.pictures(FAR)) for _ in range(10)]
+    assert {one.reason for one in shown[:3]} <= {"no_mark", "too_fast"}
+    assert shown[-1].reason == "ok"
+    assert np.linalg.norm(shown[-1].position_world_m - FAR) < 3e-4
 
 
-async def test_old_frames_are_dropped_and_counted_and_a_new_camera_is_not_old(
+async def test_late_pictures_are_counted_and_a_new_camera_is_not_late(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
     here = bench.pictures(HERE)
-    for _ in range(3):
+    for _ in range(4):
         await bench.show(*here)
     await bench.show(*here, frames=-2)
-    await bench.show(*here, frames=2)
-    assert len(bench.sent) == 3
-    assert bench.node.out_of_order == 2
-    assert "2 out of order" in bench.node.note
-    await bench.show(*here, frames=-2, epoch=2)
-    assert len(bench.sent) == 4
-    assert bench.sent[-1].valid
+    assert (len(bench.sent), bench.node.late) == (4, 1)
+    assert "1 late" in bench.node.note
+    await bench.show(*here, frames=3)
+    assert (len(bench.sent), bench.node.late) == (5, 1)
+    await bench.show(*here, frames=-3, epoch=2)
+    assert len(bench.sent) == 6
+    assert bench.sent[-1].reason == "unconfirmed"
+
+
+async def test_a_part_of_the_sensor_gives_the_same_fingertip(
+    scene: Scene, camera: TwinCamera
+) -> None:
+    full, part = await Bench(camera).start(scene), await Bench(camera).start(scene)
+    left, right = full.pictures(HERE)
+    for _ in range(3):
+        whole = await full.show(left, right)
+        cut = await part.show(
+            left[150:350, 300:500], right[160:360, 150:420], origins=((300, 150), (150, 160))
+        )
+    assert whole.valid
+    assert cut.valid
+    assert np.allclose(whole.position_world_m, cut.position_world_m, atol=1e-6)
 
 
 async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCamera) -> None:
     bench = await Bench(camera).start(scene)
     header = Header(1, 1, 1, "virtual", "camera", 1)
-    small = np.zeros((240, 320), np.uint8)
-    full = np.zeros((480, 640), np.uint8)
-    for device, left, said in (
-        ("webcam", full, 'pictures of device "webcam", the scene\'s is "twin-bumblebee"'),
-        ("twin-bumblebee", small, "left picture of 320x240 px"),
+    full, wide = np.zeros((480, 640), np.uint8), np.zeros((480, 752), np.uint8)
+    for device, left, origin, said in (
+        ("webcam", full, (0, 0), 'pictures of device "webcam", the scene\'s is "twin-bumblebee"'),
+        ("twin-bumblebee", wide, (0, 0), "left picture of 752x480 px from column 0, row 0"),
+        ("twin-bumblebee", full, (0, 8), "left picture of 640x480 px from column 0, row 8"),
     ):
-        pair = StereoPair(device=device, exposure_s=0.0, dropped_frames=0, left=left, right=full)
+        pair = StereoPair(
+            device=device,
+            exposure_s=0.0,
+            dropped_frames=0,
+            left=left,
+            right=full,
+            left_origin_px=origin,
+        )
         await bench.node.step("stereo", pair, header)
         assert said in bench.node.last_error
-    assert bench.node.errors == 2
+    assert bench.node.errors == 3
     assert bench.sent == []
 
 
@@ -261,11 +235,9 @@ async def test_nothing_is_said_before_there_is_a_scene(camera: TwinCamera) -> No
     assert (bench.sent, bench.node.errors) == ([], 0)
 
 
-async def test_a_calibration_file_is_used_and_a_foreign_one_refused(
-    tmp_path: Path, scene: Scene, camera: TwinCamera
-) -> None:
-    rig = scene.camera
-    own = StereoCalibration(
+def calibration_of(rig: StereoCamera) -> StereoCalibration:
+    """What a perfect calibration would find."""
+    return StereoCalibration(
         device=rig.device,
         date="2026-01-01T00:00:00+00:00",
         code_version="0",
@@ -278,6 +250,12 @@ async def test_a_calibration_file_is_used_and_a_foreign_one_refused(
         reprojection_rms_px=0.1,
         pairs=(),
     )
+
+
+async def test_a_calibration_file_is_used_and_a_foreign_one_refused(
+    tmp_path: Path, scene: Scene, camera: TwinCamera
+) -> None:
+    own = calibration_of(scene.camera)
     save_calibration(own, tmp_path / "own.yaml")
     save_calibration(own.model_copy(update={"device": "other"}), tmp_path / "other.yaml")
 
@@ -318,7 +296,7 @@ def fast_reach() -> tuple[Floats, Floats]:
     ("path", "limit_mm"), [(stroke, 0.12), (fast_reach, 0.2)], ids=["stroke", "fast reach"]
 )
 async def test_from_the_twins_pixels_to_the_true_fingertip(
-    scene: Scene, path: Callable[[], tuple[Floats, Floats]], limit_mm: float
+    tmp_path: Path, scene: Scene, path: Callable[[], tuple[Floats, Floats]], limit_mm: float
 ) -> None:
     """The design asks for 0.3 mm rms near the sheet."""
     clock, truths, found = VirtualClock(10**9), list[TwinFinger](), list[Fingertip]()
@@ -330,7 +308,9 @@ async def test_from_the_twins_pixels_to_the_true_fingertip(
             truths.append(message)
 
     twin = TwinFingerNode(TwinFingerParameters(), name="finger", clock=clock, send=keep)
-    eye = Triangulator(TriangulatorParameters(), name="eye", clock=clock, send=keep)
+    measured = TriangulatorParameters(calibration=CALIBRATION)
+    eye = Triangulator(measured, name="eye", clock=clock, send=keep)
+    await eye.setup()
     start = Header(1, 0, 0, "virtual", "test", 1)
     times_s, points = path()
     order = FingerPath(
@@ -344,7 +324,8 @@ async def test_from_the_twins_pixels_to_the_true_fingertip(
         clock.move_to(at_ns)
         await eye.step("stereo", twin.expose(at_ns), Header(1, at_ns, at_ns, "virtual", "f", 1))
     assert eye.errors == 0, eye.last_error
-    assert all(fingertip.valid for fingertip in found)
+    assert all(fingertip.valid for fingertip in found[2:])
+    found, truths = found[2:], truths[2:]
     on_path = [truth.path_time_s > 0 for truth in truths]
     error_mm = 1e3 * np.array(
         [f.position_world_m - t.position_world_m for f, t in zip(found, truths, strict=True)]

@@ -6,33 +6,40 @@ A method is timed on what the node does with one pair of pictures, and judged on
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene
 from nodes.methods import Case, Family, Trial
 from nodes.models import rigid
-from nodes.triangulator.mark import MARK_METHODS, MarkLooks, find_marks
+from nodes.triangulator.mark import MARK_METHODS, Mark, MarkLooks, find_spots
+from nodes.triangulator.subpixel import PixelNoise
 from nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
-    covariance_in_left,
+    measure,
+    optimal,
 )
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 CASE_POINTS = 2000
-NOISES_PX = (0.01, 0.025, 0.1)
-BASELINES_M = (0.06, 0.1205, 0.24)
-MARK_NOISE_PX = MARK_METHODS["weighted_centroid"].noise_px
+NOISES_PX = (0.01, 0.025, 0.1, 2.0)
+BASELINES_M = (0.012, 0.06, 0.1205, 0.24)
+"""The least is a tenth of the scene's rig: rays half a metre away are nearly parallel."""
+
+LARGEST_NOISE_PX = 0.1
+"""Of a mark method in its range."""
 
 
 def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
-    """Points in slabs of the finger's volume, seen with pixel noise, by rigs of three baselines.
+    """Points in slabs of the finger's volume, seen with pixel noise, by rigs of several baselines.
 
-    In range is what the mark detector's noise and at least the scene's baseline give.
+    In range is what a mark's noise and at least the scene's baseline give.
     """
     low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
     own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
@@ -55,7 +62,7 @@ def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
                     "noise_px": noise_px,
                     "baseline_mm": 1e3 * baseline_m,
                 }
-                in_range = baseline_m >= own_m and noise_px <= MARK_NOISE_PX
+                in_range = baseline_m >= own_m and noise_px <= LARGEST_NOISE_PX
                 for name in TRIANGULATION_METHODS:
                     yield _triangulation_trial(
                         name, case, geometry.normalize(*seen), geometry, truth, in_range=in_range
@@ -74,8 +81,12 @@ def _triangulation_trial(
     method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
 
     def error_mm(_: Floats) -> float:
+        """Root mean square; a point that is lost counts as being at the camera."""
         points = rigid.apply(geometry.world_from_left, method(left, right, rig))
-        return 1e3 * float(np.sqrt(np.mean(np.sum((points - truth) ** 2, axis=1))))
+        away = np.linalg.norm(points - truth, axis=1)
+        depth = rigid.apply(geometry.left_from_world, truth)[:, 2]
+        lost = ~np.isfinite(away) | (away > depth)
+        return 1e3 * float(np.sqrt(np.mean(np.square(np.where(lost, depth, away)))))
 
     return Trial(
         method=name,
@@ -95,45 +106,122 @@ TRIANGULATION = Family(
     tolerance=lambda scene: 1e3 * scene.tolerances.fingertip_m,
 )
 
-MARK_PICTURES = 200
-MARK_RADII_PX = (2.0, 3.2, 6.0)
-MARK_NOISES = (1.0, 3.0, 8.0)
+MARK_PICTURES = 60
 PICTURE_PX = 57
-RAYS = 8
+RAYS = 5
+BLUR_PX = 0.7
+GROUND_LEVEL, MARK_LEVEL = 70.0, 215.0
+MARK_CASES = (
+    *((radius_px, noise, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
+    *((3.2, 1.0, motion_px) for motion_px in (2.0, 4.0, 8.0)),
+)
+"""Radius (px), noise (as multiples of the sensor's), motion in the exposure (px).  A mark of 3 mm
+radius has 3.2 px half a metre away, 6 px at 0.27 m and 1.6 px at a metre; at 1 m/s it moves by 4 px
+in 4 ms."""
 
 
-def _mark_picture(centre: Floats, radius_px: float, noise: float, seed: int) -> Image:
-    """A bright disc on even ground, each pixel lit by its covered share, with noise (levels)."""
-    fine = (np.arange(PICTURE_PX * RAYS) - 0.5 * (RAYS - 1)) / RAYS
-    covered = np.hypot(fine[None, :] - centre[0], fine[:, None] - centre[1]) < radius_px
-    share = covered.reshape(PICTURE_PX, RAYS, PICTURE_PX, RAYS).mean(axis=(1, 3))
-    level = 40.0 + 175.0 * share + np.random.default_rng(seed).normal(0.0, noise, share.shape)
-    return np.asarray(np.clip(np.rint(level), 0, 255), dtype=np.uint8)
+@dataclass(frozen=True, slots=True)
+class DrawnDisc:
+    """A disc as a picture has it: centre, radius and motion in px, standard deviation of the blur,
+    levels of mark and ground."""
+
+    centre: Floats
+    radius_px: float
+    motion: Floats
+    blur_px: float = BLUR_PX
+    mark: float = MARK_LEVEL
+    ground: float = GROUND_LEVEL
+
+    def levels(self) -> Floats:
+        """The picture without noise: rays counted, not the fit's formula for an edge."""
+        fine = (np.arange(PICTURE_PX * RAYS) - 0.5 * (RAYS - 1)) / RAYS
+        x, y = fine[None, :] - self.centre[0], fine[:, None] - self.centre[1]
+        steps = 1 + int(4.0 * np.linalg.norm(self.motion))
+        lit = np.zeros((PICTURE_PX * RAYS, PICTURE_PX * RAYS))
+        for along in (np.arange(steps) + 0.5) / steps - 0.5:
+            away = np.hypot(x - along * self.motion[0], y - along * self.motion[1])
+            lit += np.clip(RAYS * (self.radius_px - away) + 0.5, 0.0, 1.0) / steps
+        blurred = np.asarray(cv2.GaussianBlur(lit, (0, 0), RAYS * self.blur_px))
+        share = blurred.reshape(PICTURE_PX, RAYS, PICTURE_PX, RAYS).mean(axis=(1, 3))
+        return np.asarray(self.ground + share * (self.mark - self.ground))
+
+
+def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Image:
+    """A picture as a sensor reads it: photon and read noise, whole numbers."""
+    deviation = np.sqrt(noise.read_levels**2 + levels / noise.photons_per_level)
+    seen = levels + deviation * random.standard_normal(levels.shape)
+    return np.asarray(np.clip(np.rint(seen), 0, 255), dtype=np.uint8)
+
+
+def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
+    """The Cramer-Rao bound on a drawn disc's centre, per axis, all else of it being unknown too.
+
+    Slopes of the picture by central differences.  The levels' own information on the noise is left
+    out, as is rounding's.
+    """
+    levels = disc.levels()
+    weights = 1.0 / (noise.read_levels**2 + levels / noise.photons_per_level)
+    step = 0.05
+    slopes = []
+    for name, change in (
+        ("centre", np.array([step, 0.0])),
+        ("centre", np.array([0.0, step])),
+        ("radius_px", step),
+        ("blur_px", step),
+        ("mark", 1.0),
+        ("ground", 1.0),
+    ):
+        value = getattr(disc, name)
+        more, less = (
+            replace(disc, **{name: value + sign * change}).levels() for sign in (0.5, -0.5)
+        )
+        slopes.append((more - less).ravel() / float(np.max(np.abs(change))))
+    slope = np.array(slopes)
+    covariance = np.linalg.inv((slope * weights.ravel()) @ slope.T)
+    return float(np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1])))
 
 
 def _mark_trials(scene: Scene) -> Iterator[Trial]:
-    """Discs all over the pixel grid; a mark of 3 mm radius has 3.2 px at the paper's distance."""
-    for radius_px in MARK_RADII_PX:
-        for noise in MARK_NOISES:
-            centres = 28.0 + np.random.default_rng(1).uniform(-0.5, 0.5, (MARK_PICTURES, 2))
-            pictures = [
-                _mark_picture(centre, radius_px, noise, seed) for seed, centre in enumerate(centres)
-            ]
-            for name in MARK_METHODS:
-                case: Case = {"radius_px": radius_px, "noise_levels": noise}
-                yield _mark_trial(name, case, pictures, centres, in_range=radius_px >= 3.0)
+    """Discs all over the pixel grid, moving in all directions."""
+    for radius_px, level, motion_px in MARK_CASES:
+        sensor = PixelNoise()
+        noise = PixelNoise(level * sensor.read_levels, sensor.photons_per_level / level**2)
+        random = np.random.default_rng(1)
+        centres = PICTURE_PX // 2 + random.uniform(-0.5, 0.5, (MARK_PICTURES, 2))
+        angles = random.uniform(0.0, np.pi, MARK_PICTURES)
+        motions = motion_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        discs = [
+            DrawnDisc(centre, radius_px, motion)
+            for centre, motion in zip(centres, motions, strict=True)
+        ]
+        pictures = [noisy(disc.levels(), noise, random) for disc in discs]
+        bound_px = float(np.mean([centre_bound_px(disc, noise) for disc in discs[:4]]))
+        case: Case = {"radius_px": radius_px, "noise_ratio": level, "motion_px": motion_px}
+        for name in MARK_METHODS:
+            in_range = radius_px >= 3.0 and level <= 2.0 and motion_px <= 4.0
+            yield _mark_trial(name, case, pictures, centres, bound_px=bound_px, in_range=in_range)
 
 
 def _mark_trial(
-    name: str, case: Case, pictures: list[Image], centres: Floats, *, in_range: bool
+    name: str,
+    case: Case,
+    pictures: list[Image],
+    centres: Floats,
+    *,
+    bound_px: float,
+    in_range: bool,
 ) -> Trial:
-    looks, centroid = MarkLooks(), MARK_METHODS[name].centroid
+    looks, noise, refine = MarkLooks(), PixelNoise(), MARK_METHODS[name]
 
-    def error_px(_: list[Floats]) -> float:
+    def marks_in(picture: Image) -> list[Mark]:
+        spots = find_spots(picture, looks)
+        return refine([picture] * len(spots), spots, looks, noise)
+
+    def error_px(_: list[Mark]) -> float:
         """Per axis; a mark that was not found, or not alone, counts as far off as the picture."""
-        found = [find_marks(picture, looks, centroid) for picture in pictures]
+        found = [marks_in(picture) for picture in pictures]
         off = [
-            marks[0] - centre if len(marks) == 1 else np.full(2, float(PICTURE_PX))
+            marks[0].centre - centre if len(marks) == 1 else np.full(2, float(PICTURE_PX))
             for marks, centre in zip(found, centres, strict=True)
         ]
         return float(np.sqrt(np.mean(np.square(off))))
@@ -141,18 +229,28 @@ def _mark_trial(
     return Trial(
         method=name,
         case=case,
-        run=lambda: find_marks(pictures[0], looks, centroid),
+        run=lambda: marks_in(pictures[0]),
         error=error_px,
         in_range=in_range,
+        size={"bound_px": bound_px},
     )
 
 
 def _mark_tolerance_px(scene: Scene) -> float:
     """Noise of a mark that moves a fingertip at the screen's centre by the scene's tolerance."""
     geometry = StereoGeometry.of(scene.camera)
-    centre = rigid.apply(geometry.left_from_world, np.zeros(3))
-    error_m_per_px = np.sqrt(np.trace(covariance_in_left(geometry, centre, 1.0)))
-    return float(scene.tolerances.fingertip_m / error_m_per_px)
+    left, right = geometry.project(np.zeros(3))
+    one_px = measure(
+        geometry,
+        left,
+        right,
+        method=optimal,
+        left_covariance=np.eye(2),
+        right_covariance=np.eye(2),
+    )
+    if one_px is None:
+        raise ValueError("scene: camera: the screen's centre is not in front of both cameras")
+    return scene.tolerances.fingertip_m / one_px.deviation_m
 
 
 MARK = Family(

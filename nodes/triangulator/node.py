@@ -31,14 +31,15 @@ class TriangulatorParameters(NodeParameters):
     calibration: Path | None = Field(
         default=None, description="file of `flexsheet calibrate stereo`; null: the scene's optics"
     )
-    mark: Literal["moments", "weighted_centroid"] = "weighted_centroid"
+    mark: Literal["moments", "weighted_centroid", "subpixel_fit"] = "subpixel_fit"
     triangulation: Literal["midpoint", "dlt", "optimal"] = "dlt"
     mark_noise_px: Positive | None = Field(
-        default=None, description="of a mark's centre; null: what the method leaves in the twin"
+        default=None, description="of a mark's centre; null: as the method states for each"
     )
+    mark_radius_m: Positive = 0.003
     max_reprojection_px: Positive = 1.5
     mark_min_contrast: Positive = 60.0
-    mark_min_area_px: Annotated[int, Field(ge=1)] = 6
+    mark_min_area_px: Annotated[int, Field(ge=1)] = 4
     mark_max_area_px: Annotated[int, Field(ge=1)] = 1500
     window_half_px: Annotated[int, Field(ge=8)] = 28
     tracking: Literal[
@@ -71,7 +72,6 @@ class Triangulator(Node):
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         p = self.parameters
-        method = MARK_METHODS[p.mark]
         self.geometry = None
         self.geometry = StereoGeometry.of(scene.camera, self.calibration)
         self.volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
@@ -83,9 +83,10 @@ class Triangulator(Node):
                 max_area_px=p.mark_max_area_px,
                 window_half_px=p.window_half_px,
             ),
-            centroid=method.centroid,
+            refine=MARK_METHODS[p.mark],
             triangulate=TRIANGULATION_METHODS[p.triangulation],
-            noise_px=p.mark_noise_px or method.noise_px,
+            noise_px=p.mark_noise_px,
+            mark_radius_m=p.mark_radius_m,
             max_reprojection_px=p.max_reprojection_px,
         )
         self.leads_s = np.arange(0.0, p.ahead_s + 1.5 * AHEAD_STEP_S, AHEAD_STEP_S)
@@ -111,6 +112,8 @@ class Triangulator(Node):
             eyesight=self.eyesight,
             volume=self.volume,
             expected=self.tracker.expected(at_ns),
+            left_origin_px=pair.left_origin_px,
+            right_origin_px=pair.right_origin_px,
         )
         is_late = self.tracker.is_late(at_ns)
         if reason == "ok" and measured is not None:
