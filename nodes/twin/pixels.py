@@ -45,8 +45,11 @@ Window = tuple[slice, slice]
 Position = Callable[[float], Floats]
 """The fingertip (3,) at so many seconds from the middle of the exposure."""
 
-MOTION_STEP_PX = 1.0
-"""Motion within the exposure is summed at steps no longer than this; the blur closes the gaps."""
+MOTION_STEP_PX = 0.7
+"""Motion within the exposure is summed at steps no longer than this; the blur closes the gaps.
+
+Within a step all stands still: what that leaves out would widen the blur by 4 % at most.
+"""
 
 LIGHT = np.array([-0.6, 0.7, 0.4])
 """World direction towards the lamp, about a unit: from the upper left."""
@@ -239,7 +242,7 @@ class TwinCamera:
             (first, first_depth), (last, last_depth) = (eye.see(end) for end in ends)
             if min(first_depth, last_depth) > NEAREST_M:
                 travel_px = max(travel_px, float(np.linalg.norm(last - first)))
-        steps = 1 + int(np.ceil(travel_px / MOTION_STEP_PX))
+        steps = max(1, math.ceil(travel_px / MOTION_STEP_PX))
         instants_s = exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
         return instants_s, np.stack([position(float(instant)) for instant in instants_s])
 
