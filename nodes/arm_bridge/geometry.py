@@ -12,7 +12,7 @@ from nodes.arm_bridge.kinematics import (
     JOINT_MIN_RAD,
     JOINT_SPEED_RAD_PER_S,
     forward,
-    inverse_kinematics,
+    next_joints,
 )
 from nodes.arm_bridge.limiter import JointLimits, SheetLimits
 from nodes.models.motion import EdgeBound, SheetMotion
@@ -81,12 +81,15 @@ class ArmGeometry:
         return apply(forward(joints_rad), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Joints that hold this arm's edge of the sheet there; UnreachableError."""
+        """Joints that bring this arm's edge to the sheet's, a step from the present joints.
+
+        UnreachableError says why there are none.
+        """
         edges = edge_poses(
             motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
         )
         flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
-        return inverse_kinematics(self.base_from_world @ flange, present_rad)
+        return next_joints(self.base_from_world @ flange, present_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """The sheet at rest between this arm's edge and the other's."""

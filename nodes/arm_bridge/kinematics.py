@@ -10,15 +10,24 @@ J2, J3, J5 about y; shoulder 300 mm up, upper arm 250 mm, elbow shift 90 mm back
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import partial
-from math import acos, atan2, cos, hypot, inf, pi, sin
+from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder, sin
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from messages.scene import Scene
 from nodes.methods import Family, Trial
-from nodes.models.rigid import inverse, transform_from_rpy, vector_from_rotation
+from nodes.models.rigid import (
+    apply,
+    inverse,
+    rotation_from_vector,
+    transform,
+    transform_from_rpy,
+    vector_from_rotation,
+)
 from nodes.models.sheet import edge_poses, flange_pose
 
 Floats = NDArray[np.float64]
@@ -39,14 +48,71 @@ WRIST_SINGULAR = 1e-7
 SHOULDER_SINGULAR_M = 1e-7
 """A wrist centre nearer than this to the axis of J1 leaves J1 free; it stays where it is."""
 
+WRIST_HELD_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
+"""J5 this near to zero leaves J4 where it is; from the second angle on it is exact again."""
+
+SHOULDER_HELD_M, SHOULDER_NEAR_M = 0.0007, 0.02
+"""The same for J1 and a wrist centre near its axis."""
+
+HELD_ERROR = 1.4
+"""What is left undone between both, at most, over the first of them: 1.05 degrees, 1 mm."""
+
+LARGEST_TURN_RAD = 0.01
+"""What J4 or J1 turns in one step because of a singularity, at most: half their speed at 140 Hz."""
+
 _ELBOW_TO_WRIST_M = hypot(ELBOW_SHIFT_M, FOREARM_M)
-_ELBOW_ANGLE = atan2(ELBOW_SHIFT_M, FOREARM_M)
+ELBOW_ANGLE_RAD = atan2(ELBOW_SHIFT_M, FOREARM_M)
+"""J3 (29.4 degrees) with shoulder, elbow and wrist centre in line: 30 degrees out of its range."""
+
 _LOWEST = tuple(float(angle) for angle in JOINT_MIN_RAD)
 _HIGHEST = tuple(float(angle) for angle in JOINT_MAX_RAD)
 
+FARTHEST_WRIST_M = float(
+    np.sqrt(
+        UPPER_ARM_M**2
+        + _ELBOW_TO_WRIST_M**2
+        + 2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.cos(_LOWEST[2] - ELBOW_ANGLE_RAD)
+    )
+)
+"""Of the wrist centre from the shoulder (0.4185 m), where J3 ends."""
+
+
+Shoulder = Literal["front", "back"]
+Elbow = Literal["up", "down"]
+Wrist = Literal["plain", "flipped"]
+
+
+class Branch(NamedTuple):
+    """One of the eight ways in which the arm can hold a flange pose.
+
+    shoulder: whether the wrist centre lies before or behind the plane through the axes of J1 and
+        J2.  elbow: "up" with J3 beyond `ELBOW_ANGLE_RAD`, as its whole range is, else "down".
+    wrist: "flipped" with J5 below zero.
+    """
+
+    shoulder: Shoulder
+    elbow: Elbow
+    wrist: Wrist
+
+
+BRANCHES = tuple(
+    Branch(shoulder, elbow, wrist)
+    for shoulder in get_args(Shoulder)
+    for elbow in get_args(Elbow)
+    for wrist in get_args(Wrist)
+)
+"""In the order of what `branches` returns."""
+
 
 class UnreachableError(ValueError):
-    """No joint angles within the ranges give the wanted flange pose."""
+    """No joint angles within the ranges give the wanted flange pose.
+
+    limit: what keeps the arm from there: "reach", or the joint of the branch that comes nearest.
+    """
+
+    def __init__(self, text: str, limit: str) -> None:
+        super().__init__(text)
+        self.limit = limit
 
 
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
@@ -79,7 +145,7 @@ def forward(joints_rad: ArrayLike) -> Floats:
 def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
     """Every joint solution of a flange pose, up to 8, whatever the joint ranges say.
 
-    Shoulder forward or turned back, elbow either way, wrist either way.  Where a singularity leaves
+    In the order of `BRANCHES`.  Where a singularity leaves
     a joint free it is taken from `present_rad` (6,).  Angles are within a turn of zero.  Empty when
     the wrist centre is too far or too near.
     """
@@ -87,19 +153,14 @@ def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[flo
     rotation = base_from_flange[:3, :3]
     x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
     radius, height = hypot(x, y), z - SHOULDER_HEIGHT_M
-    cosine = (radius**2 + height**2 - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
-        2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
-    )
-    if not abs(cosine) <= 1.0 + 1e-12:
+    bend = _bend(radius, height)
+    if bend is None:
         return []
-    bend = acos(min(1.0, max(-1.0, cosine)))
     azimuth = atan2(y, x) if radius > SHOULDER_SINGULAR_M else present[0]
     found: list[tuple[float, ...]] = []
     for q1, out in ((azimuth, radius), (azimuth - pi if azimuth > 0 else azimuth + pi, -radius)):
-        for q3 in (_ELBOW_ANGLE + bend, _ELBOW_ANGLE - bend):
-            along = FOREARM_M * sin(q3) - ELBOW_SHIFT_M * cos(q3)
-            up = UPPER_ARM_M + ELBOW_SHIFT_M * sin(q3) + FOREARM_M * cos(q3)
-            q2 = _wrapped(atan2(out, height) - atan2(along, up))
+        for q3 in (ELBOW_ANGLE_RAD + bend, ELBOW_ANGLE_RAD - bend):
+            q2 = _shoulder_angle(out, height, q3)
             wrist = (_arm_rotation(q1, q2 + q3).T @ rotation).tolist()
             sine = hypot(wrist[0][2], wrist[1][2])
             q5 = atan2(sine, wrist[2][2])
@@ -135,10 +196,136 @@ def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floa
         if change < least:
             nearest, least = joints, change
     if nearest is None or least == inf:
-        x, y, z = base_from_flange[:3, 3] * 1e3
-        why = "no branch is within the joint ranges" if solutions else "out of the arm's reach"
-        raise UnreachableError(f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base: {why}")
+        raise _unreachable(base_from_flange, solutions)
     return np.array(nearest)
+
+
+def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
+    """Joints (6,) for the next step of a motion: of the present branch, and without leaps.
+
+    Exact, but for the neighbourhood of two singularities.  With J5 near zero the direction of J4 is
+    that of a vector with length sin(J5), which turns as fast as one likes when it passes zero at a
+    small distance.  There J4 may stay back: J5 takes the part of the vector along J4, be it
+    negative, and the rest (HELD_ERROR * WRIST_HELD_RAD at most) is left as an error of the flange's
+    orientation.  J1 does the same for a wrist centre near its axis.  So a path that passes a
+    singularity no further than the first length is followed straight through, with little motion of
+    J4 or J1.  One that passes further away turns them as the exact solution does, and it is for the
+    caller to bound their speeds.
+
+    Where the branch ends at a joint's range, another is taken if there is one, as by
+    `inverse_kinematics`, which raises UnreachableError.
+    """
+    present = [float(angle) for angle in np.asarray(present_rad)]
+    rotation = base_from_flange[:3, :3]
+    x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
+    q1 = present[0] + _held_turn(
+        x * cos(present[0]) + y * sin(present[0]),
+        y * cos(present[0]) - x * sin(present[0]),
+        held=SHOULDER_HELD_M,
+        near=SHOULDER_NEAR_M,
+    )
+    out, height = x * cos(q1) + y * sin(q1), z - SHOULDER_HEIGHT_M
+    bend = _bend(out, height)
+    if bend is None:
+        raise _unreachable(base_from_flange, [])
+    q3 = ELBOW_ANGLE_RAD + copysign(bend, present[2] - ELBOW_ANGLE_RAD)
+    q2 = _shoulder_angle(out, height, q3)
+    wrist = (_arm_rotation(q1, q2 + q3).T @ rotation).tolist()
+    c4, s4 = cos(present[3]), sin(present[3])
+    q4 = present[3] + _held_turn(
+        c4 * wrist[0][2] + s4 * wrist[1][2],
+        c4 * wrist[1][2] - s4 * wrist[0][2],
+        held=WRIST_HELD_RAD,
+        near=WRIST_NEAR_RAD,
+    )
+    c4, s4 = cos(q4), sin(q4)
+    q5 = atan2(c4 * wrist[0][2] + s4 * wrist[1][2], wrist[2][2])
+    q6 = _last_turn(wrist, q4, q5)
+    joints = [
+        near + remainder(angle - near, 2.0 * pi)
+        for angle, near in zip((q1, q2, q3, q4, q5, q6), present, strict=True)
+    ]
+    if all(low <= q <= high for q, low, high in zip(joints, _LOWEST, _HIGHEST, strict=True)):
+        return np.array(joints)
+    return inverse_kinematics(base_from_flange, present)
+
+
+def _held_turn(along: float, across: float, *, held: float, near: float) -> float:
+    """By how much (rad) an axis turns towards a vector, or its opposite, whichever is nearer.
+
+    along, across: the vector's parts along the axis' present direction, and 90 degrees further.
+    held, near: a vector no longer than the first needs no turn, from the second length on all of
+    it.  In between the direction may be off by an angle that falls from 90 degrees to zero; it is
+    made up for, as far as LARGEST_TURN_RAD allows.
+    """
+    length = hypot(along, across)
+    if length == 0.0:
+        return 0.0
+    turn = atan2(across, along) if along >= 0.0 else atan2(-across, -along)
+    if length >= near:
+        return turn
+    slack = 0.5 * pi * min(1.0, held / length) * min(1.0, (near - length) / (near - held))
+    wanted = abs(turn)
+    free = min(LARGEST_TURN_RAD * min(1.0, length / held), wanted, slack)
+    return copysign(max(wanted - slack, 0.0) + free, turn)
+
+
+def _last_turn(wrist: list[list[float]], q4: float, q5: float) -> float:
+    """J6 that leaves the least rotation between R4 R5 R6 and the wrist's rotation (3, 3)."""
+    s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
+    first = (c4 * c5, s4 * c5, -s5)
+    second = (-s4, c4, 0.0)
+    xx, xy = (sum(row[k] * first[i] for i, row in enumerate(wrist)) for k in (0, 1))
+    yx, yy = (sum(row[k] * second[i] for i, row in enumerate(wrist)) for k in (0, 1))
+    return atan2(yx - xy, xx + yy)
+
+
+def _bend(out: float, height: float) -> float | None:
+    """Angle (0..pi) between upper arm and the line from elbow to wrist; None: out of reach."""
+    cosine = (out * out + height * height - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
+        2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
+    )
+    if not abs(cosine) <= 1.0 + 1e-12:
+        return None
+    return acos(min(1.0, max(-1.0, cosine)))
+
+
+def _shoulder_angle(out: float, height: float, q3: float) -> float:
+    """J2 that brings the wrist centre, with the elbow at J3, to that place in the arm's plane."""
+    along = FOREARM_M * sin(q3) - ELBOW_SHIFT_M * cos(q3)
+    up = UPPER_ARM_M + ELBOW_SHIFT_M * sin(q3) + FOREARM_M * cos(q3)
+    return _wrapped(atan2(out, height) - atan2(along, up))
+
+
+def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -> UnreachableError:
+    """What to say of a pose of which no solution is within the joint ranges."""
+    x, y, z = base_from_flange[:3, 3] * 1e3
+    where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
+    if not solutions:
+        wrist = base_from_flange[:3, 3] - FLANGE_M * base_from_flange[:3, 2]
+        away = float(np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M]))
+        return UnreachableError(
+            f"{where}: out of the arm's reach, the wrist would be {1e3 * away:.0f} mm from the "
+            f"shoulder, at most {1e3 * FARTHEST_WRIST_M:.1f} mm",
+            "reach",
+        )
+    _, joint, angle = min(max(_beyond(solution)) for solution in solutions)
+    return UnreachableError(
+        f"{where}: no branch is within the joint ranges; the nearest has J{joint + 1} at "
+        f"{degrees(angle):.1f} degrees, its range is {degrees(_LOWEST[joint]):.0f} to "
+        f"{degrees(_HIGHEST[joint]):.0f}",
+        f"J{joint + 1}",
+    )
+
+
+def _beyond(solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
+    """How far (rad) each joint is out of its range, with its number and its angle."""
+    found = []
+    for joint, (angle, low, high) in enumerate(zip(solution, _LOWEST, _HIGHEST, strict=True)):
+        middle = 0.5 * (low + high)
+        turned = middle + remainder(angle - middle, 2.0 * pi)
+        found.append((max(low - turned, turned - high), joint, turned))
+    return found
 
 
 def _wrapped(angle: float) -> float:
@@ -153,6 +340,103 @@ def _nearest_turn(angle: float, near: float, low: float, high: float) -> float:
         if low <= turned <= high and abs(turned - near) < abs(best - near):
             best = turned
     return best
+
+
+def branch_of(joints_rad: ArrayLike) -> Branch:
+    """The branch that joints (6,) are on; where two meet (at a singularity), the first of them."""
+    joints = np.asarray(joints_rad, dtype=np.float64)
+    return Branch(
+        "front" if _out(joints) >= 0.0 else "back",
+        "up" if sin(joints[2] - ELBOW_ANGLE_RAD) >= 0.0 else "down",
+        "plain" if sin(joints[4]) >= 0.0 else "flipped",
+    )
+
+
+def joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
+    """Joints (n, 6) of flange poses (n, 4, 4) on one branch, whatever the joint ranges say.
+
+    NaN where the wrist centre is out of reach.  J4 and J6 may be given with whole turns more or
+    less: of those within the range, or else of all, the one nearest to `near_rad` (6,).  At a
+    singularity itself the free joint is 0.
+    """
+    poses = np.asarray(base_from_flange, dtype=np.float64)
+    wrist = poses[:, :3, 3] - FLANGE_M * poses[:, :3, 2]
+    radius, height = np.hypot(wrist[:, 0], wrist[:, 1]), wrist[:, 2] - SHOULDER_HEIGHT_M
+    q1, out = np.arctan2(wrist[:, 1], wrist[:, 0]), radius
+    if branch.shoulder == "back":
+        q1, out = q1 + pi, -radius
+    cosine = (radius**2 + height**2 - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
+        2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
+    )
+    inside = np.abs(cosine) <= 1.0 + 1e-12
+    bend = np.arccos(np.where(inside, np.clip(cosine, -1.0, 1.0), np.nan))
+    q3 = ELBOW_ANGLE_RAD + (bend if branch.elbow == "up" else -bend)
+    along = FOREARM_M * np.sin(q3) - ELBOW_SHIFT_M * np.cos(q3)
+    up = UPPER_ARM_M + ELBOW_SHIFT_M * np.sin(q3) + FOREARM_M * np.cos(q3)
+    q2 = np.arctan2(out, height) - np.arctan2(along, up)
+    c1, s1, c23, s23 = np.cos(q1), np.sin(q1), np.cos(q2 + q3), np.sin(q2 + q3)
+    ahead = np.stack([c1 * c23, s1 * c23, -s23], axis=1)
+    aside = np.stack([-s1, c1, np.zeros_like(c1)], axis=1)
+    onward = np.stack([c1 * s23, s1 * s23, c23], axis=1)
+    u, v, w = (np.einsum("ni,nij->nj", axis, poses[:, :3, :3]) for axis in (ahead, aside, onward))
+    flip = 1.0 if branch.wrist == "plain" else -1.0
+    q4 = np.arctan2(flip * v[:, 2], flip * u[:, 2])
+    q5 = np.arctan2(flip * np.hypot(u[:, 2], v[:, 2]), w[:, 2])
+    c4, s4 = np.cos(q4), np.sin(q4)
+    q6 = np.arctan2(c4 * v[:, 0] - s4 * u[:, 0], c4 * v[:, 1] - s4 * u[:, 1])
+    near = np.asarray(near_rad, dtype=np.float64)
+    joints = np.stack([q1, q2, q3, q4, q5, q6], axis=1)
+    joints = near + np.remainder(joints - near + pi, 2.0 * pi) - pi
+    for joint in (3, 5):
+        angle = joints[:, joint]
+        for turned in (angle - 2.0 * pi, angle + 2.0 * pi):
+            better = (turned >= _LOWEST[joint]) & (turned <= _HIGHEST[joint])
+            better &= (angle < _LOWEST[joint]) | (angle > _HIGHEST[joint])
+            joints[:, joint] = np.where(better, turned, joints[:, joint])
+    return joints
+
+
+@dataclass(frozen=True, slots=True)
+class Singularities:
+    """How far joints (..., 6) are from the three places where the arm loses a direction of motion.
+
+    shoulder_m: of the wrist centre from the axis of J1.
+    elbow_rad: of J3 from where shoulder, elbow and wrist centre are in line (either way).
+    wrist_rad: of J5 from zero.
+    """
+
+    shoulder_m: Floats
+    elbow_rad: Floats
+    wrist_rad: Floats
+
+
+def singularities(joints_rad: ArrayLike) -> Singularities:
+    """The distances of joints (..., 6) to the arm's singularities, arrays (...)."""
+    joints = np.asarray(joints_rad, dtype=np.float64)
+    elbow = np.remainder(joints[..., 2] - ELBOW_ANGLE_RAD + 0.5 * pi, pi) - 0.5 * pi
+    wrist = np.remainder(joints[..., 4] + 0.5 * pi, pi) - 0.5 * pi
+    return Singularities(np.abs(_out(joints)), np.abs(elbow), np.abs(wrist))
+
+
+def manipulability(joints_rad: ArrayLike) -> Floats:
+    """|det J| (m^3) of joints (..., 6): 0 at a singularity (Yoshikawa, IJRR 4(2), 1985).
+
+    With a spherical wrist the determinant is that of the arm times that of the wrist; here it is
+    upper arm x (elbow to wrist) x |sin(J3 - straight)| x |wrist centre to J1's axis| x |sin J5|.
+    """
+    joints = np.asarray(joints_rad, dtype=np.float64)
+    elbow = np.sin(joints[..., 2] - ELBOW_ANGLE_RAD)
+    return np.asarray(
+        UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.abs(elbow * _out(joints) * np.sin(joints[..., 4]))
+    )
+
+
+def _out(joints: Floats) -> Floats:
+    """How far (m) the wrist centre lies before the axes of J1; negative behind it."""
+    q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
+    return np.asarray(
+        UPPER_ARM_M * np.sin(q2) - ELBOW_SHIFT_M * np.cos(q23) + FOREARM_M * np.sin(q23)
+    )
 
 
 def jacobian(joints_rad: ArrayLike) -> Floats:
@@ -207,8 +491,31 @@ def damped_least_squares(
     return joints
 
 
+CHART_LEAP_RAD = 0.35
+"""Joints that would go further than this in one step stop the bridge: out of a method's range."""
+
+CENTRE_RAD = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
+"""The arm reaching forward, far from all singularities and ranges."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Edge:
+    """A clamped edge's middle and ends (3, 3) m, seen from the flange: what errors are taken of."""
+
+    points: Floats
+
+    def error_mm(self, wanted: Floats, joints_rad: Floats) -> float:
+        """How far a point of the edge is off, at most."""
+        off = apply(forward(joints_rad), self.points) - apply(wanted, self.points)
+        return 1e3 * float(np.linalg.norm(off, axis=1).max())
+
+
 def _trials(scene: Scene) -> Iterable[Trial]:
-    """Left flange poses with the sheet tilted over the working range, started 0.03 rad away."""
+    """Steps of the left arm: tilts over the working range, and past the wrist's singularity.
+
+    tilt: the sheet turns by 0.03 rad.  past: the flange's axis passes that of the forearm at a
+    distance, in a step of 0.02 rad that begins 0.01 rad before the nearest point.
+    """
     arm = scene.arms.left
     base_from_world = inverse(
         transform_from_rpy(arm.world_from_base.position_m, arm.world_from_base.rpy_rad)
@@ -216,33 +523,52 @@ def _trials(scene: Scene) -> Iterable[Trial]:
     flange_from_edge = transform_from_rpy(
         arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad
     )
+    half = 0.5 * scene.sheet.height_m
+    edge = _Edge(apply(flange_from_edge, np.array([[0.0, -half, 0.0], [0, 0, 0], [0, half, 0]])))
 
     def flange(tilt_rad: float) -> Floats:
         world_from_sheet = transform_from_rpy(np.zeros(3), [tilt_rad, 0.0, 0.0])
         left, _ = edge_poses(world_from_sheet, scene.sheet.width_m)
         return base_from_world @ flange_pose(left, flange_from_edge)
 
-    start = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
+    start = CENTRE_RAD
     for share in (0.0, 0.5, 1.0):
         tilt_rad = share * scene.working_range.tilt_rad
-        wanted = flange(tilt_rad)
         start = inverse_kinematics(flange(tilt_rad - 0.03), start)
-        for method, solve in _METHODS.items():
-            yield Trial(
-                method=method,
-                case={"tilt_deg": round(float(np.degrees(tilt_rad)), 1)},
-                run=partial(solve, wanted, start),
-                error=partial(_position_error_mm, wanted),
-                in_range=True,
-            )
+        tilt_deg = round(degrees(tilt_rad), 1)
+        yield from _step_trials({"tilt_deg": tilt_deg}, start, flange(tilt_rad), edge)
+    for past_deg in (0.1, 1.0, 8.0):
+        distance = float(np.radians(past_deg))
+        start = CENTRE_RAD.copy()
+        start[3:] = atan2(-distance, 0.01), -hypot(distance, 0.01), 0.0
+        pose = forward(start)
+        axis = _arm_rotation(start[0], start[1] + start[2])[:, 1]
+        wrist = pose[:3, 3] - FLANGE_M * pose[:3, 2]
+        turned = rotation_from_vector(0.02 * axis) @ pose[:3, :3]
+        wanted = transform(turned, wrist + FLANGE_M * turned[:, 2])
+        yield from _step_trials({"past_singularity_deg": past_deg}, start, wanted, edge)
 
 
-def _position_error_mm(wanted: Floats, joints_rad: Floats) -> float:
-    return 1e3 * float(np.linalg.norm(forward(joints_rad)[:3, 3] - wanted[:3, 3]))
+def _step_trials(
+    case: dict[str, float | int | str], start: Floats, wanted: Floats, edge: _Edge
+) -> Iterable[Trial]:
+    near = float(singularities(start).wrist_rad) < WRIST_NEAR_RAD
+    for method, solve in _METHODS.items():
+        leap = float(np.abs(solve(wanted, start) - start).max())
+        gives_way = near and solve is next_joints
+        yield Trial(
+            method=method,
+            case=case,
+            run=partial(solve, wanted, start),
+            error=partial(edge.error_mm, wanted),
+            in_range=leap <= CHART_LEAP_RAD and not gives_way,
+            size={"leap_deg": round(degrees(leap), 2)},
+        )
 
 
 _METHODS: dict[str, Callable[[Floats, Floats], Floats]] = {
     "closed-form": inverse_kinematics,
+    "closed-form-continuous": next_joints,
     "damped-least-squares-2": partial(damped_least_squares, iterations=2),
     "damped-least-squares-20": partial(damped_least_squares, iterations=20),
 }
