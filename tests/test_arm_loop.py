@@ -95,11 +95,16 @@ class Rig:
 
 
 @asynccontextmanager
-async def running_rig(**bridge_parameters: Any) -> AsyncIterator[tuple[Rig, dict[str, Any]]]:
+async def running_rig(
+    twin_parameters: dict[str, Any] | None = None, **bridge_parameters: Any
+) -> AsyncIterator[tuple[Rig, dict[str, Any]]]:
     """The planner, two bridges and the twin's arms, cycling; yields the rig and the nodes."""
     rig = Rig(paper_scene())
     twin = TwinArmsNode(
-        TwinArmsParameters(left_port=0, right_port=0), name="twin", clock=rig.clock, send=rig.send
+        TwinArmsParameters(left_port=0, right_port=0, **(twin_parameters or {})),
+        name="twin",
+        clock=rig.clock,
+        send=rig.send,
     )
     await twin.setup()
     await twin.step("scene", rig.scene, rig.header(0))

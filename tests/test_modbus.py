@@ -15,17 +15,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from nodes.arm_bridge.link import ArmAnswerError, ArmRefusedError, ArmSilentError
 from nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
     FAULT_BITS,
     STATUS,
     STATUS_ADDRESS,
-    ArmAnswerError,
-    ArmLink,
-    ArmRefusedError,
-    ArmSilentError,
     Field,
+    ModbusLink,
     decode_status,
     encode_command,
     register_count,
@@ -130,12 +128,12 @@ def quiet_controller() -> Controller:
 
 
 @asynccontextmanager
-async def linked(fault: Fault = "none") -> AsyncIterator[tuple[ArmLink, Controller]]:
+async def linked(fault: Fault = "none") -> AsyncIterator[tuple[ModbusLink, Controller]]:
     controller = quiet_controller()
     controller.fault = fault
     server = ArmServer(controller, host="127.0.0.1", port=0, before=lambda: None)
     await server.start()
-    link = ArmLink("127.0.0.1", server.port, timeout_s=0.03)
+    link = ModbusLink("127.0.0.1", server.port, timeout_s=0.03)
     try:
         yield link, controller
     finally:
@@ -143,7 +141,7 @@ async def linked(fault: Fault = "none") -> AsyncIterator[tuple[ArmLink, Controll
         await server.stop()
 
 
-async def exchange(link: ArmLink, now_s: float = 0.0) -> int:
+async def exchange(link: ModbusLink, now_s: float = 0.0) -> int:
     status = await link.exchange(mode="move", joints_rad=JOINTS, now_ns=int(now_s * 1e9))
     return status.accepted
 
@@ -193,7 +191,7 @@ async def test_an_exception_keeps_the_connection() -> None:
 
 
 async def test_nobody_listening_is_an_error_in_one_line() -> None:
-    link = ArmLink("127.0.0.1", 1, timeout_s=0.03)
+    link = ModbusLink("127.0.0.1", 1, timeout_s=0.03)
     with pytest.raises(ArmSilentError, match=r"no connection to 127\.0\.0\.1:1"):
         await exchange(link)
 

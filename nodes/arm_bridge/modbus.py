@@ -20,6 +20,16 @@ from numpy.typing import NDArray
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
 
+from nodes.arm_bridge.link import (
+    ArmAnswerError,
+    ArmLinkError,
+    ArmRefusedError,
+    ArmSilentError,
+    ArmStatus,
+    be_cancelled,
+    checked_joints,
+)
+
 Floats = NDArray[np.float64]
 
 MAGIC = 0x4653
@@ -94,32 +104,14 @@ _COMMAND_FORMAT, _STATUS_FORMAT = struct_format(COMMAND), struct_format(STATUS)
 _STATUS_REGISTERS = register_count(STATUS)
 
 
-class ArmLinkError(Exception):
-    """The exchange with an arm failed; the text says how, in one line."""
-
-
-class ArmSilentError(ArmLinkError):
-    """No connection, or no answer in time: the connection has been closed."""
-
-
-class ArmRefusedError(ArmLinkError):
-    """The arm answered with a Modbus exception."""
-
-
-class ArmAnswerError(ArmLinkError):
-    """The answer is not this map's, is damaged, or belongs to another command."""
-
-
 @dataclass(frozen=True, slots=True)
-class ArmStatus:
-    """What the arm's controller says of itself; joints (6,) rad as measured."""
+class ModbusStatus(ArmStatus):
+    """What the status block says."""
 
     accepted: int
     cycle: int
     time_us: int
     state: str
-    faults: tuple[str, ...]
-    joints_rad: Floats
     refused: int
 
 
@@ -133,13 +125,13 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
         time_us & 0xFFFFFFFF,
         COMMAND_MODES[mode],
         0,
-        *(float(angle) for angle in joints_rad),
+        *checked_joints(joints_rad),
     )
     whole = body + struct.pack(">I", zlib.crc32(body))
     return list(struct.unpack(f">{len(whole) // 2}H", whole))
 
 
-def decode_status(registers: Sequence[int]) -> ArmStatus:
+def decode_status(registers: Sequence[int]) -> ModbusStatus:
     """The status block of its registers; ArmAnswerError says what is wrong with it."""
     if len(registers) != _STATUS_REGISTERS:
         raise ArmAnswerError(f"status of {len(registers)} registers, wanted {_STATUS_REGISTERS}")
@@ -158,7 +150,7 @@ def decode_status(registers: Sequence[int]) -> ArmStatus:
         raise ArmAnswerError(f"unknown arm state {state}")
     if not all(math.isfinite(angle) for angle in joints):
         raise ArmAnswerError("measured joints are not finite")
-    return ArmStatus(
+    return ModbusStatus(
         accepted=accepted,
         cycle=cycle,
         time_us=time_us,
@@ -169,19 +161,8 @@ def decode_status(registers: Sequence[int]) -> ArmStatus:
     )
 
 
-def _be_cancelled() -> None:
-    """Raise the cancellation that Python 3.11's `wait_for`, inside pymodbus, swallows.
-
-    It does when an answer or a time-out comes in the same turn of the loop; the task would then
-    never end.
-    """
-    task = asyncio.current_task()
-    if task is not None and task.cancelling():
-        raise asyncio.CancelledError
-
-
-class ArmLink:
-    """One connection to one arm.
+class ModbusLink:
+    """An `ArmLink`: one connection to one arm.
 
     Any failure that leaves an answer outstanding closes the connection, because pymodbus 3.16.1 can
     hand a late answer to the next request; the echoed sequence and the CRC catch what remains.  It
@@ -193,7 +174,7 @@ class ArmLink:
         host: str,
         port: int,
         *,
-        timeout_s: float,
+        timeout_s: float = 0.03,
         first_pause_s: float = 0.05,
         longest_pause_s: float = 1.0,
     ) -> None:
@@ -214,7 +195,7 @@ class ArmLink:
         """Whether there is a connection, or the pause before the next attempt is over."""
         return self.connected or now_ns >= self._try_again_ns
 
-    async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
+    async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ModbusStatus:
         """Send one command and return the status that answers it; raises ArmLinkError."""
         try:
             client = await self._open()
@@ -233,7 +214,7 @@ class ArmLink:
             self.close()
             raise
         finally:
-            _be_cancelled()
+            be_cancelled()
         self._pause_s = 0.0
         return status
 
@@ -253,7 +234,7 @@ class ArmLink:
 
     async def _ask(
         self, client: AsyncModbusTcpClient, mode: str, joints_rad: Floats, now_ns: int
-    ) -> ArmStatus:
+    ) -> ModbusStatus:
         values = encode_command(
             sequence=self._sequence, time_us=now_ns // 1000, mode=mode, joints_rad=joints_rad
         )

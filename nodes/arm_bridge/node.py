@@ -13,7 +13,8 @@ from messages.types import ArmState, EStop, SheetTarget, Side
 from nodes.arm_bridge.control import ArmControl, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, Timing, goal_of
-from nodes.arm_bridge.modbus import ArmLink, ArmLinkError, ArmSilentError
+from nodes.arm_bridge.link import ArmLinkError, ArmSilentError
+from nodes.arm_bridge.link_drivers import Driver, link_for
 from nodes.arm_bridge.pacing import Pace
 from nodes.arm_bridge.report import arm_state
 from nodes.node import Input, Node, NodeParameters, Output, periodic
@@ -24,13 +25,12 @@ class ArmBridgeParameters(NodeParameters):
     host: str = "127.0.0.1"
     port: int = Field(default=5020, ge=1, le=65535)
     rate_hz: Positive = 140.0
-    timeout_s: Positive = 0.03
+    driver: Driver = "modbus"
+    timeout_s: Positive | None = Field(default=None, description="null: the driver's own")
     servo_lag_s: NonNegative = Field(
         default=0.03, description="how far the arm trails a command that moves evenly"
     )
-    target_period_s: Positive = Field(
-        default=1.0 / 60.0, description="a sheet target this old is not yet late"
-    )
+    target_period_s: Positive = Field(default=1 / 60, description="older than that is late")
     hold_after_s: Positive = 0.02
     stop_after_s: Positive = 0.1
     furthest_extrapolation_s: Positive = 0.06
@@ -38,7 +38,7 @@ class ArmBridgeParameters(NodeParameters):
 
 
 class ArmBridge(Node):
-    """Sends one arm's joints over Modbus TCP and publishes what the arm answers."""
+    """Sends one arm's joints over its network and publishes what the arm answers."""
 
     opens_devices: ClassVar[bool] = True
     parameters: ArmBridgeParameters
@@ -50,7 +50,7 @@ class ArmBridge(Node):
 
     async def setup(self) -> None:
         given = self.parameters
-        self._link = ArmLink(given.host, given.port, timeout_s=given.timeout_s)
+        self._link = link_for(given.driver, given.host, given.port, given.timeout_s)
         patience = Patience(given.hold_after_s, given.stop_after_s)
         self._control = ArmControl(patience, largest_lag_rad=given.largest_lag_rad)
         self._geometry: ArmGeometry | None = None

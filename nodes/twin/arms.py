@@ -12,6 +12,7 @@ import logging
 import math
 import struct
 import zlib
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -24,7 +25,26 @@ from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
 Floats = NDArray[np.float64]
-Fault = Literal["none", "silent", "slow", "exception", "bad_crc", "old_version", "frozen"]
+Fault = Literal[
+    "none",
+    "silent",
+    "slow",
+    "exception",
+    "bad_crc",
+    "old_version",
+    "repeated",
+    "frozen",
+    "lagging",
+]
+"""What an arm suffers from on request.
+
+silent: answers nothing.  slow: answers LATE_S late.  exception: answers with a Modbus exception (a
+real-time packet of another type).  bad_crc: damages its answers (real-time: cuts them short).
+old_version: speaks an older register map.  repeated: counts as in the answer before.
+frozen: answers, but its joints stay.  lagging: does all LATE_S late.
+"""
+
+LATE_S = 0.05
 
 # A client that goes away in the middle of an answer is no news; the library dumps its last packets.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
@@ -54,23 +74,40 @@ STATE_IDLE, STATE_MOVING, STATE_HOLDING, STATE_STOPPED, STATE_FAULT = range(5)
 FAULT_RANGE, FAULT_STEP, FAULT_FINITE, FAULT_WATCHDOG, FAULT_SERVO = 1, 2, 4, 8, 16
 
 
+def _skew(axis: Floats) -> Floats:
+    x, y, z = axis.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+# Each joint's turn is 1 + sin C + (1 - cos) C C (Rodrigues), about a point.
+_JOINTS = [
+    (_skew(axis), _skew(axis) @ _skew(axis), point)
+    for axis, point in zip(_AXES, _POINTS, strict=True)
+]
+
+
 def forward(joints_rad: Floats) -> Floats:
     """base_from_flange (4, 4) of joints (6,): exp(S1 q1) ... exp(S6 q6) M."""
+    return _flange(*_chain(joints_rad)[0])
+
+
+def _chain(joints_rad: Floats) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:
+    """Rotation and position after all joints, and the same ahead of each."""
     rotation, position = np.eye(3), np.zeros(3)
-    for axis, point, angle in zip(_AXES, _POINTS, joints_rad, strict=True):
-        turn = _turn(axis, float(angle))
-        position = position + rotation @ (point - turn @ point)
-        rotation = rotation @ turn
+    ahead = []
+    for (cross, square, point), angle in zip(_JOINTS, joints_rad.tolist(), strict=True):
+        ahead.append((rotation, position))
+        change = math.sin(angle) * cross + (1.0 - math.cos(angle)) * square
+        position = position - rotation @ (change @ point)
+        rotation = rotation + rotation @ change
+    return (rotation, position), ahead
+
+
+def _flange(rotation: Floats, position: Floats) -> Floats:
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:3, 3] = position + rotation @ _FLANGE_AT_ZERO
     return pose
-
-
-def _turn(axis: Floats, angle: float) -> Floats:
-    x, y, z = axis.tolist()
-    cross: Floats = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
 
 
 def joints_for(base_from_flange: Floats, guess_rad: Floats) -> Floats:
@@ -80,17 +117,17 @@ def joints_for(base_from_flange: Floats, guess_rad: Floats) -> Floats:
     """
     joints = guess_rad.copy()
     for _ in range(200):
-        error = _pose_error(base_from_flange, forward(joints))
+        last, ahead = _chain(joints)
+        pose = _flange(*last)
+        error = _pose_error(base_from_flange, pose)
         if np.abs(error).max() < 1e-10:
             break
-        slope = np.empty((6, 6))
-        for joint in range(6):
-            nudged = joints.copy()
-            nudged[joint] += 1e-6
-            slope[:, joint] = (error - _pose_error(base_from_flange, forward(nudged))) / 1e-6
+        axes = np.array([turn @ axis for (turn, _), axis in zip(ahead, _AXES, strict=True)])
+        places = np.array([at + turn @ p for (turn, at), p in zip(ahead, _POINTS, strict=True)])
+        slope = np.vstack([np.cross(axes, pose[:3, 3] - places).T, axes.T])
         step = np.linalg.solve(slope.T @ slope + 1e-8 * np.eye(6), slope.T @ error)
         joints = np.clip(joints + np.clip(step, -0.3, 0.3), RANGE_RAD[:, 0], RANGE_RAD[:, 1])
-    if np.abs(_pose_error(base_from_flange, forward(joints))).max() > 1e-6:
+    if not np.abs(_pose_error(base_from_flange, forward(joints))).max() <= 1e-6:
         raise ValueError(f"the arm cannot reach a flange at {base_from_flange[:3, 3]} m (base)")
     return joints
 
@@ -108,12 +145,19 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 class Servo:
     """Six joints that follow set-points like critically damped second-order servos.
 
-    lag_s: how far a joint trails a set-point that moves evenly.
+    lag_s: how far a joint trails a set-point that moves evenly.  joints_rad is what the encoders at
+    the motors see; driven_rad is where the joints are beyond their gears, whose play of
+    `backlash_rad` leaves a joint standing for so long when its motor turns back.
     """
 
     joints_rad: Floats
     lag_s: float
+    backlash_rad: float = 0.0
     velocity_rad_per_s: Floats = field(default_factory=lambda: np.zeros(6))
+    driven_rad: Floats = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.driven_rad = self.joints_rad.copy()
 
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
         """Move on by `duration_s` in steps of at most a millisecond; braking stops where it can."""
@@ -131,6 +175,8 @@ class Servo:
             speed = self.velocity_rad_per_s + pull * step_s
             self.velocity_rad_per_s = np.clip(speed, -SPEED_RAD_PER_S, SPEED_RAD_PER_S)
             self.joints_rad = self.joints_rad + self.velocity_rad_per_s * step_s
+        play = 0.5 * self.backlash_rad
+        self.driven_rad = np.clip(self.driven_rad, self.joints_rad - play, self.joints_rad + play)
 
 
 class Controller:
@@ -140,6 +186,8 @@ class Controller:
     sequence), and falls into its fault state, where it brakes and stays, for joints out of range or
     not finite, for a set-point that leaps, and when no command came for `watchdog_s` while moving.
     An `idle` command clears a fault and may start the sequence anew.
+
+    cycle_s: a set-point acts from the controller's next cycle on; 0: at once.
     """
 
     def __init__(
@@ -149,34 +197,44 @@ class Controller:
         servo_lag_s: float,
         noise_rad: float,
         watchdog_s: float,
+        backlash_rad: float = 0.0,
+        cycle_s: float = 0.0,
         largest_step_rad: float = 0.15,
         seed: int = 0,
     ) -> None:
-        self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s)
+        self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad)
         self.state = STATE_IDLE
         self.faults = 0
         self.refused = 0
         self.accepted = 0
         self.commands = 0
-        self.cycles = 0
         self.wanted_rad = self.servo.joints_rad.copy()
         self.fault: Fault = "none"
+        self._acting_rad = self.wanted_rad
+        self._orders: deque[tuple[float, Floats]] = deque()
         self._time_s = 0.0
         self._command_at_s = 0.0
         self._watchdog_s = watchdog_s
+        self._cycle_s = cycle_s
         self._largest_step_rad = largest_step_rad
         self._noise_rad = noise_rad
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Run the servo for `duration_s` in controller cycles' stead; trips the watchdog."""
-        self._time_s += duration_s
-        self.cycles += max(1, round(duration_s / CONTROLLER_CYCLE_S))
+        """Let `duration_s` pass; trips the watchdog."""
+        end_s = self._time_s + duration_s
+        while self._orders and self._orders[0][0] <= end_s:
+            due_s, wanted_rad = self._orders.popleft()
+            self._run_until(due_s)
+            self._acting_rad = wanted_rad
+        self._run_until(end_s)
+
+    def _run_until(self, end_s: float) -> None:
+        duration_s, self._time_s = end_s - self._time_s, max(self._time_s, end_s)
         if self.state == STATE_MOVING and self._time_s - self._command_at_s > self._watchdog_s:
             self._fail(FAULT_WATCHDOG)
-        if self.fault == "frozen":
-            return
-        self.servo.advance(self.wanted_rad, duration_s, braking=self.state != STATE_MOVING)
+        if duration_s > 0.0 and self.fault != "frozen":
+            self.servo.advance(self._acting_rad, duration_s, braking=self.state != STATE_MOVING)
 
     def take(self, registers: list[int]) -> bool:
         """Judge a written command block; false refuses it as a Modbus exception."""
@@ -194,6 +252,7 @@ class Controller:
         self.commands += 1
         self._command_at_s = self._time_s
         if mode == _IDLE:
+            self._orders.clear()
             self.faults, self.state = 0, STATE_IDLE
         elif self.state != STATE_FAULT:
             self._obey(mode, np.array(joints))
@@ -201,6 +260,7 @@ class Controller:
 
     def _obey(self, mode: int, joints: Floats) -> None:
         if mode != _MOVE:
+            self._orders.clear()
             self.state = STATE_HOLDING if mode == _HOLD else STATE_STOPPED
             return
         before = self.wanted_rad if self.state == STATE_MOVING else self.servo.joints_rad
@@ -211,9 +271,18 @@ class Controller:
         elif np.abs(joints - before).max() > self._largest_step_rad:
             self._fail(FAULT_STEP)
         else:
+            if self.state != STATE_MOVING:
+                self._acting_rad = self.servo.joints_rad.copy()
             self.state, self.wanted_rad = STATE_MOVING, joints
+            self._orders.append((self._due_s(), joints))
+
+    def _due_s(self) -> float:
+        """When a set-point that comes now is to act."""
+        due_s = self._time_s + (LATE_S if self.fault == "lagging" else 0.0)
+        return math.ceil(due_s / self._cycle_s) * self._cycle_s if self._cycle_s else due_s
 
     def _fail(self, bit: int) -> None:
+        self._orders.clear()
         self.faults |= bit
         self.state = STATE_FAULT
 
@@ -227,8 +296,8 @@ class Controller:
         block = _STATUS.pack(
             0x4653,
             0 if self.fault == "old_version" else 1,
-            self.accepted,
-            self.cycles & 0xFFFFFFFF,
+            (self.accepted - (self.fault == "repeated")) & 0xFFFFFFFF,
+            int(self._time_s / CONTROLLER_CYCLE_S) & 0xFFFFFFFF,
             int(self._time_s * 1e6) & 0xFFFFFFFF,
             self.state,
             self.faults,
@@ -295,7 +364,7 @@ class ArmServer:
         if fault == "exception":
             return ExcCodes.DEVICE_FAILURE
         if fault == "slow" and written:
-            await asyncio.sleep(0.08)
+            await asyncio.sleep(LATE_S)
         self._before()
         if written:
             if address != 0 or not self.controller.take([int(value) for value in written]):

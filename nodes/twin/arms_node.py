@@ -1,4 +1,4 @@
-"""The twin's two arms on the network: Modbus TCP servers that move, and the truth about them."""
+"""The twin's two arms on the network: servers that move, and the truth about them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from messages.types import TwinArms
 from nodes.models.rigid import inverse, transform, transform_from_rpy
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 from nodes.twin.arms import ArmServer, Controller, Fault, Floats, forward, joints_for
+from nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
 
 START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
@@ -24,7 +25,17 @@ class TwinArmsParameters(NodeParameters):
     rate_hz: Positive = 140.8
     servo_lag_s: Positive = 0.025
     noise_rad: NonNegative = Field(default=5e-6, description="of the measured joints")
+    backlash_rad: NonNegative = Field(
+        default=3e-5, description="play of each gear: a repeatability of 0.02 mm at the flange"
+    )
     watchdog_s: Positive = 0.1
+    protocol: Literal["modbus", "mxt"] = "modbus"
+    cycle_s: NonNegative = Field(
+        default=0.0, description="Modbus set-points act in cycles of so long; 0: at once"
+    )
+    restart_after_s: Positive = Field(
+        default=2.0, description="how long an operator takes to clear an error of mxt"
+    )
     fault: Fault = Field(default="none", description="what `fault_side` suffers from")
     fault_side: Literal["left", "right"] = "left"
     fault_after_s: NonNegative = Field(default=0.0, description="since the arms were switched on")
@@ -40,7 +51,7 @@ class TwinArmsNode(Node):
     twin__arms: Output[TwinArms]
 
     async def setup(self) -> None:
-        self.servers: dict[str, ArmServer] = {}
+        self.servers: dict[str, ArmServer | MxtServer] = {}
         self._world_from_base: dict[str, Floats] = {}
         self._moved_ns = self._started_ns = 0
 
@@ -59,19 +70,36 @@ class TwinArmsNode(Node):
         for number, (side, spec) in enumerate(arms.items()):
             if side in self.servers:
                 continue
-            controller = Controller(
-                self._start_joints(side, spec, scene),
-                servo_lag_s=self.parameters.servo_lag_s,
-                noise_rad=self.parameters.noise_rad,
-                watchdog_s=self.parameters.watchdog_s,
-                seed=number,
-            )
             port = self.parameters.left_port if side == "left" else self.parameters.right_port
-            server = ArmServer(
-                controller, host=self.parameters.host, port=port, before=self._advance
-            )
+            server = self._server(self._start_joints(side, spec, scene), port, number)
             await server.start()
             self.servers[side] = server
+
+    def _server(self, joints_rad: Floats, port: int, seed: int) -> ArmServer | MxtServer:
+        """An arm at those joints, behind a server of the protocol."""
+        given = self.parameters
+        if given.protocol == "mxt":
+            mxt = MxtController(
+                joints_rad,
+                servo_lag_s=max(given.servo_lag_s - FILTER_S, 1e-3),
+                filter_s=FILTER_S,
+                noise_rad=given.noise_rad,
+                timeout_s=given.watchdog_s,
+                backlash_rad=given.backlash_rad,
+                restart_after_s=given.restart_after_s,
+                seed=seed,
+            )
+            return MxtServer(mxt, host=given.host, port=port, before=self._advance)
+        controller = Controller(
+            joints_rad,
+            servo_lag_s=given.servo_lag_s,
+            noise_rad=given.noise_rad,
+            watchdog_s=given.watchdog_s,
+            backlash_rad=given.backlash_rad,
+            cycle_s=given.cycle_s,
+            seed=seed,
+        )
+        return ArmServer(controller, host=given.host, port=port, before=self._advance)
 
     def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
         """Joints that hold the sheet in the imaginary screen, just stretched."""
@@ -99,7 +127,7 @@ class TwinArmsNode(Node):
         given = self.parameters
         if given.fault != "none" and self._moved_ns - self._started_ns > given.fault_after_s * 1e9:
             self.servers[given.fault_side].controller.fault = given.fault
-        joints = {side: server.controller.servo.joints_rad for side, server in self.servers.items()}
+        joints = {side: server.controller.servo.driven_rad for side, server in self.servers.items()}
         self.twin__arms.publish(
             TwinArms(
                 joints_left_rad=joints["left"],

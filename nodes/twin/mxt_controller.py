@@ -1,0 +1,340 @@
+"""The twin's arms behind the Mitsubishi real-time external control (MXT) over UDP.
+
+Written on its own from `docs/mxt.md`; shares nothing with the bridge that it judges.  The robot
+program `Mxt 1,1,<filter>` is thought to be running.  What a real controller refuses, and how it
+says so, is known only in part: this one refuses more, and says nothing once its program has ended.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+from collections.abc import Callable
+
+import numpy as np
+
+from nodes.models.rigid import transform_from_rpy
+from nodes.twin.arms import (
+    CONTROLLER_CYCLE_S,
+    LATE_S,
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+    Fault,
+    Floats,
+    Servo,
+    forward,
+    joints_for,
+)
+
+Address = tuple[str, int]
+
+_HEAD = struct.Struct("<HHHxx8f2I5HHI")
+_MONITOR = struct.Struct("<Hxx8f2I")
+_BYTES = 196
+_NONE, _MOVE, _END = 0, 1, 255
+_POSES, _JOINTS, _PULSES = (1, 4, 7), (2, 5, 8), 3
+_MORE_AT = (64, 108, 152)
+_RIGHT, _ABOVE, _NONFLIP = 4, 2, 1
+
+FILTER_S = 0.01
+"""Time constant of the low-pass that the maker recommends for `Mxt`."""
+
+FIRST_STEP_RAD = 0.01
+"""The first set-point must be where the arm is."""
+
+STEP_CYCLES = 2.0
+"""A set-point may be as far from the one before as full speed goes in so many cycles."""
+
+
+class MxtError(Exception):
+    """Why the robot program ends."""
+
+
+class MxtController:
+    """One arm's controller in its cycles of 7.1 ms, each of which takes one packet and answers it.
+
+    An error ends its program: the arm brakes, and no packet is answered until `restart`.  Errors
+    are a move without a first packet that only asks, a type of data that cannot be obeyed, numbers
+    that are no pose in range, a first set-point away from the arm, a leap, and `timeout_s` without
+    a packet.  filter_s: the low-pass that set-points go through ahead of the servos.
+    """
+
+    def __init__(
+        self,
+        joints_rad: Floats,
+        *,
+        servo_lag_s: float,
+        filter_s: float,
+        noise_rad: float,
+        timeout_s: float,
+        backlash_rad: float = 0.0,
+        restart_after_s: float = math.inf,
+        seed: int = 0,
+    ) -> None:
+        self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad)
+        self.fault: Fault = "none"
+        self.error = ""
+        self.commands = 0
+        self.refused = 0
+        self.wanted_rad = self.servo.joints_rad.copy()
+        self.answers: list[tuple[bytes, Address]] = []
+        self._filtered_rad = self.wanted_rad
+        self._filter_share = 1.0 - math.exp(-CONTROLLER_CYCLE_S / filter_s) if filter_s else 1.0
+        self._largest_step_rad = STEP_CYCLES * SPEED_RAD_PER_S * CONTROLLER_CYCLE_S
+        self._timeout_cycles = round(timeout_s / CONTROLLER_CYCLE_S)
+        self._restart_cycles = restart_after_s / CONTROLLER_CYCLE_S
+        self._noise_rad = noise_rad
+        self._random = np.random.default_rng(seed)
+        self._into_cycle_s = 0.0
+        self._waiting: tuple[bytes, Address] | None = None
+        self._late: list[tuple[int, Floats]] = []
+        self._cycles = self._failed_at = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Clear the error and start the program again, as its operator would."""
+        self.error = ""
+        self._master: Address | None = None
+        self._moved = False
+        self._count = self._timeouts = self._missing = 0
+
+    def take(self, packet: bytes, sender: Address) -> None:
+        """A packet has come; the next cycle takes the newest.
+
+        One of another length, and one of somebody else while external control is on, is ignored.
+        """
+        if len(packet) != _BYTES or (self._master not in (None, sender)):
+            self.refused += 1
+        elif not self.error:
+            self._waiting = packet, sender
+
+    @property
+    def waits(self) -> bool:
+        """Whether a packet waits for the next cycle."""
+        return self._waiting is not None
+
+    def until_cycle_s(self) -> float:
+        """How long until the next cycle."""
+        return CONTROLLER_CYCLE_S - self._into_cycle_s
+
+    def advance(self, duration_s: float) -> None:
+        """Let `duration_s` pass, cycle by cycle; what they answer is put into `answers`."""
+        while duration_s >= self.until_cycle_s():
+            duration_s -= self.until_cycle_s()
+            self._move_on(self.until_cycle_s())
+            self._into_cycle_s = 0.0
+            self._cycle()
+        self._move_on(duration_s)
+        self._into_cycle_s += duration_s
+
+    def _move_on(self, duration_s: float) -> None:
+        if duration_s > 0.0 and self.fault != "frozen":
+            self.servo.advance(self._filtered_rad, duration_s, braking=bool(self.error))
+
+    def _cycle(self) -> None:
+        self._cycles += 1
+        packet, self._waiting = self._waiting, None
+        if self.error:
+            if self._cycles - self._failed_at >= self._restart_cycles:
+                self.restart()
+        elif packet is not None:
+            self._missing = 0
+            self._obey(*packet)
+        elif self._master is not None:
+            self._timeouts = (self._timeouts + 1) & 0xFFFF
+            self._missing += 1
+            if self._missing > self._timeout_cycles:
+                self._fail("no packet in time")
+        wanted = self._acting()
+        self._filtered_rad = self._filtered_rad + self._filter_share * (wanted - self._filtered_rad)
+
+    def _acting(self) -> Floats:
+        """The set-point in force: the newest, unless the arm lags."""
+        if self.fault != "lagging":
+            self._late.clear()
+            return self.wanted_rad
+        self._late.append((self._cycles, self.wanted_rad))
+        while (
+            len(self._late) > 1 and self._late[1][0] <= self._cycles - LATE_S / CONTROLLER_CYCLE_S
+        ):
+            self._late.pop(0)
+        return self._late[0][1]
+
+    def _obey(self, packet: bytes, sender: Address) -> None:
+        command, send_type, receive_type, *data = _HEAD.unpack_from(packet)
+        if command == _NONE:
+            self._stay(sender)
+        elif command == _MOVE:
+            try:
+                self._move(send_type, np.array(data[:8]), data[8])
+            except MxtError as error:
+                self._fail(str(error))
+                return
+        elif command == _END:
+            self.restart()
+            return
+        else:
+            self._fail(f"unknown command {command}")
+            return
+        self.commands += 1
+        if self.fault != "repeated":
+            self._count = (self._count + 1) & 0xFFFFFFFF
+        if self.fault != "silent":
+            self.answers.append((self._answer(command, receive_type, packet), sender))
+
+    def _stay(self, sender: Address) -> None:
+        """A packet that only asks: the arm stays where it is, and the next set-point is a first."""
+        self._master = sender
+        if self._moved:
+            self.wanted_rad = self._filtered_rad = self.servo.joints_rad.copy()
+            self._moved = False
+
+    def _move(self, send_type: int, data: Floats, flags: int) -> None:
+        """Take a set-point; MxtError when it is one that ends the program."""
+        if self._master is None:
+            raise MxtError("a move ahead of the first packet")
+        before = self.wanted_rad if self._moved else self.servo.joints_rad
+        joints = _set_point(send_type, data, flags, before)
+        step = np.abs(joints - before)
+        if not self._moved and step.max() > FIRST_STEP_RAD:
+            raise MxtError("a first set-point away from the arm")
+        if (step > self._largest_step_rad).any():
+            raise MxtError("a set-point too far")
+        self._moved, self.wanted_rad = True, joints
+
+    def _fail(self, why: str) -> None:
+        self.error, self._failed_at = why, self._cycles
+        self.refused += 1
+        self.wanted_rad = self.servo.joints_rad.copy()
+
+    def _answer(self, command: int, wanted_type: int, packet: bytes) -> bytes:
+        found, *numbers = self._monitor(wanted_type)
+        if self.fault == "exception":
+            found = _PULSES
+        whole = _HEAD.pack(command, found, found, *numbers, *([0] * 5), self._timeouts, self._count)
+        for at in _MORE_AT:
+            whole += _MONITOR.pack(*self._monitor(*struct.unpack_from("<H", packet, at)))
+        return whole[:-4] if self.fault == "bad_crc" else whole
+
+    def _monitor(self, wanted_type: int) -> tuple[float, ...]:
+        """Type, eight numbers and two flags; type 0 for what this controller does not measure."""
+        if wanted_type in _JOINTS:
+            joints = self._seen(_JOINTS.index(wanted_type))
+            return (wanted_type, *joints, 0.0, 0.0, 0, 0)
+        if wanted_type in _POSES:
+            joints = self._seen(_POSES.index(wanted_type))
+            return (wanted_type, *numbers_of(forward(joints)), 0.0, 0.0, structure_flags(joints), 0)
+        return (0, *([0.0] * 8), 0, 0)
+
+    def _seen(self, what: int) -> Floats:
+        """The set-point, the same after the filter, or what the encoders say."""
+        noise = self._noise_rad * self._random.standard_normal(6)
+        return (self.wanted_rad, self._filtered_rad, self.servo.joints_rad + noise)[what]
+
+
+def _set_point(send_type: int, data: Floats, flags: int, before_rad: Floats) -> Floats:
+    """The joints (6,) that a packet's numbers ask for, near those before; MxtError."""
+    if send_type not in (_POSES[0], _JOINTS[0]):
+        raise MxtError(f"a set-point of type {send_type}")
+    if not np.isfinite(data).all():
+        raise MxtError("a set-point that is not finite")
+    joints = data[:6]
+    if send_type == _POSES[0]:
+        if flags != structure_flags(before_rad):
+            raise MxtError("a pose on another branch")
+        try:
+            joints = joints_for(pose_from(data), before_rad)
+        except (ValueError, np.linalg.LinAlgError) as error:
+            raise MxtError("a pose out of reach") from error
+    if (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():
+        raise MxtError("joints out of range")
+    return joints
+
+
+def pose_from(numbers: Floats) -> Floats:
+    """base_from_flange of x, y, z (mm) and turns about the fixed x, y, z axes (rad)."""
+    return transform_from_rpy(numbers[:3] * 1e-3, numbers[3:6])
+
+
+def numbers_of(pose: Floats) -> tuple[float, ...]:
+    """The six numbers of a pose: the inverse of `pose_from`."""
+    turn = pose[:3, :3]
+    b = math.atan2(-turn[2, 0], math.hypot(turn[0, 0], turn[1, 0]))
+    a, c = math.atan2(turn[2, 1], turn[2, 2]), math.atan2(turn[1, 0], turn[0, 0])
+    return (*(pose[:3, 3] * 1e3).tolist(), a, b, c)
+
+
+def structure_flags(joints_rad: Floats) -> int:
+    """4 with the wrist ahead of the shoulder, 2 with the elbow up, 1 with J5 not negative."""
+    q2, q3 = float(joints_rad[1]), float(joints_rad[2])
+    ahead = 0.25 * math.sin(q2) - 0.09 * math.cos(q2 + q3) + 0.16 * math.sin(q2 + q3)
+    return (_RIGHT if ahead >= 0 else 0) | _ABOVE | (_NONFLIP if joints_rad[4] >= 0 else 0)
+
+
+class MxtServer:
+    """A UDP port in front of a controller."""
+
+    def __init__(
+        self, controller: MxtController, *, host: str, port: int, before: Callable[[], None]
+    ) -> None:
+        """`before` is called ahead of each packet and cycle, to bring the arm up to date."""
+        self.controller = controller
+        self._address = (host, port)
+        self._before = before
+        self._transport: asyncio.DatagramTransport | None = None
+        self._due: asyncio.TimerHandle | None = None
+
+    async def start(self) -> None:
+        """Listen; OSError when the port is taken."""
+        loop = asyncio.get_running_loop()
+        self._transport, _ = await loop.create_datagram_endpoint(
+            lambda: _Packets(self._received), local_addr=self._address
+        )
+
+    @property
+    def port(self) -> int:
+        """The port listened on (useful when it was given as 0)."""
+        if self._transport is None:
+            raise RuntimeError("the arm's server does not listen")
+        return int(self._transport.get_extra_info("sockname")[1])
+
+    async def stop(self) -> None:
+        if self._due is not None:
+            self._due.cancel()
+        if self._transport is not None:
+            self._transport.close()
+        self._due = self._transport = None
+
+    def _received(self, packet: bytes, sender: Address) -> None:
+        self._before()
+        self.controller.take(packet, sender)
+        self._wait_for_cycle()
+
+    def _wait_for_cycle(self) -> None:
+        """Answer when the cycle under way is over."""
+        if self._due is None:
+            loop = asyncio.get_running_loop()
+            self._due = loop.call_later(self.controller.until_cycle_s(), self._flush)
+
+    def _flush(self) -> None:
+        self._due = None
+        self._before()
+        answers, self.controller.answers = self.controller.answers, []
+        late_s = LATE_S if self.controller.fault == "slow" else 0.0
+        for packet, sender in answers:
+            asyncio.get_running_loop().call_later(late_s, self._send, packet, sender)
+        if self.controller.waits:
+            self._wait_for_cycle()
+
+    def _send(self, packet: bytes, sender: Address) -> None:
+        if self._transport is not None:
+            self._transport.sendto(packet, sender)
+
+
+class _Packets(asyncio.DatagramProtocol):
+    def __init__(self, received: Callable[[bytes, Address], None]) -> None:
+        self._received = received
+
+    def datagram_received(self, data: bytes, addr: Address) -> None:
+        self._received(data, addr)
