@@ -22,13 +22,17 @@ Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
 """Called with (steps done, steps in all, what was just done)."""
 
-CHARUCO_SCALE = 2
-"""Markers are looked for in an enlarged picture: small ones are found, and found more exactly."""
+SCALE = 2
+"""Corners are refined in a picture so much larger.  OpenCV's refinement interpolates linearly
+between pixels, which pulls corners by 0.015 px and the board's size by 3e-5; markers are found
+sooner, too, in a larger picture."""
 
 MIN_CORNERS = 8
 """Of a ChArUco board in a view; fewer say too little about the board's pose."""
 
-LARGEST_HALF_WINDOW_PX = 15
+SMALLEST_HALF_WINDOW, LARGEST_HALF_WINDOW = 3, 15
+"""In pixels of the larger picture."""
+
 LARGEST_MOVE_PX = 1.0
 """A ChArUco corner that refinement takes further was drawn to another edge, and is left out."""
 
@@ -144,25 +148,23 @@ class CornerFinder:
             return None
         start = np.asarray(corners.reshape(-1, 2), dtype=np.float64)
         half_px = 0.4 * _nearest(start)
-        pixels = _refined(image, start, half_px, smoothing_px=CHESSBOARD_SMOOTHING_PX)
+        pixels = _refined(_larger(image), start, half_px, smoothing_px=CHESSBOARD_SMOOTHING_PX)
         return View(np.arange(board.rows * board.columns), pixels)
 
     def _charuco(self, image: Image) -> View | None:
         assert self._detector is not None
         assert self.board.marker_m is not None
-        larger = cv2.resize(
-            image, None, fx=CHARUCO_SCALE, fy=CHARUCO_SCALE, interpolation=cv2.INTER_CUBIC
-        )
+        larger = _larger(image)
         corners, found, _, _ = self._detector.detectBoard(larger)
         if found is None or len(found) < MIN_CORNERS:
             return None
         order = np.argsort(found.ravel())
         ids = found.ravel()[order].astype(np.int64)
         in_larger = np.asarray(corners.reshape(-1, 2)[order], dtype=np.float64)
-        start = (in_larger + 0.5) / CHARUCO_SCALE - 0.5
+        start = (in_larger + 0.5) / SCALE - 0.5
         rim = 0.5 * (1.0 - self.board.marker_m / self.board.square_m)
         half_px = min(0.4, 0.7 * rim) * _nearest(start)
-        pixels = _refined(image, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)
+        pixels = _refined(larger, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)
         last = np.array([image.shape[1], image.shape[0]]) - 1.0
         clear = np.minimum(start, last - start).min(axis=1) > half_px + 2.0
         sound = clear & (np.linalg.norm(pixels - start, axis=1) < LARGEST_MOVE_PX)
@@ -180,21 +182,29 @@ def _nearest(pixels: Floats) -> Floats:
     return np.asarray(distances.min(axis=1))
 
 
-def _refined(image: Image, start: Floats, half_px: Floats, *, smoothing_px: float) -> Floats:
-    """Corners (n, 2) at the saddle points of their neighbourhoods, half_px (n,) to each side.
+def _larger(image: Image) -> Image:
+    """The picture SCALE times as large; pixel x lies at SCALE * (x + 1/2) - 1/2."""
+    larger = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_CUBIC)
+    return np.asarray(larger, dtype=np.uint8)
 
-    A window must stay clear of the next edges (those of a neighbouring corner, or of a marker): a
-    larger one drags corners by pixels.  Smoothing takes noise from the gradients that the saddle
-    point is found by (and the blocks of JPEG).
+
+def _refined(larger: Image, start: Floats, half_px: Floats, *, smoothing_px: float) -> Floats:
+    """Corners (n, 2) px at the saddle points of their neighbourhoods, half_px (n,) to each side.
+
+    larger: of `_larger`; all else in pixels of the picture itself.  A window must stay clear of the
+    next edges (those of a neighbouring corner, or of a marker): a larger one drags corners by
+    pixels.  Smoothing takes noise from the gradients that the saddle point is found by (and the
+    blocks of JPEG).
     """
-    smooth = cv2.GaussianBlur(image, (0, 0), smoothing_px)
-    halves = np.clip(half_px, 2, LARGEST_HALF_WINDOW_PX).astype(int)
+    smooth = cv2.GaussianBlur(larger, (0, 0), SCALE * smoothing_px)
+    halves = np.clip(SCALE * half_px, SMALLEST_HALF_WINDOW, LARGEST_HALF_WINDOW).astype(int)
     refined = np.empty_like(start)
     for half in np.unique(halves):
         these = halves == half
-        corners = start[these].reshape(-1, 1, 2).astype(np.float32)
+        corners = (SCALE * (start[these] + 0.5) - 0.5).reshape(-1, 1, 2).astype(np.float32)
         window = (int(half), int(half))
-        refined[these] = cv2.cornerSubPix(smooth, corners, window, (-1, -1), REFINEMENT)[:, 0]
+        found = cv2.cornerSubPix(smooth, corners, window, (-1, -1), REFINEMENT)[:, 0]
+        refined[these] = (found + 0.5) / SCALE - 0.5
     return refined
 
 
