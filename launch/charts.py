@@ -21,6 +21,7 @@ FAMILIES: dict[str, str] = {
     "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
     "soft-body": "nodes.fem_solver.families:SOFT_BODY",
     "correction": "launch.families:CORRECTION",
+    "mesh-normal": "nodes.planner.families:MESH_NORMAL",
 }
 """Families by their name on the command line; each node's folder describes its own."""
 

@@ -72,7 +72,9 @@ MOST_DEVIATION = 0.22
 """The surface stays within this many `rho` of the mesh, or `rho` is too long for it."""
 MOST_OF_EXTENT = 1.0 / 3.0
 MOST_WAYS = 6
-"""So many separate places are tried for the nearest of all."""
+"""So many places besides the first are tried for the nearest of all."""
+LEAST_SHARE = 0.1
+"""Close to a centre of curvature, where I + h A is less than this, any foot of a jet is rough."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -192,35 +194,29 @@ class SmoothMeshShape:
 
         A descent from the nearest jet ends at distance D.  Any nearer place has a jet within the
         cover c of it, which by the bound on curvature is at most sqrt(D^2 + c^2 (1 + 4 D / rho))
-        away; descents are made from there as well, from one jet in each neighbourhood that no
-        descent has begun or ended in.
+        away; descents are made from those that `_promising` leaves of them as well.
         """
-        nearest = self._tree.query(queries)[1]
+        nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
         feet = self._descend(queries, self._on_jet(queries, nearest))
-        way = np.linalg.norm(queries - feet.point, axis=1)
-        slack = self._cover**2 * (1.0 + 2.0 * TIGHTEST * way / self.smoothing_m)
-        near = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
-        undecided, rho = np.zeros(len(queries), dtype=bool), self.smoothing_m
-        jets = [self._centre[one] for one in near]
-        for i, (jet, foot, first) in enumerate(zip(jets, feet.point, start, strict=True)):
-            jets[i] = self._away(self._away(jet, foot), first)
-        for _ in range(MOST_WAYS - 1):
-            rows = np.array([i for i, jet in enumerate(jets) if len(jet)], dtype=np.int64)
-            if not len(rows):
-                break
-            starts = np.array([self._first(jets[i], queries[i]) for i in rows])
-            other = self._descend(queries[rows], starts)
+        way = np.linalg.norm(
+            queries - np.where(feet.is_nearest[:, None], feet.point, start), axis=1
+        )
+        slack = self._cover**2 * (1.0 + 2.0 * TIGHTEST * way / rho)
+        lists = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
+        undecided = np.zeros(len(queries), dtype=bool)
+        rows, jets = self._promising(queries, lists, feet.point, start)
+        if len(rows):
+            other = self._descend(queries[rows], self._on_jet(queries[rows], jets))
             other_way = np.linalg.norm(queries[rows] - other.point, axis=1)
-            apart = np.linalg.norm(other.point - feet.point[rows], axis=1) > APART_RATIO * rho
-            valid = other.is_nearest
-            tied = valid & apart & (np.abs(other_way - way[rows]) < SAME_M)
-            nearer = valid & ((other_way < way[rows] - SAME_M) | ~feet.is_nearest[rows])
-            undecided[rows] = np.where(nearer, False, undecided[rows] | tied)
-            for i, foot, first in zip(rows, other.point, starts, strict=True):
-                jets[i] = self._away(self._away(jets[i], foot), first)
-            _put(feet, rows[nearer], other, nearer)
-            way[rows[nearer]] = other_way[nearer]
+            for i in np.flatnonzero(other.is_nearest):
+                row, shorter = rows[i], way[rows[i]] - other_way[i]
+                apart = float(np.linalg.norm(other.point[i] - feet.point[row])) > APART_RATIO * rho
+                if shorter > SAME_M or not feet.is_nearest[row]:
+                    _put(feet, rows[i : i + 1], other, np.array([i]))
+                    way[row], undecided[row] = other_way[i], False
+                elif apart and shorter > -SAME_M:
+                    undecided[row] = True
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
             # At a rim that the jets do not close: the nearest jet itself.
@@ -228,6 +224,41 @@ class SmoothMeshShape:
             feet.shape_operator[lost] = self._operator[nearest[lost]]
             feet.support[lost] = 0.0
         return feet, undecided
+
+    def _promising(
+        self, queries: Floats, lists: list[list[int]], feet: Floats, starts: Floats
+    ) -> tuple[Indices, Indices]:
+        """Rows of queries and jets that a nearest point may lie at, away from feet and starts.
+
+        Such a jet's own quadratic has a nearest point, a minimum, not far from the jet.  Of jets
+        that lie within `rho` of one another one is taken.
+        """
+        rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
+        jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
+        square = self.smoothing_m**2
+        away = np.square(self._centre[jets] - feet[rows]).sum(1) > square
+        away &= np.square(self._centre[jets] - starts[rows]).sum(1) > square
+        rows, jets = rows[away], jets[away]
+        if not len(rows):
+            return rows, jets
+        normal = self._normal[jets]
+        offset = queries[rows] - self._centre[jets]
+        height = (offset * normal).sum(1)[:, None]
+        across = offset - height * normal
+        values, vectors = np.linalg.eigh(_IDENTITY + height[:, :, None] * self._operator[jets])
+        along = (np.swapaxes(vectors, 1, 2) @ across[:, :, None])[:, :, 0]
+        # Far from flat the quadratic's own foot is rough, hence the factor.
+        reach = 2.0 * self._cover * np.maximum(values, LEAST_SHARE)
+        hopeful = (values[:, 0] > 0.0) & (np.abs(along) <= reach).all(axis=1)
+        rows, jets, offset = rows[hopeful], jets[hopeful], offset[hopeful]
+        taken: dict[int, list[int]] = {}
+        for i in np.argsort(np.square(offset).sum(1)):
+            kept = taken.setdefault(int(rows[i]), [])
+            apart = np.square(self._centre[jets[kept]] - self._centre[jets[i]]).sum(1) > square
+            if len(kept) < MOST_WAYS and apart.all():
+                kept.append(int(i))
+        chosen = np.array(sorted(i for kept in taken.values() for i in kept), dtype=np.int64)
+        return rows[chosen], jets[chosen]
 
     def _descend(self, queries: Floats, starts: Floats) -> Feet:
         rho = self.smoothing_m
@@ -251,14 +282,6 @@ class SmoothMeshShape:
         along *= np.minimum(1.0, STRIDE_RATIO * self.smoothing_m / np.maximum(length, 1e-300))
         sag = 0.5 * np.einsum("ni,nij,nj->n", along, operator, along)
         return np.asarray(self._centre[jet] + along - sag[:, None] * normal)
-
-    def _away(self, jets: Floats, place: Floats) -> Floats:
-        """The jets (m, 3) that are not in the neighbourhood of a place (3,)."""
-        return jets[np.square(jets - place).sum(1) > self.smoothing_m**2] if len(jets) else jets
-
-    @staticmethod
-    def _first(jets: Floats, query: Floats) -> Floats:
-        return np.asarray(jets[np.square(jets - query).sum(1).argmin()])
 
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
         """For each jet those (padded with one that is infinitely far) whose supports reach the

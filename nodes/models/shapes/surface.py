@@ -144,7 +144,7 @@ class Feet:
     is_nearest: Bools
 
 
-MOST_STEPS = 60
+MOST_STEPS = 25
 LEAST_BEND = 0.2
 """Floor of the reduced Hessian's eigenvalues (1 on a flat surface): below it, within four fifths
 of a centre of curvature or past it, the full Newton step would be too long or go uphill."""
