@@ -18,6 +18,7 @@ from nodes.methods import Family, Point, measure, pareto_front
 FAMILIES: dict[str, str] = {
     "mark": "nodes.triangulator.families:MARK",
     "triangulation": "nodes.triangulator.families:TRIANGULATION",
+    "tracking": "launch.families:TRACKING",
     "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
     "soft-body": "nodes.fem_solver.families:SOFT_BODY",
     "correction": "launch.families:CORRECTION",

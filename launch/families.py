@@ -2,7 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import numpy as np
+
+from launch.experiments.stroke import stroke_path
+from messages.scene import Scene
+from messages.types import FingerPath
 from nodes.renderer.families import correction_family
+from nodes.triangulator.tracking_family import Motion, tracking_family
 from nodes.twin.eye import seen_at
+from nodes.twin.finger import FingerMotion
+from nodes.twin.gestures import GESTURES
 
 CORRECTION = correction_family(seen_at)
+
+TRACKED_GESTURES = ("hold", "reach", "tap", "stop", "stroke-push")
+RESTING = ("hold",)
+
+
+def finger_motions(scene: Scene) -> Mapping[str, Motion]:
+    """The paper's stroke and some gestures, as the twin's finger makes them."""
+    paths = {"stroke": stroke_path(scene, 10.0)}
+    paths |= {name: GESTURES[name](scene) for name in TRACKED_GESTURES}
+    return {name: _motion(scene, path, resting=name in RESTING) for name, path in paths.items()}
+
+
+def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
+    """The path with its unsteadiness, once the reach to its start is over."""
+    start = np.asarray(path.positions_world_m[0])
+    motion = FingerMotion.resting(start, seed=1).followed_by(
+        0.0,
+        times_s=path.times_s,
+        points=path.positions_world_m,
+        wander_m=path.wander_m,
+        tremor_m=path.tremor_m,
+        max_speed_m_per_s=scene.finger.max_speed_m_per_s,
+        joined_by=path.joined_by,
+    )
+    duration_s = float(path.times_s[-1] - path.times_s[0])
+    return Motion(lambda time_s: motion.at(motion.ease_s + time_s).position, duration_s, resting)
+
+
+TRACKING = tracking_family(finger_motions)

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from ruamel.yaml import YAML
 
+from messages.scene import Scene
+from nodes.methods import measure as measure_trial
 from nodes.models.prediction import path_at
 from nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter, Kalman, Tremor
 from nodes.triangulator.tracking import Tracker, TrackingSettings
+from nodes.triangulator.tracking_family import Motion, tracking_family
 
 Floats = NDArray[np.float64]
 Path = Callable[[float], Floats]
 
+SCENE_FILE = FilePath(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
 FRAME_NS = 16_666_667
 NOISE = np.diag([1e-5, 2e-5, 8e-5]) ** 2
 SETTINGS = TrackingSettings(max_speed_m_per_s=1.5)
@@ -406,3 +413,41 @@ def test_half_the_frames_are_enough() -> None:
         return float(np.sqrt(np.mean(np.square(errors))))
 
     assert rms_m(2) < 2.0 * rms_m(1)
+
+
+# The family
+
+
+def wandering(time_s: float) -> Floats:
+    """Half a millimetre at 0.6 Hz and tremor at 9.6 Hz, on every axis in a phase of its own."""
+    phases = np.array([0.0, 1.0, 2.0])
+    slow = np.sin(2 * np.pi * 0.6 * time_s + phases)
+    quick = np.sin(2 * np.pi * 9.6 * time_s + 2 * phases)
+    return 5e-4 * slow + 3.5e-5 * quick
+
+
+def reaching(time_s: float) -> Floats:
+    return np.array([0.05 * np.sin(2 * np.pi * 0.5 * time_s), 0.0, 0.0])
+
+
+def test_methods_are_as_good_as_they_say_in_their_range() -> None:
+    """A dearer method is better where it matters: the longer the lead and the livelier the hand."""
+    family = tracking_family(
+        lambda scene: {
+            "rest": Motion(wandering, 6.0, resting=True),
+            "reach": Motion(lambda t: reaching(t) + wandering(t), 6.0, resting=False),
+        }
+    )
+    errors: dict[tuple[str, str, int], float] = {}
+    for trial in family.trials(SCENE):
+        point = measure_trial(trial, repeats=1)
+        errors[trial.method, str(trial.case["motion"]), int(trial.case["lead_ms"])] = point.error
+        known = trial.method not in ("none", "exponential")
+        assert trial.in_range >= known
+        if trial.in_range and trial.case["motion"] == "rest" and trial.case["lead_ms"] < 50:
+            assert point.error < family.tolerance(SCENE)
+    for motion, lead_ms in (("rest", 20), ("rest", 50), ("reach", 20), ("reach", 50)):
+        best = min(TRACKING_METHODS, key=lambda name: errors[name, motion, lead_ms])
+        assert best == "hand"
+    assert errors["none", "reach", 50] > 5 * errors["hand", "reach", 50]
+    assert errors["hand", "rest", 0] < errors["none", "rest", 0]
