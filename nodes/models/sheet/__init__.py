@@ -1,0 +1,26 @@
+"""The rubber sheet: where its edges are, and how it pushes back.
+
+Sheet frame: origin at the centre, x from the left clamped edge to the right one, y along the edges,
+z towards the user.
+"""
+
+from __future__ import annotations
+
+from nodes.models.sheet.geometry import corners, edge_poses, flange_pose, sheet_from_edges
+from nodes.models.sheet.tension import (
+    edge_force_for_stiffness,
+    edge_force_n,
+    push_stiffness_n_per_m,
+    stretch_for_edge_force,
+)
+
+__all__ = [
+    "corners",
+    "edge_force_for_stiffness",
+    "edge_force_n",
+    "edge_poses",
+    "flange_pose",
+    "push_stiffness_n_per_m",
+    "sheet_from_edges",
+    "stretch_for_edge_force",
+]

@@ -1,0 +1,446 @@
+"""The sheet as a finite-element membrane: the most exact of its force laws, and the slowest.
+
+Constant-strain triangles of incompressible Mooney-Rivlin rubber in plane stress,
+
+    W = C1 (I1 - 3) + C2 (I2 - 3),    E = 6 (C1 + C2)
+
+(neo-Hookean for C2 = 0).  A membrane carries no compression: it wrinkles.  Where the smaller
+principal stretch falls below what it is in simple tension, l2 < l1^-1/2, the energy is that of
+simple tension alone, and nothing where both are slack (tension field: Pipkin, IMA J. Appl. Math.
+36, 1986).  The stress and its tangent are written in the principal frame of C = F'F, which serves
+every isotropic energy.
+
+The fingertip is a rigid sphere pushed in along the flat sheet's normal.  What it has touched keeps
+to it, as rubber keeps to skin.  The equilibria along the push are found one from the other by
+Newton's method, damped (Levenberg, Marquardt) where the slack sheet offers no resistance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+CELLS = 32
+FINEST_RADII = 0.3
+"""Cell under the finger, in finger radii."""
+STEP_RADII = 0.4
+"""Largest advance of the finger from one equilibrium to the next, in its radii."""
+BED_PER_MODULUS = 3e3
+"""Pressure of the finger per depth of penetration, in E t / width^2."""
+MOST_ITERATIONS = 120
+TOLERANCE = 1e-7
+"""Residual at equilibrium, in E t width."""
+
+
+class NoEquilibriumError(ArithmeticError):
+    """No equilibrium of the membrane was found; the message says where and how far off."""
+
+
+@dataclass(frozen=True, slots=True)
+class Membrane:
+    """A sheet clamped along two edges `width_m` apart, each `height_m` long, when slack.
+
+    mooney_share: C2 / (C1 + C2), from 0 (neo-Hookean) to below 1.
+    """
+
+    width_m: float
+    height_m: float
+    thickness_m: float
+    young_modulus_pa: float
+    mooney_share: float = 0.0
+
+    def __post_init__(self) -> None:
+        """ValueError for a size, modulus or share outside of its range."""
+        sizes = (self.width_m, self.height_m, self.thickness_m, self.young_modulus_pa)
+        if not (np.isfinite(sizes).all() and min(sizes) > 0.0):
+            raise ValueError(f"sheet's sizes and modulus {sizes} must be finite and above zero")
+        if not 0.0 <= self.mooney_share < 1.0:
+            raise ValueError(f"mooney_share: {self.mooney_share} is not from 0 to below 1")
+
+
+@dataclass(frozen=True, slots=True)
+class PushPath:
+    """Equilibria of one push, a row per depth.
+
+    depths_m (n,).  forces_n (n,): of the sheet on the finger, along its normal.  edge_forces_n
+    (n,): on each clamp, along the line between them (mean of both).  positions (n, rows, columns,
+    3): in the frame of the flat sheet, origin at its centre.
+    """
+
+    depths_m: Floats
+    forces_n: Floats
+    edge_forces_n: Floats
+    positions: Floats
+
+
+def push_path(
+    membrane: Membrane,
+    *,
+    stretch_ratio: float,
+    depths_m: Sequence[float] | Floats,
+    place_m: tuple[float, float] = (0.0, 0.0),
+    finger_radius_m: float,
+    cells: int = CELLS,
+) -> PushPath:
+    """Equilibria as a fingertip pushes to each of the ascending depths (n,), m, one after another.
+
+    stretch_ratio: distance of the edges over the slack width.  place_m: (x, y) of the push on the
+    stretched sheet, from its centre.  ValueError for a place off the sheet or depths that do not
+    ascend from 0; NoEquilibriumError where none was found.
+    """
+    depths = np.asarray(depths_m, dtype=np.float64)
+    if (
+        depths.ndim != 1
+        or not np.isfinite(depths).all()
+        or (np.diff(depths, prepend=0.0) < 0).any()
+    ):
+        raise ValueError(f"depths {depths} must ascend from 0")
+    if not stretch_ratio > 0.0 or not finger_radius_m > 0.0:
+        raise ValueError(f"stretch {stretch_ratio} and radius {finger_radius_m} must be above zero")
+    focus = np.array(
+        [place_m[0] / stretch_ratio + 0.5 * membrane.width_m, place_m[1] + 0.5 * membrane.height_m]
+    )
+    if not (0.0 < focus[0] < membrane.width_m and 0.0 < focus[1] < membrane.height_m):
+        raise ValueError(f"place {place_m} is not on the sheet")
+    grid = _Grid(membrane, focus, FINEST_RADII * finger_radius_m, cells)
+    state = _flat(grid, stretch_ratio)
+    state = _settle(grid, state, None)
+    foot: Floats = np.array([*place_m, 0.0], dtype=np.float64)
+    kept = np.zeros(len(state), dtype=bool)
+    depth = 0.0
+    rows: list[tuple[float, float, Floats]] = []
+    for wanted in depths:
+        steps = max(1, int(np.ceil((wanted - depth) / (STEP_RADII * finger_radius_m))))
+        advance = (wanted - depth) / steps
+        for _ in range(steps if wanted > depth else 0):
+            state = _carried(grid, state, foot, kept, (depth, advance))
+            depth += advance
+            centre: Floats = foot + np.array([0.0, 0.0, finger_radius_m - depth], dtype=np.float64)
+            ball = _Ball(centre, finger_radius_m, grid.bed, kept)
+            state = _settle(grid, state, ball)
+            kept = kept | ball.touched(state)
+        inner = grid.gradient(state).reshape(-1, 3)
+        finger = -inner[kept, 2].sum()
+        left, right = inner[grid.left, 0].sum(), inner[grid.right, 0].sum()
+        rows.append((float(finger), float(0.5 * (right - left)), state))
+    return PushPath(
+        depths_m=depths,
+        forces_n=np.array([row[0] for row in rows]),
+        edge_forces_n=np.array([row[1] for row in rows]),
+        positions=np.array([row[2] for row in rows]).reshape(len(rows), *grid.shape, 3),
+    )
+
+
+def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floats:
+    """(cells + 1,) coordinates from 0 to length_m: a node at the focus, spacing growing from there.
+
+    On either side x = sinh(k u) / sinh(k), u uniform, with the k that gives the finest cell.
+    """
+    share = int(np.clip(round(cells * focus_m / length_m), cells // 4, cells - cells // 4))
+
+    def side(extent: float, count: int) -> Floats:
+        even = np.linspace(0.0, 1.0, count + 1)
+        if extent <= finest_m * count:
+            return extent * even
+        low, high = 1e-6, 30.0
+        for _ in range(60):
+            k = 0.5 * (low + high)
+            first = extent * np.sinh(k / count) / np.sinh(k)
+            low, high = (k, high) if first > finest_m else (low, k)
+        result: Floats = extent * np.sinh(high * even) / np.sinh(high)
+        return result
+
+    left, right = side(focus_m, share), side(length_m - focus_m, cells - share)
+    return np.concatenate([focus_m - left[::-1], focus_m + right[1:]])
+
+
+class _Grid:
+    """Triangles of the rest sheet, their strain, and the pattern of the stiffness matrix."""
+
+    def __init__(self, membrane: Membrane, focus: Floats, finest_m: float, cells: int) -> None:
+        x = graded(membrane.width_m, float(focus[0]), finest_m, cells)
+        y = graded(membrane.height_m, float(focus[1]), finest_m, cells)
+        rows, columns = len(y), len(x)
+        self.shape = (rows, columns)
+        self.rest = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        self.centre = 0.5 * np.array([membrane.width_m, membrane.height_m])
+        self.c1 = membrane.young_modulus_pa / 6.0 * (1.0 - membrane.mooney_share)
+        self.c2 = membrane.young_modulus_pa / 6.0 * membrane.mooney_share
+        self.force_scale = membrane.young_modulus_pa * membrane.thickness_m * membrane.width_m
+
+        number = np.arange(rows * columns).reshape(rows, columns)
+        a, b = number[:-1, :-1], number[:-1, 1:]
+        d, c = number[1:, :-1], number[1:, 1:]
+        # The diagonals point to the middle of the crosses of four cells, so that no direction of
+        # the sheet is favoured.
+        row, column = np.indices(a.shape)
+        rising = ((row + column) % 2 == 0)[..., None]
+        first = np.where(rising, np.stack([a, b, c], -1), np.stack([a, b, d], -1))
+        second = np.where(rising, np.stack([a, c, d], -1), np.stack([b, c, d], -1))
+        self.triangles = np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)])
+        corners = self.rest[self.triangles]
+        sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
+        area = 0.5 * np.linalg.det(sides)
+        self.volume = area * membrane.thickness_m
+        inverse = np.linalg.inv(sides)
+        # (triangles, 3 nodes, 2): gradient of the hat functions; F = sum of positions x gradient.
+        self.hats = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
+        node_area = np.bincount(self.triangles.ravel(), np.repeat(area / 3.0, 3), len(self.rest))
+        self.bed = (
+            BED_PER_MODULUS
+            * membrane.young_modulus_pa
+            * membrane.thickness_m
+            / membrane.width_m**2
+            * node_area
+        )
+        self.left, self.right = number[:, 0], number[:, -1]
+        clamped = np.zeros(len(self.rest), dtype=bool)
+        clamped[self.left] = clamped[self.right] = True
+        self.clamped = clamped
+        coordinates = (3 * self.triangles[:, :, None] + np.arange(3)).reshape(-1, 9)
+        self._coordinates = coordinates
+        size = 3 * len(self.rest)
+        keys = np.repeat(coordinates, 9, axis=1) + size * np.tile(coordinates, (1, 9))
+        self._keys, self._slots = np.unique(keys.ravel(), return_inverse=True)
+        self._rows, self._columns = self._keys % size, self._keys // size
+        self._size = size
+        self._diagonal = np.searchsorted(self._keys, np.arange(size) * (size + 1))
+
+    def strain(self, positions: Floats) -> tuple[Floats, Floats]:
+        """F (triangles, 3, 2) and C = F'F (triangles, 2, 2)."""
+        deformed = positions[self.triangles].transpose(0, 2, 1) @ self.hats
+        return deformed, deformed.transpose(0, 2, 1) @ deformed
+
+    def energy(self, positions: Floats) -> float:
+        _, c = self.strain(positions)
+        large, small, _ = principal(c)
+        return float(self.volume @ relaxed(large, small, self.c1, self.c2)[0])
+
+    def gradient(self, positions: Floats) -> Floats:
+        """Forces (3 nodes,) that hold the sheet there, N."""
+        deformed, c = self.strain(positions)
+        stress, _ = stress_and_tangent(c, self.c1, self.c2, tangent=False)
+        local = self.volume[:, None, None] * self.hats @ stress @ deformed.transpose(0, 2, 1)
+        return self._gathered(local)
+
+    def _gathered(self, local: Floats) -> Floats:
+        """Element forces (triangles, 3, 3) summed at the nodes (3 nodes,)."""
+        sums = np.bincount(self._coordinates.ravel(), weights=local.ravel(), minlength=self._size)
+        return np.asarray(sums, dtype=np.float64)
+
+    def _summed(self, blocks: Floats) -> Floats:
+        """Element stiffnesses summed into the entries of the pattern."""
+        sums = np.bincount(self._slots, weights=blocks.ravel(), minlength=len(self._keys))
+        return np.asarray(sums, dtype=np.float64)
+
+    def system(
+        self, positions: Floats, added: Floats, free: Bools, damping: float
+    ) -> tuple[Floats, csc_array]:
+        """Gradient (3 nodes,) and the stiffness of the free coordinates; added (nodes, 3, 3)."""
+        deformed, c = self.strain(positions)
+        stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
+        volume, hats = self.volume[:, None, None], self.hats
+        local = volume * hats @ stress @ deformed.transpose(0, 2, 1)
+        count = len(local)
+        # Variation of E = (C - I)/2 as [E11, E22, 2 E12] with the nodes' coordinates.
+        by_node = np.empty((count, 3, 3, 3))
+        by_node[:, 0] = hats[:, :, :1] * deformed[:, None, :, 0]
+        by_node[:, 1] = hats[:, :, 1:] * deformed[:, None, :, 1]
+        by_node[:, 2] = (
+            hats[:, :, 1:] * deformed[:, None, :, 0] + hats[:, :, :1] * deformed[:, None, :, 1]
+        )
+        b = by_node.reshape(count, 3, 9)
+        blocks = (b.transpose(0, 2, 1) @ (volume * tangent @ b)).reshape(count, 3, 3, 3, 3)
+        geometric = volume * hats @ stress @ hats.transpose(0, 2, 1)
+        for axis in range(3):
+            blocks[:, :, axis, :, axis] += geometric
+        values = self._summed(blocks)
+        values[self._diagonal] += damping
+        for node in np.flatnonzero(added.any(axis=(1, 2))):
+            at = 3 * node + np.arange(3)
+            values[np.searchsorted(self._keys, at[:, None] + self._size * at)] += added[node]
+        keep = free[self._rows] & free[self._columns]
+        number = np.cumsum(free) - 1
+        matrix = csc_array(
+            (values[keep], (number[self._rows[keep]], number[self._columns[keep]])),
+            shape=(int(free.sum()),) * 2,
+        )
+        return self._gathered(local), matrix
+
+
+def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
+    """Eigenvalues (n,) of C (n, 2, 2), the larger first, and the larger one's direction (n, 2)."""
+    middle, half = 0.5 * (c[:, 0, 0] + c[:, 1, 1]), 0.5 * (c[:, 0, 0] - c[:, 1, 1])
+    spread = np.hypot(half, c[:, 0, 1])
+    angle = 0.5 * np.arctan2(c[:, 0, 1], half)
+    return middle + spread, middle - spread, np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def relaxed(large: Floats, small: Floats, c1: float, c2: float) -> tuple[Floats, Floats, Floats]:
+    """Energy of squared principal stretches p >= q (n,), per rest volume, with its derivatives.
+
+    Returns W (n,), [W_p, W_q] (2, n) and [W_pp, W_qq, W_pq] (3, n).
+    """
+    p = np.maximum(large, 1.0)
+    taut = small > p**-0.5
+    q = np.where(taut, small, p**-0.5)
+    p_full = np.where(taut, large, p)
+    pq = p_full * q
+    energy = c1 * (p_full + q + 1.0 / pq - 3.0) + c2 * (1.0 / p_full + 1.0 / q + pq - 3.0)
+    first = np.stack(
+        [
+            c1 * (1.0 - 1.0 / (p_full * pq)) + c2 * (q - p_full**-2),
+            c1 * (1.0 - 1.0 / (q * pq)) + c2 * (p_full - q**-2),
+        ]
+    )
+    second = np.stack(
+        [
+            2.0 * c1 / (p_full**2 * pq) + 2.0 * c2 * p_full**-3,
+            2.0 * c1 / (q**2 * pq) + 2.0 * c2 * q**-3,
+            c1 / pq**2 + c2,
+        ]
+    )
+    # Loose: the width follows freely, so that only the slope along the tension is left.
+    loose = ~taut
+    first[1, loose] = 0.0
+    along = second[0, loose] - second[2, loose] ** 2 / second[1, loose]
+    second[0, loose] = np.where(large[loose] > 1.0, along, 0.0)
+    second[1:, loose] = 0.0
+    return energy, first, second
+
+
+def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tuple[Floats, Floats]:
+    """Second Piola-Kirchhoff stress (n, 2, 2), and its tangent (n, 3, 3) for [E11, E22, 2 E12]."""
+    large, small, direction = principal(c)
+    _, first, second = relaxed(large, small, c1, c2)
+    cos, sin = direction.T
+    along = np.stack([cos * cos, sin * sin, cos * sin])
+    across = np.stack([sin * sin, cos * cos, -cos * sin])
+    flat = 2.0 * (first[0] * along + first[1] * across)
+    stress = np.stack([np.stack([flat[0], flat[2]], -1), np.stack([flat[2], flat[1]], -1)], -1)
+    if not tangent:
+        return stress, np.empty((0, 3, 3))
+    gap = large - small
+    apart = gap > 1e-9
+    turning = np.where(
+        apart, (first[0] - first[1]) / np.where(apart, gap, 1.0), second[0] - second[2]
+    )
+    shear = np.stack([-2.0 * cos * sin, 2.0 * cos * sin, cos * cos - sin * sin])
+    result = 4.0 * (
+        np.einsum("n,in,jn->nij", second[0], along, along)
+        + np.einsum("n,in,jn->nij", second[1], across, across)
+        + np.einsum("n,in,jn->nij", second[2], along, across)
+        + np.einsum("n,in,jn->nij", second[2], across, along)
+    ) + 2.0 * np.einsum("n,in,jn->nij", turning, shear, shear)
+    return stress, result
+
+
+class _Ball:
+    """The fingertip: presses nodes that lie in it outwards; what it kept before moves with it."""
+
+    def __init__(self, centre: Floats, radius_m: float, bed: Floats, kept: Bools) -> None:
+        self.centre, self.radius, self.kept = centre, radius_m, kept
+        self._bed = np.where(kept, 0.0, bed)
+
+    def _reach(self, positions: Floats) -> tuple[Floats, Floats]:
+        offset = positions - self.centre
+        distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-12)
+        return np.maximum(self.radius - distance, 0.0), offset / distance[:, None]
+
+    def touched(self, positions: Floats) -> Bools:
+        touched: Bools = self._reach(positions)[0] > 0.0
+        return touched
+
+    def energy(self, positions: Floats) -> float:
+        return 0.5 * float(self._bed @ self._reach(positions)[0] ** 2)
+
+    def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
+        """Gradient (nodes, 3) and the definite part of its derivative (nodes, 3, 3)."""
+        inside, outward = self._reach(positions)
+        stiff = np.where(inside > 0.0, self._bed, 0.0)
+        return -(stiff * inside)[:, None] * outward, np.einsum(
+            "n,ni,nj->nij", stiff, outward, outward
+        )
+
+
+def _flat(grid: _Grid, stretch_ratio: float) -> Floats:
+    positions = np.zeros((len(grid.rest), 3))
+    positions[:, :2] = (grid.rest - grid.centre) * [stretch_ratio, 1.0]
+    return positions
+
+
+def _carried(
+    grid: _Grid, state: Floats, foot: Floats, kept: Bools, push: tuple[float, float]
+) -> Floats:
+    """A guess at the next equilibrium: the dent grows in proportion, the first one is a cone.
+
+    push: the depth there and how much deeper the finger goes.
+    """
+    depth, advance = push
+    grown = state.copy()
+    if depth > 0.0:
+        grown[:, 2] *= (depth + advance) / depth
+    else:
+        away = np.hypot(state[:, 0] - foot[0], state[:, 1] - foot[1])
+        grown[:, 2] = -advance * np.maximum(1.0 - away / np.abs(grid.centre).max(), 0.0)
+        grown[grid.clamped, 2] = 0.0
+    grown[kept] = state[kept] - [0.0, 0.0, advance]
+    return grown
+
+
+def _settle(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
+    """The equilibrium near `start`, its clamped and kept nodes staying where they are."""
+    held = grid.clamped if ball is None else grid.clamped | ball.kept
+    free = np.repeat(~held, 3)
+    positions, damping = start, 1e-7
+    stiffness_scale = grid.force_scale / grid.centre[0]
+    added = np.zeros((len(start), 3, 3))
+
+    def energy(at: Floats) -> float:
+        return grid.energy(at) + (0.0 if ball is None else ball.energy(at))
+
+    current, residual = energy(positions), np.inf
+    for _ in range(MOST_ITERATIONS):
+        push = np.zeros_like(start)
+        if ball is not None:
+            push, added = ball.gradient(positions)
+        gradient, matrix = grid.system(positions, added, free, damping * stiffness_scale)
+        downhill = -(gradient + push.ravel())[free]
+        residual = float(np.linalg.norm(downhill))
+        if residual < TOLERANCE * grid.force_scale:
+            return positions
+        solved = splu(
+            matrix,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        ).solve(downhill)
+        slope = float(solved @ downhill)
+        step = np.zeros_like(start)
+        step.reshape(-1)[free] = solved
+        share = min(1.0, 0.1 * grid.centre[0] / max(float(np.abs(step).max()), 1e-12))
+        moved = False
+        for _ in range(20 if slope > 0.0 else 0):
+            trial = positions + share * step
+            value = energy(trial)
+            if value <= current - 1e-4 * share * slope + 1e-15 * abs(current):
+                positions, current, moved = trial, value, True
+                break
+            share *= 0.5
+        if not moved and damping > 1e3:
+            break
+        damping = damping * 30.0 if not moved else max(damping / 10.0, 1e-9)
+    if residual < 100.0 * TOLERANCE * grid.force_scale:
+        return positions
+    raise NoEquilibriumError(
+        f"membrane: residual {residual:.2e} N, wanted {TOLERANCE * grid.force_scale:.2e}"
+    )
