@@ -21,7 +21,7 @@ from messages.calibration import (
     save_calibration,
 )
 from messages.scene import Lens
-from nodes.camera.calibration import calibrate_stereo, fit_pairs
+from nodes.camera.calibration import calibrate_stereo
 from nodes.camera.check import check_stereo, cross_check, rigid_fit_residuals
 from nodes.camera.corners import (
     BoardPair,
@@ -30,6 +30,7 @@ from nodes.camera.corners import (
     find_pairs,
     same_order,
 )
+from nodes.camera.selection import fit_pairs
 from nodes.camera.uncertainty import position_slopes, view_of_work
 from nodes.models import camera, rigid
 

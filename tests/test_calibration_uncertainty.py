@@ -13,12 +13,13 @@ from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
 from launch.plan import load_plan
-from messages.calibration import Board, StereoCalibration, load_calibration
+from messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
 from messages.scene import Lens, Scene, StereoCamera
 from nodes.camera import bundle
-from nodes.camera.calibration import fit_pairs, state_uncertainty
+from nodes.camera.calibration import state_uncertainty
 from nodes.camera.check import Rig, triangulated
 from nodes.camera.corners import BoardPair, CornerFinder, View, board_points, pair_of
+from nodes.camera.selection import Selection, fit_pairs, fit_selection
 from nodes.camera.uncertainty import (
     jackknife_covariance,
     position_slopes,
@@ -34,6 +35,8 @@ ROOT = Path(__file__).resolve().parent.parent
 SHIPPED = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 BOARD = Board(columns=9, rows=6, square_m=0.025)
 POINTS = board_points(BOARD)
+COARSE = Board(columns=6, rows=4, square_m=0.035)
+"""For small pictures."""
 
 
 @cache
@@ -75,17 +78,23 @@ def numbers_of(camera: StereoCamera | StereoCalibration) -> Floats:
     return np.concatenate([*lenses, bundle.pose_vector(camera.right_from_left)])
 
 
-def photographed(camera: StereoCamera, *, seed: int, count: int) -> list[BoardPair]:
-    """What is found in the twin's pictures of a board."""
-    board, finder = TwinBoard(camera, BOARD, seed=seed), CornerFinder(BOARD)
+def calibrated(
+    camera: StereoCamera, board: Board, *, seed: int, count: int, distance_m: float
+) -> tuple[bundle.Fit, Uncertainty]:
+    """A calibration from the twin's pictures of a board."""
+    twin, finder = TwinBoard(camera, board, seed=seed), CornerFinder(board)
     pairs = []
-    for left_from_board in board.poses(count):
-        left, right = board.pair(left_from_board)
-        pair = pair_of(finder.find(left), finder.find(right), BOARD, ("left", "right"))
-        if isinstance(pair, BoardPair):  # small pictures of a far, tilted board may be too coarse
-            pairs.append(pair)
-    assert len(pairs) >= 0.75 * count
-    return pairs
+    for left_from_board in twin.poses(count):
+        left, right = twin.pair(left_from_board)
+        pairs.append(pair_of(finder.find(left), finder.find(right), board, ("left", "right")))
+    selection = Selection(pairs, [str(number) for number in range(count)])
+    size, points = (camera.width_px, camera.height_px), board_points(board)
+    fit = fit_selection(selection, points, size)
+    assert len(selection.good) >= 0.75 * count
+    uncertainty = state_uncertainty(
+        fit, selection.pairs(), points, size=size, distance_m=distance_m
+    )
+    return fit, uncertainty
 
 
 @cache
@@ -238,9 +247,7 @@ def test_fingertips_err_as_the_calibrations_state() -> None:
     left, right = drawn(true, points)
     errors, stated = [], []
     for seed in range(6):
-        pairs = photographed(camera, seed=seed, count=12)
-        fit = fit_pairs(pairs, POINTS, (320, 240))
-        uncertainty = state_uncertainty(fit, pairs, POINTS, size=(320, 240), distance_m=0.5)
+        fit, uncertainty = calibrated(camera, COARSE, seed=seed, count=12, distance_m=0.5)
         errors.append(triangulated(Rig.of(fit.rig), left, right) - points)
         stated.append((uncertainty.depth_std_m, uncertainty.lateral_std_m))
     variances = np.mean(np.square(errors), axis=(0, 1))
@@ -267,10 +274,10 @@ def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
     """Fewer pairs, other poses, other noise."""
     shipped = load_calibration(SHIPPED)
     assert shipped.uncertainty is not None
-    pairs = photographed(true_camera(scene_camera()), seed=77, count=10)
-    fit = fit_pairs(pairs, POINTS, (640, 480))
     distance_m = shipped.uncertainty.working_distance_m
-    anew = state_uncertainty(fit, pairs, POINTS, size=(640, 480), distance_m=distance_m)
+    fit, anew = calibrated(
+        true_camera(scene_camera()), BOARD, seed=77, count=10, distance_m=distance_m
+    )
     slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), distance_m))
     shifts = slopes @ (fit.rig - numbers_of(shipped))
     depth_m = np.hypot(anew.depth_std_m, shipped.uncertainty.depth_std_m)

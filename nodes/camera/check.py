@@ -19,12 +19,10 @@ from nodes.camera.bundle import (
     LEFT,
     RIGHT,
     STAND,
-    NotDeterminedError,
     floats,
     lens_arrays,
     pose_transform,
 )
-from nodes.camera.calibration import MIN_PAIRS, fit_pairs
 from nodes.camera.corners import (
     BoardPair,
     CalibrationError,
@@ -36,6 +34,7 @@ from nodes.camera.corners import (
     read_gray,
     same_order,
 )
+from nodes.camera.selection import MIN_PAIRS, Selection, fit_selection
 
 Floats = NDArray[np.float64]
 
@@ -284,13 +283,8 @@ def cross_check(
     for group in range(groups):
         out = numbers[group::groups]
         kept = [i for i in numbers if i not in out]
-        try:
-            rig = Rig.of(fit_pairs([whole[i] for i in kept], points, size).rig)
-        except (cv2.error, NotDeterminedError) as error:
-            raise CalibrationError(
-                f"without {', '.join(left_paths[i].name for i in out)} the rest does not determine "
-                f"the rig: {error}"
-            ) from error
+        selection = Selection([whole[i] for i in kept], [left_paths[i].name for i in kept])
+        rig = Rig.of(fit_selection(selection, points, size).rig)
         ours.update({i: measure_board(rig, whole[i], board) for i in out})
         if plain:
             yardstick = plain_opencv([plain[i] for i in kept if i in plain], points, size)
