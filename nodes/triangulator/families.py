@@ -106,7 +106,7 @@ TRIANGULATION = Family(
     tolerance=lambda scene: 1e3 * scene.tolerances.fingertip_m,
 )
 
-MARK_PICTURES = 60
+MARK_PICTURES = 40
 PICTURE_PX = 57
 RAYS = 5
 BLUR_PX = 0.7

@@ -50,7 +50,7 @@ class MarkLooks:
 
     min_contrast: levels that its brightest pixel stands above its surroundings.
     min_area_px, max_area_px: pixels brighter than half that contrast.
-    window_half_px: half the side of the window that is searched around an expected place.
+    window_half_px: half the side of the least window that is searched around an expected place.
     max_motion_px: a mark is not drawn out by more during an exposure.
     max_blur: of the edge, one standard deviation, as a share of the radius; a mark with more is
         out of focus.
@@ -60,7 +60,7 @@ class MarkLooks:
     min_contrast: float = 60.0
     min_area_px: int = 4
     max_area_px: int = 1500
-    window_half_px: int = 28
+    window_half_px: int = 16
     max_motion_px: float = 9.0
     max_blur: float = 0.5
     max_misfit: float = 0.04
@@ -190,9 +190,11 @@ def _spots_in(
         x, y = x + columns.start, y + rows.start
         if x == 0 or y == 0 or x + width == part.shape[1] or y + height == part.shape[0]:
             continue
-        spot = _spot(part, (x, y, width, height), area, looks, origin)
-        if spot is not None:
-            spots.append(spot)
+        window = _around((x, y, width, height))
+        cut = part[window]
+        surround, peak = _surround(cut), cv2.minMaxLoc(cut)[1]
+        if peak - surround >= looks.min_contrast:
+            spots.append(_spot(cut, window, area=area, surround=surround, peak=peak, origin=origin))
     return spots
 
 
@@ -213,18 +215,16 @@ def _surround(cut: Image) -> float:
 
 
 def _spot(
-    part: Image,
-    box: tuple[int, int, int, int],
+    cut: Image,
+    window: Window,
+    *,
     area: float,
-    looks: MarkLooks,
+    surround: float,
+    peak: float,
     origin: tuple[int, int],
-) -> Spot | None:
-    """The spot in a box that fits it; None if it does not stand out there."""
-    rows, columns = _around(box)
-    cut = part[rows, columns]
-    surround, peak = _surround(cut), cv2.minMaxLoc(cut)[1]
-    if peak - surround < looks.min_contrast:
-        return None
+) -> Spot:
+    """The spot of so many pixels in a window of a picture's part; `origin`: of the part."""
+    rows, columns = window
     found = _light_moments(cut, surround, peak)
     light = found["m00"]
     a, b, c = found["mu20"] / light, found["mu11"] / light, found["mu02"] / light
@@ -271,9 +271,10 @@ class Systematic:
     still_px: float
     moving: float
 
-    def variance(self, motion: tuple[float, float]) -> float:
-        """px^2 for a mark that moved so far during the exposure."""
-        return self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
+    def covariance(self, motion: tuple[float, float]) -> Floats:
+        """(2, 2) px^2 for a mark that moved so far during the exposure."""
+        variance = self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
+        return np.array([[variance, 0.0], [0.0, variance]])
 
 
 BY_MOMENTS = Systematic(still_px=0.1, moving=0.03)
@@ -344,7 +345,7 @@ def _simple_mark(
         centre=np.array(
             [columns.start + found["m10"] / found["m00"], rows.start + found["m01"] / found["m00"]]
         ),
-        covariance=covariance + np.eye(2) * systematic.variance(spot.motion),
+        covariance=covariance + systematic.covariance(spot.motion),
         radius=spot.radius,
         radius_deviation=0.1,
         blur=spot.blur,
@@ -376,7 +377,7 @@ def subpixel_fit(
         marks.append(
             Mark(
                 centre=fit.centre,
-                covariance=fit.covariance + np.eye(2) * BY_SUBPIXEL_FIT.variance(fit.motion),
+                covariance=fit.covariance + BY_SUBPIXEL_FIT.covariance(fit.motion),
                 radius=fit.radius,
                 radius_deviation=0.02,
                 blur=fit.blur,

@@ -41,7 +41,7 @@ class TriangulatorParameters(NodeParameters):
     mark_min_contrast: Positive = 60.0
     mark_min_area_px: Annotated[int, Field(ge=1)] = 4
     mark_max_area_px: Annotated[int, Field(ge=1)] = 1500
-    window_half_px: Annotated[int, Field(ge=8)] = 28
+    window_half_px: Annotated[int, Field(ge=8)] = 16
     tracking: Literal[
         "none", "exponential", "one_euro", "constant_velocity", "constant_acceleration", "hand"
     ] = "hand"

@@ -8,7 +8,7 @@ motion during the exposure, on ground that may slope.  The level at a distance d
 with Phi the normal distribution's integral.  All of it is fitted at once by Gauss and Newton's
 method, each pixel weighted by its noise, and the inverse of the Fisher information is the
 covariance of the result: the Cramer-Rao bound, if pictures are as the model has it.  Where they are
-not, the misfit shows, and widens the covariance.
+not, the misfit shows, and its odd part widens the covariance.
 
 Centre and slopes are odd in the picture and all else is even, so that a wrong radius, blur, level
 or motion spoils the certainty of the centre, but does not move it.
@@ -29,11 +29,13 @@ Image = NDArray[np.uint8]
 
 X, Y, RADIUS, BLUR, MARK, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range(10)
 STILL_PARAMETERS = 8
+ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
+"""Parameters that change the picture oddly about the disc's centre."""
 
 WHITE = 255
-MARGIN_PX = 2.25
+MARGIN_PX = 2.5
 LEAST_MARGIN_PX = 1.25
-MARGIN_PER_MOTION = 0.15
+MARGIN_PER_MOTION = 0.3
 """The fit looks so far beyond the disc: enough to know the ground, short of the finger's own edge;
 that edge comes nearer by the motion, and is no ground that slopes evenly."""
 
@@ -47,17 +49,19 @@ LEAST = np.array([0.5, 0.3])
 LARGEST = np.array([40.0, 8.0])
 """Bounds of radius and blur, px."""
 
-MOTION_STEP_PX = 1.4
+MOTION_STEP_PX = 1.8
 """The motion is summed at steps no longer than this; the blur closes the gaps."""
 
-LEAST_MOTION_PX = 1.2
+LEAST_MOTION_PX = 2.0
 """A motion too short to be told from blur is not fitted."""
 
 PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
 ITERATIONS = 8
-SETTLED_PX = np.array([5e-3, 5e-3, 0.05, 0.05])
-"""Of centre, radius and blur: a last step as short is the last that is taken."""
+SETTLED_PX = np.array([0.02, 0.02, 0.05, 0.05])
+"""Of centre, radius and blur: a last step as short is the last that is taken.  It leaves its square
+over the blur, less than a thousandth of a pixel."""
+
 LARGEST_STEP_PX = 0.7
 LARGEST_SHIFT_PX = 2.0
 """A centre that leaves its start by more is not of the disc that was seen."""
@@ -123,7 +127,7 @@ def fit_discs(
             for one, (x, y) in zip(starts, seen.offsets, strict=True)
         ]
     )
-    if np.abs(start[:, MOTION_X:]).max() < LEAST_MOTION_PX:
+    if max(math.hypot(*one.motion) for one in starts) < LEAST_MOTION_PX:
         start = start[:, :STILL_PARAMETERS]
     believed = PRIOR_WEIGHTS[: start.shape[1]]
     prior = np.diag(believed)
@@ -145,20 +149,35 @@ def fit_discs(
         if (np.abs(step[:, : BLUR + 1]) < SETTLED_PX).all():
             settled = True
             break
-    covariances = np.linalg.inv(information)[:, :RADIUS, :RADIUS]
     # The last step is not drawn again: to first order it takes the gradient's way off the squares.
-    squares = np.einsum("ni,ni,ni->n", residuals, residuals, used)
-    squares -= np.einsum("ni,ni->n", gradient, step)
+    gains = gradient * step
+    squares = np.einsum("ni,ni,ni->n", residuals, residuals, used) - np.add.reduce(gains, axis=1)
+    mirrored = used[:, ::-1]
+    common = used * mirrored / (used + mirrored + 1e-300)
+    odd = residuals - residuals[:, ::-1]
+    is_odd = ODD[: start.shape[1]]
+    odd_squares = np.einsum("ni,ni,ni->n", odd, odd, common) - 2.0 * (gains @ is_odd)
+    odd_free = np.maximum(np.count_nonzero(common, axis=1) - 2.0 * is_odd.sum(), 1.0)
+    fitness = zip(
+        squares.tolist(),
+        np.count_nonzero(used, axis=1).tolist(),
+        np.add.reduce(used, axis=1).tolist(),
+        (odd_squares / odd_free).tolist(),
+        strict=True,
+    )
+    covariances = np.linalg.inv(information)[:, :RADIUS, :RADIUS]
+    shifts = np.abs(found - start)[:, :RADIUS].max(axis=1).tolist()
     return [
         _judged(
-            found[i],
-            (found[i, :RADIUS] - start[i, :RADIUS]).tolist(),
-            seen.corners[i],
-            covariances[i],
-            Fitness(float(squares[i]), int(np.count_nonzero(used[i])), float(used[i].sum())),
-            settled=settled,
+            parameters,
+            corner,
+            covariance,
+            fits,
+            settled=settled and shift < LARGEST_SHIFT_PX,
         )
-        for i in range(len(starts))
+        for parameters, corner, covariance, fits, shift in zip(
+            found.tolist(), seen.corners, covariances, fitness, shifts, strict=True
+        )
     ]
 
 
@@ -236,51 +255,41 @@ def _seen(pictures: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNo
 def _disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     """Levels (n, s s) of discs and their slopes (n, parameters, s s).
 
-    x: (1, 1, s), y: (1, s, 1).
+    x: (1, 1, s), y: (1, s, 1).  Along a motion the disc stands at k places: (n, k, s, s) inside.
     """
     count, parameters = found.shape
+    moving = parameters > STILL_PARAMETERS
     side = x.shape[2]
     columns = found.T[:, :, None, None]
     dx, dy = x - columns[X], y - columns[Y]
-    radius, inverse = columns[RADIUS], 1.0 / columns[BLUR]
+    radius, inverse = columns[RADIUS][:, None], 1.0 / columns[BLUR][:, None]
     slopes = np.empty((count, parameters, side, side))
-    if parameters == STILL_PARAMETERS:
-        away = np.sqrt(dx * dx + (dy * dy + 1e-12))
-        inward = (radius - away) * inverse
-        share = ndtr(inward)
-        edge = np.exp(inward * inward * -0.5) * (PEAK_OF_NORMAL * inverse)
-        slopes[:, RADIUS] = edge
-        np.multiply(edge, -inward, out=slopes[:, BLUR])
-        edge /= away
-        np.multiply(edge, dx, out=slopes[:, X])
-        np.multiply(edge, dy, out=slopes[:, Y])
-    else:
-        motion_x, motion_y = columns[MOTION_X], columns[MOTION_Y]
-        longest = float(np.abs(found[:, MOTION_X:]).max())
-        steps = int(math.sqrt(2.0) * longest / MOTION_STEP_PX) + 2
-        share = np.zeros((count, side, side))
-        slopes[:, :MARK], slopes[:, MOTION_X:] = 0.0, 0.0
-        for step in range(steps):
-            along = (step + 0.5) / steps - 0.5
-            ax, ay = dx - along * motion_x, dy - along * motion_y
-            away = np.sqrt(ax * ax + (ay * ay + 1e-12))
-            inward = (radius - away) * inverse
-            share += ndtr(inward)
-            edge = np.exp(inward * inward * -0.5) * (PEAK_OF_NORMAL / steps * inverse)
-            slopes[:, RADIUS] += edge
-            slopes[:, BLUR] -= edge * inward
-            edge /= away
-            ax, ay = edge * ax, edge * ay
-            slopes[:, X] += ax
-            slopes[:, Y] += ay
-            slopes[:, MOTION_X] += along * ax
-            slopes[:, MOTION_Y] += along * ay
-        share /= steps
+    ax, ay, steps = dx[:, None], dy[:, None], 1
+    if moving:
+        longest = math.sqrt(np.square(found[:, MOTION_X:]).sum(axis=1).max())
+        steps = int(longest / MOTION_STEP_PX) + 1
+        along = ((np.arange(steps) + 0.5) / steps - 0.5).reshape(1, steps, 1, 1)
+        ax = ax - along * columns[MOTION_X][:, None]
+        ay = ay - along * columns[MOTION_Y][:, None]
+    away = np.sqrt(ax * ax + (ay * ay + 1e-12))
+    inward = (radius - away) * inverse
+    edge = np.exp(inward * inward * -0.5)
+    edge *= (PEAK_OF_NORMAL / steps) * inverse
+    share = np.add.reduce(ndtr(inward), axis=1)
+    share /= steps
+    np.add.reduce(edge, axis=1, out=slopes[:, RADIUS])
+    np.add.reduce(edge * -inward, axis=1, out=slopes[:, BLUR])
+    edge /= away
+    ax, ay = edge * ax, edge * ay
+    np.add.reduce(ax, axis=1, out=slopes[:, X])
+    np.add.reduce(ay, axis=1, out=slopes[:, Y])
     ground = columns[GROUND] + (columns[SLOPE_X] * dx + columns[SLOPE_Y] * dy)
     height = columns[MARK] - ground
-    slopes[:, :MARK] *= height[:, None]
-    if parameters > STILL_PARAMETERS:
+    if moving:
+        np.add.reduce(along * ax, axis=1, out=slopes[:, MOTION_X])
+        np.add.reduce(along * ay, axis=1, out=slopes[:, MOTION_Y])
         slopes[:, MOTION_X:] *= height[:, None]
+    slopes[:, :MARK] *= height[:, None]
     slopes[:, MARK] = share
     left = np.subtract(1.0, share, out=slopes[:, GROUND])
     np.multiply(left, dx, out=slopes[:, SLOPE_X])
@@ -289,29 +298,24 @@ def _disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return levels.reshape(count, side * side), slopes.reshape(count, parameters, side * side)
 
 
-@dataclass(frozen=True, slots=True)
-class Fitness:
-    """Weighted squares of what a fit leaves, its pixels, and the sum of their weights."""
-
-    squares: float
-    pixels: int
-    weight: float
-
-
 def _judged(
-    found: Floats,
-    shift: list[float],
+    found: list[float],
     corner: tuple[int, int],
     covariance: Floats,
-    fitness: Fitness,
+    fitness: tuple[float, int, float, float],
     *,
     settled: bool,
 ) -> DiscFit:
-    """What a fit came to: its covariance widened by the misfit."""
-    x, y, radius, blur, mark, ground, _, _, *motion = found.tolist()
-    ratio = fitness.squares / max(fitness.pixels - len(found), 1)
+    """What a fit came to: its covariance widened by what the noise does not explain.
+
+    fitness: weighted squares of what it leaves, its pixels, the sum of their weights, and the noise
+    that the odd part of what it leaves shows, as a ratio of variances: that part alone can have
+    moved the centre.
+    """
+    squares, pixels, weight, ratio = fitness
+    x, y, radius, blur, mark, ground, _, _, *motion = found
     height = mark - ground
-    excess = max(fitness.squares - fitness.pixels, 0.0) / max(fitness.weight, 1e-12)
+    excess = max(squares - pixels, 0.0) / max(weight, 1e-12)
     return DiscFit(
         centre=np.array([corner[0] + x, corner[1] + y]),
         covariance=covariance * max(ratio, LEAST_VARIANCE_RATIO),
@@ -321,5 +325,5 @@ def _judged(
         motion=(motion[0], motion[1]) if motion else (0.0, 0.0),
         height=height,
         misfit=math.sqrt(excess) / max(abs(height), 1e-6),
-        settled=settled and height > 0.0 and max(map(abs, shift)) < LARGEST_SHIFT_PX,
+        settled=settled and height > 0.0,
     )

@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -332,10 +333,10 @@ def measure(
         in_right, geometry.matrices[1], geometry.distortions[1]
     )
     slope = np.concatenate((left_slope, right_slope @ rig[:3, :3]))
-    try:
-        inverse = np.linalg.inv(slope.T @ slope) @ slope.T
-    except np.linalg.LinAlgError:  # the rays are parallel to the last digit
+    known, information = cv2.invert(slope.T @ slope)
+    if not known:  # the rays are parallel to the last digit
         return None
+    inverse = information @ slope.T
     world = geometry.world_from_left
     left_part = world[:3, :3] @ inverse[:, :2]
     right_part = world[:3, :3] @ inverse[:, 2:]

@@ -1,0 +1,171 @@
+"""One stereo pair to a fingertip: in a region of interest against a search of both whole pictures.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip
+
+Twin pictures of a finger before the sheet, its hand and small glints ("lab"), at rest and at 1 m/s,
+640x480.  Both ways see the same pictures in turn; OpenCV is kept to one thread, and the time is the
+processor's of that thread, so that what else the machine does counts little.  Prints median and
+99th percentile of the time of a pair, their ratios, and the errors against the truth, beside the
+Cramer-Rao bound of the same pixels and the mean squared error normalised by what is stated (1: it
+is exact).
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from messages.scene import Scene
+from nodes.triangulator.fingertip import Eyesight, locate
+from nodes.triangulator.mark import MARK_METHODS, MarkLooks
+from nodes.triangulator.tracking import Expected
+from nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from nodes.twin.bound import fingertip_bound
+from nodes.twin.clutter import CLUTTER
+from nodes.twin.pixels import TwinCamera
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+PAIRS, ROUNDS, BOUNDS = 100, 10, 10
+SPEEDS_M_PER_S = (0.0, 1.0)
+REACH_M = 0.009
+"""How far from its prediction a finger can be one frame later, with 60 m/s^2 at 60 Hz."""
+
+PREDICTION_M = 0.001
+"""Standard deviation, per axis, of the prediction about the truth."""
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """A pair of pictures, where the fingertip is, and where it is expected."""
+
+    left: Image
+    right: Image
+    truth: Floats
+    velocity: Floats
+    expected: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Times (s) of all calls, and of each shot the error (3,) m and its covariance; NaN: none."""
+
+    times_s: Floats
+    errors_m: Floats
+    covariances: Floats
+
+
+def even(tip: Floats, velocity: Floats) -> Callable[[float], Floats]:
+    """The fingertip at a time (s) from mid-exposure."""
+    return lambda offset_s: tip + offset_s * velocity
+
+
+def shots(camera: TwinCamera, speed_m_per_s: float, exposure_s: float) -> list[Shot]:
+    """Fingertips all over the working range, that go all ways."""
+    random = np.random.default_rng(1)
+    taken = []
+    for _ in range(PAIRS):
+        tip = random.uniform([-0.08, -0.08, -0.03], [0.08, 0.08, 0.08])
+        way = random.standard_normal(3)
+        velocity = speed_m_per_s * way / np.linalg.norm(way)
+        left, right = camera.picture(even(tip, velocity), exposure_s=exposure_s)
+        taken.append(
+            Shot(left, right, tip, velocity, tip + PREDICTION_M * random.standard_normal(3))
+        )
+    return taken
+
+
+def measure(scene: Scene, method: str, taken: list[Shot]) -> tuple[Run, Run]:
+    """The region of interest and the whole picture, in turn on every shot."""
+    geometry = StereoGeometry.of(scene.camera)
+    eyesight = Eyesight(
+        looks=MarkLooks(),
+        refine=MARK_METHODS[method],
+        triangulate=TRIANGULATION_METHODS["dlt"],
+        max_reprojection_px=1.5,
+    )
+    volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
+    times = np.empty((2, ROUNDS, len(taken)))
+    errors = np.full((2, len(taken), 3), np.nan)
+    covariances = np.full((2, len(taken), 3, 3), np.nan)
+    gc.disable()
+    for turn in range(ROUNDS):
+        for i, shot in enumerate(taken):
+            for way, expected in enumerate((Expected(shot.expected, REACH_M), None)):
+                start = time.thread_time()
+                reason, measured = locate(
+                    shot.left,
+                    shot.right,
+                    geometry=geometry,
+                    eyesight=eyesight,
+                    volume=volume,
+                    expected=expected,
+                )
+                times[way, turn, i] = time.thread_time() - start
+                if reason == "ok" and measured is not None:
+                    errors[way, i] = measured.point_world - shot.truth
+                    covariances[way, i] = measured.covariance
+    gc.enable()
+    runs = [Run(times[way].ravel(), errors[way], covariances[way]) for way in (0, 1)]
+    return runs[0], runs[1]
+
+
+def report(method: str, name: str, run: Run, bound_m: float) -> None:
+    """One line of the table."""
+    found = np.isfinite(run.errors_m[:, 0])
+    errors_m = run.errors_m[found]
+    rms_m = float(np.sqrt(np.mean(np.sum(errors_m**2, axis=1))))
+    worst_m = float(np.quantile(np.linalg.norm(errors_m, axis=1), 0.99))
+    normalised = np.mean(
+        [
+            error @ np.linalg.solve(covariance, error)
+            for error, covariance in zip(errors_m, run.covariances[found], strict=True)
+        ]
+    )
+    median_s, p99_s = np.quantile(run.times_s, [0.5, 0.99])
+    print(
+        f"{method:18s} {name:7s} {1e6 * median_s:6.0f} {1e6 * p99_s:6.0f} us;"
+        f" found {found.sum():3d} of {len(found)}, {1e3 * rms_m:.3f} mm rms, {1e3 * worst_m:.3f} mm"
+        f" at 99 %, {rms_m / bound_m:5.2f} x bound, normalised {normalised / 3.0:.2f}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    cv2.setNumThreads(1)
+    scene = load_scene(SCENE_FILE)
+    exposure_s = scene.camera.exposure_s
+    camera = TwinCamera(
+        scene.camera, finger_radius_m=scene.finger.radius_m, seed=1, clutter=CLUTTER["lab"]
+    )
+    for speed_m_per_s in SPEEDS_M_PER_S:
+        taken = shots(camera, speed_m_per_s, exposure_s)
+        bounds = [
+            fingertip_bound(camera, even(shot.truth, shot.velocity), exposure_s=exposure_s)
+            for shot in taken[:BOUNDS]
+        ]
+        bound_m = float(np.sqrt(np.mean([np.trace(bound.position_m2) for bound in bounds])))
+        print(f"\n{speed_m_per_s:g} m/s, bound {1e3 * bound_m:.3f} mm rms; p50, p99 a pair:")
+        for method in MARK_METHODS:
+            near, whole = measure(scene, method, taken)
+            report(method, "region", near, bound_m)
+            report(method, "whole", whole, bound_m)
+            ratios = [
+                float(np.quantile(whole.times_s, q) / np.quantile(near.times_s, q))
+                for q in (0.5, 0.99)
+            ]
+            print(f"{method:18s} whole over region: p50 {ratios[0]:.1f}, p99 {ratios[1]:.1f}")
+
+
+if __name__ == "__main__":
+    main()
