@@ -24,7 +24,7 @@ app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(experiment.app, name="experiment")
 app.command()(experiment.demo)
 app.command()(chart.chart)
-app.command()(doctor.doctor)
+app.add_typer(doctor.app, name="doctor")
 
 
 def main() -> None:

@@ -1,23 +1,45 @@
-"""`flexsheet doctor`: is this machine fit, and if not, what is to be done."""
+"""`flexsheet doctor`: is this machine fit, do the arms reach; and if not, what is to be done."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import FAILED, print_json, print_table, words
+from launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    print_fields,
+    print_json,
+    print_table,
+    progress_words,
+    words,
+)
+
+app = typer.Typer(
+    invoke_without_command=True,
+    help="Check this machine, or with `scene` whether the arms reach a scene's working range.",
+)
 
 
+@app.callback()
 def doctor(
+    context: typer.Context,
     sweep: Annotated[
         bool, typer.Option("--sweep", help="First end what launchers that are gone left running.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check this machine; exit code 1 when something must be put right."""
+    """Check this machine; exit code 1 when something must be put right.
+
+    With `scene`, check instead whether the arms reach a scene's working range.
+    """
+    if context.invoked_subcommand is not None:
+        return
     from launch.doctor import check_all
     from launch.runs import sweep as sweep_leftovers
 
@@ -38,3 +60,117 @@ def doctor(
         )
     if any(finding.state == "failed" for finding in findings):
         raise typer.Exit(FAILED)
+
+
+@app.command("scene")
+def check_scene(
+    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to check.")],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="PICTURE", help="Draw what is out of reach there."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check that both arms reach a scene's whole working range; exit code 1 when they do not.
+
+    Every contact within the scene's tilt, pushed up to its depth, at the least and the largest
+    stretch.  Also said: how fast a finger may move for the arms to follow.
+    """
+    from launch.layout import check_layout, draw_layout, layout_result
+    from launch.plan import load_scene
+
+    if output is not None and not output.resolve().parent.is_dir():
+        raise CommandError(
+            f"--output {output}: the folder {output.parent} does not exist", BAD_INPUT
+        )
+    scene = load_scene(scene_file)
+    with progress_words() as progress:
+        layout = check_layout(scene, progress=progress)
+    result = layout_result(layout)
+    if output is not None:
+        try:
+            draw_layout(layout, output)
+        except (OSError, ValueError) as error:
+            raise CommandError(
+                f"--output {output}: cannot be written: {error}; name a .png or .svg", BAD_INPUT
+            ) from error
+        words.print(f"picture: {output}", markup=False)
+    if as_json:
+        print_json(result)
+    else:
+        _print_layout(result, scene.working_range.speed_m_per_s)
+    if not layout.reachable:
+        raise typer.Exit(FAILED)
+
+
+def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
+    arms = result["arms"]
+    print_fields(
+        [
+            ("scene", result["scene"]),
+            ("reachable", "yes" if result["reachable"] else "NO"),
+            (
+                "share",
+                f"{100 * result['share']:.1f} % of {result['samples']} samples, "
+                + ", ".join(f"{side} {100 * one['share']:.1f} %" for side, one in arms.items()),
+            ),
+            *((f"{side} branch", ", ".join(one["branch"].values())) for side, one in arms.items()),
+            (
+                "speed",
+                f"{1e3 * asked_m_per_s:.0f} mm/s asked; followed everywhere: "
+                f"{1e3 * result['speed_everywhere_m_per_s']:.0f} mm/s, at half of the places: "
+                f"{1e3 * result['speed_at_half_m_per_s']:.0f} mm/s",
+            ),
+        ]
+    )
+    print()
+    print_table(
+        ("arm", "what binds", "share", "first at tilt", "depth"),
+        [
+            (
+                side,
+                one["limit"],
+                f"{100 * one['share']:.1f} %",
+                f"{_degrees(one['first_tilt_rad']):.1f}°",
+                f"{1e3 * one['first_depth_m']:.0f} mm",
+            )
+            for side, arm in arms.items()
+            for one in arm["binding"]
+        ],
+    )
+    print()
+    print_table(
+        ("arm", "least margin of", "which", "margin", "at tilt", "depth"),
+        [
+            (
+                side,
+                kind,
+                one["limit"],
+                _margin(one["margin"], one["unit"]),
+                f"{_degrees(one['tilt_rad']):.1f}°",
+                f"{1e3 * one['depth_m']:.0f} mm",
+            )
+            for side, arm in arms.items()
+            for kind, one in arm["least_margins"].items()
+        ],
+    )
+    for way in result["broken_ways"]:
+        words.print(f"no way {way}", markup=False)
+    for remedy in result["remedies"]:
+        print(f"remedy: {remedy['what']}")
+    if not result["reachable"] and not result["remedies"]:
+        words.print("no single change of those that were tried makes all of it reachable")
+
+
+def _degrees(angle_rad: float) -> float:
+    return angle_rad * 57.29577951308232
+
+
+def _margin(value: float, unit: str) -> str:
+    shown = {
+        "rad": f"{_degrees(value):.1f}°",
+        "m": f"{1e3 * value:.0f} mm",
+        "N": f"{value:.1f} N",
+        "share": f"{100 * (1.0 - value):.0f} % used",
+    }
+    return shown[unit]

@@ -1,0 +1,413 @@
+"""What the arms reach: margins of many places, ways between two, and the check of a whole scene."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from launch import cli
+from launch.layout import (
+    Layout,
+    check_layout,
+    draw_layout,
+    layout_result,
+    samples_of,
+    touches,
+    with_base_moved,
+)
+from launch.plan import load_scene
+from messages.scene import Scene
+from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.kinematics import CENTRE_RAD, WRIST_NEAR_RAD, branch_of, jacobian, next_joints
+from nodes.arm_bridge.reach import (
+    LARGEST_STEP_RAD,
+    LIMITS,
+    SPEED_LIMITS,
+    PathError,
+    Places,
+    arm_reach,
+    best_reach,
+    coordinated_path,
+    flange_poses,
+)
+from nodes.models.motion import SheetMotion
+from nodes.models.rigid import is_rigid, transform_from_rpy
+from nodes.twin.arms import forward as twin_forward
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
+SCENE = load_scene(SCENE_FILE)
+LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
+FRONT = branch_of(CENTRE_RAD)
+
+
+def sheet(position_m: Any, rpy_rad: Any = (0.0, 0.0, 0.0), stretch: float = 1.04) -> SheetMotion:
+    return SheetMotion(transform_from_rpy(position_m, rpy_rad), np.zeros(6), stretch, 0.0)
+
+
+def places(*motions: SheetMotion, twists: Floats | None = None) -> Places:
+    return Places(
+        np.array([motion.world_from_sheet for motion in motions]),
+        np.array([motion.stretch_ratio for motion in motions]),
+        np.empty((len(motions), 0, 6)) if twists is None else twists,
+    )
+
+
+def edges_by_the_twin(left_rad: Floats, right_rad: Floats) -> tuple[Floats, Floats]:
+    """World poses of both edges, by the twin's own arm."""
+    left, right = (
+        arm.world_from_base @ twin_forward(joints) @ arm.flange_from_edge
+        for arm, joints in ((LEFT, left_rad), (RIGHT, right_rad))
+    )
+    return left, right
+
+
+def turned_about_the_left_edge(yaw_rad: float) -> SheetMotion:
+    """The left edge stays at the front and turns about the world's z; at -0.6 rad its J5 is 0."""
+    turn = transform_from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, yaw_rad))[:3, :3]
+    half = np.array([0.5 * 1.04 * 0.24, 0.0, 0.0])
+    return sheet(turn @ half - half, (0.0, 0.0, yaw_rad))
+
+
+near = st.floats(-0.08, 0.08)
+lean = st.floats(-0.4, 0.4)
+
+
+@settings(max_examples=60)
+@given(st.tuples(near, near, near), st.tuples(lean, lean, lean), st.floats(1.0, 1.08))
+def test_the_joints_hold_the_sheet_by_the_twins_arms(
+    position: tuple[float, ...], rpy: tuple[float, ...], stretch: float
+) -> None:
+    wanted = sheet(position, rpy, stretch)
+    both = [best_reach(arm, other, places(wanted)) for arm, other in ((LEFT, RIGHT), (RIGHT, LEFT))]
+    assume(all(np.isfinite(one.joints_rad).all() for one in both))
+    left, right = edges_by_the_twin(both[0].joints_rad[0], both[1].joints_rad[0])
+    assert right[:3, 3] - left[:3, 3] == pytest.approx(
+        0.24 * stretch * wanted.world_from_sheet[:3, 0], abs=1e-9
+    )
+    assert 0.5 * (left + right)[:3, 3] == pytest.approx(position, abs=1e-9)
+    for edge in (left, right):
+        assert edge[:3, :3] == pytest.approx(wanted.world_from_sheet[:3, :3], abs=1e-9)
+
+
+@settings(max_examples=30)
+@given(near, near, lean, st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6))
+def test_speeds_are_those_of_the_jacobian(y: float, z: float, roll: float, twist: Any) -> None:
+    where = places(sheet((0.0, y, z), (roll, 0.0, 0.0)), twists=np.array(twist).reshape(1, 1, 6))
+    reach = arm_reach(LEFT, RIGHT, where, FRONT)
+    assume(reach.margins["wrist singularity"][0] > 0.0)
+    flange = flange_poses(LEFT, where)[0]
+    linear, angular = np.split(np.array(twist), 2)
+    at_flange = linear + np.cross(angular, flange[:3, 3] - where.world_from_sheet[0, :3, 3])
+    turn = LEFT.base_from_world[:3, :3]
+    velocity = np.concatenate([turn @ at_flange, turn @ angular])
+    rates = np.linalg.solve(jacobian(reach.joints_rad[0]), velocity)
+    used = 1.0 - np.array([reach.margins[f"J{joint} speed"][0] for joint in range(1, 7)])
+    assert used * LEFT.joint_limits.speed_rad_per_s == pytest.approx(np.abs(rates), abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "limit"),
+    [
+        (sheet((0.35, 0.0, 0.0)), "reach"),
+        (sheet((0.12, 0.0, 0.0)), "J3 range"),
+        (sheet((0.0, 0.0, 0.0), stretch=1.09), "edge force"),
+        (sheet((0.0, 0.0, 0.0), stretch=0.3), "flange distance"),
+        (turned_about_the_left_edge(-0.6), "wrist singularity"),
+        (turned_about_the_left_edge(0.6), "J5 range"),
+    ],
+)
+def test_each_limit_binds_where_it_should(wanted: SheetMotion, limit: str) -> None:
+    reach = arm_reach(LEFT, RIGHT, places(sheet((0.0, 0.0, 0.0)), wanted), FRONT)
+    assert reach.reached.tolist() == [True, False]
+    assert LIMITS[reach.binding[1]] == limit
+    assert reach.margins[limit][1] < 0.0 < reach.margins[limit][0]
+
+
+def test_the_workspace_binds_where_the_arm_could_go_on() -> None:
+    arms = SCENE.arms.model_copy(update={"workspace_max_m": np.array([0.4, 0.3, 0.1])})
+    smaller = ArmGeometry(SCENE.model_copy(update={"arms": arms}), "left")
+    where = places(sheet((0.0, 0.0, 0.09)), sheet((0.0, 0.0, 0.11)))
+    reach = arm_reach(smaller, RIGHT, where, FRONT)
+    assert [LIMITS[one] if one >= 0 else "" for one in reach.binding] == ["", "workspace"]
+    assert reach.margins["workspace"] == pytest.approx([0.01, -0.01])
+    assert arm_reach(LEFT, RIGHT, where, FRONT).reached.all()
+
+
+def test_a_place_too_fast_to_follow_is_reached_all_the_same() -> None:
+    fast = np.array([[[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], [[0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]])
+    where = places(sheet((0.0, 0.0, 0.0)), sheet((0.0, 0.0, 0.0)), twists=fast)
+    reach = arm_reach(LEFT, RIGHT, where, FRONT)
+    assert reach.reached.tolist() == [True, True]
+    assert reach.followed.tolist() == [False, True]
+    assert LIMITS[reach.binding[0]] in SPEED_LIMITS
+    most = LEFT.max_tool_speed
+    assert reach.margins["tool speed"] == pytest.approx([1.0 - 0.3 / most, 1.0 - 0.2 / most])
+
+
+def test_no_places_are_all_reached() -> None:
+    none = Places(np.empty((0, 4, 4)), np.empty(0), np.empty((0, 2, 6)))
+    assert arm_reach(LEFT, RIGHT, none, FRONT).reached.all()
+
+
+def assert_sound(path: Any, start: SheetMotion, goal: SheetMotion) -> None:
+    """Both edges agree with the sheet all the way, no joint leaps, nothing is too fast."""
+    assert path.places.world_from_sheet[0] == pytest.approx(start.world_from_sheet)
+    assert path.places.world_from_sheet[-1] == pytest.approx(goal.world_from_sheet)
+    assert path.places.stretch_ratio[-1] == pytest.approx(goal.stretch_ratio)
+    for pose, stretch, left_rad, right_rad in zip(
+        path.places.world_from_sheet,
+        path.places.stretch_ratio,
+        path.left_rad,
+        path.right_rad,
+        strict=True,
+    ):
+        assert is_rigid(pose)
+        left, right = edges_by_the_twin(left_rad, right_rad)
+        across = right[:3, 3] - left[:3, 3]
+        assert across == pytest.approx(0.24 * stretch * pose[:3, 0], abs=1e-9)
+        assert left[:3, :3] == pytest.approx(right[:3, :3], abs=1e-9)
+    for arm, joints in ((LEFT, path.left_rad), (RIGHT, path.right_rad)):
+        steps = np.abs(np.diff(joints, axis=0))
+        assert steps.max(initial=0.0) <= LARGEST_STEP_RAD
+        assert (joints >= arm.joint_limits.lowest_rad).all()
+        assert (joints <= arm.joint_limits.highest_rad).all()
+        assert (np.abs(joints[:, 4]) >= WRIST_NEAR_RAD).all()
+        times = np.diff(path.times_s)[:, None]
+        assert (steps <= times * arm.joint_limits.speed_rad_per_s * (1.0 + 1e-9)).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.tuples(near, near, st.floats(-1.0, 1.0)), st.tuples(near, near, st.floats(-1.0, 1.0)))
+def test_a_way_between_two_places_keeps_the_edges_together(
+    here: tuple[float, ...], there: tuple[float, ...]
+) -> None:
+    start = sheet((0.0, here[0], here[1]), (here[2], 0.0, 0.0), 1.02)
+    goal = sheet((0.0, there[0], there[1]), (there[2], 0.0, 0.0), 1.07)
+    assert_sound(coordinated_path(LEFT, RIGHT, start, goal), start, goal)
+
+
+def test_a_way_to_where_one_is_takes_no_time() -> None:
+    start = sheet((0.0, 0.0, 0.0))
+    path = coordinated_path(LEFT, RIGHT, start, start)
+    assert_sound(path, start, start)
+    assert path.times_s[-1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_way_begins_with_the_joints_given() -> None:
+    start, goal = sheet((0.0, 0.0, 0.0)), sheet((0.0, 0.03, 0.05), (0.4, 0.0, 0.0))
+    joints = best_reach(LEFT, RIGHT, places(start)).joints_rad[0]
+    path = coordinated_path(LEFT, RIGHT, start, goal, left_rad=joints)
+    assert path.left_rad[0] == pytest.approx(joints, abs=1e-9)
+    assert path.via_m is None
+
+
+def test_where_the_straight_way_is_barred_it_goes_round() -> None:
+    random = np.random.default_rng(0)
+    for _ in range(101):  # the hundredth of these pairs has only a way round
+        start, goal = (
+            sheet(
+                random.uniform([-0.1, -0.15, -0.2], [0.1, 0.2, 0.2]),
+                random.uniform([-1.2, -0.5, -0.5], [1.2, 0.5, 0.5]),
+            )
+            for _ in range(2)
+        )
+    with pytest.raises(PathError) as barred:
+        coordinated_path(LEFT, RIGHT, start, goal, detours_m=())
+    assert barred.value.limit == "J5 range"
+    assert 0.4 < barred.value.share < 0.6
+    found = coordinated_path(LEFT, RIGHT, start, goal)
+    assert found.via_m is not None
+    assert_sound(found, start, goal)
+
+
+@pytest.mark.parametrize(
+    ("goal", "side", "limit"),
+    [
+        (sheet((0.35, 0.0, 0.0)), "left", "J3 range"),
+        (sheet((-0.35, 0.0, 0.0)), "right", "J3 range"),
+        (sheet((0.0, 0.0, 0.0), stretch=1.09), "left", "edge force"),
+    ],
+)
+def test_a_way_that_no_arm_can_go_says_why(goal: SheetMotion, side: str, limit: str) -> None:
+    with pytest.raises(PathError, match=f"{side} arm") as caught:
+        coordinated_path(LEFT, RIGHT, sheet((0.0, 0.0, 0.0)), goal)
+    assert (caught.value.side, caught.value.limit) == (side, limit)
+    assert 0.0 < caught.value.share <= 1.0
+
+
+def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_no() -> None:
+    # The bridge follows with a bounded error; a layout must keep clear of it all the same.
+    present = best_reach(LEFT, RIGHT, places(turned_about_the_left_edge(0.0))).joints_rad[0]
+    signs = []
+    for yaw in np.linspace(0.0, -0.9, 200):
+        pose = flange_poses(LEFT, places(turned_about_the_left_edge(yaw)))[0]
+        before, present = present, next_joints(LEFT.base_from_world @ pose, present)
+        assert np.abs(present - before).max() < 0.02
+        signs.append(np.sign(present[4]))
+    assert signs[0] == -signs[-1]
+    asked = places(*(turned_about_the_left_edge(yaw) for yaw in (-0.4, -0.6)))
+    assert arm_reach(LEFT, RIGHT, asked, FRONT).reached.tolist() == [True, False]
+
+
+def barred_scene() -> Scene:
+    """The left base stands so far off that much of the range is out of its reach."""
+    return with_base_moved(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
+
+
+@pytest.fixture(scope="module")
+def demo() -> Layout:
+    return check_layout(SCENE)
+
+
+@pytest.fixture(scope="module")
+def barred() -> Layout:
+    return check_layout(barred_scene())
+
+
+def test_the_demo_scene_is_within_reach(demo: Layout) -> None:
+    assert demo.reachable
+    assert demo.remedies == ()
+    assert demo.broken_ways == ()
+    result = layout_result(demo)
+    assert result["share"] == 1.0
+    # Its edges are 0.12 m long each way: strokes round so small an object turn them too fast.
+    assert 0.02 < result["speed_everywhere_m_per_s"] < SCENE.working_range.speed_m_per_s
+    json.dumps(result, allow_nan=False)
+
+
+def test_the_samples_cover_the_working_range(demo: Layout) -> None:
+    tilt, most = demo.samples.tilt_rad, SCENE.working_range.tilt_rad
+    assert (tilt.min(), tilt.max()) == pytest.approx((-most, most), abs=1e-6)
+    assert np.diff(np.unique(np.round(tilt, 3))).max() < 0.15
+    assert demo.samples.depth_m.max() == SCENE.working_range.push_depth_m
+    # Along the whole object, and rolled up and down the sheet.
+    assert np.ptp(demo.samples.contact_world_m[:, 0]) == pytest.approx(0.12, abs=1e-6)
+    contact = demo.samples.contact_world_m - demo.samples.places.world_from_sheet[:, :3, 3]
+    along = np.einsum("ni,ni->n", contact, demo.samples.places.world_from_sheet[:, :3, 1])
+    rolled = 0.5 * 2.0 * most * SCENE.object.geometry.radius_m  # type: ignore[union-attr]
+    assert along.max() > rolled
+    assert np.abs(along).max() <= SCENE.sheet.usable_half_height_m + 1e-9
+
+
+def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> None:
+    assert not barred.reachable
+    assert barred.right.reached.all()
+    assert not barred.left.reached.all()
+    binding = {one["limit"] for one in layout_result(barred)["arms"]["left"]["binding"]}
+    assert {"reach", "J3 range"} <= binding
+    moved = [one for one in barred.remedies if "left_base_offset_m" in one.values]
+    assert len(moved) == 1
+    offset = np.array(moved[0].values["left_base_offset_m"])
+    again = with_base_moved(barred_scene(), "left", offset)
+    reach = best_reach(ArmGeometry(again, "left"), RIGHT, samples_of(again, touches(again)).places)
+    assert reach.reached.all()
+
+
+def test_the_first_place_that_binds_is_the_nearest_to_the_front(barred: Layout) -> None:
+    samples, binding = barred.samples, barred.left.binding
+    for one in layout_result(barred)["arms"]["left"]["binding"]:
+        same = binding == LIMITS.index(one["limit"])
+        assert abs(one["first_tilt_rad"]) == pytest.approx(
+            float(np.abs(samples.tilt_rad[same]).min()), abs=1e-5
+        )
+
+
+def test_less_tilt_helps_where_a_base_cannot() -> None:
+    arms = SCENE.arms.model_copy(update={"workspace_max_m": np.array([0.4, 0.03, 0.3])})
+    found = check_layout(SCENE.model_copy(update={"arms": arms}))
+    assert not found.reachable
+    assert {one for remedy in found.remedies for one in remedy.values} <= {
+        "tilt_rad",
+        "push_depth_m",
+    }
+    for remedy in found.remedies:
+        if "tilt_rad" in remedy.values:
+            kept = np.abs(found.samples.tilt_rad) <= remedy.values["tilt_rad"]
+            assert found.reached[kept].all()
+
+
+@pytest.mark.parametrize(
+    ("geometry", "reachable"),
+    [
+        ({"shape": "sphere", "radius_m": 0.04}, True),
+        ({"shape": "plane", "width_m": 0.1, "height_m": 0.1}, True),
+        ({"shape": "rounded_box", "size_m": (0.08, 0.06, 0.05), "edge_radius_m": 0.02}, True),
+        ({"shape": "ellipsoid", "semi_axes_m": (0.06, 0.04, 0.03)}, True),
+    ],
+)
+def test_every_shape_can_be_asked(geometry: dict[str, Any], reachable: bool) -> None:
+    range_ = SCENE.working_range.model_copy(update={"tilt_rad": 0.3, "push_depth_m": 0.02})
+    content = SCENE.model_copy(update={"working_range": range_}).model_dump()
+    content["object"]["geometry"] = geometry
+    scene = Scene.model_validate(content)
+    found = check_layout(scene)
+    assert len(found.samples.places) > 20
+    assert found.reachable is reachable
+
+
+def test_the_picture_is_drawn(barred: Layout, tmp_path: Path) -> None:
+    draw_layout(barred, tmp_path / "layout.png")
+    assert (tmp_path / "layout.png").stat().st_size > 10_000
+
+
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object
+        ) -> tuple[int, str, str]:  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+def test_the_command_says_reachable_by_its_exit_code(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    picture = tmp_path / "layout.png"
+    code, out, _ = run(
+        capsys, monkeypatch, "doctor", "scene", SCENE_FILE, "--json", "--output", picture
+    )
+    assert code == 0
+    assert json.loads(out)["reachable"] is True
+    assert picture.is_file()
+
+
+def test_the_command_fails_and_offers_a_remedy(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    far = tmp_path / "far.yaml"
+    text = SCENE_FILE.read_text()
+    far.write_text(text.replace("position_m: [-0.5, -0.45, 0.0]", "position_m: [-0.6, -0.5, 0.06]"))
+    code, out, _ = run(capsys, monkeypatch, "doctor", "scene", far)
+    assert code == 1
+    assert "reachable     NO" in out
+    assert "remedy: move the left base by" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["nowhere.yaml"], "nowhere.yaml"),
+        ([SCENE_FILE, "--output", "nowhere/x.png"], "does not exist"),
+        ([SCENE_FILE, "--output", "layout.weird"], "weird"),
+    ],
+)
+def test_bad_input_to_the_command_is_named(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[object],
+    words: str,
+) -> None:
+    code, _, err = run(capsys, monkeypatch, "doctor", "scene", *arguments)
+    assert code == 2
+    assert words in err
