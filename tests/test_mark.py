@@ -266,7 +266,8 @@ def test_the_mark_family_tells_the_methods_apart() -> None:
         name: max(point.error for point in points if point.in_range and point.method == name)
         for name in MARK.methods
     }
-    assert worst["subpixel_fit"] < MARK.tolerance(scene) < worst["moments"]
-    assert worst["weighted_centroid"] < MARK.tolerance(scene)
+    # Ground that slopes under the mark shifts a centroid; the fit allows for it.
+    assert worst["subpixel_fit"] < 0.5 * MARK.tolerance(scene)
+    assert MARK.tolerance(scene) < worst["weighted_centroid"] < worst["moments"]
     for point in points:
         assert point.error > 0.7 * float(point.params["bound_px"])

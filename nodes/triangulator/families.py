@@ -111,19 +111,24 @@ PICTURE_PX = 57
 RAYS = 5
 BLUR_PX = 0.7
 GROUND_LEVEL, MARK_LEVEL = 70.0, 215.0
+GROUND_REACH_PX = 10.0
+"""Half the width of what slopes under a mark."""
+
 MARK_CASES = (
-    *((radius_px, noise, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
-    *((3.2, 1.0, motion_px) for motion_px in (2.0, 4.0, 8.0)),
+    *((radius_px, noise, 0.0, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
+    *((3.2, 1.0, motion_px, 0.0) for motion_px in (2.0, 4.0, 8.0)),
+    *((radius_px, 1.0, 0.0, 3.0) for radius_px in (1.6, 3.2, 6.0)),
 )
-"""Radius (px), noise (as multiples of the sensor's), motion in the exposure (px).  A mark of 3 mm
-radius has 3.2 px half a metre away, 6 px at 0.27 m and 1.6 px at a metre; at 1 m/s it moves by 4 px
-in 4 ms."""
+"""Radius (px), noise (as multiples of the sensor's), motion in the exposure (px), slope of the
+ground (levels per px).  A mark of 3 mm radius has 3.2 px half a metre away, 6 px at 0.27 m and
+1.6 px at a metre; at 1 m/s it moves by 4 px in 4 ms; a finger that is lit from its side slopes by 2
+or 3 levels per px."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnDisc:
     """A disc as a picture has it: centre, radius and motion in px, standard deviation of the blur,
-    levels of mark and ground."""
+    levels of mark and ground, and the ground's slope (levels per px) along y."""
 
     centre: Floats
     radius_px: float
@@ -131,6 +136,7 @@ class DrawnDisc:
     blur_px: float = BLUR_PX
     mark: float = MARK_LEVEL
     ground: float = GROUND_LEVEL
+    slope: float = 0.0
 
     def levels(self) -> Floats:
         """The picture without noise: rays counted, not the fit's formula for an edge."""
@@ -143,7 +149,9 @@ class DrawnDisc:
             lit += np.clip(RAYS * (self.radius_px - away) + 0.5, 0.0, 1.0) / steps
         blurred = np.asarray(cv2.GaussianBlur(lit, (0, 0), RAYS * self.blur_px))
         share = blurred.reshape(PICTURE_PX, RAYS, PICTURE_PX, RAYS).mean(axis=(1, 3))
-        return np.asarray(self.ground + share * (self.mark - self.ground))
+        rows = np.clip(np.arange(PICTURE_PX) - self.centre[1], -GROUND_REACH_PX, GROUND_REACH_PX)
+        ground = self.ground + self.slope * rows[:, None]
+        return np.asarray(ground + share * (self.mark - ground))
 
 
 def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Image:
@@ -183,7 +191,7 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
 
 def _mark_trials(scene: Scene) -> Iterator[Trial]:
     """Discs all over the pixel grid, moving in all directions."""
-    for radius_px, level, motion_px in MARK_CASES:
+    for radius_px, level, motion_px, slope in MARK_CASES:
         sensor = PixelNoise()
         noise = PixelNoise(level * sensor.read_levels, sensor.photons_per_level / level**2)
         random = np.random.default_rng(1)
@@ -191,12 +199,17 @@ def _mark_trials(scene: Scene) -> Iterator[Trial]:
         angles = random.uniform(0.0, np.pi, MARK_PICTURES)
         motions = motion_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         discs = [
-            DrawnDisc(centre, radius_px, motion)
+            DrawnDisc(centre, radius_px, motion, slope=slope)
             for centre, motion in zip(centres, motions, strict=True)
         ]
         pictures = [noisy(disc.levels(), noise, random) for disc in discs]
         bound_px = float(np.mean([centre_bound_px(disc, noise) for disc in discs[:4]]))
-        case: Case = {"radius_px": radius_px, "noise_ratio": level, "motion_px": motion_px}
+        case: Case = {
+            "radius_px": radius_px,
+            "noise_ratio": level,
+            "motion_px": motion_px,
+            "slope_levels_per_px": slope,
+        }
         for name in MARK_METHODS:
             in_range = radius_px >= 3.0 and level <= 2.0 and motion_px <= 4.0
             yield _mark_trial(name, case, pictures, centres, bound_px=bound_px, in_range=in_range)

@@ -33,9 +33,9 @@ ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
 """Parameters that change the picture oddly about the disc's centre."""
 
 WHITE = 255
-MARGIN_PX = 2.5
+MARGIN_PX = 3.0
 LEAST_MARGIN_PX = 1.25
-MARGIN_PER_MOTION = 0.3
+MARGIN_PER_MOTION = 0.5
 """The fit looks so far beyond the disc: enough to know the ground, short of the finger's own edge;
 that edge comes nearer by the motion, and is no ground that slopes evenly."""
 
@@ -129,6 +129,42 @@ def fit_discs(
     )
     if max(math.hypot(*one.motion) for one in starts) < LEAST_MOTION_PX:
         start = start[:, :STILL_PARAMETERS]
+    solved = _solved(seen, start)
+    covariances = np.linalg.inv(solved.information)[:, :RADIUS, :RADIUS]
+    shifts = np.abs(solved.found - start)[:, :RADIUS].max(axis=1).tolist()
+    return [
+        _judged(
+            parameters,
+            corner,
+            covariance,
+            fitness,
+            settled=solved.settled and shift < LARGEST_SHIFT_PX,
+        )
+        for parameters, corner, covariance, fitness, shift in zip(
+            solved.found.tolist(), seen.corners, covariances, _fitness(solved), shifts, strict=True
+        )
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """Where Gauss and Newton's method ended, and what its last picture was like.
+
+    found: (n, parameters), after the last step, which took `gains` (n, parameters) off the weighted
+    squares of the residuals (n, s s), to first order.  weights: (n, s s), of the pixels that
+    counted.  information: (n, parameters, parameters).
+    """
+
+    found: Floats
+    residuals: Floats
+    weights: Floats
+    information: Floats
+    gains: Floats
+    settled: bool
+
+
+def _solved(seen: Seen, start: Floats) -> Solved:
+    """The most likely parameters (n, parameters) of the discs, from where they start."""
     believed = PRIOR_WEIGHTS[: start.shape[1]]
     prior = np.diag(believed)
     found, settled, used = start.copy(), False, seen.weights
@@ -146,39 +182,36 @@ def fit_discs(
         found += step
         bounded = found[:, RADIUS : BLUR + 1]
         np.maximum(np.minimum(bounded, LARGEST), LEAST, out=bounded)
-        if (np.abs(step[:, : BLUR + 1]) < SETTLED_PX).all():
+        if (np.abs(shape) < SETTLED_PX).all():
             settled = True
             break
-    # The last step is not drawn again: to first order it takes the gradient's way off the squares.
-    gains = gradient * step
-    squares = np.einsum("ni,ni,ni->n", residuals, residuals, used) - np.add.reduce(gains, axis=1)
-    mirrored = used[:, ::-1]
-    common = used * mirrored / (used + mirrored + 1e-300)
+    return Solved(found, residuals, used, information, gradient * step, settled)
+
+
+def _fitness(solved: Solved) -> list[tuple[float, int, float, float]]:
+    """Of each fit: weighted squares of what it leaves, its pixels, the sum of their weights, and
+    the noise that the odd part of what it leaves shows, as a ratio of variances.
+
+    That part alone, the difference of pixels that mirror one another in the centre, can have moved
+    the centre.
+    """
+    residuals, weights, gains = solved.residuals, solved.weights, solved.gains
+    squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
+    mirrored = weights[:, ::-1]
+    common = weights * mirrored / (weights + mirrored + 1e-300)
     odd = residuals - residuals[:, ::-1]
-    is_odd = ODD[: start.shape[1]]
+    is_odd = ODD[: gains.shape[1]]
     odd_squares = np.einsum("ni,ni,ni->n", odd, odd, common) - 2.0 * (gains @ is_odd)
-    odd_free = np.maximum(np.count_nonzero(common, axis=1) - 2.0 * is_odd.sum(), 1.0)
-    fitness = zip(
-        squares.tolist(),
-        np.count_nonzero(used, axis=1).tolist(),
-        np.add.reduce(used, axis=1).tolist(),
-        (odd_squares / odd_free).tolist(),
-        strict=True,
+    free = np.maximum(np.count_nonzero(common, axis=1) - 2.0 * is_odd.sum(), 1.0)
+    return list(
+        zip(
+            squares.tolist(),
+            np.count_nonzero(weights, axis=1).tolist(),
+            weights.sum(axis=1).tolist(),
+            (odd_squares / free).tolist(),
+            strict=True,
+        )
     )
-    covariances = np.linalg.inv(information)[:, :RADIUS, :RADIUS]
-    shifts = np.abs(found - start)[:, :RADIUS].max(axis=1).tolist()
-    return [
-        _judged(
-            parameters,
-            corner,
-            covariance,
-            fits,
-            settled=settled and shift < LARGEST_SHIFT_PX,
-        )
-        for parameters, corner, covariance, fits, shift in zip(
-            found.tolist(), seen.corners, covariances, fitness, shifts, strict=True
-        )
-    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,9 +341,7 @@ def _judged(
 ) -> DiscFit:
     """What a fit came to: its covariance widened by what the noise does not explain.
 
-    fitness: weighted squares of what it leaves, its pixels, the sum of their weights, and the noise
-    that the odd part of what it leaves shows, as a ratio of variances: that part alone can have
-    moved the centre.
+    fitness: as `_fitness` gives it.
     """
     squares, pixels, weight, ratio = fitness
     x, y, radius, blur, mark, ground, _, _, *motion = found
