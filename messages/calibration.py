@@ -59,6 +59,9 @@ class PairResidual(Part):
     stray_corners: int = Field(
         default=0, description="corners of both views that were left out of a used pair"
     )
+    digest: str = Field(
+        default="", description="of both files' bytes: SHA-256, its first 16 hexadecimal digits"
+    )
 
 
 class Uncertainty(Part):

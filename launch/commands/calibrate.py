@@ -237,8 +237,7 @@ def check(
     again = result["used_to_calibrate"]
     if isinstance(again, list) and again:
         words.print(
-            f"pictures of the same names made this calibration, which flatters it: "
-            f"{', '.join(again)}; check on others",
+            f"pictures that made this calibration flatter it: {', '.join(again)}; check on others",
             markup=False,
         )
     if as_json:

@@ -30,6 +30,7 @@ from nodes.camera.corners import (
     BoardPair,
     Progress,
     board_points,
+    digest_of,
     find_pairs,
     ignore_progress,
 )
@@ -121,6 +122,7 @@ def calibrate_stereo(
                 left_rms_px=float(residuals[i][0]) if i in residuals else None,
                 right_rms_px=float(residuals[i][1]) if i in residuals else None,
                 stray_corners=selection.stray_corners(i),
+                digest=digest_of(left_path, right_path),
             )
             for i, (left_path, right_path) in enumerate(zip(left_paths, right_paths, strict=True))
         ),

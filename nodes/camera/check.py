@@ -29,6 +29,7 @@ from nodes.camera.corners import (
     Progress,
     View,
     board_points,
+    digest_of,
     find_pairs,
     ignore_progress,
     read_gray,
@@ -188,11 +189,11 @@ def check_stereo(
     pairs = [pair for pair in found if isinstance(pair, BoardPair)]
     if not pairs:
         raise CalibrationError(f"no usable pair of {len(found)}: {found[0]}")
-    used = {(pair.left, pair.right) for pair in calibration.pairs if pair.used}
+    used = {pair.digest for pair in calibration.pairs if pair.used}
     again = [
         left.name
         for left, right in zip(left_paths, right_paths, strict=True)
-        if (left.name, right.name) in used
+        if digest_of(left, right) in used
     ]
     rig = Rig.calibrated(calibration)
     return {

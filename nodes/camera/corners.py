@@ -6,6 +6,7 @@ same id is the same corner in every picture.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -250,6 +251,11 @@ def read_gray(path: Path) -> Image:
     if image is None:
         raise CalibrationError(f"{path}: not a picture that can be read")
     return np.asarray(image, dtype=np.uint8)
+
+
+def digest_of(left: Path, right: Path) -> str:
+    """What tells a pair of files from others of the same names."""
+    return hashlib.sha256(left.read_bytes() + right.read_bytes()).hexdigest()[:16]
 
 
 def find_pairs(
