@@ -110,21 +110,6 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """What was found in a pair of pictures.
-
-    reason, measured: as by `locate`.
-    marks: all that look like a mark and are where the finger can be, the likeliest first.
-    others: those that look like one and are elsewhere.
-    """
-
-    reason: FingertipReason
-    measured: Measured | None
-    marks: tuple[Measured, ...] = ()
-    others: tuple[Measured, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
 class Sight:
     """What one call of `locate` has to do with: both views, and what is known beforehand."""
 
@@ -157,57 +142,16 @@ def locate(
 
     A measurement is given where two rays meet at all, even when the reason is not "ok".
     """
-    sight = _sight(
-        (left, right), (left_origin_px, right_origin_px), geometry, eyesight, volume, expected
-    )
-    found = _seen(sight, _windows(sight))
-    return found.reason, found.measured
-
-
-def look(
-    left: Image,
-    right: Image,
-    *,
-    geometry: StereoGeometry,
-    eyesight: Eyesight,
-    volume: tuple[Floats, Floats],
-    expected: Expected | None,
-    left_origin_px: Origin = (0, 0),
-    right_origin_px: Origin = (0, 0),
-) -> Sighting:
-    """As `locate`, and all marks that are not the one.
-
-    Where the finger is not found in its window the whole pictures are searched for them.
-    """
-    sight = _sight(
+    if expected is not None and not np.isfinite(expected.point).all():
+        expected = None
+    sight = Sight(
         (left, right), (left_origin_px, right_origin_px), geometry, eyesight, volume, expected
     )
     windows = _windows(sight)
-    found = _seen(sight, windows)
-    if found.reason != "ok" and windows != (None, None):
-        found = replace(found, others=_found_in(sight, (None, None)).others)
-    return found
-
-
-def _sight(
-    images: tuple[Image, Image],
-    origins: tuple[Origin, Origin],
-    geometry: StereoGeometry,
-    eyesight: Eyesight,
-    volume: tuple[Floats, Floats],
-    expected: Expected | None,
-) -> Sight:
-    """An expected place that is no number is none."""
-    if expected is not None and not np.isfinite(expected.point).all():
-        expected = None
-    return Sight(images, origins, geometry, eyesight, volume, expected)
-
-
-def _seen(sight: Sight, windows: tuple[Window | None, Window | None]) -> Sighting:
-    found = _found_in(sight, windows)
-    if found.reason != "ok" and _dazzled(sight, windows):
-        return replace(found, reason="saturated")
-    return found
+    reason, measured = _found_in(sight, windows)
+    if reason != "ok" and _dazzled(sight, windows):
+        return "saturated", measured
+    return reason, measured
 
 
 def _windows(sight: Sight) -> tuple[Window | None, Window | None]:
@@ -245,31 +189,30 @@ def _dazzled(sight: Sight, windows: tuple[Window | None, Window | None]) -> bool
     )
 
 
-def _found_in(sight: Sight, windows: tuple[Window | None, Window | None]) -> Sighting:
-    """What is in one window of each picture, or in all of it."""
+def _found_in(
+    sight: Sight, windows: tuple[Window | None, Window | None]
+) -> tuple[FingertipReason, Measured | None]:
+    """As `locate`, in one window of each picture, or in all of it."""
     left, right = (
         find_spots(image, sight.eyesight.looks, window)
         for image, window in zip(sight.images, windows, strict=True)
     )
     if not left and not right:
-        return Sighting("no_mark", None)
+        return "no_mark", None
     if not left or not right:
-        return Sighting("mark_in_one_view", None)
+        return "mark_in_one_view", None
     pairs = _pairs(sight, left, right)
     likely = [pair for pair in pairs if pair.lack is None]
     near = [pair for pair in likely if pair.away <= 1.0]
-    others = tuple(one for one, _ in _sound(sight, [pair for pair in likely if pair.away > 1.0]))
     if near:
-        return replace(_chosen(sight, near), others=others)
+        return _chosen(sight, near)
     if likely:
         nearest = min(likely, key=lambda pair: pair.away)
-        measured = _measured(sight, _refined(sight, [nearest])[0])
-        return Sighting("too_fast", measured, others=others)
+        return "too_fast", _measured(sight, _refined(sight, [nearest])[0])
     if not pairs:
-        return Sighting("inconsistent", None)
+        return "inconsistent", None
     nearest = min(pairs, key=lambda pair: (pair.lack != "outside_volume", pair.cost))
-    measured = _measured(sight, _refined(sight, [nearest])[0])
-    return Sighting(nearest.lack or "inconsistent", measured)
+    return nearest.lack or "inconsistent", _measured(sight, _refined(sight, [nearest])[0])
 
 
 def _pairs(sight: Sight, left: Sequence[Spot], right: Sequence[Spot]) -> list[Pair]:
