@@ -150,6 +150,9 @@ class Skin(Message):
     triangles: Triangles
 
 
+ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
+
+
 class SoftBody(Message):
     """The skin's answer to the finger."""
 
@@ -159,6 +162,11 @@ class SoftBody(Message):
     push_depth_m: NonNegative
     force_world_n: Vector3 = Field(description="of the object on the finger")
     stiffness_n_per_m: NonNegative = Field(description="of the object where the finger is")
+    force_curve: ForceCurve = Field(
+        default_factory=lambda: np.zeros((0, 2)),
+        description="of the object where the finger is, whether it touches or not: rows of depth "
+        "(m) and force (N), both from 0 and never falling; empty: not known",
+    )
     displacement_world_m: Points3
 
 

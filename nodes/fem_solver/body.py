@@ -80,8 +80,14 @@ class SceneBody:
     def at_rest(self) -> Response:
         """The untouched body; its stiffness is that of the place nearest to the user."""
         front = np.array([0.0, 0.0, self.spec.radius_m])
-        stiffness = self.method.stiffness_n_per_m(front)
-        return Response(self.method.at_rest, np.zeros(3), stiffness, 0.0, True)
+        return Response(
+            displacement=self.method.at_rest,
+            force_n=np.zeros(3),
+            stiffness_n_per_m=self.method.stiffness_n_per_m(front),
+            force_curve=self.method.force_curve(front),
+            push_depth_m=0.0,
+            in_range=True,
+        )
 
     def _push(self, point: Floats, normal: Floats) -> Push:
         return push_on_cylinder(
@@ -99,6 +105,7 @@ class SceneBody:
             push_depth_m=response.push_depth_m,
             force_world_n=rotation @ response.force_n,
             stiffness_n_per_m=response.stiffness_n_per_m,
+            force_curve=response.force_curve,
             displacement_world_m=np.ascontiguousarray(turned),
         )
 
@@ -120,6 +127,7 @@ def scene_body(
         linear_depth_m=linear_depth_m,
         largest_depth_m=largest_depth_m,
         touch_angle_rad=spec.touch_angle_rad - PAD_RATIO * scene.finger.radius_m / spec.radius_m,
+        push_depth_m=scene.working_range.push_depth_m,
     )
     pose_digest = hashlib.sha256(pose.tobytes()).hexdigest()[:8]
     skin = Skin(

@@ -33,6 +33,8 @@ FLANK_RATIO = 0.9
 """Beyond this part of the radius the fingertip goes on as a cone, tangent to the sphere."""
 FULL_STEPS = 8
 MAX_ITERATIONS = 40
+CURVE_SHARES = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
+"""Depths at which the force curve is sampled within the linear range, as shares of it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,7 @@ class Response:
     displacement: Floats32
     force_n: Floats
     stiffness_n_per_m: float
+    force_curve: Floats
     push_depth_m: float
     in_range: bool
 
@@ -93,6 +96,13 @@ class SoftBodyMethod(Protocol):
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
         """Stiffness (N/m) at the touchable place nearest to a surface point (3,), m."""
+        ...
+
+    def force_curve(self, surface: Floats) -> Floats:
+        """Force over depth at the touchable place nearest to a surface point (3,), m.
+
+        (n, 2): depth (m) and force (N), both from 0 and never falling.
+        """
         ...
 
     def respond(self, push: Push) -> Response:
@@ -148,6 +158,15 @@ def saturated(depth_m: float, linear_m: float, largest_m: float) -> float:
         return depth_m
     span = largest_m - linear_m
     return linear_m + span * -float(np.expm1(-(depth_m - linear_m) / span))
+
+
+def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
+    """Depths of a force curve: dense where the contact grows, then on to the deepest push."""
+    deepest = largest_m if push_m is None else max(push_m, largest_m)
+    deeper = np.geomspace(
+        linear_m, deepest, max(2, round(4 * np.log2(deepest / linear_m)) // 2 + 1)
+    )
+    return np.concatenate([[0.0], linear_m * np.array(CURVE_SHARES), deeper[1:]])
 
 
 def triangle_points(divisions: int) -> tuple[Floats, Floats]:
@@ -294,8 +313,12 @@ class LinearSoftBody:
         linear_depth_m: float,
         largest_depth_m: float,
         touch_angle_rad: float,
+        push_depth_m: float | None = None,
     ) -> None:
-        """ValueError unless 0 < linear_depth_m < largest_depth_m."""
+        """push_depth_m: how deep the force curve goes; None: to `largest_depth_m`.
+
+        ValueError unless 0 < linear_depth_m < largest_depth_m.
+        """
         if not 0.0 < linear_depth_m < largest_depth_m:
             raise ValueError(
                 f"linear_depth_m: {linear_depth_m:g} must be positive and less than "
@@ -312,9 +335,10 @@ class LinearSoftBody:
         corners = np.unique(response.faces[:, :3])
         self._places = response.rest[response.touch[corners]]
         normals = response.normals[corners]
-        self._place_stiffness = np.array(
+        self._depths = curve_depths(linear_depth_m, largest_depth_m, push_depth_m)
+        self._place_forces = np.array(
             [
-                self._secant(Push(place, normal, linear_depth_m))
+                self._forces(place, normal)
                 for place, normal in zip(self._places, normals, strict=True)
             ]
         )
@@ -326,14 +350,16 @@ class LinearSoftBody:
         """The body's answer; any finite push has one."""
         depth = saturated(push.depth_m, self._linear, self._largest)
         contact = self.contact.solve(push, depth)
-        stiffness = self.stiffness_n_per_m(push.surface)
+        curve = self.force_curve(push.surface)
+        stiffness = float(curve[len(CURVE_SHARES), 1]) / self._linear
         if contact is None:
-            return Response(self.at_rest, np.zeros(3), stiffness, 0.0, True)
+            return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, True)
         angle = abs(float(np.arctan2(push.normal[1], push.normal[2])))
         return Response(
             displacement=self._displacement(contact),
             force_n=contact.force_n * (push.depth_m / depth if push.depth_m > depth else 1.0),
             stiffness_n_per_m=stiffness,
+            force_curve=curve,
             push_depth_m=max(0.0, push.depth_m - push.beyond_m),
             in_range=push.depth_m <= self._linear
             and push.beyond_m == 0.0
@@ -343,16 +369,38 @@ class LinearSoftBody:
     def stiffness_n_per_m(self, surface: Floats) -> float:
         """Force over depth at the end of the linear range, at the touchable place near `surface`.
 
-        It does not depend on the present push, so that it is there before the finger touches; it
-        is a Gaussian mean over the corners of the mesh around, so that it is smooth.
+        It does not depend on the present push, so that it is there before the finger touches.
         """
+        forces = self._weights(surface) @ self._place_forces
+        return float(forces[len(CURVE_SHARES)]) / self._linear
+
+    def force_curve(self, surface: Floats) -> Floats:
+        """Force over depth near `surface`, as `SoftBodyMethod`; past the linear range as `respond`.
+
+        A mean over the places around: costs a sum, not a contact solve.
+        """
+        return np.column_stack([self._depths, self._weights(surface) @ self._place_forces])
+
+    def _weights(self, surface: Floats) -> Floats:
+        """Gaussian weights of the mesh's corners around a point: the mean by them is smooth."""
         squared = np.square(self._places - surface).sum(axis=1)
         weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
-        return float(weights @ self._place_stiffness / weights.sum())
+        result: Floats = weights / weights.sum()
+        return result
 
-    def _secant(self, push: Push) -> float:
-        contact = self.contact.solve(push, push.depth_m)
-        return 0.0 if contact is None else float(contact.force_n @ push.normal) / push.depth_m
+    def _forces(self, place: Floats, normal: Floats) -> Floats:
+        """Force along the normal (n,) at the depths of the curve, never falling."""
+        shallow = self._depths[: len(CURVE_SHARES) + 1]
+        solved = np.append(shallow, [0.5 * (self._linear + self._largest), self._largest])
+        forces = np.zeros(len(solved))
+        for number, depth in enumerate(solved[1:], start=1):
+            contact = self.contact.solve(Push(place, normal, float(depth)), float(depth))
+            if contact is not None:
+                forces[number] = float(contact.force_n @ normal)
+        bent = np.array([saturated(float(d), self._linear, self._largest) for d in self._depths])
+        grown = np.divide(self._depths, bent, out=np.ones_like(bent), where=bent > 0.0)
+        result: Floats = np.maximum.accumulate(np.interp(bent, solved, forces) * grown)
+        return result
 
     def _displacement(self, contact: Contact) -> Floats32:
         forces = (contact.forces / self._modulus).astype(np.float32)

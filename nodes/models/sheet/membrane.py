@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from nodes.models.sheet.rubber import Rubber
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
@@ -46,28 +48,6 @@ class NoEquilibriumError(ArithmeticError):
 
 
 @dataclass(frozen=True, slots=True)
-class Membrane:
-    """A sheet clamped along two edges `width_m` apart, each `height_m` long, when slack.
-
-    mooney_share: C2 / (C1 + C2), from 0 (neo-Hookean) to below 1.
-    """
-
-    width_m: float
-    height_m: float
-    thickness_m: float
-    young_modulus_pa: float
-    mooney_share: float = 0.0
-
-    def __post_init__(self) -> None:
-        """ValueError for a size, modulus or share outside of its range."""
-        sizes = (self.width_m, self.height_m, self.thickness_m, self.young_modulus_pa)
-        if not (np.isfinite(sizes).all() and min(sizes) > 0.0):
-            raise ValueError(f"sheet's sizes and modulus {sizes} must be finite and above zero")
-        if not 0.0 <= self.mooney_share < 1.0:
-            raise ValueError(f"mooney_share: {self.mooney_share} is not from 0 to below 1")
-
-
-@dataclass(frozen=True, slots=True)
 class PushPath:
     """Equilibria of one push, a row per depth.
 
@@ -83,7 +63,7 @@ class PushPath:
 
 
 def push_path(
-    membrane: Membrane,
+    rubber: Rubber,
     *,
     stretch_ratio: float,
     depths_m: Sequence[float] | Floats,
@@ -107,11 +87,11 @@ def push_path(
     if not stretch_ratio > 0.0 or not finger_radius_m > 0.0:
         raise ValueError(f"stretch {stretch_ratio} and radius {finger_radius_m} must be above zero")
     focus = np.array(
-        [place_m[0] / stretch_ratio + 0.5 * membrane.width_m, place_m[1] + 0.5 * membrane.height_m]
+        [place_m[0] / stretch_ratio + 0.5 * rubber.width_m, place_m[1] + 0.5 * rubber.height_m]
     )
-    if not (0.0 < focus[0] < membrane.width_m and 0.0 < focus[1] < membrane.height_m):
+    if not (0.0 < focus[0] < rubber.width_m and 0.0 < focus[1] < rubber.height_m):
         raise ValueError(f"place {place_m} is not on the sheet")
-    grid = _Grid(membrane, focus, FINEST_RADII * finger_radius_m, cells)
+    grid = _Grid(rubber, focus, FINEST_RADII * finger_radius_m, cells)
     state = _flat(grid, stretch_ratio)
     state = _settle(grid, state, None)
     foot: Floats = np.array([*place_m, 0.0], dtype=np.float64)
@@ -120,11 +100,12 @@ def push_path(
     rows: list[tuple[float, float, Floats]] = []
     for wanted in depths:
         steps = max(1, int(np.ceil((wanted - depth) / (STEP_RADII * finger_radius_m))))
-        advance = (wanted - depth) / steps
+        advance = float(wanted - depth) / steps
         for _ in range(steps if wanted > depth else 0):
             state = _carried(grid, state, foot, kept, (depth, advance))
             depth += advance
-            centre: Floats = foot + np.array([0.0, 0.0, finger_radius_m - depth], dtype=np.float64)
+            centre = foot.copy()
+            centre[2] = finger_radius_m - depth
             ball = _Ball(centre, finger_radius_m, grid.bed, kept)
             state = _settle(grid, state, ball)
             kept = kept | ball.touched(state)
@@ -166,16 +147,16 @@ def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floa
 class _Grid:
     """Triangles of the rest sheet, their strain, and the pattern of the stiffness matrix."""
 
-    def __init__(self, membrane: Membrane, focus: Floats, finest_m: float, cells: int) -> None:
-        x = graded(membrane.width_m, float(focus[0]), finest_m, cells)
-        y = graded(membrane.height_m, float(focus[1]), finest_m, cells)
+    def __init__(self, rubber: Rubber, focus: Floats, finest_m: float, cells: int) -> None:
+        x = graded(rubber.width_m, float(focus[0]), finest_m, cells)
+        y = graded(rubber.height_m, float(focus[1]), finest_m, cells)
         rows, columns = len(y), len(x)
         self.shape = (rows, columns)
         self.rest = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        self.centre = 0.5 * np.array([membrane.width_m, membrane.height_m])
-        self.c1 = membrane.young_modulus_pa / 6.0 * (1.0 - membrane.mooney_share)
-        self.c2 = membrane.young_modulus_pa / 6.0 * membrane.mooney_share
-        self.force_scale = membrane.young_modulus_pa * membrane.thickness_m * membrane.width_m
+        self.centre = 0.5 * np.array([rubber.width_m, rubber.height_m])
+        self.c1 = rubber.young_modulus_pa / 6.0 * (1.0 - rubber.mooney_share)
+        self.c2 = rubber.young_modulus_pa / 6.0 * rubber.mooney_share
+        self.force_scale = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
 
         number = np.arange(rows * columns).reshape(rows, columns)
         a, b = number[:-1, :-1], number[:-1, 1:]
@@ -190,18 +171,13 @@ class _Grid:
         corners = self.rest[self.triangles]
         sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
         area = 0.5 * np.linalg.det(sides)
-        self.volume = area * membrane.thickness_m
+        self.volume = area * rubber.thickness_m
         inverse = np.linalg.inv(sides)
         # (triangles, 3 nodes, 2): gradient of the hat functions; F = sum of positions x gradient.
         self.hats = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
         node_area = np.bincount(self.triangles.ravel(), np.repeat(area / 3.0, 3), len(self.rest))
-        self.bed = (
-            BED_PER_MODULUS
-            * membrane.young_modulus_pa
-            * membrane.thickness_m
-            / membrane.width_m**2
-            * node_area
-        )
+        pressure = rubber.young_modulus_pa * rubber.thickness_m / rubber.width_m**2
+        self.bed = np.asarray(BED_PER_MODULUS * pressure * node_area, dtype=np.float64)
         self.left, self.right = number[:, 0], number[:, -1]
         clamped = np.zeros(len(self.rest), dtype=bool)
         clamped[self.left] = clamped[self.right] = True

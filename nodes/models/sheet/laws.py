@@ -1,0 +1,407 @@
+"""How the sheet pushes back: interchangeable laws behind one signature.
+
+A law says, for a stretch ratio, depths of a fingertip below the flat sheet, the place on the
+stretched sheet (x, y from its centre, m) and the fingertip's radius, which force along the sheet's
+normal answers, how it grows with the depth, and how hard the sheet then pulls at its clamps.
+
+From cheap to dear: `LinearLaw`, `CubicLaw`, `ScaledLaw`, `nodes.models.sheet.table.TableLaw`,
+`MembraneLaw`.  Each says by `outside` where it must not be trusted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import sqrt
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.models.sheet.membrane import CELLS, push_path
+from nodes.models.sheet.rubber import Rubber
+from nodes.models.sheet.tension import PUSH_FACTOR
+
+Floats = NDArray[np.float64]
+Place = tuple[float, float]
+
+CENTRE: Place = (0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Pressed:
+    """A law's answer at each depth (n,): N, N/m, and N on each clamp."""
+
+    force_n: Floats
+    stiffness_n_per_m: Floats
+    edge_force_n: Floats
+
+
+class SheetLaw(Protocol):
+    """What every law of the family offers."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def rubber(self) -> Rubber: ...
+
+    def press(
+        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+    ) -> Pressed:
+        """Answers at depths (n,), m; a depth of zero or less presses nothing.
+
+        ValueError for what is not finite.
+        """
+        ...
+
+    def outside(
+        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+    ) -> str:
+        """Why the law does not hold there; empty where it does."""
+        ...
+
+
+def strain_measure(stretch_ratio: float, mooney_share: float = 0.0) -> float:
+    """Nominal stress of simple tension over E: (s - s^-2)/3, for Mooney's rubber times
+    1 - m + m/s; 0 when slack."""
+    s = max(stretch_ratio, 1.0)
+    return (s - s**-2) / 3.0 * (1.0 - mooney_share + mooney_share / s)
+
+
+CLAMP_SHARE, CLAMP_BY_HEIGHT = 1.004, 0.0735
+"""Edge force over that of simple tension: grows with height over width, since the clamps keep the
+sheet from narrowing.  Within 0.3 % of membrane FE from 0.5 to 1.5, stretch to 1.12."""
+
+
+def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
+    """Force (N) on each clamp of the unpushed sheet."""
+    clamped = CLAMP_SHARE + CLAMP_BY_HEIGHT * rubber.height_m / rubber.width_m
+    modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.height_m
+    return clamped * modulus * strain_measure(stretch_ratio, rubber.mooney_share)
+
+
+def _checked(
+    stretch_ratio: float, depths_m: Floats, place_m: Place, finger_radius_m: float
+) -> Floats:
+    """The depths, none below 0; ValueError unless all is finite, stretch and radius above 0."""
+    depths = np.asarray(depths_m, dtype=np.float64)
+    numbers = (stretch_ratio, *place_m, finger_radius_m)
+    if not (np.isfinite(numbers).all() and np.isfinite(depths).all()):
+        raise ValueError(
+            f"a push of {depths} m at {place_m}, stretch {stretch_ratio}, radius "
+            f"{finger_radius_m} is not finite"
+        )
+    if stretch_ratio <= 0.0 or finger_radius_m <= 0.0:
+        raise ValueError(f"stretch {stretch_ratio} and radius {finger_radius_m} must be above 0")
+    return np.maximum(depths, 0.0)
+
+
+def relative_place(rubber: Rubber, stretch_ratio: float, place_m: Place) -> tuple[float, float]:
+    """(|x|, |y|) of a place on the stretched sheet: 0 in the middle, 1 at clamp and free edge."""
+    half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
+    return abs(place_m[0]) / half_width, abs(place_m[1]) / (0.5 * rubber.height_m)
+
+
+NEAREST_CLAMP = 0.98
+"""Relative x at which the closed forms stop growing: at the clamp they are infinite."""
+
+
+@dataclass(frozen=True, slots=True)
+class LinearLaw:
+    """Force in proportion to tension and depth: F = 0.95 T0/W d, as a string's, in place x too.
+
+    The figure is of a 10 mm disc; a fingertip makes its contact only as it goes in, so that the
+    line cuts the true curve, which starts flatter and ends steeper.
+    """
+
+    rubber: Rubber
+    name: str = "linear"
+
+    def press(
+        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+    ) -> Pressed:
+        depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
+        edge = flat_edge_force_n(self.rubber, stretch_ratio)
+        x, _ = relative_place(self.rubber, stretch_ratio, place_m)
+        slope = PUSH_FACTOR * edge / self.rubber.width_m / (1.0 - min(x, NEAREST_CLAMP) ** 2)
+        return Pressed(slope * depths, np.full(depths.shape, slope), np.full(depths.shape, edge))
+
+    def outside(
+        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+    ) -> str:
+        scaled = scaled_depth(self.rubber, stretch_ratio, depth_m)
+        if stretch_ratio < 1.01:
+            return "a slack sheet is not linear at all"
+        if not LINEAR_FROM <= scaled <= LINEAR_TO:
+            return "the line meets the curve of a fingertip at middle depths only"
+        return _outside_simple(self.rubber, stretch_ratio, place_m, finger_radius_m)
+
+
+LINEAR_FROM, LINEAR_TO = 0.15, 0.33
+"""Scaled depths between which the line is within 25 % of the membrane."""
+
+
+def _outside_simple(
+    rubber: Rubber, stretch_ratio: float, place_m: Place, finger_radius_m: float
+) -> str:
+    """What the linear and the cubic law ask alike: about the middle of a square sheet."""
+    x, y = relative_place(rubber, stretch_ratio, place_m)
+    if max(x, y) > 0.34:
+        return "too near to an edge"
+    if stretch_ratio > LARGEST_STRETCH:
+        return f"stretch {stretch_ratio:.3f} is more than {LARGEST_STRETCH:g}"
+    return _outside_sizes(rubber, finger_radius_m)
+
+
+LARGEST_STRETCH = 1.13
+
+
+def _outside_sizes(rubber: Rubber, finger_radius_m: float) -> str:
+    if not 0.9 <= rubber.height_m / rubber.width_m <= 1.1:
+        return "the sheet is not about square"
+    if not 0.02 <= finger_radius_m / rubber.width_m <= 0.043:
+        return "the fingertip's radius is not 2 to 4.3 % of the sheet's width"
+    return ""
+
+
+CUBIC_FACTOR = 2.43
+"""F = CUBIC_FACTOR E t W (d/W)^3 of a slack square sheet under a fingertip of 7 mm."""
+
+
+def scaled_depth(rubber: Rubber, stretch_ratio: float, depth_m: float) -> float:
+    """Depth over width and over the root of the strain: sheets of equal scaled depth are alike."""
+    strain = strain_measure(stretch_ratio, rubber.mooney_share)
+    return depth_m / rubber.width_m / sqrt(max(strain, 1e-12))
+
+
+@dataclass(frozen=True, slots=True)
+class CubicLaw:
+    """The linear law and a term that the tension the push itself makes adds: + c E t W (d/W)^3."""
+
+    rubber: Rubber
+    name: str = "cubic"
+
+    def press(
+        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+    ) -> Pressed:
+        line = LinearLaw(self.rubber).press(
+            stretch_ratio, depths_m, place_m=place_m, finger_radius_m=finger_radius_m
+        )
+        depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
+        rubber = self.rubber
+        x, y = relative_place(rubber, stretch_ratio, place_m)
+        factor = (
+            CUBIC_FACTOR
+            * (rubber.young_modulus_pa * rubber.thickness_m / rubber.width_m**2)
+            * _slack_place(x, y)
+            * max(stretch_ratio, 1.0) ** -_CUBIC_STRETCH
+        )
+        return Pressed(
+            line.force_n + factor * depths**3,
+            line.stiffness_n_per_m + 3.0 * factor * depths**2,
+            line.edge_force_n + _push_tension(rubber, stretch_ratio, depths, (x, y))[0],
+        )
+
+    def outside(
+        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+    ) -> str:
+        if scaled_depth(self.rubber, stretch_ratio, depth_m) < CUBIC_FROM:
+            return "shallower than where the fingertip has made its contact"
+        return _outside_simple(self.rubber, stretch_ratio, place_m, finger_radius_m)
+
+
+CUBIC_FROM = 0.16
+"""Scaled depth from which the cubic law is within 25 % of the membrane."""
+
+# Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet: stretch 1
+# to 1.12, fingertips of 5 to 10 mm on 240 mm, depths of 2 to 50 mm, places to half way to a clamp
+# and three quarters of the way to a free edge; 3.6 % rms.  See docs/sheet.md.
+_TAUT_FACTOR, _TAUT_POWER, _TAUT_STRETCH, _TAUT_RADIUS = 1.781, 1.414, 0.762, 0.067
+_KNEE, _KNEE_SHARPNESS, _KNEE_POWER = 1.149, 5.0, 0.567
+_CUBIC_STRETCH, _CUBIC_RADIUS = 5.582, 0.062
+_TAUT_X, _SLACK_X = 1.031, 2.847
+_TAUT_Y, _TAUT_Y_POWER, _SLACK_Y, _SLACK_Y_POWER = 0.594, 2.289, 0.363, 2.114
+_TAUT_HEIGHT, _SLACK_HEIGHT = 0.8, 0.4
+_PULL, _PULL_KNEE, _PULL_X, _PULL_Y, _PULL_STRETCH = 0.779, 0.484, 1.093, 0.333, 5.072
+_FITTED_RADIUS = 0.007 / 0.24
+
+
+def _slack_place(x: float, y: float) -> float:
+    near = 1.0 - min(x, NEAREST_CLAMP) ** 2
+    sideways = 1.0 - _SLACK_Y * min(y, 1.0) ** _SLACK_Y_POWER
+    return float(sideways * near**-_SLACK_X)
+
+
+def _push_tension(
+    rubber: Rubber, stretch_ratio: float, depths: Floats, place: tuple[float, float]
+) -> tuple[Floats, float]:
+    """What a push adds to the force on each clamp (n,), N, at a relative place; and E t W."""
+    modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
+    share = depths / rubber.width_m
+    scaled = share / max(strain_measure(stretch_ratio, rubber.mooney_share), 1e-12) ** 0.5
+    near = 1.0 - min(place[0], NEAREST_CLAMP) ** 2
+    where = near**-_PULL_X * (1.0 - _PULL_Y * min(place[1], 1.0) ** 2)
+    taut = max(stretch_ratio, 1.0) ** -_PULL_STRETCH
+    added = _PULL * modulus * taut * where * share**2 * np.sqrt(scaled / (scaled + _PULL_KNEE))
+    return added, modulus
+
+
+@dataclass(frozen=True, slots=True)
+class ScaledLaw:
+    """One curve for all tensions: a taut part, a power of the scaled depth, and a cubic part.
+
+    With e the strain measure, w = d/W and u = w/sqrt(e) (a membrane's equations keep their form
+    under this scaling while strains are small):
+
+        F = E t W (e^3/2 s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3),
+
+    each part with its own dependence on place, fingertip radius and height.  cubic_ratio: the
+    second part over that of ideal rubber, from calibration.
+    """
+
+    rubber: Rubber
+    cubic_ratio: float = 1.0
+    name: str = "scaled"
+
+    def press(
+        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+    ) -> Pressed:
+        depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
+        rubber, s = self.rubber, max(stretch_ratio, 1.0)
+        x, y = relative_place(rubber, s, place_m)
+        tension, modulus = _push_tension(rubber, s, depths, (x, y))
+        strain = strain_measure(s, rubber.mooney_share)
+        share = depths / rubber.width_m
+        radius = finger_radius_m / rubber.width_m / _FITTED_RADIUS
+        height = rubber.height_m / rubber.width_m
+        cubic = (
+            self.cubic_ratio
+            * CUBIC_FACTOR
+            * s**-_CUBIC_STRETCH
+            * radius**_CUBIC_RADIUS
+            * height**_SLACK_HEIGHT
+            * _slack_place(x, y)
+        )
+        force = cubic * share**3
+        slope = 3.0 * cubic * share**2
+        if strain > 0.0:
+            near = 1.0 - min(x, NEAREST_CLAMP) ** 2
+            taut = (
+                _TAUT_FACTOR
+                * s**_TAUT_STRETCH
+                * radius**_TAUT_RADIUS
+                * height**_TAUT_HEIGHT
+                * near**-_TAUT_X
+                * (1.0 - _TAUT_Y * min(y, 1.0) ** _TAUT_Y_POWER)
+            )
+            u = share / strain**0.5
+            bend = (u / _KNEE) ** _KNEE_SHARPNESS
+            curve = u ** (_TAUT_POWER - 1.0) * (1.0 + bend) ** (-_KNEE_POWER / _KNEE_SHARPNESS)
+            force = force + taut * strain**1.5 * curve * u
+            power = _TAUT_POWER - _KNEE_POWER * bend / (1.0 + bend)
+            slope = slope + taut * strain * curve * power
+        return Pressed(
+            modulus * force,
+            modulus / rubber.width_m * slope,
+            flat_edge_force_n(rubber, s) + tension,
+        )
+
+    def outside(
+        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+    ) -> str:
+        rubber = self.rubber
+        if not 1.0 <= stretch_ratio <= LARGEST_STRETCH:
+            return f"stretch {stretch_ratio:.3f} is not from 1 to {LARGEST_STRETCH:g}"
+        if not 0.008 <= depth_m / rubber.width_m <= 0.21:
+            return "the depth is not 0.8 to 21 % of the sheet's width"
+        x, y = relative_place(rubber, stretch_ratio, place_m)
+        if x > 0.5 or y > 0.76:
+            return "too near to an edge"
+        return _outside_sizes(rubber, finger_radius_m)
+
+
+@dataclass(frozen=True, slots=True)
+class MembraneLaw:
+    """Finite elements, solved anew for every question: exact, and seconds slow."""
+
+    rubber: Rubber
+    cells: int = CELLS
+    name: str = "membrane"
+
+    def press(
+        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+    ) -> Pressed:
+        depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
+        wanted = np.unique(np.concatenate([depths, _SLOPE_SHARE * depths]))
+        path = push_path(
+            self.rubber,
+            stretch_ratio=stretch_ratio,
+            depths_m=wanted,
+            place_m=place_m,
+            finger_radius_m=finger_radius_m,
+            cells=self.cells,
+        )
+        at = np.searchsorted(wanted, depths)
+        shallower = path.forces_n[np.searchsorted(wanted, _SLOPE_SHARE * depths)]
+        rise = path.forces_n[at] - shallower
+        run = np.where(depths > 0.0, (1.0 - _SLOPE_SHARE) * depths, 1.0)
+        return Pressed(path.forces_n[at], rise / run, path.edge_forces_n[at])
+
+    def outside(
+        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+    ) -> str:
+        if depth_m < 0.2 * finger_radius_m:
+            return "the contact is smaller than the mesh"
+        x, y = relative_place(self.rubber, stretch_ratio, place_m)
+        return "" if x <= 0.8 and y <= 0.9 else "the fingertip reaches over an edge"
+
+
+_SLOPE_SHARE = 0.96
+"""A force at this share of the depth gives the slope there."""
+
+
+def depth_for_force(
+    law: SheetLaw,
+    stretch_ratio: float,
+    forces_n: Floats,
+    *,
+    deepest_m: float,
+    place_m: Place,
+    finger_radius_m: float,
+) -> Floats:
+    """Depths (n,) at which the law answers with these forces; no deeper than `deepest_m`.
+
+    One question to the law, at depths that lie denser near 0, and a monotone cubic between them
+    (of log force over log depth, which is nearly straight): within 1e-4 of the depth.
+    """
+    grid = deepest_m * _INVERSE_GRID
+    pressed = law.press(
+        stretch_ratio, grid, place_m=place_m, finger_radius_m=finger_radius_m
+    ).force_n
+    return interpolated_inverse(grid, pressed, np.asarray(forces_n, dtype=np.float64))
+
+
+_INVERSE_GRID = np.geomspace(1e-3, 1.0, 48)
+
+
+def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats:
+    """Where a rising function reaches `wanted`, from its values at `grid` (both above 0).
+
+    Before the grid it goes as the first interval's power; beyond, it stays at the end.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    rising = np.maximum.accumulate(values)
+    logs = np.log(np.maximum(rising, 1e-300))
+    keep = np.concatenate([[True], np.diff(logs) > 1e-12])
+    logs, places = logs[keep], np.log(grid[keep])
+    result = np.zeros(wanted.shape)
+    some = wanted > 0.0
+    if len(logs) < 2 or not some.any():
+        result[some] = grid[-1]
+        return result
+    asked = np.log(wanted[some])
+    power = (places[1] - places[0]) / (logs[1] - logs[0])
+    inside = PchipInterpolator(logs, places)(np.clip(asked, logs[0], logs[-1]))
+    result[some] = np.exp(np.where(asked < logs[0], places[0] + power * (asked - logs[0]), inside))
+    return result

@@ -1,0 +1,128 @@
+"""A sheet's law as a table: what was measured or computed over what the scaled law says.
+
+The quotient of the two hardly changes, so that few entries are enough, and between them and for
+other fingertips the scaled law goes on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+
+from nodes.models.sheet.laws import Place, Pressed, ScaledLaw
+from nodes.models.sheet.rubber import Rubber
+
+Floats = NDArray[np.float64]
+Measure = Callable[[float, Floats, Place], Floats]
+"""Forces (n,) at a stretch ratio, depths (n,) and a place."""
+
+
+@dataclass(frozen=True, slots=True)
+class TableLaw:
+    """The scaled law times a tabulated quotient.
+
+    stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending, the places in the quadrant of
+    positive x and y, as the sheet is symmetric.  ratios (a, b, c, d).  Linear between stretches
+    and places, a monotone cubic between depths, and constant beyond the ends.
+    """
+
+    base: ScaledLaw
+    stretches: Floats
+    depths_m: Floats
+    xs_m: Floats
+    ys_m: Floats
+    ratios: Floats
+    name: str = "table"
+
+    def __post_init__(self) -> None:
+        """ValueError for axes that do not ascend, ratios of another shape or not above zero."""
+        axes = (self.stretches, self.depths_m, self.xs_m, self.ys_m)
+        shape = tuple(len(axis) for axis in axes)
+        if 0 in shape or any((np.diff(axis) <= 0.0).any() for axis in axes):
+            raise ValueError("a table's stretches, depths and places must ascend")
+        if self.ratios.shape != shape:
+            raise ValueError(f"a table of {self.ratios.shape} entries for axes of {shape}")
+        if not (np.isfinite(self.ratios).all() and (self.ratios > 0.0).all()):
+            raise ValueError("a table's ratios must be finite and above zero")
+
+    @property
+    def rubber(self) -> Rubber:
+        return self.base.rubber
+
+    def press(
+        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
+    ) -> Pressed:
+        pressed = self.base.press(
+            stretch_ratio, depths_m, place_m=place_m, finger_radius_m=finger_radius_m
+        )
+        ratios = _between(self.stretches, stretch_ratio, self.ratios)
+        ratios = _between(self.xs_m, abs(place_m[0]), np.moveaxis(ratios, 1, 0))
+        ratios = _between(self.ys_m, abs(place_m[1]), np.moveaxis(ratios, 1, 0))
+        if len(self.depths_m) == 1:
+            ratio, slope = np.full(pressed.force_n.shape, ratios[0]), np.zeros(1)
+        else:
+            curve = PchipInterpolator(self.depths_m, ratios)
+            within = np.clip(depths_m, self.depths_m[0], self.depths_m[-1])
+            ratio = curve(within)
+            slope = np.where(within == depths_m, curve(within, 1), 0.0)
+        return Pressed(
+            pressed.force_n * ratio,
+            pressed.stiffness_n_per_m * ratio + pressed.force_n * slope,
+            pressed.edge_force_n,
+        )
+
+    def outside(
+        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
+    ) -> str:
+        x, y = abs(place_m[0]), abs(place_m[1])
+        asked = {
+            "stretch": (stretch_ratio, self.stretches),
+            "depth": (depth_m, self.depths_m),
+            "place along x": (x, self.xs_m),
+            "place along y": (y, self.ys_m),
+        }
+        for what, (value, axis) in asked.items():
+            if not axis[0] - 1e-9 <= value <= axis[-1] + 1e-9:
+                return f"{what} {value:.4g} is not in the table's {axis[0]:.4g} to {axis[-1]:.4g}"
+        return ""
+
+
+def _between(axis: Floats, value: float, entries: Floats) -> Floats:
+    """Entries (n, ...) at a value of their first axis, linearly; constant beyond the ends."""
+    if len(axis) == 1:
+        return np.asarray(entries[0])
+    value = float(np.clip(value, axis[0], axis[-1]))
+    upper = int(np.clip(np.searchsorted(axis, value), 1, len(axis) - 1))
+    share = (value - axis[upper - 1]) / (axis[upper] - axis[upper - 1])
+    return np.asarray((1.0 - share) * entries[upper - 1] + share * entries[upper])
+
+
+def make_table(
+    base: ScaledLaw,
+    measure: Measure,
+    *,
+    stretches: Floats,
+    depths_m: Floats,
+    xs_m: Floats,
+    ys_m: Floats,
+    finger_radius_m: float,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TableLaw:
+    """The table of what `measure` says; `progress` is told of each of its questions."""
+    ratios = np.empty((len(stretches), len(depths_m), len(xs_m), len(ys_m)))
+    total, done = len(stretches) * len(xs_m) * len(ys_m), 0
+    for a, stretch in enumerate(stretches):
+        for c, x in enumerate(xs_m):
+            for d, y in enumerate(ys_m):
+                place = (float(x), float(y))
+                scaled = base.press(
+                    float(stretch), depths_m, place_m=place, finger_radius_m=finger_radius_m
+                )
+                ratios[a, :, c, d] = measure(float(stretch), depths_m, place) / scaled.force_n
+                done += 1
+                progress(done, total)
+    return TableLaw(base, stretches, depths_m, xs_m, ys_m, ratios)
