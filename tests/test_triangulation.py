@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
-from messages.calibration import Board, StereoCalibration
+from messages.calibration import Board, CalibrationMismatchError, StereoCalibration
 from messages.scene import Scene
 from nodes.methods import measure as measure_trial
 from nodes.models import camera, rigid
@@ -20,7 +20,6 @@ from nodes.triangulator.families import TRIANGULATION
 from nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     Approach,
-    CalibrationMismatchError,
     Measured,
     StereoGeometry,
     measure,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.calibration import StereoCalibration
+from messages.calibration import StereoCalibration, refuse_other_camera
 from messages.scene import Lens, StereoCamera
 from nodes.models import camera, rigid
 
@@ -31,10 +31,6 @@ LEAST_SINE = 1e-6
 
 FARTHEST_M = 1e4
 """Points farther are at infinity: their rays are parallel but for rounding."""
-
-
-class CalibrationMismatchError(ValueError):
-    """A calibration of another device or picture size than the scene's camera."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +56,7 @@ class StereoGeometry:
         """
         optics: StereoCamera | StereoCalibration = scene_camera
         if calibration is not None:
-            _refuse_other_camera(scene_camera, calibration)
+            refuse_other_camera(calibration, scene_camera)
             optics = calibration
         world_from_left = rigid.transform_from_rpy(
             scene_camera.world_from_left.position_m, scene_camera.world_from_left.rpy_rad
@@ -95,22 +91,6 @@ class StereoGeometry:
 
 def _matrix(lens: Lens) -> Floats:
     return camera.camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
-
-
-def _refuse_other_camera(scene_camera: StereoCamera, calibration: StereoCalibration) -> None:
-    if calibration.device != scene_camera.device:
-        raise CalibrationMismatchError(
-            f'calibration is of device "{calibration.device}", the scene\'s camera is '
-            f'"{scene_camera.device}": name the right file in the parameter "calibration", or '
-            "calibrate this camera"
-        )
-    measured = (calibration.width_px, calibration.height_px)
-    wanted = (scene_camera.width_px, scene_camera.height_px)
-    if measured != wanted:
-        raise CalibrationMismatchError(
-            f"calibration of {calibration.device} is for {measured[0]}x{measured[1]} px, the "
-            f"scene's camera gives {wanted[0]}x{wanted[1]} px: calibrate at this size"
-        )
 
 
 def _rays(normalized: Floats) -> Floats:
