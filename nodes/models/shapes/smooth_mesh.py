@@ -64,8 +64,8 @@ LEAST_SUPPORT = 0.1
 """On the mesh the weights add up to several times this; less is beyond such a rim as well."""
 STRIDE_RATIO = 0.4
 """A descent goes at most this many `rho` a step, so that it never leaves the supports."""
-REST_RATIO = 2e-4
-"""A step under this many `rho` is a descent's last; it leaves some 1e-8 `rho`."""
+REST_RATIO = 1e-3
+"""A step under this many `rho` is a descent's last; it leaves nanometres, and some 1e-5 rad."""
 APART_RATIO = 0.4
 """Nearest points that far apart, in `rho`, are two."""
 MOST_DEVIATION = 0.22
@@ -205,7 +205,7 @@ class SmoothMeshShape:
         slack = self._cover**2 * (1.0 + 2.0 * TIGHTEST * way / rho)
         lists = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
         undecided = np.zeros(len(queries), dtype=bool)
-        rows, jets = self._promising(queries, lists, feet.point, start)
+        rows, jets = self._promising(queries, lists, feet.point, start, way)
         if len(rows):
             other = self._descend(queries[rows], self._on_jet(queries[rows], jets))
             other_way = np.linalg.norm(queries[rows] - other.point, axis=1)
@@ -226,12 +226,13 @@ class SmoothMeshShape:
         return feet, undecided
 
     def _promising(
-        self, queries: Floats, lists: list[list[int]], feet: Floats, starts: Floats
+        self, queries: Floats, lists: list[list[int]], feet: Floats, starts: Floats, way: Floats
     ) -> tuple[Indices, Indices]:
-        """Rows of queries and jets that a nearest point may lie at, away from feet and starts.
+        """Rows of queries and jets that a point nearer than `way` (n,) may lie at, away from the
+        feet and starts there were.
 
-        Such a jet's own quadratic has a nearest point, a minimum, not far from the jet.  Of jets
-        that lie within `rho` of one another one is taken.
+        Such a jet's own quadratic has a nearest point, a minimum, not far from the jet, and not
+        much farther away than `way`.  Of jets that lie within `rho` of one another one is taken.
         """
         rows = np.repeat(np.arange(len(lists)), [len(one) for one in lists])
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
@@ -247,9 +248,11 @@ class SmoothMeshShape:
         across = offset - height * normal
         values, vectors = np.linalg.eigh(_IDENTITY + height[:, :, None] * self._operator[jets])
         along = (np.swapaxes(vectors, 1, 2) @ across[:, :, None])[:, :, 0]
-        # Far from flat the quadratic's own foot is rough, hence the factor.
-        reach = 2.0 * self._cover * np.maximum(values, LEAST_SHARE)
+        # Feet of quadratics are rough, hence the room that is given.
+        reach = 1.5 * self._cover * np.maximum(values, LEAST_SHARE)
         hopeful = (values[:, 0] > 0.0) & (np.abs(along) <= reach).all(axis=1)
+        rough_way = np.linalg.norm(queries[rows] - self._on_jet(queries[rows], jets), axis=1)
+        hopeful &= rough_way < way[rows] + self._cover
         rows, jets, offset = rows[hopeful], jets[hopeful], offset[hopeful]
         taken: dict[int, list[int]] = {}
         for i in np.argsort(np.square(offset).sum(1)):

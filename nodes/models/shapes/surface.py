@@ -190,7 +190,9 @@ def descend(
         point[moving] = x + step
         normal[moving] = turned / np.sqrt((turned * turned).sum(-1))[:, None]
         operator[moving] = weingarten
-        resting = size <= rest_m
+        # Where eigenvalues are raised the steps shrink slowly: the last must be far shorter.
+        raised = values[:, 0] < LEAST_BEND
+        resting = size <= np.where(raised, 1e-3 * rest_m, rest_m)
         steepness[moving], support[moving] = length, known
         is_nearest[moving] = resting & (values[:, 0] > 0.0)
         if resting.all():
