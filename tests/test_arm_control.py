@@ -503,3 +503,89 @@ def test_joints_on_another_branch_are_refused(monkeypatch: pytest.MonkeyPatch) -
     )
     arms[0].cycle(on_time(HOME), arms[1].as_other())
     assert "leap" in arms[0].control.faults[0]
+
+
+def test_when_somebody_has_stopped_the_other_arm_this_one_stands_and_lets_nothing_go() -> None:
+    arms = pair(sheet_at(stretch=1.06))
+    run(arms, on_time(sheet_at(stretch=1.06)), 30)
+    arms[0].control.engage_estop("button")
+    run(arms, on_time(sheet_at(0.05, stretch=1.06)), 60)
+    assert [arm.control.mode for arm in arms] == ["estop", "idle"]
+    assert arms[1].control.reason == "other arm: e-stop"
+    joints = arms[1].joints
+    arms[1].control.faults = ("drill",)
+    run(arms, on_time(sheet_at(stretch=1.06)), 60)
+    assert arms[1].control.mode == "fault"
+    assert (arms[1].joints == joints).all()
+
+
+def test_an_age_that_is_no_number_stops() -> None:
+    for overdue_s, age_s in ((float("nan"), 0.005), (0.0, float("nan"))):
+        arms = pair()
+        run(arms, on_time(HOME), 60)
+        for _ in range(60):
+            arms[0].cycle(Goal(sheet_at(0.05), overdue_s), arms[1].as_other(age_s))
+        assert arms[0].control.mode == "idle"
+
+
+def test_another_arm_that_says_it_is_nowhere_is_not_moved_with() -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 60)
+    other = arms[1].as_other()
+    nowhere = np.full((4, 4), np.nan)
+    for broken in (
+        replace(other, world_from_flange=nowhere),
+        replace(other, world_from_flange_commanded=nowhere),
+    ):
+        run(arms, on_time(HOME), 30)
+        before = arms[0].joints
+        for _ in range(20):
+            arms[0].cycle(on_time(sheet_at(0.05)), broken)
+        assert arms[0].control.reason == "the other arm is silent"
+        assert arms[0].joints == pytest.approx(before, abs=1e-3)
+
+
+def test_measured_flanges_outside_the_workspace_or_too_near_are_faults() -> None:
+    for shift, words in (((0.0, 0.4, 0.0), "outside the workspace"), ((0.2, 0, 0), "mm apart")):
+        arms = pair()
+        run(arms, on_time(HOME), 60)
+        control, geometry = arms[0].control, arms[0].geometry
+        moved = geometry.world_from_flange(arms[0].joints)
+        moved[:3, 3] += shift
+        geometry.world_from_flange = lambda joints, moved=moved: moved
+        control._watch(geometry, arms[1].as_other(), arms[0].joints)
+        assert control.faults
+        assert control.faults[0].startswith("measured: ")
+        assert words in control.faults[0]
+
+
+def test_an_arm_that_does_not_let_go_is_not_led_on() -> None:
+    """Frozen while the sheet shall be slackened: its command stops where the arm may trail it."""
+    arms = pair(sheet_at(stretch=1.08))
+    run(arms, on_time(sheet_at(stretch=1.08)), 30)
+    arms[0].control.faults = ("drill",)
+    arms[0].control._largest_lag_rad = 0.01
+    stuck = arms[0].joints
+    for _ in range(600):
+        arms[0].control.step(arms[0].geometry, on_time(HOME), arms[1].as_other(), STEP_S)
+        arms[0].control.take_measurement(stuck, ())
+        assert np.abs(arms[0].control.commanded_rad - stuck).max() < 0.015
+    assert arms[0].control.mode == "fault"
+
+
+def test_only_a_reset_clears_a_fault() -> None:
+    arms = pair()
+    run(arms, on_time(HOME), 10)
+    arms[0].control.faults = ("drill",)
+    run(arms, on_time(HOME), 200)
+    for event in (
+        lambda: arms[0].control.lose_connection("cable"),
+        lambda: arms[0].control.take_measurement(arms[0].joints, ()),
+        arms[0].control.interrupt,
+        lambda: run(arms, None, 60),
+        lambda: run(arms, on_time(HOME), 60),
+    ):
+        event()
+        assert arms[0].control.faults == ("drill",)
+    assert arms[0].control.reset()
+    assert arms[0].control.faults == ()

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
+from benchmarks.limiter import run
 from nodes.arm_bridge.kinematics import (
     JOINT_MAX_RAD,
     JOINT_MIN_RAD,
@@ -16,12 +17,14 @@ from nodes.arm_bridge.kinematics import (
     forward,
 )
 from nodes.arm_bridge.limiter import (
+    EVEN_STEP_S,
     JointLimits,
     SheetLimits,
     braked,
     limited,
     place_trouble,
     sheet_trouble,
+    step_trouble,
     towards,
     within_range,
 )
@@ -198,3 +201,76 @@ def test_flanges_outside_the_workspace_or_too_near_are_in_trouble() -> None:
     near = place_trouble(transform(np.eye(3), [0.2, 0.0, 0.0]), far, SHEET)
     assert near is not None
     assert "flanges 100 mm apart" in near
+
+
+@pytest.mark.parametrize("step_s", [0.0, -0.007, float("nan"), float("inf")])
+def test_a_step_that_is_no_duration_is_an_error(step_s: float) -> None:
+    joints = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
+    with pytest.raises(ValueError, match="has no speed"):
+        step(joints, np.zeros(6), joints, np.zeros(6), step_s)
+
+
+def test_after_a_long_gap_a_command_leads_no_further_than_after_an_even_one() -> None:
+    joints, velocity = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0]), np.zeros(6)
+    far = joints + np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    for _ in range(60):
+        velocity = step(joints, velocity, far, np.zeros(6), STEP_S)
+        joints = joints + velocity * STEP_S
+    for gap_s in (0.5 * STEP_S, STEP_S, 2.0 * STEP_S):
+        moved = step(joints, velocity, far, np.zeros(6), gap_s) * gap_s
+        way = np.linalg.norm(tool_points(joints + moved) - tool_points(joints), axis=1).max()
+        assert way <= TOOL_SPEED * min(gap_s, EVEN_STEP_S) * (1 + 1e-9)
+        assert way >= 0.9 * TOOL_SPEED * min(gap_s, EVEN_STEP_S)
+
+
+def test_what_is_not_finite_is_trouble() -> None:
+    sound, odd = edge(-0.12), edge(0.12)
+    for row, column in ((0, 0), (1, 2), (0, 3), (2, 3)):
+        broken = odd.copy()
+        broken[row, column] = np.nan
+        assert sheet_trouble(sound, broken, left=True, limits=SHEET) is not None
+        assert sheet_trouble(broken, sound, left=False, limits=SHEET) is not None
+        if column == 3:
+            assert place_trouble(sound, broken, SHEET) is not None
+            assert place_trouble(broken, sound, SHEET) is not None
+    assert step_trouble(np.full(6, np.nan), np.zeros(6), 0.1) is not None
+
+
+def test_a_command_far_from_the_measured_joints_is_trouble() -> None:
+    joints = np.zeros(6)
+    assert step_trouble(joints + 0.1, joints, 0.12) is None
+    assert step_trouble(joints + 0.13, joints, 0.12) == "the arm trails its command by 7.4 degrees"
+
+
+def test_measured_places_have_some_slack_and_commanded_ones_none() -> None:
+    far = transform(np.eye(3), [0.3, 0.0, 0.0])
+    outside = transform(np.eye(3), [0.0, 0.0, 0.301])
+    assert place_trouble(outside, far, SHEET) is not None
+    assert place_trouble(outside, far, SHEET, slack_m=0.002) is None
+    near = transform(np.eye(3), [0.1515, 0.0, 0.0])
+    assert place_trouble(near, far, SHEET) is not None
+    assert place_trouble(near, far, SHEET, slack_m=0.002) is None
+
+
+@settings(max_examples=100, deadline=None)
+@given(tilt=st.tuples(*[st.floats(-3.0, 3.0)] * 3), shift=st.tuples(*[st.floats(-0.2, 0.2)] * 3))
+def test_the_turn_between_edges_is_the_angle_of_their_rotation(
+    tilt: tuple[float, ...], shift: tuple[float, ...]
+) -> None:
+    turned = transform_from_rpy(shift, tilt)
+    angle = np.arccos(np.clip(0.5 * (np.trace(turned[:3, :3]) - 1.0), -1.0, 1.0))
+    found = sheet_trouble(transform(np.eye(3), [-0.1, 0.0, 0.0]), turned, left=True, limits=SHEET)
+    if angle > 0.201 and np.linalg.norm(turned[:3, 3] - [-0.1, 0.0, 0.0]) < 0.2401:
+        assert found is not None
+        assert f"turned by {np.degrees(angle):.1f}" in found or "force" in found
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_random_or_adversarial_command_moves_an_arm_out_of_its_limits(seed: int) -> None:
+    """Shorter than `python -m benchmarks.limiter`, and with its judges."""
+    result = run(5000, seed, hunting=False)
+    assert result["commands"] >= 5000
+    assert not any(result["violations"].values()), result
+    assert result["worst_share"]["simulated tool speed"] > 0.8, "the judge sees motion"
+    assert result["worst_share"]["commanded speed"] > 0.9
+    assert result["harder_braking"] < 0.05 * result["commands"]

@@ -23,6 +23,7 @@ from nodes.arm_bridge.limiter import (
     limited,
     place_trouble,
     sheet_trouble,
+    step_trouble,
     with_tool_speed,
 )
 from nodes.models.motion import (
@@ -67,11 +68,17 @@ RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 # On its target, for good: from then until it next stops, the sheet goes with the target.
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
 
+MEASURED_SLACK_M = 0.002
+"""How far a measured flange may be past a place where it may still be sent: servos ripple."""
+
 SLACK_STRETCH = 1.0005
 """A sheet this long pulls with a tenth of a newton: let go."""
 
 FAR_BEYOND = 1.1
 """A sheet that seems longer than so many times its limit is no sheet: nothing relaxes."""
+
+ESTOP = "e-stop: "
+"""How the fault of an arm that somebody has stopped begins."""
 
 JUMP_RAD = 0.35
 """Joints that would have to go further than this at once are on another branch of solutions."""
@@ -105,6 +112,17 @@ class OtherArm:
             state.faults,
             age_s,
         )
+
+    @property
+    def is_somewhere(self) -> bool:
+        """Whether its poses are numbers; else it is as good as silent."""
+        poses = (self.world_from_flange, self.world_from_flange_commanded)
+        return all(bool(np.isfinite(pose).all()) for pose in poses)
+
+    @property
+    def estopped(self) -> bool:
+        """Whether somebody has stopped it: then nothing moves, not even to let go."""
+        return self.mode == "estop" or any(text.startswith(ESTOP) for text in self.faults)
 
     @property
     def trouble(self) -> str | None:
@@ -155,7 +173,7 @@ class ArmControl:
     @property
     def all_faults(self) -> tuple[str, ...]:
         """What the other arm must stop for: own faults, e-stop, a lost connection."""
-        estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
+        estop = () if self.estop_reason is None else (f"{ESTOP}{self.estop_reason}",)
         lost = (self.reason,) if self.mode == "disconnected" else ()
         return (*self.faults, *estop, *lost)
 
@@ -247,9 +265,14 @@ class ArmControl:
         if self._clear_arm:
             self._clear_arm = False
             return Command("idle", measured)
+        if other is not None and not other.is_somewhere:
+            other = None
         self._watch(geometry, other, measured)
         if self.estop_reason is not None:
-            return self._stop("estop", f"e-stop: {self.estop_reason}", geometry, step_s)
+            return self._stop("estop", f"{ESTOP}{self.estop_reason}", geometry, step_s)
+        if other is not None and other.estopped:
+            rest_mode: ArmMode = "fault" if self.faults else "idle"
+            return self._stop(rest_mode, "other arm: e-stop", geometry, step_s)
         if self.faults:
             return self._stop_and_relax("fault", self.faults[0], geometry, other, step_s)
         return self._serve(geometry, goal, other, measured, step_s)
@@ -263,11 +286,11 @@ class ArmControl:
         step_s: float,
     ) -> Command:
         """Nothing is wrong with this arm: go with the target, if there are target and other arm."""
-        if other is None or other.age_s > self._patience.stop_after_s:
+        if other is None or not other.age_s <= self._patience.stop_after_s:
             return self._stop("idle", "the other arm is silent", geometry, step_s)
         if other.trouble is not None:
             return self._stop_and_relax("idle", other.trouble, geometry, other, step_s)
-        if goal is None or goal.overdue_s > self._patience.stop_after_s:
+        if goal is None or not goal.overdue_s <= self._patience.stop_after_s:
             return self._stop("idle", "no sheet target", geometry, step_s)
         if self._relax_from is not None:
             return self._stop("idle", "after relaxing", geometry, step_s)
@@ -308,12 +331,15 @@ class ArmControl:
         """Latch a fault when the measured poses are not as they must be while moving."""
         if self.faults or self._sheet is None or self.mode not in ("follow", "hold"):
             return
-        lag = float(np.abs(self.commanded_rad - measured).max())
-        if lag > self._largest_lag_rad:
-            self.faults = (f"the arm trails its command by {np.degrees(lag):.1f} degrees",)
+        trouble = step_trouble(self.commanded_rad, measured, self._largest_lag_rad)
+        if trouble is not None:
+            self.faults = (trouble,)
         elif other is not None:
-            trouble = sheet_trouble(
-                geometry.world_from_edge(measured),
+            flange = geometry.world_from_flange(measured)
+            trouble = place_trouble(
+                flange, other.world_from_flange, geometry.sheet_limits, slack_m=MEASURED_SLACK_M
+            ) or sheet_trouble(
+                flange @ geometry.flange_from_edge,
                 other.world_from_flange @ geometry.other_flange_from_edge,
                 left=geometry.left,
                 limits=geometry.sheet_limits,
@@ -397,7 +423,7 @@ class ArmControl:
         """Stop; once at rest let the sheet go slack, moving this edge towards the other one."""
         measured = self.measured_rad
         braking = not self.at_rest and self._relax_from is None
-        alone = other is None or other.age_s > self._patience.stop_after_s
+        alone = other is None or not other.age_s <= self._patience.stop_after_s
         if braking or alone or not self._has_pulled or other is None or measured is None:
             return self._stop(rest_mode, reason, geometry, step_s)
         between = geometry.sheet_between(
@@ -413,6 +439,11 @@ class ArmControl:
         if self._relax_from is None or self._sheet is None:
             self._start_at(measured)
             self._sheet, self._relax_from = between, between.stretch_ratio
+        trailing = step_trouble(self.commanded_rad, measured, self._largest_lag_rad)
+        if trailing is not None:
+            # It does not obey: to go on would be a leap once it does.
+            self._has_pulled = False
+            return self._stop(rest_mode, f"{reason}; {trailing}", geometry, step_s)
         # Alone, this arm has to give way by the whole of the stretch, twice its share.
         target = replace(
             self._sheet,

@@ -14,7 +14,7 @@ from nodes.arm_bridge.kinematics import (
     forward,
     next_joints,
 )
-from nodes.arm_bridge.limiter import JointLimits, SheetLimits
+from nodes.arm_bridge.limiter import TOOL_SPEED_SHARE, JointLimits, SheetLimits
 from nodes.models.motion import EdgeBound, SheetMotion
 from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
@@ -43,14 +43,15 @@ class ArmGeometry:
         self.base_from_world = inverse(self.world_from_base)
         self.flange_from_edge = _transform(arm.flange_from_edge)
         self.other_flange_from_edge = _transform(other.flange_from_edge)
-        self.max_tool_speed = scene.arms.max_tool_speed_m_per_s
+        self.max_tool_speed = TOOL_SPEED_SHARE * scene.arms.max_tool_speed_m_per_s
         sheet = scene.sheet
         half = 0.5 * sheet.height_m
         self.edge_bound = EdgeBound(EDGE_SPEED_SHARE * self.max_tool_speed, half)
-        self._tool_points = apply(
+        self.edge_points_flange = apply(
             self.flange_from_edge,
             np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
         )
+        self._tool_points = np.vstack([self.edge_points_flange, np.zeros(3)])
         self.joint_limits = JointLimits(
             JOINT_MIN_RAD + RANGE_MARGIN_RAD,
             JOINT_MAX_RAD - RANGE_MARGIN_RAD,
@@ -77,7 +78,7 @@ class ArmGeometry:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Middle and both ends of the clamped edge (3, 3), in the base frame."""
+        """Middle and both ends of the clamped edge, and the flange (4, 3), in the base frame."""
         return apply(forward(joints_rad), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:

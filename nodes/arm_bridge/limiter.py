@@ -7,6 +7,7 @@ is named, and the caller stops the arm.  Plain functions: joints (6,) rad, poses
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -14,10 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.models.motion import BRAKE_SHARE, closing_speed
-from nodes.models.rigid import angle_between, vector_from_rotation
+from nodes.models.rigid import angle_between
 from nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
+
+TOOL_SPEED_SHARE = 0.92
+"""Share of the tool speed that commands may use: an arm that is sent to a place at a time, and not
+a velocity, ripples about its mean speed (benchmarks/limiter.py)."""
+
+EVEN_STEP_S = 0.01
+"""After a longer gap than that a command leads no further than in this time: what a late one makes
+up at once, the arm would do faster than it may."""
+
+LEAST_SHARE = 0.02
+"""Below this share of the way from braking to the wanted velocity it is not worth looking."""
 
 RANGE_BRAKE_SHARE = 2.0 / 3.0
 """Share of a joint's acceleration kept for stopping short of the end of its range."""
@@ -66,8 +78,10 @@ def limited(
     velocity is what the last call returned.  tool_points: joints to points (n, 3) in metres, none
     of which may exceed `max_tool_speed`.  Whatever the goal, joints_rad + result * step_s is in
     range, and speed and tool speed are kept.  So is the acceleration, unless range or tool speed
-    could not be kept otherwise.
+    could not be kept otherwise.  ValueError when step_s is no duration.
     """
+    if not 0.0 < step_s < np.inf:
+        raise ValueError(f"a step of {step_s} s has no speed")
     if np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all():
         wanted = towards(joints_rad, goal_rad, goal_velocity, limits=limits, step_s=step_s)
         wanted = within_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s)
@@ -139,31 +153,56 @@ def with_tool_speed(
 ) -> Floats:
     """The wanted velocities (6,), held back until no tool point moves faster than it may.
 
-    First the change of velocity is held back, so that the acceleration stays in bounds; if the
-    present velocity is too fast itself, it is braked; if even that is not enough, it is cut: the
+    What lies between the wanted velocities and those of braking is within acceleration and range
+    like both; the nearest to the wanted ones is taken.  If even braking is too fast, it is cut: the
     speed limit comes before the smooth ride.
     """
     here = tool_points(joints_rad)
+    furthest = max_tool_speed * min(step_s, EVEN_STEP_S)
 
-    def speed(candidate: Floats) -> float:
-        there = tool_points(joints_rad + candidate * step_s)
-        return float(np.linalg.norm(there - here, axis=1).max()) / step_s
+    def shifts(candidate: Floats) -> Floats:
+        return tool_points(joints_rad + candidate * step_s) - here
 
-    if speed(wanted) <= max_tool_speed:
+    fast = shifts(wanted)
+    if _longest(fast) <= furthest:
         return wanted
-    if speed(velocity) <= max_tool_speed:
-        share, step = 0.0, 0.5
-        for _ in range(5):
-            if speed(velocity + (share + step) * (wanted - velocity)) <= max_tool_speed:
-                share += step
-            step *= 0.5
-        slower = velocity + share * (wanted - velocity)
-    else:
-        slower = braked(velocity, limits=limits, step_s=step_s)
-    slower = within_range(joints_rad, velocity, slower, limits=limits, step_s=step_s)
-    while (present := speed(slower)) > max_tool_speed:
-        slower = slower * (0.99 * max_tool_speed / present)
+    slower = within_range(
+        joints_rad,
+        velocity,
+        braked(velocity, limits=limits, step_s=step_s),
+        limits=limits,
+        step_s=step_s,
+    )
+    slow = shifts(slower)
+    if (way := _longest(slow)) <= furthest:
+        share = _share_within(slow, fast, furthest)
+        while share > LEAST_SHARE:
+            between = slower + share * (wanted - slower)
+            if _longest(shifts(between)) <= furthest:
+                return between
+            share *= 0.8
+        return slower
+    while way > furthest:
+        slower = slower * (0.99 * furthest / way)
+        way = _longest(shifts(slower))
     return slower
+
+
+def _longest(shifts: Floats) -> float:
+    """The length of the longest of vectors (n, 3)."""
+    return math.sqrt(float((shifts * shifts).sum(axis=1).max()))
+
+
+def _share_within(slow: Floats, fast: Floats, furthest: float) -> float:
+    """How far to go from shifts (n, 3) that are within a length to such that are not.
+
+    As if they went straight over; from |slow + share (fast - slow)| = furthest.
+    """
+    change = fast - slow
+    square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)
+    left = (slow * slow).sum(axis=1) - furthest * furthest
+    root = np.sqrt(mixed * mixed - square * np.minimum(left, 0.0))
+    return float(((root - mixed) / np.maximum(square, 1e-30)).min()) * (1.0 - 1e-3)
 
 
 def sheet_trouble(
@@ -171,11 +210,11 @@ def sheet_trouble(
 ) -> str | None:
     """What is wrong with the sheet between two edges (world poses), or None.
 
-    edge is this arm's, and `left` says which side that is.
+    edge is this arm's, and `left` says which side that is.  What is not finite is wrong.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
-    distance = float(np.linalg.norm(across))
-    if distance > limits.longest_m:
+    distance = math.sqrt(float(across @ across))
+    if not distance <= limits.longest_m:
         return f"sheet of {distance * 1e3:.1f} mm, at most {limits.longest_m * 1e3:.1f} mm"
     force = edge_force_n(
         distance / limits.width_m,
@@ -183,16 +222,18 @@ def sheet_trouble(
         height_m=limits.height_m,
         thickness_m=limits.thickness_m,
     )
-    if force > limits.max_edge_force_n:
+    if not force <= limits.max_edge_force_n:
         return f"edge force {force:.1f} N, at most {limits.max_edge_force_n:.1f} N"
-    twist = float(np.linalg.norm(vector_from_rotation(edge[:3, :3].T @ other_edge[:3, :3])))
-    if twist > limits.max_twist_rad:
+    # Of two rotations' difference the Frobenius norm is sqrt(8) sin(half the angle between them).
+    apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
+    twist = 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
+    if not twist <= limits.max_twist_rad:
         return (
             f"edges turned by {np.degrees(twist):.1f} degrees to one another, "
             f"at most {np.degrees(limits.max_twist_rad):.1f}"
         )
     skewed = angle_between(across if left else -across, edge[:3, 0])
-    if skewed > limits.max_twist_rad:
+    if not skewed <= limits.max_twist_rad:
         return (
             f"edge skewed by {np.degrees(skewed):.1f} degrees to the line between both, "
             f"at most {np.degrees(limits.max_twist_rad):.1f}"
@@ -200,16 +241,31 @@ def sheet_trouble(
     return None
 
 
-def place_trouble(flange_world: Floats, other_flange: Floats, limits: SheetLimits) -> str | None:
-    """Whether a flange (world pose) leaves the workspace or comes too near to the other arm's."""
+def place_trouble(
+    flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
+) -> str | None:
+    """Whether a flange (world pose) leaves the workspace or comes too near to the other arm's.
+
+    slack_m: by how much both limits may be overstepped.  What is not finite is trouble.
+    """
     place = flange_world[:3, 3]
-    if (place < limits.workspace_min_m).any() or (place > limits.workspace_max_m).any():
+    lowest, highest = limits.workspace_min_m - slack_m, limits.workspace_max_m + slack_m
+    if not ((place >= lowest) & (place <= highest)).all():
         x, y, z = place * 1e3
         return f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm is outside the workspace"
-    distance = float(np.linalg.norm(other_flange[:3, 3] - place))
-    if distance < limits.min_flange_distance_m:
+    apart = other_flange[:3, 3] - place
+    distance = math.sqrt(float(apart @ apart))
+    if not distance >= limits.min_flange_distance_m - slack_m:
         return (
             f"flanges {distance * 1e3:.0f} mm apart, "
             f"at least {limits.min_flange_distance_m * 1e3:.0f} mm"
         )
+    return None
+
+
+def step_trouble(joints_rad: Floats, measured_rad: Floats, largest_rad: float) -> str | None:
+    """Whether a command (6,) is further from the measured joints than an arm may trail."""
+    lag = float(np.abs(joints_rad - measured_rad).max())
+    if not lag <= largest_rad:
+        return f"the arm trails its command by {np.degrees(lag):.1f} degrees"
     return None

@@ -6,10 +6,14 @@ Twists are 6-vectors, linear part first (m/s), then angular (rad/s), both seen i
 
 from __future__ import annotations
 
+from math import atan2, cos, hypot, inf, nan, sin, sqrt
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Floats = NDArray[np.float64]
+
+_UNIT: Floats = np.eye(4)
 
 
 def rotation_from_rpy(rpy_rad: ArrayLike) -> Floats:
@@ -27,24 +31,36 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> Floats:
 
 
 def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
-    """Rotation matrix about `vector_rad` by its length (Rodrigues); exact near zero."""
-    vector = np.asarray(vector_rad, dtype=np.float64)
-    angle = float(np.linalg.norm(vector))
-    cross = skew(vector)
+    """Rotation matrix about `vector_rad` by its length (Rodrigues); exact near zero.
+
+    All nan for a vector that has no finite length.
+    """
+    x, y, z = np.asarray(vector_rad, dtype=np.float64).tolist()
+    angle = sqrt(x * x + y * y + z * z)
     if angle < 1e-8:
-        return np.eye(3) + cross + 0.5 * (cross @ cross)
-    turn = np.sin(angle) / angle * cross + (1.0 - np.cos(angle)) / angle**2 * (cross @ cross)
-    return np.asarray(np.eye(3) + turn, dtype=np.float64)
+        first, second = 1.0, 0.5
+    elif angle < inf:
+        first, second = sin(angle) / angle, (1.0 - cos(angle)) / (angle * angle)
+    else:
+        return np.full((3, 3), nan)
+    xy, xz, yz = second * x * y, second * x * z, second * y * z
+    x2, y2, z2 = second * x * x, second * y * y, second * z * z
+    x, y, z = first * x, first * y, first * z
+    return np.array(
+        [
+            [1.0 - y2 - z2, xy - z, xz + y],
+            [xy + z, 1.0 - x2 - z2, yz - x],
+            [xz - y, yz + x, 1.0 - x2 - y2],
+        ]
+    )
 
 
 def vector_from_rotation(rotation: Floats) -> Floats:
     """Rotation vector (rad), length 0..pi, of a rotation matrix; also sound near 0 and pi."""
-    quaternion = quaternion_from_rotation(rotation)
-    length = float(np.linalg.norm(quaternion[1:]))
-    if length < 1e-12:
-        return 2.0 * quaternion[1:]
-    scale = 2.0 * float(np.arctan2(length, quaternion[0])) / length
-    return scale * quaternion[1:]
+    w, x, y, z = quaternion_from_rotation(rotation).tolist()
+    length = sqrt(x * x + y * y + z * z)
+    scale = 2.0 if length < 1e-12 else 2.0 * atan2(length, w) / length
+    return np.array([scale * x, scale * y, scale * z])
 
 
 def quaternion_from_rotation(rotation: Floats) -> Floats:
@@ -53,33 +69,32 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
     Takes the largest of the four components first (Shepperd's method), so that no division is by a
     small number.
     """
-    trace = float(np.trace(rotation))
-    weights = np.array([trace, rotation[0, 0], rotation[1, 1], rotation[2, 2]])
-    largest = int(np.argmax(weights))
-    if largest == 0:
-        quaternion = np.array(
-            [
-                1.0 + trace,
-                rotation[2, 1] - rotation[1, 2],
-                rotation[0, 2] - rotation[2, 0],
-                rotation[1, 0] - rotation[0, 1],
-            ]
-        )
+    turn = rotation.tolist()
+    diagonal = turn[0][0], turn[1][1], turn[2][2]
+    trace = diagonal[0] + diagonal[1] + diagonal[2]
+    i = max(range(3), key=diagonal.__getitem__)
+    j, k = (i + 1) % 3, (i + 2) % 3
+    quaternion = [turn[k][j] - turn[j][k], 0.0, 0.0, 0.0]
+    if trace >= diagonal[i]:
+        quaternion = [
+            1.0 + trace,
+            turn[2][1] - turn[1][2],
+            turn[0][2] - turn[2][0],
+            turn[1][0] - turn[0][1],
+        ]
     else:
-        i = largest - 1
-        j, k = (i + 1) % 3, (i + 2) % 3
-        quaternion = np.empty(4)
-        quaternion[0] = rotation[k, j] - rotation[j, k]
-        quaternion[1 + i] = 1.0 + rotation[i, i] - rotation[j, j] - rotation[k, k]
-        quaternion[1 + j] = rotation[j, i] + rotation[i, j]
-        quaternion[1 + k] = rotation[k, i] + rotation[i, k]
-    quaternion /= np.linalg.norm(quaternion)
-    return -quaternion if quaternion[0] < 0 else quaternion
+        quaternion[1 + i] = 1.0 + diagonal[i] - diagonal[j] - diagonal[k]
+        quaternion[1 + j] = turn[j][i] + turn[i][j]
+        quaternion[1 + k] = turn[k][i] + turn[i][k]
+    length = sqrt(sum(part * part for part in quaternion)) or nan
+    if quaternion[0] < 0.0:
+        length = -length
+    return np.array([part / length for part in quaternion])
 
 
 def skew(vector: ArrayLike) -> Floats:
     """Matrix S with S @ u = vector x u."""
-    x, y, z = np.asarray(vector, dtype=np.float64)
+    x, y, z = np.asarray(vector, dtype=np.float64).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
@@ -112,10 +127,12 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         return False
     rotation = matrix[:3, :3]
+    # As numpy.allclose judges it, at a tenth of its cost.
+    allowed = tolerance + 1e-5 * _UNIT
     return bool(
-        np.allclose(rotation @ rotation.T, np.eye(3), atol=tolerance)
+        (np.abs(rotation @ rotation.T - _UNIT[:3, :3]) <= allowed[:3, :3]).all()
         and np.linalg.det(rotation) > 0
-        and np.allclose(matrix[3], [0.0, 0.0, 0.0, 1.0], atol=tolerance)
+        and (np.abs(matrix[3] - _UNIT[3]) <= allowed[3]).all()
     )
 
 
@@ -134,4 +151,6 @@ def twist_between(world_from_before: Floats, world_from_after: Floats, duration_
 
 def angle_between(a: Floats, b: Floats) -> float:
     """Angle (rad, 0..pi) between two vectors; exact for small angles, unlike the arc cosine."""
-    return float(np.arctan2(np.linalg.norm(np.cross(a, b)), np.dot(a, b)))
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    across = hypot(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
+    return atan2(across, ax * bx + ay * by + az * bz)
