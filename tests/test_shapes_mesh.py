@@ -163,7 +163,7 @@ def test_gradient_and_curvature_by_differences(shape: object) -> None:
         solid.closest(point + way * along, previous=point).normal for way in (1e-6, -1e-6)
     )
     bend = (found.shape_operator[keep] @ along[:, :, None])[:, :, 0]
-    assert np.allclose((ahead - behind) / 2e-6, bend, atol=2e-3 * np.abs(bend).max() + 0.5)
+    assert np.allclose((ahead - behind) / 2e-6, bend, atol=5e-3 * np.abs(bend).max() + 0.5)
 
 
 def walk(shape: SmoothMeshShape, start: Floats, step_m: float, steps: int) -> tuple[Floats, Floats]:

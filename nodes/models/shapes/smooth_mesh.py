@@ -199,15 +199,17 @@ class SmoothMeshShape:
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
         feet = self._descend(queries, self._on_jet(queries, nearest))
-        way = np.linalg.norm(
-            queries - np.where(feet.is_nearest[:, None], feet.point, start), axis=1
-        )
+        way = np.linalg.norm(queries - feet.point, axis=1)
+        # A descent that ended farther away than it began went astray.
+        begun = np.linalg.norm(queries - start, axis=1)
+        feet.is_nearest[way > begun + self._cover] = False
+        way = np.where(feet.is_nearest, way, begun)
         slack = self._cover**2 * (1.0 + 2.0 * TIGHTEST * way / rho)
         lists = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
         undecided = np.zeros(len(queries), dtype=bool)
-        rows, jets = self._promising(queries, lists, feet.point, start, way)
+        rows, jets = self._promising(queries, lists, feet.point, way)
         if len(rows):
-            other = self._descend(queries[rows], self._on_jet(queries[rows], jets))
+            other = self._descend(queries[rows], self._centre[jets])
             other_way = np.linalg.norm(queries[rows] - other.point, axis=1)
             for i in np.flatnonzero(other.is_nearest):
                 row, shorter = rows[i], way[rows[i]] - other_way[i]
@@ -222,14 +224,14 @@ class SmoothMeshShape:
             # At a rim that the jets do not close: the nearest jet itself.
             feet.point[lost], feet.normal[lost] = start[lost], self._normal[nearest[lost]]
             feet.shape_operator[lost] = self._operator[nearest[lost]]
-            feet.support[lost] = 0.0
+            feet.support[lost], undecided[lost] = 0.0, True
         return feet, undecided
 
     def _promising(
-        self, queries: Floats, lists: list[list[int]], feet: Floats, starts: Floats, way: Floats
+        self, queries: Floats, lists: list[list[int]], feet: Floats, way: Floats
     ) -> tuple[Indices, Indices]:
         """Rows of queries and jets that a point nearer than `way` (n,) may lie at, away from the
-        feet and starts there were.
+        feet there were.
 
         Such a jet's own quadratic has a nearest point, a minimum, not far from the jet, and not
         much farther away than `way`.  Of jets that lie within `rho` of one another one is taken.
@@ -238,7 +240,6 @@ class SmoothMeshShape:
         jets = np.fromiter((jet for one in lists for jet in one), np.int64, len(rows))
         square = self.smoothing_m**2
         away = np.square(self._centre[jets] - feet[rows]).sum(1) > square
-        away &= np.square(self._centre[jets] - starts[rows]).sum(1) > square
         rows, jets = rows[away], jets[away]
         if not len(rows):
             return rows, jets
@@ -337,7 +338,7 @@ class SmoothMeshShape:
         hessian += FLATNESS * ((normal_t * pull[:, None]) @ normal)
         count = len(points)
         hessian += (weight[:, None] @ operator.reshape(count, -1, 9)).reshape(count, 3, 3)
-        return value, gradient, hessian / total[:, None, None], total
+        return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
 
 
 def _put(feet: Feet, rows: Indices, other: Feet, chosen: Bools | slice = slice(None)) -> None:

@@ -145,9 +145,9 @@ class Feet:
 
 
 MOST_STEPS = 25
-LEAST_BEND = 0.2
-"""Floor of the reduced Hessian's eigenvalues (1 on a flat surface): below it, within four fifths
-of a centre of curvature or past it, the full Newton step would be too long or go uphill."""
+LEAST_BEND = 0.02
+"""Floor of the size of the reduced Hessian's eigenvalues (1 on a flat surface): close to a centre
+of curvature the full Newton step would be too long; past it, downhill is the other way."""
 
 
 def descend(
@@ -181,7 +181,8 @@ def descend(
         fall = (-value / square)[:, None] * gradient
         slope = tangent @ (offset[:, :, None] - bend @ fall[:, :, None])
         values, vectors = np.linalg.eigh(tangent @ bend @ tangent + outward)
-        along = np.swapaxes(vectors, 1, 2) @ slope / np.maximum(values, LEAST_BEND)[:, :, None]
+        bounded = np.maximum(np.abs(values), LEAST_BEND)
+        along = np.swapaxes(vectors, 1, 2) @ slope / bounded[:, :, None]
         step = (vectors @ along)[:, :, 0] + fall
         size = np.sqrt((step * step).sum(-1))
         step *= np.minimum(1.0, stride_m / np.maximum(size, 1e-300))[:, None]
@@ -190,9 +191,9 @@ def descend(
         point[moving] = x + step
         normal[moving] = turned / np.sqrt((turned * turned).sum(-1))[:, None]
         operator[moving] = weingarten
-        # Where eigenvalues are raised the steps shrink slowly: the last must be far shorter.
-        raised = values[:, 0] < LEAST_BEND
-        resting = size <= np.where(raised, 1e-3 * rest_m, rest_m)
+        # Where eigenvalues are bounded the steps shrink slowly: the last must be far shorter.
+        slow = values[:, 0] < LEAST_BEND
+        resting = size <= np.where(slow, 1e-3 * rest_m, rest_m)
         steepness[moving], support[moving] = length, known
         is_nearest[moving] = resting & (values[:, 0] > 0.0)
         if resting.all():
