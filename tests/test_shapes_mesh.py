@@ -230,6 +230,19 @@ def test_a_nearest_point_is_the_nearest_of_all() -> None:
     assert np.abs(found.height_m - known.closest(inside).height_m).max() < 5e-5
 
 
+def test_a_nearest_point_of_the_real_mesh_is_that_of_its_facets() -> None:
+    shape, rng = liver(), np.random.default_rng(2)
+    base = shape.closest(rng.uniform(-0.05, 0.05, (300, 3)))
+    queries = base.point + rng.uniform(-0.015, 0.02, (300, 1)) * base.normal
+    vertices, triangles = liver_arrays()
+    triangle, weights = Facets(vertices, triangles).nearest(queries)
+    foot = (weights[:, None] @ vertices[triangles[triangle]])[:, 0]
+    distance = np.linalg.norm(queries - foot, axis=1)
+    off = np.abs(np.abs(shape.closest(queries).height_m) - distance)
+    assert np.quantile(off, 0.98) < 0.0004
+    assert off.max() < 0.002
+
+
 def test_the_earlier_point_decides_between_two_sides() -> None:
     shape = smooth_ellipsoid((0.05, 0.05, 0.012), 4)
     middle = np.array([0.002, 0.001, 0.0])
