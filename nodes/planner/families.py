@@ -128,7 +128,7 @@ def _trial(
 MESH_NORMAL = Family(
     name="mesh-normal",
     unit="deg",
-    reference="largest error against an ellipsoid's known normals",
+    reference="an ellipsoid's known normals, the worst of 400",
     methods=tuple(METHODS),
     trials=mesh_normal_trials,
     tolerance=lambda scene: float(
