@@ -6,7 +6,17 @@ import sys
 
 import typer
 
-from launch.commands import bag, calibrate, chart, doctor, experiment, launching, node, topic
+from launch.commands import (
+    bag,
+    calibrate,
+    calibrate_arms,
+    chart,
+    doctor,
+    experiment,
+    launching,
+    node,
+    topic,
+)
 from launch.commands.output import BAD_INPUT, FAILED, CommandError, words
 
 app = typer.Typer(
@@ -20,6 +30,7 @@ app.command()(launching.launch)
 app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(bag.app, name="bag")
+calibrate_arms.register(calibrate.app)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(experiment.app, name="experiment")
 app.command()(experiment.demo)

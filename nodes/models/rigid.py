@@ -30,6 +30,19 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> Floats:
     )
 
 
+def rpy_from_rotation(rotation: Floats) -> Floats:
+    """Roll, pitch, yaw (rad) of a rotation matrix: inverse of `rotation_from_rpy`.
+
+    With the pitch straight up or down roll and yaw turn about one axis; the yaw is then zero.
+    """
+    level = float(np.hypot(rotation[0, 0], rotation[1, 0]))
+    pitch = float(np.arctan2(-rotation[2, 0], level))
+    if level < 1e-9:
+        return np.array([np.arctan2(-rotation[1, 2], rotation[1, 1]), pitch, 0.0])
+    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+    return np.array([roll, pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
+
+
 def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
     """Rotation matrix about `vector_rad` by its length (Rodrigues); exact near zero.
 

@@ -1,0 +1,513 @@
+"""`flexsheet calibrate arms`: where the arms' bases stand, by a board on the flange."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import sys
+import tempfile
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch.commands.calibrate import (
+    FOUR_BITS,
+    BoardOption,
+    DictionaryOption,
+    MarkerOption,
+    SquareOption,
+    _board,
+    _progress,
+)
+from launch.commands.graph import JsonOption, RunOption, run_interruptible
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    print_fields,
+    print_json,
+    words,
+)
+
+if TYPE_CHECKING:
+    from launch.arm_places import PlaceTaker
+    from messages.arms_calibration import ArmBase, ArmsCalibration
+    from messages.calibration import Board, StereoCalibration
+    from messages.scene import Scene
+    from messages.types import Side
+    from nodes.arm_bridge.hand_eye import BaseFit, Sighting
+
+SceneOption = Annotated[
+    Path, typer.Option("--scene", metavar="SCENE", help="Scene with the camera's place.")
+]
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        metavar="FILE",
+        help="What `calibrate stereo` wrote; without it the scene's own optics.",
+    ),
+]
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to `flexsheet calibrate`."""
+    app.command("arms")(arms)
+    app.command("arms-capture")(capture)
+    app.command("arms-scene")(write_scene)
+
+
+def arms(
+    *,
+    scene_file: SceneOption,
+    board: BoardOption,
+    square_mm: SquareOption,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration file to write.")],
+    left_arm: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Places of the left arm: joints.csv and pictures."),
+    ] = None,
+    right_arm: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Places of the right arm.")
+    ] = None,
+    twin: Annotated[
+        bool, typer.Option("--twin", help="Take the places from the scene's twin, both arms.")
+    ] = False,
+    places: Annotated[int, typer.Option(help="Places of each of the twin's arms.", min=6)] = 16,
+    seed: Annotated[int, typer.Option(help="Of the twin's bases, places and noise.")] = 1,
+    calibration: CalibrationOption = None,
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = FOUR_BITS,
+    copy: Annotated[
+        Path | None,
+        typer.Option("--write-scene", metavar="FILE", help="Write a copy of the scene with it."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure where the arms' bases stand in the world of the stereo camera.
+
+    The board is fast on the flange; the arm stands still at 15 to 20 places, its flange turned to
+    all sides.  Give a folder for each arm (see docs/arms.md), or --twin.
+    """
+    from launch.plan import load_scene
+    from messages.arms_calibration import save_arms_calibration
+
+    if not output.resolve().parent.is_dir():
+        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    if twin == (left_arm is not None or right_arm is not None):
+        raise CommandError("give --left-arm, --right-arm or both; or else --twin", BAD_INPUT)
+    if copy is not None:
+        _refuse_overwriting(copy, "--write-scene")
+    scene = load_scene(scene_file)
+    described = _board(board, square_mm, marker_mm, dictionary)
+    optics = _optics(calibration, scene)
+    folders: dict[Side, Path | None] = {"left": left_arm, "right": right_arm}
+    fits: dict[Side, BaseFit] = {}
+    blind: dict[Side, list[tuple[str, str]]] = {}
+    made_up = Path(tempfile.mkdtemp(prefix="flexsheet-arms-")) if twin else None
+    try:
+        for side in SIDES:
+            if made_up is not None:
+                folders[side] = _made_up(
+                    scene, described, side, folder=made_up, places=places, seed=seed
+                )
+            folder = folders[side]
+            if folder is not None:
+                fits[side], blind[side] = _fit(folder, described, scene, optics, side)
+    finally:
+        if made_up is not None:
+            shutil.rmtree(made_up)
+    found = _calibration(fits, scene, described)
+    save_arms_calibration(found, output, comment=shlex.join(["flexsheet", *sys.argv[1:]]))
+    if copy is not None:
+        _write_copy(scene_file, found, copy)
+    truth = {side: _true_errors(scene, side, fits[side], seed) for side in fits} if twin else {}
+    _tell(found, scene, blind=blind, truth=truth, output=output, copy=copy, as_json=as_json)
+
+
+def write_scene(
+    calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="Of the arms.")],
+    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene to copy.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")],
+) -> None:
+    """Copy a scene with the bases of a calibration of the arms; all else stays as it is."""
+    from launch.plan import load_scene
+    from messages.arms_calibration import load_arms_calibration
+    from messages.calibration import CalibrationFileError
+
+    _refuse_overwriting(output, "-o")
+    load_scene(scene_file)
+    try:
+        _write_copy(scene_file, load_arms_calibration(calibration), output)
+    except CalibrationFileError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    words.print(f"scene: {output}", markup=False)
+
+
+def capture(
+    *,
+    side: Annotated[str, typer.Option("--arm", metavar="left|right", help="The arm to watch.")],
+    board: BoardOption,
+    square_mm: SquareOption,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FOLDER", help="New folder for the places.")
+    ],
+    scene_file: SceneOption,
+    places: Annotated[int, typer.Option(help="End after so many.", min=1)] = 20,
+    calibration: CalibrationOption = None,
+    marker_mm: MarkerOption = None,
+    dictionary: DictionaryOption = FOUR_BITS,
+    run: RunOption = None,
+) -> None:
+    """Take places from the graph that runs, from the topics of the arm and `stereo`.
+
+    Move the arm by its teach pendant.  A place is taken when the arm rests and the board is seen
+    somewhere new; Ctrl-C ends.
+    """
+    from launch.arm_places import PlaceTaker, rig_of
+    from launch.plan import load_scene
+
+    if side not in SIDES:
+        raise CommandError(f"--arm {side}: left or right", BAD_INPUT)
+    scene = load_scene(scene_file)
+    described = _board(board, square_mm, marker_mm, dictionary)
+    try:
+        output.mkdir(parents=True)
+    except OSError as error:
+        raise CommandError(
+            f"-o {output}: cannot be made: {error.strerror}; name a new folder", BAD_INPUT
+        ) from error
+    taker = PlaceTaker(output, described, rig_of(scene, _optics(calibration, scene)))
+    size = (scene.camera.width_px, scene.camera.height_px)
+    run_interruptible(_watch(f"arm_{side}", taker, size, places, run))
+    words.print(f"{taker.taken} places in {output}", markup=False)
+
+
+async def _watch(
+    arm: str, taker: PlaceTaker, size: tuple[int, int], places: int, run: Path | None
+) -> int:
+    import asyncio
+    import time
+
+    from launch.commands.topic import endpoints_of
+    from messages.bus import Subscriber
+    from messages.topics import TOPICS
+    from nodes.node import PortCounts
+
+    pictures: asyncio.Queue[tuple[Any, float]] = asyncio.Queue(maxsize=1)
+
+    def on_stereo(pair: Any, _: Any) -> None:
+        # A pair that comes while the last one is looked at is left out: the next will do.
+        if pictures.empty():
+            pictures.put_nowait((pair, time.monotonic()))
+
+    def on_arm(state: Any, _: Any) -> None:
+        taker.see_joints(state.joints_rad, time.monotonic())
+
+    subscribers = [
+        Subscriber(
+            TOPICS[name],
+            endpoints_of(TOPICS[name], run),
+            handler,
+            PortCounts(),
+            on_problem=lambda text: words.print(text, markup=False),
+        )
+        for name, handler in ((arm, on_arm), ("stereo", on_stereo))
+    ]
+    said = ""
+    try:
+        for subscriber in subscribers:
+            subscriber.start()
+        while taker.taken < places:
+            pair, time_s = await pictures.get()
+            if (pair.left.shape[1], pair.left.shape[0]) != size or any(pair.left_origin_px):
+                hint = "the camera sends parts of its pictures only; let it send them whole"
+            else:
+                hint = await asyncio.to_thread(taker.see_pictures, pair.left, pair.right, time_s)
+            if hint != said:
+                words.print(hint, markup=False)
+            said = hint
+    finally:
+        for subscriber in subscribers:
+            subscriber.close()
+    return 0
+
+
+def _refuse_overwriting(path: Path, option: str) -> None:
+    if path.exists():
+        raise CommandError(f"{option} {path}: exists already; name a new file", BAD_INPUT)
+    if not path.resolve().parent.is_dir():
+        raise CommandError(f"{option} {path}: the folder {path.parent} does not exist", BAD_INPUT)
+
+
+def _optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
+    from messages.calibration import (
+        CalibrationFileError,
+        CalibrationMismatchError,
+        load_calibration,
+        refuse_other_camera,
+    )
+
+    if path is None:
+        return None
+    try:
+        calibration = load_calibration(path)
+        refuse_other_camera(calibration, scene.camera)
+    except CalibrationFileError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    except CalibrationMismatchError as error:
+        raise CommandError(f"{path}: {error}", BAD_INPUT) from error
+    return calibration
+
+
+def _made_up(
+    scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
+) -> Path:
+    """A folder with the twin's places."""
+    from launch.arm_places import twin_places
+    from nodes.twin.board import BoardError
+
+    mine = folder / side
+    mine.mkdir()
+    try:
+        with _progress(f"the twin's {side} arm") as progress:
+            for done in twin_places(scene, board, side, mine, places=places, seed=seed):
+                progress(done, places, f"the twin's {side} arm")
+    except BoardError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    return mine
+
+
+def _fit(
+    folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
+) -> tuple[BaseFit, list[tuple[str, str]]]:
+    from launch.arm_places import PlacesError, read_sightings, rig_of
+    from nodes.arm_bridge.hand_eye import HandEyeError, calibrate_base
+    from nodes.camera.corners import CalibrationError
+
+    rig = rig_of(scene, optics)
+    size = (scene.camera.width_px, scene.camera.height_px)
+    sightings: list[Sighting]
+    try:
+        with _progress(f"{side} arm: looking for the board") as progress:
+            sightings, blind = read_sightings(folder, board, rig, size, progress)
+        with words.status(f"{side} arm: fitting"):
+            return calibrate_base(sightings, rig), blind
+    except (PlacesError, CalibrationError) as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    except HandEyeError as error:
+        raise CommandError(f"{side} arm, {folder}: {error}", BAD_INPUT) from error
+
+
+def _calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsCalibration:
+    from messages.arms_calibration import ArmsCalibration
+
+    return ArmsCalibration(
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        code_version=version("flexsheet"),
+        scene=scene.name,
+        device=scene.camera.device,
+        board=board,
+        left=_arm_base(fits["left"]) if "left" in fits else None,
+        right=_arm_base(fits["right"]) if "right" in fits else None,
+    )
+
+
+def _arm_base(fit: BaseFit) -> ArmBase:
+    import numpy as np
+
+    from messages.arms_calibration import ArmBase, ArmPlace
+    from messages.scene import Pose
+    from nodes.models.rigid import rpy_from_rotation
+
+    def pose(transform: Any) -> Pose:
+        return Pose(
+            position_m=np.ascontiguousarray(transform[:3, 3]),
+            rpy_rad=rpy_from_rotation(transform[:3, :3]),
+        )
+
+    position_std_m, rotation_std_rad = fit.std_at(np.zeros(3))
+    return ArmBase(
+        world_from_base=pose(fit.world_from_base),
+        flange_from_board=pose(fit.flange_from_board),
+        position_std_m=position_std_m,
+        rotation_std_rad=rotation_std_rad,
+        covariance=fit.covariance,
+        jackknife_ratio=fit.jackknife_ratio,
+        largest_change_m=float(np.linalg.norm(fit.leave_one_out[:, 3:], axis=1).max()),
+        largest_change_rad=float(np.linalg.norm(fit.leave_one_out[:, :3], axis=1).max()),
+        corner_sigma_px=fit.corner_sigma_px,
+        arm_sigma_m=fit.arm_sigma_m,
+        arm_sigma_rad=fit.arm_sigma_rad,
+        places=tuple(
+            ArmPlace(
+                name=one.name,
+                used=not one.reason,
+                reason=one.reason,
+                shift_m=one.shift_m,
+                turn_rad=one.turn_rad,
+                rms_px=one.rms_px,
+            )
+            for one in fit.residuals
+        ),
+    )
+
+
+def _write_copy(scene_file: Path, found: ArmsCalibration, copy: Path) -> None:
+    """Write the scene with the measured bases; comments and layout stay."""
+    from ruamel.yaml import YAML
+
+    from launch.plan import load_scene
+
+    yaml = YAML(typ="rt", pure=True)
+    yaml.width = 4096
+    yaml.preserve_quotes = True
+    yaml.indent(sequence=4, offset=2)
+    tree = yaml.load(scene_file.read_text(encoding="utf-8"))
+    for side in SIDES:
+        base: ArmBase | None = getattr(found, side)
+        if base is None:
+            continue
+        given = tree["arms"][side]["world_from_base"]
+        for key in ("position_m", "rpy_rad"):
+            for index, value in enumerate(getattr(base.world_from_base, key)):
+                given[key][index] = _rounded(value)
+    with copy.open("w", encoding="utf-8") as file:
+        yaml.dump(tree, file)
+    load_scene(copy)
+
+
+def _rounded(value: float) -> float:
+    """To a nanometre or nanoradian: what is beyond is noise, and hard to read."""
+    return round(float(value), 9) + 0.0
+
+
+def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str, float]:
+    """How far the found base of the twin is off, at the world's origin."""
+    import numpy as np
+
+    from launch.arm_places import true_base
+    from nodes.models.rigid import inverse, vector_from_rotation
+
+    off = true_base(scene, side, seed=seed) @ inverse(fit.world_from_base)
+    return {
+        "true_error_m": float(np.linalg.norm(off[:3, 3])),
+        "true_error_rad": float(np.linalg.norm(vector_from_rotation(off[:3, :3]))),
+    }
+
+
+def _tell(
+    found: ArmsCalibration,
+    scene: Scene,
+    *,
+    blind: dict[Side, list[tuple[str, str]]],
+    truth: dict[Side, dict[str, float]],
+    output: Path,
+    copy: Path | None,
+    as_json: bool,
+) -> None:
+    result: dict[str, Any] = {
+        "calibration": str(output),
+        "scene": None if copy is None else str(copy),
+        "arms": {},
+    }
+    lines = []
+    for side in SIDES:
+        base: ArmBase | None = getattr(found, side)
+        if base is None:
+            continue
+        lines += [f"  {side}:", f"    world_from_base: {_scene_line(base)}"]
+        strays = [(one.name, one.reason) for one in base.places if not one.used]
+        for name, reason in [*blind[side], *strays]:
+            words.print(f"{side} arm, left out: {name}: {reason}", markup=False)
+        moved_m, turned_rad = _shift(base, scene, side)
+        result["arms"][side] = {
+            "world_from_base": base.world_from_base.model_dump(mode="json"),
+            "position_std_m": base.position_std_m,
+            "rotation_std_rad": base.rotation_std_rad,
+            "moved_from_scene_m": moved_m,
+            "turned_from_scene_rad": turned_rad,
+            "places_used": sum(one.used for one in base.places),
+            "places": len(base.places) + len(blind[side]),
+            "left_out": dict([*blind[side], *strays]),
+            "jackknife_ratio": base.jackknife_ratio,
+            "largest_change_m": base.largest_change_m,
+            "largest_change_rad": base.largest_change_rad,
+            "corner_sigma_px": base.corner_sigma_px,
+            "arm_sigma_m": base.arm_sigma_m,
+            "arm_sigma_rad": base.arm_sigma_rad,
+            **truth.get(side, {}),
+        }
+    if as_json:
+        print_json(result)
+        return
+    print_fields([("calibration", output), *([] if copy is None else [("scene", copy)])])
+    for side, one in result["arms"].items():
+        print()
+        print_fields(_fields(side, one))
+    if copy is None:
+        print("\narms:\n" + "\n".join(lines))
+
+
+def _fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
+    degrees = 57.29577951308232
+    rows = [
+        (f"{side} arm", f"{one['places_used']} of {one['places']} places used"),
+        (
+            "uncertainty",
+            f"{1e3 * one['position_std_m']:.2f} mm at the screen's centre, "
+            f"{degrees * one['rotation_std_rad']:.3f} degrees",
+        ),
+        (
+            "off the scene",
+            f"{1e3 * one['moved_from_scene_m']:.1f} mm, "
+            f"{degrees * one['turned_from_scene_rad']:.2f} degrees",
+        ),
+        (
+            "one place less",
+            f"moves the base by up to {1e3 * one['largest_change_m']:.2f} mm, "
+            f"{degrees * one['largest_change_rad']:.3f} degrees; scatter over what the fit states "
+            f"{one['jackknife_ratio']:.2f}",
+        ),
+        ("corners", f"{one['corner_sigma_px']:.3f} px"),
+        (
+            "arm's own error",
+            f"{1e3 * one['arm_sigma_m']:.2f} mm, {degrees * one['arm_sigma_rad']:.3f} degrees",
+        ),
+    ]
+    if "true_error_m" in one:
+        rows.append(
+            (
+                "error, by the twin",
+                f"{1e3 * one['true_error_m']:.2f} mm at the screen's centre, "
+                f"{degrees * one['true_error_rad']:.3f} degrees",
+            )
+        )
+    return rows
+
+
+def _scene_line(base: ArmBase) -> str:
+    position, rpy = (
+        ", ".join(repr(_rounded(value)) for value in values)
+        for values in (base.world_from_base.position_m, base.world_from_base.rpy_rad)
+    )
+    return f"{{position_m: [{position}], rpy_rad: [{rpy}]}}"
+
+
+def _shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
+    """How far the base was found from where the scene has it: m and rad."""
+    import numpy as np
+
+    from nodes.models.rigid import transform_from_rpy, vector_from_rotation
+
+    given = getattr(scene.arms, side).world_from_base
+    before, now = (
+        transform_from_rpy(one.position_m, one.rpy_rad) for one in (given, base.world_from_base)
+    )
+    return (
+        float(np.linalg.norm(now[:3, 3] - before[:3, 3])),
+        float(np.linalg.norm(vector_from_rotation(now[:3, :3] @ before[:3, :3].T))),
+    )

@@ -1,0 +1,116 @@
+"""The arms' calibration file: what `flexsheet calibrate arms` writes; where the bases stand.
+
+It is YAML, so that people can read it, with every number in full precision.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from messages.calibration import Board, CalibrationFileError, Covariance
+from messages.scene import NonNegative, Part, Pose
+
+ARMS_CALIBRATION_VERSION = 1
+
+
+class ArmPlace(Part):
+    """How one place of the arm fits."""
+
+    name: str
+    used: bool
+    reason: str = Field(description="why it was left out; empty when used")
+    shift_m: NonNegative = Field(description="from where the joints say to where it was seen")
+    turn_rad: NonNegative
+    rms_px: NonNegative = Field(description="of the corners, drawn where the joints say")
+
+
+class ArmBase(Part):
+    """Where one arm's base stands, and how well that is known; deviations are standard ones."""
+
+    world_from_base: Pose
+    flange_from_board: Pose
+    position_std_m: NonNegative = Field(
+        description="of where this arm is sent to at the world's origin, all three axes together"
+    )
+    rotation_std_rad: NonNegative = Field(description="of the base, all three axes together")
+    covariance: Covariance = Field(
+        description="(6, 6) of the base's error: a turn about its origin, in the world's axes "
+        "(rad), then a shift (m)"
+    )
+    jackknife_ratio: NonNegative = Field(
+        description="what refits without one place scatter, over what the fit states; above 1 the "
+        "covariance was raised by its square"
+    )
+    largest_change_m: NonNegative = Field(
+        description="of the base's position, when any one place is left out"
+    )
+    largest_change_rad: NonNegative
+    corner_sigma_px: NonNegative = Field(description="of one coordinate of a corner")
+    arm_sigma_m: NonNegative = Field(description="of one component of the flange's own error")
+    arm_sigma_rad: NonNegative
+    places: tuple[ArmPlace, ...]
+
+
+class ArmsCalibration(Part):
+    """The measured bases; an arm that was not measured is null."""
+
+    version: Literal[1] = 1
+    date: str = Field(description="ISO 8601, UTC")
+    code_version: str
+    scene: str = Field(description="whose camera's place in the world was taken as given")
+    device: str = Field(description="the stereo camera")
+    board: Board
+    left: ArmBase | None = None
+    right: ArmBase | None = None
+
+
+def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
+    """Write the file, replacing an older one only when the new one is complete.
+
+    comment: a line more for its head, as the command that made it.
+    """
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 4096
+    text = io.StringIO()
+    text.write(f"# Where the arms of scene {calibration.scene} stand, {calibration.date}.\n")
+    if comment:
+        text.write(f"# {comment}\n")
+    yaml.dump(calibration.model_dump(mode="json"), text)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text.getvalue())
+    partial.replace(path)
+
+
+def load_arms_calibration(path: Path) -> ArmsCalibration:
+    """Read the file; raises CalibrationFileError for one that is absent, foreign or incomplete."""
+    remedy = "`flexsheet calibrate arms` writes one"
+    try:
+        content: Any = YAML(typ="safe").load(path.read_text())
+    except OSError as error:
+        raise CalibrationFileError(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise CalibrationFileError(f"{path}: not YAML: {error}") from error
+    if not isinstance(content, dict) or "version" not in content:
+        raise CalibrationFileError(
+            f'{path}: no key "version": not a calibration of the arms; {remedy}'
+        )
+    if content["version"] != ARMS_CALIBRATION_VERSION:
+        raise CalibrationFileError(
+            f"{path}: version: {content['version']!r}, this program reads "
+            f"{ARMS_CALIBRATION_VERSION}; calibrate anew"
+        )
+    try:
+        return ArmsCalibration.model_validate(content)
+    except ValidationError as error:
+        problems = "; ".join(
+            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
+            for problem in error.errors()
+        )
+        raise CalibrationFileError(f"{path}: {problems}") from error

@@ -1,0 +1,492 @@
+"""Where the arms' bases stand: measured from a board on the flange, with honest uncertainty."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from launch import cli
+from launch.arm_places import (
+    STILL_S,
+    TABLE,
+    PlacesError,
+    PlaceTaker,
+    add_row,
+    read_sightings,
+    read_table,
+    rig_of,
+    true_base,
+)
+from launch.plan import load_scene
+from messages.arms_calibration import load_arms_calibration
+from messages.calibration import Board, CalibrationFileError
+from messages.types import Side
+from nodes.arm_bridge.hand_eye import (
+    BaseFit,
+    HandEyeError,
+    Sighting,
+    View,
+    calibrate_base,
+)
+from nodes.models.rigid import (
+    apply,
+    inverse,
+    rotation_from_rpy,
+    rotation_from_vector,
+    rpy_from_rotation,
+    transform,
+    vector_from_rotation,
+)
+from nodes.twin.arms import forward as twin_forward
+from nodes.twin.arms import joints_for
+from nodes.twin.board import TwinBoard
+from nodes.twin.rig import pixels_of
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
+OPTICS_FILE = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
+SCENE = load_scene(SCENE_FILE)
+RIG = rig_of(SCENE, None)
+BOARD = Board(columns=7, rows=5, square_m=0.015)
+CORNERS = np.concatenate([np.mgrid[:7, :5].T.reshape(-1, 2) * 0.015, np.zeros((35, 1))], axis=1)
+READY = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
+SIZE = (SCENE.camera.width_px, SCENE.camera.height_px)
+
+
+def seen(left_from_board: Floats, noise: Floats) -> list[View]:
+    """The corners by the twin's own projection; noise (2, 35, 2) px."""
+    views = []
+    for lens, eye_from_left, off in zip(
+        (SCENE.camera.left, SCENE.camera.right),
+        (np.eye(4), SCENE.camera.right_from_left),
+        noise,
+        strict=True,
+    ):
+        in_eye = apply(eye_from_left @ left_from_board, CORNERS)
+        views.append(View(CORNERS, pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:]) + off))
+    return views
+
+
+class Workplace:
+    """An arm of the twin with a board on its flange, before the camera."""
+
+    def __init__(self, seed: int, side: Side = "left") -> None:
+        self.random = np.random.default_rng(seed)
+        self.base = true_base(SCENE, side, seed=seed)
+        flange = self.base @ twin_forward(READY)
+        self.held = flange[:3, 3] + 0.06 * flange[:3, 2]
+        facing = RIG.world_from_left[:3, :3]
+        middle = CORNERS.mean(axis=0)
+        board = transform(facing, self.held - facing @ middle)
+        self.flange_from_board = inverse(flange) @ board
+
+    def joints(self, turn_rad: Floats, shift_m: Floats) -> Floats:
+        """Joints that turn the board (rotation vector, in the camera's axes) and shift it."""
+        rotation = RIG.world_from_left[:3, :3] @ rotation_from_vector(turn_rad)
+        board = transform(rotation, self.held + shift_m - rotation @ CORNERS.mean(axis=0))
+        return joints_for(inverse(self.base) @ board @ inverse(self.flange_from_board), READY)
+
+    def sighting(
+        self, name: str, joints: Floats, *, noise_px: float = 0.0, joint_noise_rad: float = 0.0
+    ) -> Sighting:
+        true = joints + self.random.normal(0.0, 1.0, 6) * joint_noise_rad
+        left_from_board = (
+            inverse(RIG.world_from_left) @ self.base @ twin_forward(true) @ self.flange_from_board
+        )
+        left, right = seen(left_from_board, self.random.normal(0.0, 1.0, (2, 35, 2)) * noise_px)
+        return Sighting(name, joints, left, right)
+
+    def sightings(
+        self,
+        count: int,
+        *,
+        noise_px: float = 0.0,
+        joint_noise_rad: float = 0.0,
+        turn_rad: Any = 0.3,
+    ) -> list[Sighting]:
+        """turn_rad: deviation of the turns, one for all three axes or for each."""
+        found: list[Sighting] = []
+        while len(found) < count:
+            turn = self.random.normal(0.0, 1.0, 3) * turn_rad
+            try:
+                joints = self.joints(turn, self.random.uniform(-0.06, 0.06, 3))
+            except ValueError:
+                continue
+            name = f"place {len(found)}"
+            found.append(
+                self.sighting(name, joints, noise_px=noise_px, joint_noise_rad=joint_noise_rad)
+            )
+        return found
+
+    def error(self, fit: BaseFit) -> Floats:
+        """(6,) motion from the found base to the true one."""
+        turn = self.base[:3, :3] @ fit.world_from_base[:3, :3].T
+        shift = self.base[:3, 3] - fit.world_from_base[:3, 3]
+        return np.concatenate([vector_from_rotation(turn), shift])
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_without_noise_the_base_is_found_exactly(side: Side) -> None:
+    place = Workplace(1, side)
+    fit = calibrate_base(place.sightings(10), RIG)
+    assert place.error(fit) == pytest.approx(np.zeros(6), abs=1e-7)
+    assert fit.flange_from_board == pytest.approx(place.flange_from_board, abs=1e-7)
+    assert all(one.reason == "" for one in fit.residuals)
+
+
+@pytest.mark.parametrize(
+    ("noise_px", "joint_noise_rad"),
+    [(0.1, 0.0), (0.1, 2e-4), (0.02, 1e-3)],
+    ids=["camera's noise", "both", "arm's noise"],
+)
+def test_the_errors_are_within_the_stated_uncertainty(
+    noise_px: float, joint_noise_rad: float
+) -> None:
+    squares = []
+    for seed in range(6):
+        place = Workplace(100 + seed)
+        fit = calibrate_base(
+            place.sightings(15, noise_px=noise_px, joint_noise_rad=joint_noise_rad), RIG
+        )
+        error = place.error(fit)
+        squares.append(float(error @ np.linalg.solve(fit.covariance, error)))
+        assert all(one.reason == "" for one in fit.residuals)
+        assert fit.corner_sigma_px == pytest.approx(noise_px, rel=0.15)
+    # Chi-square with six degrees of freedom each: neither boasting nor over-cautious.
+    assert max(squares) < chi2.ppf(0.9999, 6)
+    assert chi2.ppf(1e-4, 36) < sum(squares) < chi2.ppf(0.999, 36)
+
+
+def test_the_arms_own_error_is_told_from_the_cameras() -> None:
+    place = Workplace(7)
+    fit = calibrate_base(place.sightings(40, noise_px=0.05, joint_noise_rad=1e-3), RIG)
+    # Three wrist joints and what the others add: somewhat more than one joint's deviation.
+    assert 0.8e-3 < fit.arm_sigma_rad < 2.5e-3
+    assert 1e-4 < fit.arm_sigma_m < 1e-3
+    assert fit.corner_sigma_px == pytest.approx(0.05, rel=0.1)
+    quiet = calibrate_base(Workplace(7).sightings(40, noise_px=0.05), RIG)
+    assert quiet.arm_sigma_rad < 1e-4
+    assert quiet.std_at(np.zeros(3))[0] < 0.2 * fit.std_at(np.zeros(3))[0]
+
+
+def test_more_places_make_it_more_certain() -> None:
+    few, many = (
+        calibrate_base(Workplace(3).sightings(n, noise_px=0.1, joint_noise_rad=5e-4), RIG)
+        for n in (8, 40)
+    )
+    assert many.std_at(np.zeros(3))[0] < 0.6 * few.std_at(np.zeros(3))[0]
+
+
+@pytest.mark.parametrize("strays", [1, 3])
+def test_places_with_wrong_joints_are_left_out(strays: int) -> None:
+    place = Workplace(5)
+    sightings = place.sightings(14, noise_px=0.1, joint_noise_rad=2e-4)
+    for index in range(strays):
+        one = sightings[index]
+        wrong = one.joints_rad + place.random.normal(0.0, 0.05, 6)
+        sightings[index] = Sighting(one.name, wrong, one.left, one.right)
+    fit = calibrate_base(sightings, RIG)
+    left_out = [one.name for one in fit.residuals if one.reason]
+    assert left_out == [f"place {index}" for index in range(strays)]
+    error = place.error(fit)
+    assert float(error @ np.linalg.solve(fit.covariance, error)) < chi2.ppf(0.9999, 6)
+    assert len(fit.leave_one_out) == 14 - strays
+
+
+def test_when_nothing_fits_together_it_says_so() -> None:
+    place = Workplace(6)
+    sightings = place.sightings(12, noise_px=0.1)
+    shuffled = [
+        Sighting(one.name, other.joints_rad, one.left, one.right) if index % 2 else one
+        for index, (one, other) in enumerate(
+            zip(sightings, [*sightings[5:], *sightings[:5]], strict=True)
+        )
+    ]
+    with pytest.raises(HandEyeError, match=r"do not fit .*are the joints those"):
+        calibrate_base(shuffled, RIG)
+
+
+@pytest.mark.parametrize(
+    ("turn_rad", "words"),
+    [
+        (0.0, "hardly turns between the places \\(0.0 degrees rms"),
+        (0.02, "hardly turns"),
+        ([0.0, 0.0, 0.4], "turns about one axis only"),
+        ([0.4, 0.0, 0.0], "turns about one axis only"),
+        ([0.4, 0.03, 0.03], "turns about one axis only"),
+    ],
+)
+def test_motions_that_leave_it_open_are_refused(turn_rad: Any, words: str) -> None:
+    sightings = Workplace(8).sightings(12, noise_px=0.1, turn_rad=turn_rad)
+    with pytest.raises(HandEyeError, match=words):
+        calibrate_base(sightings, RIG)
+
+
+def test_too_few_places_are_refused() -> None:
+    with pytest.raises(HandEyeError, match="5 places of the arm, at least 6"):
+        calibrate_base(Workplace(9).sightings(5), RIG)
+
+
+@pytest.mark.parametrize("joints", [np.full(6, np.nan), np.zeros(5)])
+def test_joints_that_are_none_are_named(joints: Floats) -> None:
+    sightings = Workplace(9).sightings(6)
+    one = sightings[2]
+    sightings[2] = Sighting(one.name, joints, one.left, one.right)
+    with pytest.raises(HandEyeError, match="place 2: its joints"):
+        calibrate_base(sightings, RIG)
+
+
+def test_the_same_places_give_the_same_result() -> None:
+    sightings = Workplace(4).sightings(8, noise_px=0.1, joint_noise_rad=2e-4)
+    first, second = (calibrate_base(sightings, RIG) for _ in range(2))
+    assert (first.world_from_base == second.world_from_base).all()
+    assert (first.covariance == second.covariance).all()
+
+
+@settings(max_examples=100)
+@given(st.lists(st.floats(-np.pi, np.pi), min_size=3, max_size=3))
+def test_roll_pitch_yaw_there_and_back(rpy: list[float]) -> None:
+    rotation = rotation_from_rpy(rpy)
+    assert rotation_from_rpy(rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-8)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+def test_roll_pitch_yaw_of_straight_up_and_down(pitch: float) -> None:
+    rotation = rotation_from_rpy([0.3, pitch, 0.5])
+    assert rotation_from_rpy(rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-9)
+
+
+def write_poses(folder: Path, sightings: list[Sighting], place: Workplace, unit: str) -> None:
+    """A table with the board's poses instead of pictures."""
+    names = ("board_x_m", "board_y_m", "board_z_m", "board_rx_rad", "board_ry_rad", "board_rz_rad")
+    with (folder / TABLE).open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*(f"j{n}_{unit}" for n in range(1, 7)), *names])
+        for one in sightings:
+            pose = (
+                inverse(RIG.world_from_left)
+                @ place.base
+                @ twin_forward(one.joints_rad)
+                @ place.flange_from_board
+            )
+            joints = np.degrees(one.joints_rad) if unit == "deg" else one.joints_rad
+            turn = vector_from_rotation(pose[:3, :3])
+            writer.writerow([repr(float(v)) for v in (*joints, *pose[:3, 3], *turn)])
+
+
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_a_table_of_board_poses_will_do(tmp_path: Path, unit: str) -> None:
+    place = Workplace(11)
+    write_poses(tmp_path, place.sightings(8), place, unit)
+    sightings, blind = read_sightings(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
+    assert blind == []
+    assert place.error(calibrate_base(sightings, RIG)) == pytest.approx(np.zeros(6), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot be read"),
+        ("", "columns none; it needs j1_deg"),
+        ("left,right,j1_deg\n", "it needs j1_deg to j6_deg"),
+        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "it needs the columns left and right"),
+        ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "holds no rows"),
+        (
+            "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,x,0,0,0\n",
+            "row 2, column j3_deg: 'x' is not a number",
+        ),
+        (
+            "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,0,0,0,nan\n",
+            "row 2, column j6_deg",
+        ),
+        ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0\n", "row 2, column j3_deg"),
+        ("\x00\xff", "columns"),
+    ],
+)
+def test_a_bad_table_is_named_to_the_cell(tmp_path: Path, text: str | None, words: str) -> None:
+    if text is not None:
+        (tmp_path / TABLE).write_text(text)
+    with pytest.raises(PlacesError, match=words):
+        read_table(tmp_path)
+
+
+def test_a_board_behind_the_camera_is_refused(tmp_path: Path) -> None:
+    header = ",".join([*(f"j{n}_deg" for n in range(1, 7)), "board_x_m", "board_y_m", "board_z_m"])
+    (tmp_path / TABLE).write_text(
+        f"{header},board_rx_rad,board_ry_rad,board_rz_rad\n0,25,119,0,-54,0,0,0,-0.5,0,0,0\n"
+    )
+    with pytest.raises(PlacesError, match="row 2: the board lies behind a camera"):
+        read_sightings(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
+
+
+class Live:
+    """A PlaceTaker that is shown what the twin's camera sees, with a clock of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.place = Workplace(12)
+        self.taker = PlaceTaker(folder, BOARD, RIG)
+        self.shown = TwinBoard(SCENE.camera, BOARD, seed=1)
+        self.now_s = 0.0
+
+    def show(self, joints: Floats, *, wait_s: float = 2.0 * STILL_S) -> str:
+        self.taker.see_joints(joints, self.now_s)
+        self.now_s += wait_s
+        pose = (
+            inverse(RIG.world_from_left)
+            @ self.place.base
+            @ twin_forward(joints)
+            @ self.place.flange_from_board
+        )
+        return self.taker.see_pictures(*self.shown.pair(pose), self.now_s)
+
+
+def test_a_place_is_taken_when_the_arm_rests_somewhere_new(tmp_path: Path) -> None:
+    live = Live(tmp_path)
+    dark = np.zeros((480, 640), np.uint8)
+    assert live.taker.see_pictures(dark, dark, 0.0) == "no word from the arm yet"
+    here = live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3))
+    there = live.place.joints(np.array([-0.2, 0.1, 0.1]), np.full(3, 0.02))
+    assert live.show(here, wait_s=0.1) == "the arm moves"
+    assert live.show(here).startswith("place 1 taken")
+    assert "seen from here already" in live.show(here)
+    assert live.show(there).startswith("place 2 taken")
+    live.taker.see_joints(there, live.now_s)
+    assert live.taker.see_pictures(dark, dark, live.now_s + 5.0).startswith("no chessboard")
+    sightings, blind = read_sightings(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
+    assert blind == []
+    assert [one.name for one in sightings] == ["left01.png", "left02.png"]
+    assert sightings[1].joints_rad == pytest.approx(there, abs=1e-12)
+
+
+def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object
+        ) -> tuple[int, str, str]:  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    out, err = capsys.readouterr()
+    return int(end.value.code or 0), out, err
+
+
+COMMON = ("--scene", SCENE_FILE, "--board", "7x5", "--square-mm", "15")
+
+
+def test_the_twins_arms_are_calibrated_from_pictures(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    output, copy = tmp_path / "arms.yaml", tmp_path / "copy.yaml"
+    code, out, err = run(
+        capsys, monkeypatch,
+        "calibrate", "arms", *COMMON, "--twin", "--places", 10, "--calibration", OPTICS_FILE,
+        "-o", output, "--write-scene", copy, "--json",
+    )  # fmt: skip
+    assert code == 0, err
+    result = json.loads(out)
+    for side in ("left", "right"):
+        one = result["arms"][side]
+        assert one["places_used"] == 10
+        assert one["true_error_m"] < 4.0 * one["position_std_m"] < 0.002
+        assert one["true_error_rad"] < 4.0 * one["rotation_std_rad"]
+        assert one["moved_from_scene_m"] > 0.001
+    found = load_arms_calibration(output)
+    assert found.left is not None
+    # The copy is the scene but for the bases, comments and all.
+    before, after = SCENE_FILE.read_text().splitlines(), copy.read_text().splitlines()
+    changed = [i for i, pair in enumerate(zip(before, after, strict=True)) if pair[0] != pair[1]]
+    assert len(changed) == 2
+    assert all("world_from_base" in before[i] for i in changed)
+    arms = load_scene(copy).arms
+    assert arms.left.world_from_base.position_m == pytest.approx(
+        found.left.world_from_base.position_m, abs=1e-9
+    )
+    again = tmp_path / "again.yaml"
+    code, _, _ = run(
+        capsys, monkeypatch, "calibrate", "arms-scene", output, SCENE_FILE, "-o", again
+    )
+    assert code == 0
+    assert again.read_text() == copy.read_text()
+
+
+def test_one_arm_alone_from_a_folder(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    place = Workplace(13, "right")
+    write_poses(tmp_path, place.sightings(8), place, "deg")
+    code, out, err = run(
+        capsys, monkeypatch,
+        "calibrate", "arms", *COMMON, "--right-arm", tmp_path, "-o", tmp_path / "arms.yaml",
+    )  # fmt: skip
+    assert code == 0, err
+    assert "right arm        8 of 8 places used" in out
+    assert "  right:\n    world_from_base: {position_m: [" in out
+    assert load_arms_calibration(tmp_path / "arms.yaml").left is None
+
+
+def test_bad_input_to_the_command_is_named(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    place = Workplace(14)
+    poor = tmp_path / "poor"
+    poor.mkdir()
+    write_poses(poor, place.sightings(8, turn_rad=[0.0, 0.0, 0.4]), place, "rad")
+    output = tmp_path / "arms.yaml"
+    for arguments, words in (
+        ([*COMMON, "-o", output], "give --left-arm, --right-arm or both; or else --twin"),
+        ([*COMMON, "--left-arm", tmp_path / "none", "-o", output], "joints.csv: cannot be read"),
+        ([*COMMON, "--left-arm", poor, "-o", output], "turns about one axis only"),
+        ([*COMMON, "--left-arm", poor, "-o", tmp_path / "no" / "x"], "does not exist"),
+        (
+            [*COMMON, "--left-arm", poor, "-o", output, "--write-scene", SCENE_FILE],
+            "exists already",
+        ),
+        (
+            [*COMMON, "--left-arm", poor, "-o", output, "--calibration", SCENE_FILE],
+            "cylinder.yaml",
+        ),
+    ):
+        code, _, err = run(capsys, monkeypatch, "calibrate", "arms", *arguments)
+        assert code == 2
+        assert words in err.replace("\n", " ")
+        assert not output.exists()
+
+
+def test_pictures_of_another_size_or_without_a_board(tmp_path: Path) -> None:
+    live = Live(tmp_path)
+    live.show(live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3)))
+    with pytest.raises(PlacesError, match="pictures of 640x480 px"):
+        read_sightings(tmp_path, BOARD, RIG, (800, 600), lambda *_: None)
+    add_row(tmp_path, ["left01.png", "left01.png"], READY)
+    other = Board(columns=9, rows=6, square_m=0.015)
+    _, blind = read_sightings(tmp_path, other, RIG, SIZE, lambda *_: None)
+    assert [name for name, _ in blind] == ["left01.png", "left01.png"]
+    assert "9x6" in blind[0][1]
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (None, "cannot be read"),
+        ("[1]", 'no key "version"'),
+        ("version: 99", "version: 99, this program reads 1"),
+        ("version: 1", "date"),
+        ("a: [", "not YAML"),
+    ],
+)
+def test_a_bad_calibration_file_is_named(tmp_path: Path, text: str | None, words: str) -> None:
+    path = tmp_path / "arms.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(CalibrationFileError, match=words):
+        load_arms_calibration(path)
