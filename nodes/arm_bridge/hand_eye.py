@@ -85,6 +85,9 @@ ROUNDS = 30
 SETTLED = 1e-10
 """A step of all unknowns (rad, m) that ends the iteration."""
 
+STARTED = 1e-6
+"""The same for what is only a start."""
+
 
 class HandEyeError(ValueError):
     """Places that do not fix where the base stands; the message says why and what to do."""
@@ -196,7 +199,8 @@ class _Linear:
 
     seen: (6,) motion of the flange, in its own frame, that draws the corners best.
     spread: (6, 6), its covariance per px^2 of the corners.  by_unknowns: (6, 12), the flange's
-        motion for those of base and board.  inner_px2: what is left of the squared pixels (sum) after that motion.
+        motion for those of base and board.
+    inner_px2: what is left of the squared pixels (sum) after the motion that is seen.
     count: coordinates.  rms_px: of the corners, without that motion.
     """
 
@@ -310,7 +314,7 @@ def _board_pose(sighting: Sighting, rig: Rig) -> Floats:
             residuals, slopes = _pixels_by_motion(sighting, rig, pose, np.eye(4))
             step = np.linalg.lstsq(slopes, residuals, rcond=None)[0]
             pose = pose @ transform(rotation_from_vector(step[:3]), step[3:])
-            if np.abs(step).max() < SETTLED:
+            if np.abs(step).max() < STARTED:
                 break
         cost = float(residuals @ residuals)
         if np.isfinite(cost) and cost < least:
@@ -343,13 +347,11 @@ def _pixels_by_motion(
                 project(in_eye + way * nudge, lens.matrix, lens.distortion) for way in (1.0, -1.0)
             )
             by_place[:, :, axis] = (ahead - behind) / 1e-6
-        motion = np.concatenate(
-            [
-                -np.array([skew(point) for point in on_flange]),
-                np.tile(np.eye(3), (len(in_eye), 1, 1)),
-            ],
-            axis=2,
-        )
+        x, y, z = on_flange.T
+        motion = np.zeros((len(on_flange), 3, 6))
+        motion[:, 0, 1], motion[:, 0, 2], motion[:, 1, 2] = z, -y, x
+        motion[:, 1, 0], motion[:, 2, 0], motion[:, 2, 1] = -z, y, -x
+        motion[:, :, 3:] = np.eye(3)
         slopes.append((by_place @ turn @ motion).reshape(-1, 6))
     return np.concatenate(residuals), np.concatenate(slopes)
 
