@@ -10,6 +10,7 @@ from launch.commands import (
     bag,
     calibrate,
     calibrate_arms,
+    calibrate_sheet,
     chart,
     doctor,
     experiment,
@@ -31,6 +32,7 @@ app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(bag.app, name="bag")
 calibrate_arms.register(calibrate.app)
+calibrate_sheet.register(calibrate.app)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(experiment.app, name="experiment")
 app.command()(experiment.demo)

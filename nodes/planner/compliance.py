@@ -1,8 +1,26 @@
-"""How far to stretch the sheet so that it yields to the finger as the object would."""
+"""How the sheet is stretched and moved so that it yields to the finger as the object would.
+
+A finger `d` deep in the object, if the sheet stood in the object's tangent plane, would push the
+sheet in by `d`, and only at one depth would the sheet answer with the object's force.  So the sheet
+is also moved along its normal: it retreats by r(d) (or, below zero, comes towards the finger), and
+the indentation that is left, i = d - r, is the one at which the sheet's law gives the object's
+force:
+
+    F_sheet(stretch, d - r(d)) = F_object(d).
+
+A retreat takes work from a finger that pushes while the sheet lags behind, so it damps; an advance
+gives it work: with lag t and sheet stiffness k, as a damper of -k a t would.  Hence the bound a on
+the advance, and hence the choice of the stretch: the least one that presents the curve without an
+advance, or with the smallest.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
 
 from messages.scene import SheetSpec
 from nodes.models.sheet import (
@@ -11,15 +29,15 @@ from nodes.models.sheet import (
     push_stiffness_n_per_m,
     stretch_for_edge_force,
 )
+from nodes.models.sheet.laws import (
+    CENTRE,
+    Place,
+    SheetLaw,
+    depth_for_force,
+    interpolated_inverse,
+)
 
-
-@dataclass(frozen=True, slots=True)
-class Compliance:
-    """The stretch that presents an object's stiffness; `note` says so where the sheet cannot."""
-
-    stretch_ratio: float
-    note: str
-
+Floats = NDArray[np.float64]
 
 RESERVE = 0.85
 """Share of the largest edge force and strain that is planned with.
@@ -27,6 +45,427 @@ RESERVE = 0.85
 The bridges stop the arms where commanded or measured poses reach the limits themselves; two arms
 that move are never exactly as far apart as planned (one sees the other a cycle or two late).
 """
+
+FELT_N = 0.05
+"""Forces below this are not compared, but as if they were this large: those of the first 2 mm into
+an object of 4 kPa, which the soft body itself knows to a tenth at best."""
+
+GOOD_RATIO = 0.10
+"""Error of the presented force, over the wanted, that is aimed for."""
+
+WEBER_RATIO, WEBER_RATIO_BARE = 0.15, 0.22
+"""Least relative difference of stiffness that people notice: with the skin's deformation as a cue
+(Bergmann Tiest & Kappers 2009), and without work or terminal force as a cue (Tan et al. 1995)."""
+
+ADVANCE_PER_DEPTH = 0.5
+"""How far the sheet may come towards the finger per depth of push: presents up to 1.5 times the
+sheet's own stiffness, and with 10 ms of lag at 100 N/m takes 0.5 N s/m of damping, less than a
+finger has."""
+
+CANDIDATES = 17
+"""Stretches that are tried between the least and the largest."""
+
+
+class UnfitCurveError(ValueError):
+    """A force curve that is no curve; the message says what is wrong with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectCurve:
+    """The object's force over depth: rows (n,) from (0, 0), depths ascending, forces not falling.
+
+    Between the rows a monotone cubic; beyond the last a straight line at the last slope.
+    """
+
+    depths_m: Floats
+    forces_n: Floats
+    _curve: PchipInterpolator = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """UnfitCurveError unless there are two rows or more, finite and in order."""
+        depths, forces = self.depths_m, self.forces_n
+        if depths.ndim != 1 or len(depths) < 2 or depths.shape != forces.shape:
+            raise UnfitCurveError(
+                f"a force curve of {depths.shape} depths and {forces.shape} forces; it takes as "
+                "many forces as depths, two or more"
+            )
+        if not (np.isfinite(depths).all() and np.isfinite(forces).all()):
+            raise UnfitCurveError("a force curve has entries that are not finite")
+        if depths[0] != 0.0 or forces[0] != 0.0:
+            raise UnfitCurveError(
+                f"a force curve begins at {depths[0]:g} m, {forces[0]:g} N; it must begin at 0, 0"
+            )
+        if (np.diff(depths) <= 0.0).any() or (np.diff(forces) < 0.0).any():
+            raise UnfitCurveError("a force curve's depths must ascend and its forces not fall")
+        object.__setattr__(self, "_curve", PchipInterpolator(depths, forces))
+
+    @classmethod
+    def from_rows(cls, rows: Floats) -> ObjectCurve:
+        """From `SoftBody.force_curve`: (n, 2) depth and force."""
+        return cls(np.ascontiguousarray(rows[:, 0]), np.ascontiguousarray(rows[:, 1]))
+
+    @classmethod
+    def linear(cls, stiffness_n_per_m: float, deepest_m: float) -> ObjectCurve:
+        """Of a spring."""
+        return cls(np.array([0.0, deepest_m]), np.array([0.0, stiffness_n_per_m * deepest_m]))
+
+    def force_n(self, depths_m: Floats) -> Floats:
+        """Forces (n,) at depths (n,); 0 before the touch."""
+        last = self.depths_m[-1]
+        inside = self._curve(np.clip(depths_m, 0.0, last))
+        beyond = np.maximum(np.asarray(depths_m) - last, 0.0)
+        result: Floats = inside + beyond * float(self._curve(last, 1))
+        return result
+
+
+@dataclass(frozen=True, slots=True)
+class Pull:
+    """What the sheet and the arms that hold it may be asked for."""
+
+    least_stretch: float
+    largest_stretch: float
+    edge_force_n: float
+    advance_per_depth: float = ADVANCE_PER_DEPTH
+
+
+def pull_of(sheet: SheetSpec, law: SheetLaw) -> Pull:
+    """The scene's limits less the reserve; a pushed sheet pulls harder, see `present`."""
+    force = RESERVE * sheet.max_edge_force_n
+    least = sheet.min_stretch_ratio
+    low, high = least, max(least, 1.0 + RESERVE * (sheet.max_stretch_ratio - 1.0))
+    if _flat_pull_n(law, high) > force:
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if _flat_pull_n(law, middle) > force else (middle, high)
+        high = low
+    return Pull(least, high, force)
+
+
+def _flat_pull_n(law: SheetLaw, stretch_ratio: float) -> float:
+    """Force (N) on each clamp of the unpushed sheet."""
+    pressed = law.press(
+        stretch_ratio, np.zeros(1), place_m=CENTRE, finger_radius_m=0.03 * law.rubber.width_m
+    )
+    return float(pressed.edge_force_n[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Presented:
+    """What a stretch presents at one place, a row per depth (n,).
+
+    edge_force_n: on each clamp.  advance_per_depth: the fastest that the sheet comes towards the
+    finger.  pull_bound: whether the arms' pull kept the sheet from pressing as it should.
+    """
+
+    depths_m: Floats
+    wanted_n: Floats
+    force_n: Floats
+    stiffness_n_per_m: Floats
+    indentation_m: Floats
+    edge_force_n: Floats
+    advance_per_depth: float
+    pull_bound: bool
+
+    @property
+    def retreat_m(self) -> Floats:
+        return self.depths_m - self.indentation_m
+
+    @property
+    def error_ratio(self) -> Floats:
+        """(n,) presented over wanted, less one; 0 where neither can be felt."""
+        felt = np.maximum(self.wanted_n, self.force_n) >= FELT_N
+        difference = (self.force_n - self.wanted_n) / np.maximum(self.wanted_n, FELT_N)
+        result: Floats = np.where(felt, difference, 0.0)
+        return result
+
+
+DEPTH_SHARES = np.concatenate([[0.0], np.geomspace(4e-3, 1.0, 56)])
+"""Depths, over the deepest, at which the retreat is worked out: denser where contact grows."""
+
+PULL_BEND = 0.1
+"""Share of the largest indentation over which it is approached, not met with a kink."""
+
+
+def present(
+    curve: ObjectCurve,
+    law: SheetLaw,
+    pull: Pull,
+    *,
+    stretch_ratio: float,
+    deepest_m: float,
+    place_m: Place = CENTRE,
+    finger_radius_m: float,
+) -> Presented:
+    """The best that this stretch can do for the curve at this place, within the pull.
+
+    The indentation never makes the clamps pull harder than `pull.edge_force_n` (beyond, the sheet
+    gives way with the finger), and grows by at most 1 + `pull.advance_per_depth` per depth.
+    """
+    depths = deepest_m * DEPTH_SHARES
+    wanted = curve.force_n(depths)
+    asked = depth_for_force(
+        law,
+        stretch_ratio,
+        wanted,
+        deepest_m=(1.0 + pull.advance_per_depth) * deepest_m,
+        place_m=place_m,
+        finger_radius_m=finger_radius_m,
+    )
+    furthest = _indentation_for_pull(
+        law,
+        pull.edge_force_n,
+        stretch_ratio=stretch_ratio,
+        deepest_m=deepest_m,
+        place_m=place_m,
+        finger_radius_m=finger_radius_m,
+    )
+    held = _bent(asked, furthest)
+    growth = (1.0 + pull.advance_per_depth) * depths
+    indentation = growth + np.minimum.accumulate(held - growth)
+    pressed = law.press(
+        stretch_ratio, indentation, place_m=place_m, finger_radius_m=finger_radius_m
+    )
+    steps = np.diff(indentation) / np.diff(depths)
+    return Presented(
+        depths_m=depths,
+        wanted_n=wanted,
+        force_n=pressed.force_n,
+        stiffness_n_per_m=pressed.stiffness_n_per_m,
+        indentation_m=indentation,
+        edge_force_n=pressed.edge_force_n,
+        advance_per_depth=max(0.0, float(steps.max()) - 1.0),
+        pull_bound=bool(asked.max() > (1.0 - PULL_BEND) * furthest),
+    )
+
+
+def _indentation_for_pull(
+    law: SheetLaw,
+    edge_n: float,
+    *,
+    stretch_ratio: float,
+    deepest_m: float,
+    place_m: Place,
+    finger_radius_m: float,
+) -> float:
+    """The indentation (m) at which the clamps pull with `edge_n`; 0 if they do so unpushed."""
+    grid = 2.0 * deepest_m * DEPTH_SHARES[1:]
+    flat = _flat_pull_n(law, stretch_ratio)
+    if flat >= edge_n:
+        # Reached by rounding only: `pull_of` keeps the flat sheet within the pull.
+        return 0.0 if flat > edge_n * (1.0 + 1e-6) else float(grid[0])
+    pulled = law.press(stretch_ratio, grid, place_m=place_m, finger_radius_m=finger_radius_m)
+    added = pulled.edge_force_n - flat
+    if added[-1] <= edge_n - flat:
+        return float(grid[-1])
+    return float(interpolated_inverse(grid, added, np.array([edge_n - flat]))[0])
+
+
+def _bent(asked: Floats, furthest: float) -> Floats:
+    """Follows `asked`, then bends (C1) towards `furthest` and never passes it."""
+    if furthest <= 0.0:
+        return np.zeros_like(asked)
+    knee, span = (1.0 - PULL_BEND) * furthest, PULL_BEND * furthest
+    over = np.maximum(asked - knee, 0.0)
+    result: Floats = np.minimum(asked, knee) - span * np.expm1(-over / span)
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class Compliance:
+    """One object presented by one stretch: where the sheet goes for each depth of the finger.
+
+    stretch_ratio: constant over the push.  note: empty, or what the sheet cannot present and by
+    how much.  centre: the whole push at the sheet's middle.
+    """
+
+    stretch_ratio: float
+    note: str
+    centre: Presented
+    law: SheetLaw
+    pull: Pull
+    finger_radius_m: float
+    _nodes: tuple[Floats, Floats]
+    _indentation: PchipInterpolator = field(repr=False)
+
+    @property
+    def deepest_m(self) -> float:
+        """To here the push was worked out; deeper the sheet goes with the finger."""
+        return float(self.centre.depths_m[-1])
+
+    def indentation_m(self, depths_m: Floats | float, place_m: Place = CENTRE) -> Floats:
+        """How deep the finger shall push the sheet in, (n,), with the finger at depths (n,)."""
+        depths = np.clip(np.asarray(depths_m, dtype=np.float64), 0.0, self.deepest_m)
+        result: Floats = self._indentation(depths) @ self._weights(place_m)
+        return result
+
+    def retreat_m(self, depths_m: Floats | float, place_m: Place = CENTRE) -> Floats:
+        """How far behind the object's tangent plane the sheet shall be, (n,); below 0: before it.
+
+        Smooth (C1) in the depth and in the place; 0 while the finger does not touch.
+        """
+        depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
+        result: Floats = depths - self.indentation_m(depths, place_m)
+        return result
+
+    def presented(self, depths_m: Floats, place_m: Place = CENTRE) -> Floats:
+        """The force (n,), N, that the sheet then answers with, by its law."""
+        return self.law.press(
+            self.stretch_ratio,
+            self.indentation_m(depths_m, place_m),
+            place_m=place_m,
+            finger_radius_m=self.finger_radius_m,
+        ).force_n
+
+    def _weights(self, place_m: Place) -> Floats:
+        """Of the nodes (9,): the polynomial in x^2 and y^2 through them, as the sheet is even."""
+        along = [
+            _lagrange(nodes, min(abs(at), nodes[-1]))
+            for nodes, at in zip(self._nodes, place_m, strict=True)
+        ]
+        return np.outer(*along).ravel()
+
+
+def _lagrange(nodes: Floats, at: float) -> Floats:
+    """Weights (n,) of the polynomial in the square through the nodes (n,)."""
+    squares, square = nodes**2, at * at
+    weights = np.ones(len(nodes))
+    for i, mine in enumerate(squares):
+        for j, other in enumerate(squares):
+            if i != j:
+                weights[i] *= (square - other) / (mine - other)
+    return weights
+
+
+def fit_compliance(
+    curve: ObjectCurve,
+    law: SheetLaw,
+    pull: Pull,
+    *,
+    deepest_m: float,
+    finger_radius_m: float,
+    usable_half_height_m: float,
+    position_error_m: float,
+) -> Compliance:
+    """The stretch and the retreat that present the curve best to pushes of `deepest_m`.
+
+    position_error_m: how exactly the sheet is held in place (the scene's tolerance); an object so
+    soft that this much changes its force beyond what people notice is noted as such.
+    """
+    stretches = np.linspace(pull.least_stretch, pull.largest_stretch, CANDIDATES)
+    tried = [
+        present(
+            curve,
+            law,
+            pull,
+            stretch_ratio=float(stretch),
+            deepest_m=deepest_m,
+            finger_radius_m=finger_radius_m,
+        )
+        for stretch in np.unique(stretches)
+    ]
+    worst = [float(np.abs(one.error_ratio).max()) for one in tried]
+    allowed = max(min(worst) + 0.01, 0.02)
+    chosen = min(
+        (number for number, error in enumerate(worst) if error <= allowed),
+        key=lambda number: (round(tried[number].advance_per_depth, 2), number),
+    )
+    return compliance_at(
+        curve,
+        law,
+        pull,
+        stretch_ratio=float(np.unique(stretches)[chosen]),
+        deepest_m=deepest_m,
+        finger_radius_m=finger_radius_m,
+        usable_half_height_m=usable_half_height_m,
+        position_error_m=position_error_m,
+    )
+
+
+def compliance_at(
+    curve: ObjectCurve,
+    law: SheetLaw,
+    pull: Pull,
+    *,
+    stretch_ratio: float,
+    deepest_m: float,
+    finger_radius_m: float,
+    usable_half_height_m: float,
+    position_error_m: float,
+) -> Compliance:
+    """The retreat for a curve at a given stretch: for an object that feels otherwise elsewhere."""
+    rubber = law.rubber
+    xs = 0.5 * rubber.width_m * np.array([0.0, 0.3, 0.5])
+    ys = min(usable_half_height_m, 0.4 * rubber.height_m) * np.array([0.0, 0.6, 1.0])
+    at_nodes = [
+        present(
+            curve,
+            law,
+            pull,
+            stretch_ratio=stretch_ratio,
+            deepest_m=deepest_m,
+            place_m=(float(x), float(y)),
+            finger_radius_m=finger_radius_m,
+        )
+        for x in xs
+        for y in ys
+    ]
+    return Compliance(
+        stretch_ratio=stretch_ratio,
+        note=_note(at_nodes[0], position_error_m),
+        centre=at_nodes[0],
+        law=law,
+        pull=pull,
+        finger_radius_m=finger_radius_m,
+        _nodes=(xs, ys),
+        _indentation=PchipInterpolator(
+            at_nodes[0].depths_m, np.column_stack([one.indentation_m for one in at_nodes])
+        ),
+    )
+
+
+def _note(shown: Presented, position_error_m: float) -> str:
+    """What the sheet cannot present of a push, and by how much; empty if it can."""
+    error = shown.error_ratio
+    off = np.abs(error) > GOOD_RATIO
+    if off.any():
+        # Where it is off by most newtons: that is what a finger will notice first.
+        at = int(np.argmax(np.where(off, np.abs(shown.force_n - shown.wanted_n), 0.0)))
+        cause = (
+            "the arms may not pull harder"
+            if shown.pull_bound
+            else "the sheet may not come towards the finger faster"
+        )
+        kind, than = ("stiffer", "too soft") if error[at] < 0.0 else ("softer", "too stiff")
+        return (
+            f"object is {kind} than the sheet can present: {100 * abs(error[at]):.0f} % {than} at "
+            f"{1e3 * shown.depths_m[at]:.0f} mm ({shown.force_n[at]:.2f} of "
+            f"{shown.wanted_n[at]:.2f} N), {100 * np.abs(error).max():.0f} % at most; {cause}; "
+            f"people notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
+        )
+    unsure = unsureness(shown, position_error_m)
+    if unsure > WEBER_RATIO:
+        return (
+            f"object is softer than the sheet presents surely: {1e3 * position_error_m:g} mm of "
+            f"the sheet's place is {100 * unsure:.0f} % of the force in the deeper half of the "
+            f"push; people notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
+        )
+    return ""
+
+
+def unsureness(shown: Presented, position_error_m: float) -> float:
+    """The largest relative change of force, over the deeper half, by an error of the sheet's
+    place."""
+    deep = shown.depths_m >= 0.5 * shown.depths_m[-1]
+    change = shown.stiffness_n_per_m[deep] * position_error_m
+    return float((change / np.maximum(shown.wanted_n[deep], 1e-9)).max())
+
+
+@dataclass(frozen=True, slots=True)
+class StretchChoice:
+    """A stretch that presents an object's stiffness; `note` says so where the sheet cannot."""
+
+    stretch_ratio: float
+    note: str
 
 
 def stretch_range(sheet: SheetSpec) -> tuple[float, float]:
@@ -41,8 +480,11 @@ def stretch_range(sheet: SheetSpec) -> tuple[float, float]:
     return sheet.min_stretch_ratio, max(sheet.min_stretch_ratio, min(longest, strongest))
 
 
-def compliance_for(stiffness_n_per_m: float, sheet: SheetSpec) -> Compliance:
-    """The stretch for an object of that stiffness (N/m, small pushes), within the sheet's range."""
+def compliance_for(stiffness_n_per_m: float, sheet: SheetSpec) -> StretchChoice:
+    """The stretch for an object of that stiffness (N/m, small pushes) when the sheet only tilts.
+
+    By the linear law: it knows neither the object's curve nor the fingertip.
+    """
     least, largest = stretch_range(sheet)
     wanted = stretch_for_edge_force(
         edge_force_for_stiffness(stiffness_n_per_m, width_m=sheet.width_m),
@@ -63,4 +505,4 @@ def compliance_for(stiffness_n_per_m: float, sheet: SheetSpec) -> Compliance:
         note = f"object of {stiffness_n_per_m:.0f} N/m is softer than the sheet's {presented:.0f}"
     elif wanted > largest:
         note = f"object of {stiffness_n_per_m:.0f} N/m is stiffer than the sheet's {presented:.0f}"
-    return Compliance(stretch, note)
+    return StretchChoice(stretch, note)

@@ -256,18 +256,20 @@ class ScaledLaw:
         F = E t W (e^3/2 s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3),
 
     each part with its own dependence on place, fingertip radius and height.  cubic_ratio: the
-    second part over that of ideal rubber, from calibration.
+    second part over that of ideal rubber, and stretch_scale: the true stretch over the one that is
+    asked for, where the slack sheet is not as wide as thought; both from calibration.
     """
 
     rubber: Rubber
     cubic_ratio: float = 1.0
+    stretch_scale: float = 1.0
     name: str = "scaled"
 
     def press(
         self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
     ) -> Pressed:
         depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
-        rubber, s = self.rubber, max(stretch_ratio, 1.0)
+        rubber, s = self.rubber, max(self.stretch_scale * stretch_ratio, 1.0)
         x, y = relative_place(rubber, s, place_m)
         tension, modulus = _push_tension(rubber, s, depths, (x, y))
         strain = strain_measure(s, rubber.mooney_share)
@@ -309,7 +311,7 @@ class ScaledLaw:
     def outside(
         self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
     ) -> str:
-        rubber = self.rubber
+        rubber, stretch_ratio = self.rubber, self.stretch_scale * stretch_ratio
         if not 1.0 <= stretch_ratio <= LARGEST_STRETCH:
             return f"stretch {stretch_ratio:.3f} is not from 1 to {LARGEST_STRETCH:g}"
         if not 0.008 <= depth_m / rubber.width_m <= 0.21:

@@ -1,0 +1,220 @@
+"""`flexsheet calibrate sheet`: the sheet's law, fitted to measured pushes or to the twin's."""
+
+from __future__ import annotations
+
+import shlex
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, words
+
+if TYPE_CHECKING:
+    from messages.scene import Scene
+    from messages.sheet_calibration import SheetCalibration
+    from nodes.models.sheet.fit import Push
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command to `flexsheet calibrate`."""
+    app.command("sheet")(sheet)
+
+
+def sheet(
+    *,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Calibration file to write.")],
+    rows: Annotated[
+        Path | None,
+        typer.Option(metavar="CSV", help="Measured pushes; see docs/sheet.md for its columns."),
+    ] = None,
+    scene_file: Annotated[
+        Path, typer.Option("--scene", metavar="FILE", help="Scene of the measured sheet.")
+    ] = SCENE_FILE,
+    twin: Annotated[
+        Path | None, typer.Option(metavar="SCENE", help="Push the twin's sheet of a scene.")
+    ] = None,
+    places: Annotated[
+        bool, typer.Option("--places", help="Push the twin's sheet all over, not in the middle.")
+    ] = False,
+    table: Annotated[
+        bool, typer.Option("--table", help="Keep a table of what the fitted law leaves, too.")
+    ] = False,
+    mooney: Annotated[
+        bool, typer.Option("--mooney", help="Fit Mooney's share too; wants stretches past 1.15.")
+    ] = False,
+    noise_n: Annotated[float, typer.Option(help="Of the twin's gauge, N.", min=0.0)] = 0.005,
+    seed: Annotated[int, typer.Option(help="Of that noise.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Fit modulus x thickness, slack width and cubic term of a sheet to pushes.
+
+    From measured rows of a CSV (--rows, --scene) or from the twin (--twin).
+    """
+    from launch.plan import load_scene
+    from launch.sheet_rows import read_rows
+    from messages.sheet_calibration import save_sheet_calibration
+    from nodes.models.sheet.fit import FitError
+
+    if not output.parent.is_dir():
+        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    if (rows is None) == (twin is None):
+        raise CommandError("give measured pushes by --rows, or the twin by --twin", BAD_INPUT)
+    made = ["flexsheet", "calibrate", "sheet"]
+    if rows is not None:
+        scene = load_scene(scene_file)
+        pushes, lines = read_rows(rows, scene.sheet, scene.finger.radius_m)
+        made += ["--rows", str(rows), "--scene", str(scene_file)]
+        source = str(rows)
+    else:
+        assert twin is not None
+        scene = load_scene(twin)
+        pushes = _twin_rows(scene, places, noise_n, seed)
+        lines = list(range(1, len(pushes) + 1))
+        made += ["--twin", str(twin), "--noise-n", f"{noise_n:g}", "--seed", str(seed)]
+        made += ["--places"] if places else []
+        source = f"twin of {scene.name}"
+    made += ["--table"] if table else []
+    made += ["--mooney"] if mooney else []
+    try:
+        calibration = fitted(
+            scene, pushes, lines, source=source, with_mooney=mooney, with_table=table
+        )
+    except FitError as error:
+        raise CommandError(f"{source}: {error}", BAD_INPUT) from error
+    save_sheet_calibration(calibration, output, comment=shlex.join([*made, "-o", str(output)]))
+    _tell(calibration, output, as_json)
+
+
+def fitted(
+    scene: Scene,
+    pushes: list[Push],
+    lines: list[int],
+    *,
+    source: str,
+    with_mooney: bool,
+    with_table: bool,
+) -> SheetCalibration:
+    """The calibration that pushes give; FitError where they do not determine one."""
+    from importlib.metadata import version
+
+    from messages.sheet_calibration import Fitted, LeftOutRow, SheetCalibration, SheetTable
+    from nodes.models.sheet.fit import fit_law, table_from
+    from nodes.planner.sheet_force import rubber_of
+
+    fit = fit_law(pushes, rubber_of(scene.sheet), with_mooney=with_mooney)
+    numbers = {
+        name: Fitted(value=value, standard_deviation=deviation)
+        for name, value, deviation in zip(
+            fit.names, fit.values, fit.standard_deviations, strict=True
+        )
+    }
+    kept = None
+    if with_table:
+        entries = table_from(fit.law, pushes, fit.used, scene.sheet.width_m)
+        kept = SheetTable(
+            stretch_ratios=entries.stretches,
+            depths_m=entries.depths_m,
+            xs_m=entries.xs_m,
+            ys_m=entries.ys_m,
+            ratios=entries.ratios,
+        )
+    stretches = [push.edge_distance_m / scene.sheet.width_m for push in pushes]
+    return SheetCalibration(
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+        code_version=version("flexsheet"),
+        source=source,
+        nominal_width_m=scene.sheet.width_m,
+        height_m=scene.sheet.height_m,
+        thickness_m=scene.sheet.thickness_m,
+        finger_radius_m=scene.finger.radius_m,
+        modulus_thickness_n_per_m=numbers["modulus_thickness_n_per_m"],
+        slack_width_m=numbers["slack_width_m"],
+        cubic_ratio=numbers["cubic_ratio"],
+        mooney_share=numbers.get("mooney_share"),
+        rows=len(pushes),
+        left_out=tuple(
+            LeftOutRow(line=line, residual_ratio=float(ratio))
+            for line, ratio, used in zip(lines, fit.residual_ratio, fit.used, strict=True)
+            if not used
+        ),
+        residual_rms_ratio=fit.rms_ratio,
+        residual_worst_ratio=fit.worst_ratio,
+        least_stretch_ratio=min(stretches),
+        largest_stretch_ratio=max(stretches),
+        deepest_m=max(push.depth_m for push in pushes),
+        table=kept,
+    )
+
+
+def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[Push]:
+    from rich.progress import Progress
+
+    from launch.sheet_rows import twin_rows
+
+    with Progress(console=words, transient=True) as bar:
+        task = bar.add_task("pushing the twin's sheet", total=None)
+        return twin_rows(
+            scene,
+            places=places,
+            noise_n=noise_n,
+            seed=seed,
+            progress=lambda done, total: bar.update(task, completed=done, total=total),
+        )
+
+
+def _tell(calibration: SheetCalibration, output: Path, as_json: bool) -> None:
+    mooney = calibration.mooney_share
+    told = {
+        "modulus_thickness_n_per_m": calibration.modulus_thickness_n_per_m,
+        "slack_width_m": calibration.slack_width_m,
+        "cubic_ratio": calibration.cubic_ratio,
+        **({} if mooney is None else {"mooney_share": mooney}),
+    }
+    if as_json:
+        print_json(
+            {
+                "calibration": str(output),
+                "rows": calibration.rows,
+                "left_out": [one.model_dump() for one in calibration.left_out],
+                "residual_rms_ratio": calibration.residual_rms_ratio,
+                "residual_worst_ratio": calibration.residual_worst_ratio,
+                "table": calibration.table is not None,
+                **{name: one.model_dump() for name, one in told.items()},
+            }
+        )
+        return
+    units = {
+        "modulus_thickness_n_per_m": ("modulus x thickness", 1.0, "N/m"),
+        "slack_width_m": ("slack width", 1e3, "mm"),
+        "cubic_ratio": ("cubic term, of ideal rubber's", 1.0, ""),
+        "mooney_share": ("Mooney's share", 1.0, ""),
+    }
+    print_fields(
+        [
+            ("calibration", output),
+            ("rows used", f"{calibration.rows - len(calibration.left_out)} of {calibration.rows}"),
+            *(
+                (
+                    units[name][0],
+                    f"{units[name][1] * one.value:.4g} "
+                    f"± {units[name][1] * one.standard_deviation:.2g} {units[name][2]}".rstrip(),
+                )
+                for name, one in told.items()
+            ),
+            (
+                "residuals",
+                f"{100 * calibration.residual_rms_ratio:.1f} % rms, "
+                f"{100 * calibration.residual_worst_ratio:.1f} % at most",
+            ),
+            ("table", "none" if calibration.table is None else calibration.table.ratios.shape),
+        ]
+    )
+    for one in calibration.left_out:
+        words.print(
+            f"left out: row of line {one.line}, {100 * one.residual_ratio:+.0f} % off", markup=False
+        )

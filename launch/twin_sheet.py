@@ -1,0 +1,44 @@
+"""The twin's sheet on the bench: what it answers to a push, for calibration and judgement."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from messages.scene import SheetSpec
+from nodes.models.rigid import transform
+from nodes.twin.membrane import CELLS, Rubber, solve
+
+
+def twin_push(
+    sheet: SheetSpec,
+    stretch_ratio: float,
+    depth_m: float,
+    place_m: tuple[float, float],
+    finger_radius_m: float,
+    *,
+    cells: int = CELLS,
+) -> tuple[float, float]:
+    """Force along the sheet's normal and mean force on a clamp, N, of the scene's sheet pushed in
+    at a place (x, y from its centre)."""
+    half = 0.5 * sheet.width_m * stretch_ratio
+    pushed = solve(
+        Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
+        transform(np.eye(3), [-half, 0.0, 0.0]),
+        transform(np.eye(3), [half, 0.0, 0.0]),
+        finger_tip=np.array([*place_m, -depth_m]),
+        finger_radius_m=finger_radius_m,
+        cells=cells,
+    )
+    pull = 0.5 * (pushed.left_force_n[0] - pushed.right_force_n[0])
+    return float(pushed.finger_force_n[2]), float(pull)
+
+
+def twin_force(
+    sheet: SheetSpec,
+    stretch_ratio: float,
+    depth_m: float,
+    place_m: tuple[float, float],
+    finger_radius_m: float,
+) -> float:
+    """The first of `twin_push`."""
+    return twin_push(sheet, stretch_ratio, depth_m, place_m, finger_radius_m)[0]

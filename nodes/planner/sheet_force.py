@@ -1,0 +1,168 @@
+"""The law of a scene's sheet, and the sheet-force method family."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Scene, SheetSpec
+from messages.sheet_calibration import SheetCalibration, refuse_other_sheet
+from nodes.methods import Family, Trial
+from nodes.models.sheet.fit import law_of
+from nodes.models.sheet.laws import (
+    CubicLaw,
+    LinearLaw,
+    MembraneLaw,
+    Place,
+    Pressed,
+    ScaledLaw,
+    SheetLaw,
+)
+from nodes.models.sheet.membrane import push_path
+from nodes.models.sheet.rubber import Rubber
+from nodes.models.sheet.table import TableLaw, make_table
+
+Floats = NDArray[np.float64]
+
+Judge = Callable[[SheetSpec, float, float, Place, float], float]
+"""The true force (N) at a stretch ratio, a depth (m), a place and a fingertip radius."""
+
+
+def rubber_of(sheet: SheetSpec) -> Rubber:
+    """The scene's sheet as ideal (neo-Hookean) rubber."""
+    return Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
+
+
+def law_for(sheet: SheetSpec, calibration: SheetCalibration | None = None) -> SheetLaw:
+    """The law to plan with: as calibrated, else the scaled law of the scene's sheet.
+
+    SheetCalibrationError for a calibration of a sheet of other sizes.
+    """
+    rubber = rubber_of(sheet)
+    if calibration is None:
+        return ScaledLaw(rubber)
+    refuse_other_sheet(calibration, sheet)
+    mooney = calibration.mooney_share
+    law = law_of(
+        rubber,
+        modulus_thickness_n_per_m=float(calibration.modulus_thickness_n_per_m.value),
+        slack_width_m=float(calibration.slack_width_m.value),
+        cubic_ratio=float(calibration.cubic_ratio.value),
+        mooney_share=0.0 if mooney is None else float(mooney.value),
+    )
+    table = calibration.table
+    if table is None:
+        return law
+    return TableLaw(law, table.stretch_ratios, table.depths_m, table.xs_m, table.ys_m, table.ratios)
+
+
+TABLE_DEPTHS_M = np.array([0.002, 0.004, 0.008, 0.015, 0.025, 0.04, 0.05])
+
+
+def membrane_table(
+    rubber: Rubber,
+    *,
+    stretches: Floats,
+    xs_m: Floats,
+    ys_m: Floats,
+    finger_radius_m: float,
+    depths_m: Floats = TABLE_DEPTHS_M,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> TableLaw:
+    """The table that the membrane's finite elements give: a push for each stretch and place."""
+
+    def measure(stretch_ratio: float, depths: Floats, place_m: Place) -> Floats:
+        return push_path(
+            rubber,
+            stretch_ratio=stretch_ratio,
+            depths_m=depths,
+            place_m=place_m,
+            finger_radius_m=finger_radius_m,
+        ).forces_n
+
+    return make_table(
+        ScaledLaw(rubber),
+        measure,
+        stretches=stretches,
+        depths_m=depths_m,
+        xs_m=xs_m,
+        ys_m=ys_m,
+        finger_radius_m=finger_radius_m,
+        progress=progress,
+    )
+
+
+CHART_DEPTHS_M = (0.002, 0.005, 0.010, 0.020, 0.040)
+MEMBRANE_DEPTHS_M = (0.005, 0.020)
+"""The slow one is charted at these only, at the middle stretch."""
+CHART_PLACES: tuple[tuple[str, float, float], ...] = (
+    ("centre", 0.0, 0.0),
+    ("off-centre", 0.13, 0.19),
+    ("near the clamp", 0.25, 0.0),
+    ("near the free edge", 0.0, 0.36),
+)
+"""Names, and x over the width, y over the height."""
+
+
+def sheet_force_family(judge: Judge) -> Family:
+    """Every law at the scene's stretches, slack and at the arms' limit, over depths and places."""
+    return Family(
+        name="sheet-force",
+        unit="%",
+        reference="the twin's membrane",
+        methods=("linear", "cubic", "scaled", "table", "membrane"),
+        trials=partial(_trials, judge),
+        tolerance=lambda scene: 100.0 * scene.tolerances.force_ratio,
+    )
+
+
+def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
+    sheet, radius = scene.sheet, scene.finger.radius_m
+    rubber = rubber_of(sheet)
+    middle = 0.5 * (sheet.min_stretch_ratio + sheet.max_stretch_ratio)
+    table = membrane_table(
+        rubber,
+        stretches=np.array([sheet.min_stretch_ratio, sheet.max_stretch_ratio]),
+        xs_m=rubber.width_m * np.array([0.0, 0.13, 0.25]),
+        ys_m=rubber.height_m * np.array([0.0, 0.19, 0.36]),
+        finger_radius_m=radius,
+    )
+    laws: tuple[SheetLaw, ...] = (
+        LinearLaw(rubber),
+        CubicLaw(rubber),
+        ScaledLaw(rubber),
+        table,
+        MembraneLaw(rubber),
+    )
+    stretches = (1.0, middle, sheet.max_stretch_ratio)
+    for stretch, depth, (where, x, y) in product(stretches, CHART_DEPTHS_M, CHART_PLACES):
+        if where != "centre" and stretch != middle:
+            continue
+        if depth > scene.working_range.push_depth_m:
+            continue
+        place = (x * rubber.width_m, y * rubber.height_m)
+        true_n = judge(sheet, stretch, depth, place, radius)
+        for law in laws:
+            if law.name == "membrane" and (stretch != middle or depth not in MEMBRANE_DEPTHS_M):
+                continue
+            yield Trial(
+                method=law.name,
+                case={"stretch": stretch, "depth_mm": 1e3 * depth, "place": where},
+                run=partial(
+                    law.press,
+                    stretch,
+                    np.array([depth]),
+                    place_m=place,
+                    finger_radius_m=radius,
+                ),
+                error=partial(_error_percent, true_n=true_n),
+                in_range=not law.outside(stretch, depth, place_m=place, finger_radius_m=radius),
+            )
+
+
+def _error_percent(pressed: Pressed, *, true_n: float) -> float:
+    return 100.0 * abs(float(pressed.force_n[0]) / true_n - 1.0)
