@@ -205,6 +205,18 @@ def test_places_with_wrong_joints_are_left_out(strays: int) -> None:
     assert len(fit.leave_one_out) == 14 - strays
 
 
+def test_a_board_read_from_its_other_end_is_left_out() -> None:
+    place = Workplace(15)
+    sightings = place.sightings(10, noise_px=0.1)
+    one = sightings[3]
+    left, right = (
+        View(view.points_board, view.pixels[::-1].copy()) for view in (one.left, one.right)
+    )
+    sightings[3] = Sighting(one.name, one.joints_rad, left, right)
+    fit = calibrate_base(sightings, RIG)
+    assert [each.name for each in fit.residuals if each.reason] == ["place 3"]
+
+
 def test_when_nothing_fits_together_it_says_so() -> None:
     place = Workplace(6)
     sightings = place.sightings(12, noise_px=0.1)

@@ -24,7 +24,7 @@ from launch.layout import (
     with_base_moved,
 )
 from launch.plan import load_scene
-from messages.scene import Scene
+from messages.scene import Scene, cylinder_of
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.kinematics import CENTRE_RAD, WRIST_NEAR_RAD, branch_of, jacobian, next_joints
 from nodes.arm_bridge.reach import (
@@ -295,7 +295,7 @@ def test_the_samples_cover_the_working_range(demo: Layout) -> None:
     assert np.ptp(demo.samples.contact_world_m[:, 0]) == pytest.approx(0.12, abs=1e-6)
     contact = demo.samples.contact_world_m - demo.samples.places.world_from_sheet[:, :3, 3]
     along = np.einsum("ni,ni->n", contact, demo.samples.places.world_from_sheet[:, :3, 1])
-    rolled = 0.5 * 2.0 * most * SCENE.object.geometry.radius_m  # type: ignore[union-attr]
+    rolled = most * cylinder_of(SCENE).radius_m
     assert along.max() > rolled
     assert np.abs(along).max() <= SCENE.sheet.usable_half_height_m + 1e-9
 
