@@ -142,8 +142,7 @@ class ArmBridge(Node):
 
     def _other(self) -> OtherArm | None:
         state = self.other_arm.message
-        age_s = (self.clock.now_ns() - self.other_arm.received_ns) * 1e-9
-        return None if state is None else OtherArm.from_state(state, age_s)
+        return None if state is None else OtherArm.from_state(state, self.other_arm.age_s())
 
     def _publish(self, geometry: ArmGeometry) -> None:
         header, received_ns = self._used

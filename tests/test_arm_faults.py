@@ -1,0 +1,256 @@
+"""What can go wrong with an arm or its network in mid-stroke, over real sockets: each decided.
+
+Every patience is stretched alike, so that the pauses of a busy machine are not taken for faults;
+`test_arm_control.py` has the true ones, without a clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+
+from messages.base import Header, Message
+from messages.types import ArmState, EStop
+from nodes.arm_bridge.link_drivers import link_for
+from nodes.twin import arms as twin_arms
+from nodes.twin.arms import STATE_FAULT, Fault
+from tests.network import Cut
+from tests.test_arm_loop import (
+    AT_FRONT,
+    Path3,
+    Rig,
+    both_follow,
+    play_finger,
+    running_rig,
+)
+from tests.test_arm_loop import until as until_within
+
+until = partial(until_within, within_s=25.0)
+LONGEST_M = 0.24 * 1.09
+TIMEOUT_S, LATE_S = 0.25, 0.4
+PATIENT = {"timeout_s": TIMEOUT_S, "hold_after_s": 0.1, "stop_after_s": 0.6}
+PATIENT_TWIN = {"watchdog_s": 0.8}
+STOPPED = {"stopping", "relax", "idle", "fault"}
+
+
+@dataclass
+class Stroke:
+    """A stroke that is under way, to and fro for as long as the test needs it."""
+
+    rig: Rig
+    nodes: dict[str, Any]
+    cut: Cut
+
+    def mode(self, side: str) -> str:
+        return self.rig.newest(side).mode
+
+    def modes(self) -> set[str]:
+        return {self.mode("left"), self.mode("right")}
+
+    def reasons(self) -> str:
+        return "; ".join((*self.rig.newest("left").faults, *self.rig.newest("right").faults))
+
+    def suffer(self, fault: Fault, side: str = "left") -> None:
+        self.nodes["twin"].servers[side].controller.fault = fault
+
+    async def goes_on(self) -> None:
+        """Both arms follow again, without anybody's help."""
+        await until(lambda: self.modes() == {"follow"})
+        assert self.reasons() == ""
+
+    async def lasts(self, states: int) -> list[ArmState]:
+        """The next so many states of each arm."""
+        counts = {side: len(self.rig.states[side]) for side in ("arm_left", "arm_right")}
+        await until(
+            lambda: all(len(self.rig.states[name]) >= counts[name] + states for name in counts)
+        )
+        return [state for name in counts for state, _ in self.rig.states[name][counts[name] :]]
+
+    def longest_m(self) -> float:
+        """The longest that the sheet ever was, as measured."""
+        return max(
+            state.edge_distance_m or 0.0
+            for states in self.rig.states.values()
+            for state, _ in states
+        )
+
+
+def to_and_fro(radius: float, seconds: float) -> Path3:
+    """Strokes of +-30 degrees, there and back in so many seconds, a millimetre in the skin."""
+
+    def path(at_s: float) -> np.ndarray:
+        angle, reach = np.radians(30.0) * np.sin(2.0 * np.pi * at_s / seconds), radius - 0.001
+        return np.array([0.0, reach * np.sin(angle), reach * np.cos(angle) - radius])
+
+    return path
+
+
+@asynccontextmanager
+async def mid_stroke(seconds: float = 6.0, **bridge: Any) -> AsyncIterator[Stroke]:
+    """Both arms follow a stroking finger; the left bridge reaches its arm through a cable."""
+    async with (
+        running_rig(PATIENT_TWIN, **(PATIENT | bridge)) as (rig, nodes),
+        Cut(nodes["twin"].servers["left"].port) as cut,
+    ):
+        left = nodes["left"]
+        left._link.close()
+        left._link = link_for("modbus", "127.0.0.1", cut.port, TIMEOUT_S)
+        await both_follow(rig, nodes["planner"], AT_FRONT)
+        path = to_and_fro(rig.scene.object.geometry.radius_m, seconds)
+        task = asyncio.create_task(play_finger(rig, nodes["planner"], path, 60.0))
+        stroke = Stroke(rig, nodes, cut)
+        try:
+            await stroke.lasts(40)
+            yield stroke
+            assert stroke.longest_m() <= LONGEST_M
+        finally:
+            task.cancel()
+            with suppress(asyncio.CancelledError):
+                await task
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("silent", "no answer"),
+        ("slow", "no answer"),
+        ("exception", "Modbus exception 4"),
+        ("bad_crc", "fails its CRC"),
+        ("old_version", "register map version 0, wanted 1"),
+        ("repeated", "answer to command"),
+    ],
+)
+async def test_an_arm_without_a_sound_answer_is_lost_and_the_other_stops(
+    fault: Fault, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(twin_arms, "LATE_S", LATE_S)
+    async with mid_stroke() as stroke:
+        stroke.suffer(fault)
+        await until(lambda: stroke.mode("left") == "disconnected")
+        assert words in stroke.reasons()
+        await until(lambda: stroke.mode("right") in STOPPED)
+        await until(lambda: stroke.mode("right") == "idle")
+        assert stroke.rig.newest("right").faults == ()
+        stroke.suffer("none")
+        await stroke.goes_on()
+
+
+async def test_a_frozen_arm_is_a_fault_of_it_until_somebody_resets_it() -> None:
+    async with mid_stroke(largest_lag_rad=0.06) as stroke:
+        stroke.suffer("frozen")
+        await until(lambda: bool(stroke.reasons()))
+        await until(lambda: stroke.modes() <= {"idle", "fault"})
+        assert "fault" in stroke.modes()
+        stroke.suffer("none")
+        states = await stroke.lasts(40)
+        assert {state.mode for state in states} <= {"idle", "fault"}
+        for side in ("left", "right"):
+            message = EStop(engaged=False, reason="seen to")
+            header = stroke.rig.header(stroke.rig.clock.now_ns())
+            await stroke.nodes[side].step("estop", message, header)
+        await stroke.goes_on()
+
+
+async def test_an_arm_that_moves_fifty_milliseconds_late_is_lived_with_in_a_slow_stroke() -> None:
+    async with mid_stroke(8.0) as stroke:
+        stroke.suffer("lagging")
+        states = await stroke.lasts(200)
+        assert {state.mode for state in states} <= {"follow", "hold"}
+        assert stroke.reasons() == ""
+
+
+async def test_an_arm_that_moves_fifty_milliseconds_late_stops_both_in_a_fast_stroke() -> None:
+    async with mid_stroke(1.2, largest_lag_rad=0.1) as stroke:
+        stroke.suffer("lagging")
+        await until(lambda: "trails its command" in stroke.reasons())
+        await until(lambda: stroke.modes() <= {"idle", "fault"})
+
+
+async def test_an_arm_whose_state_comes_late_makes_the_other_hold() -> None:
+    async with mid_stroke() as stroke:
+        loop, listeners = asyncio.get_running_loop(), stroke.rig.listeners["arm_left"]
+        (told,) = listeners
+
+        def later(message: Message, header: Header) -> None:
+            loop.call_later(0.3, told, message, header)
+
+        listeners[:] = [later]
+        await until(lambda: stroke.mode("right") == "hold")
+        assert stroke.reasons() == ""
+        listeners[:] = [told]
+        await stroke.goes_on()
+
+
+async def test_a_connection_that_is_reset_once_is_forgiven() -> None:
+    async with mid_stroke() as stroke:
+        stroke.cut.close_all()
+        states = await stroke.lasts(60)
+        assert {state.mode for state in states} <= {"follow", "hold"}
+        assert stroke.nodes["left"]._link.connections >= 2
+        await stroke.goes_on()
+
+
+async def test_a_cable_that_swallows_everything_stops_both_and_the_arm_by_itself() -> None:
+    async with mid_stroke() as stroke:
+        controller = stroke.nodes["twin"].servers["left"].controller
+        stroke.cut.half_open = True
+        await until(lambda: controller.state == STATE_FAULT)
+        await until(lambda: stroke.mode("left") == "disconnected")
+        await until(lambda: stroke.mode("right") == "idle")
+        stroke.cut.half_open = False
+        await stroke.goes_on()
+
+
+async def test_a_cable_that_is_drawn_stops_both_until_it_is_back() -> None:
+    async with mid_stroke() as stroke:
+        stroke.cut.refuse = True
+        stroke.cut.close_all()
+        await until(lambda: stroke.mode("left") == "disconnected")
+        await until(lambda: stroke.mode("right") == "idle")
+        stroke.cut.refuse = False
+        await stroke.goes_on()
+
+
+Listeners = dict[str, list[Callable[[Message, Header], None]]]
+
+
+def without(listeners: Listeners, topics: tuple[str, ...], keep: int) -> Listeners:
+    """The listeners of those topics taken away, but for the first `keep` of each."""
+    return {topic: told[:keep] if topic in topics else told for topic, told in listeners.items()}
+
+
+@pytest.mark.parametrize("topics", [("sheet_target",), ("sheet_target", "arm_left", "arm_right")])
+async def test_a_network_cut_between_the_computers_holds_then_stops_then_goes_on(
+    topics: tuple[str, ...],
+) -> None:
+    async with mid_stroke() as stroke:
+        whole = stroke.rig.listeners
+        began = {name: len(states) for name, states in stroke.rig.states.items()}
+        stroke.rig.listeners = without(whole, topics, keep=0)
+        await until(lambda: stroke.modes() == {"idle"})
+        for name, states in stroke.rig.states.items():
+            modes = [state.mode for state, _ in states[began[name] :]]
+            firsts = [modes.index(mode) for mode in ("hold", "idle")]
+            assert firsts == sorted(firsts)
+        assert stroke.reasons() == ""
+        stroke.rig.listeners = whole
+        await stroke.goes_on()
+
+
+async def test_when_only_one_arms_computer_is_cut_off_both_stop() -> None:
+    async with mid_stroke() as stroke:
+        whole = stroke.rig.listeners
+        # The left bridge listens first to targets; its own state no longer reaches the right one.
+        cut = without(whole, ("arm_left", "arm_right"), keep=0)
+        cut["sheet_target"] = whole["sheet_target"][1:]
+        stroke.rig.listeners = cut
+        await until(lambda: stroke.modes() == {"idle"})
+        stroke.rig.listeners = whole
+        await stroke.goes_on()
