@@ -7,7 +7,8 @@ its origin at the centre of the imaginary screen, x to the right, y up, z toward
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -108,15 +109,90 @@ Geometry = Annotated[
 ]
 
 
+class StripSupport(Part):
+    """Held is the skin that faces away from the user."""
+
+    kind: Literal["strip"] = "strip"
+    angle_rad: Positive = Field(
+        description="full angle that the held skin's normals span about the line from the user"
+    )
+
+
+class BaseSupport(Part):
+    """Held is the lowest skin, as of an object that stands on something."""
+
+    kind: Literal["base"] = "base"
+    height_m: Positive = Field(description="of the held skin, above the lowest point")
+    down_world: tuple[Finite, Finite, Finite] = Field(
+        default=(0.0, 0.0, -1.0), description="where low is; of any length but zero"
+    )
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> Self:
+        if not any(self.down_world):
+            raise ValueError("down_world: (0, 0, 0) is no direction; [0, -1, 0] is below")
+        return self
+
+
+class SpherePatchSupport(Part):
+    """Held is the skin within a sphere, as by a clamp."""
+
+    kind: Literal["sphere_patch"] = "sphere_patch"
+    centre_m: Vector3 = Field(description="object frame")
+    radius_m: Positive
+
+
+class BoxPatchSupport(Part):
+    """Held is the skin within a box, its sides along the object frame's axes."""
+
+    kind: Literal["box_patch"] = "box_patch"
+    min_m: Vector3 = Field(description="object frame")
+    max_m: Vector3
+
+    @model_validator(mode="after")
+    def _holds_something(self) -> Self:
+        if not (self.min_m < self.max_m).all():
+            raise ValueError(f"min_m: {self.min_m} is not below max_m: {self.max_m} on every axis")
+        return self
+
+
+Support = Annotated[
+    StripSupport | BaseSupport | SpherePatchSupport | BoxPatchSupport, Field(discriminator="kind")
+]
+
+
 class VirtualObject(Part):
-    """The soft object that is seen and touched."""
+    """The soft object that is seen and touched.
+
+    `support_angle_rad: x` in a scene file is short for `support: {kind: strip, angle_rad: x}`.
+    """
 
     geometry: Geometry
     material: Material
     world_from_object: Pose
-    support_angle_rad: Positive = Field(
-        description="full angle of the strip of skin, opposite the user, that is held fixed"
-    )
+    support: Support = Field(description="the part of the skin that does not move")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _strip_by_its_angle(cls, values: Any) -> Any:
+        if not isinstance(values, Mapping) or "support_angle_rad" not in values:
+            return values
+        if "support" in values:
+            raise ValueError(
+                "support and support_angle_rad are both given; the latter is short for "
+                "support: {kind: strip, angle_rad: ...}, keep one of them"
+            )
+        rest = {key: value for key, value in values.items() if key != "support_angle_rad"}
+        return rest | {"support": {"kind": "strip", "angle_rad": values["support_angle_rad"]}}
+
+    @property
+    def support_angle_rad(self) -> float:
+        """Angle of the held strip, for who can handle no other support; UnfitGeometryError."""
+        if not isinstance(self.support, StripSupport):
+            raise UnfitGeometryError(
+                f'object.support.kind: "{self.support.kind}" cannot be handled here; use "strip"'
+            )
+        return self.support.angle_rad
 
 
 class SheetSpec(Part):
