@@ -478,9 +478,10 @@ async def test_a_cancellation_is_not_swallowed() -> None:
             task = asyncio.create_task(exchange(link))
             for _ in range(turns):
                 await asyncio.sleep(0)
+            done = task.done()
             task.cancel()
             await asyncio.wait([task])
-            assert task.cancelled()
+            assert done or task.cancelled()
         await exchange(link, "idle")
 
 
