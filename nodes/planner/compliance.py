@@ -446,18 +446,17 @@ def _note(shown: Presented, position_error_m: float) -> str:
     if unsure > WEBER_RATIO:
         return (
             f"object is softer than the sheet presents surely: {1e3 * position_error_m:g} mm of "
-            f"the sheet's place is {100 * unsure:.0f} % of the force in the deeper half of the "
-            f"push; people notice {100 * WEBER_RATIO:.0f} to {100 * WEBER_RATIO_BARE:.0f} %"
+            f"the sheet's place is {100 * unsure:.0f} % of the force at "
+            f"{1e3 * shown.depths_m[-1]:.0f} mm; people notice {100 * WEBER_RATIO:.0f} to "
+            f"{100 * WEBER_RATIO_BARE:.0f} %"
         )
     return ""
 
 
 def unsureness(shown: Presented, position_error_m: float) -> float:
-    """The largest relative change of force, over the deeper half, by an error of the sheet's
-    place."""
-    deep = shown.depths_m >= 0.5 * shown.depths_m[-1]
-    change = shown.stiffness_n_per_m[deep] * position_error_m
-    return float((change / np.maximum(shown.wanted_n[deep], 1e-9)).max())
+    """The relative change of the deepest push's force by an error of the sheet's place."""
+    change = float(shown.stiffness_n_per_m[-1]) * position_error_m
+    return change / max(float(shown.wanted_n[-1]), 1e-9)
 
 
 @dataclass(frozen=True, slots=True)

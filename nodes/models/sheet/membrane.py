@@ -36,7 +36,7 @@ FINEST_RADII = 0.3
 """Cell under the finger, in finger radii."""
 STEP_RADII = 0.4
 """Largest advance of the finger from one equilibrium to the next, in its radii."""
-BED_PER_MODULUS = 3e3
+BED_PER_MODULUS = 2e5
 """Pressure of the finger per depth of penetration, in E t / width^2."""
 MOST_ITERATIONS = 120
 TOLERANCE = 1e-7

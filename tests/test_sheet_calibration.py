@@ -1,0 +1,330 @@
+"""`flexsheet calibrate sheet`: what it finds again, says of bad rows, and keeps in its file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from launch.cli import app
+from launch.commands.calibrate_sheet import fitted
+from launch.commands.output import CommandError
+from launch.documents import BadInputError
+from launch.plan import load_scene
+from launch.sheet_rows import read_rows, twin_rows
+from launch.twin_sheet import twin_force
+from messages.sheet_calibration import (
+    SheetCalibration,
+    SheetCalibrationError,
+    load_sheet_calibration,
+    save_sheet_calibration,
+)
+from nodes.models.sheet.fit import FitError, Push, fit_law, law_of, table_from
+from nodes.models.sheet.laws import CENTRE, ScaledLaw
+from nodes.models.sheet.table import TableLaw
+from nodes.planner.sheet_force import law_for, rubber_of
+
+SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SCENE = load_scene(SCENE_FILE)
+NOMINAL = rubber_of(SCENE.sheet)
+RADIUS = 0.007
+
+
+def pushes_of(
+    law: ScaledLaw,
+    *,
+    stretches: tuple[float, ...] = (1.02, 1.04, 1.06, 1.09),
+    depths: tuple[float, ...] = (0.004, 0.008, 0.015, 0.025, 0.04),
+    noise_n: float = 0.0,
+    edges: bool = False,
+    seed: int = 1,
+) -> list[Push]:
+    """What a gauge would say of a sheet that has this law."""
+    rng = np.random.default_rng(seed)
+    pushes = []
+    for stretch in stretches:
+        pressed = law.press(stretch, np.array(depths), place_m=CENTRE, finger_radius_m=RADIUS)
+        for depth, force, pull in zip(depths, pressed.force_n, pressed.edge_force_n, strict=True):
+            pushes.append(
+                Push(
+                    edge_distance_m=stretch * NOMINAL.width_m,
+                    depth_m=depth,
+                    force_n=float(force) + float(rng.normal(0.0, noise_n)),
+                    finger_radius_m=RADIUS,
+                    edge_force_n=float(pull) if edges else None,
+                )
+            )
+    return pushes
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.floats(200.0, 4000.0), st.floats(0.237, 0.243), st.floats(0.5, 2.0))
+def test_a_sheets_numbers_are_found_again(modulus: float, width: float, cubic: float) -> None:
+    law = law_of(
+        NOMINAL,
+        modulus_thickness_n_per_m=modulus,
+        slack_width_m=width,
+        cubic_ratio=cubic,
+        mooney_share=0.0,
+    )
+    fit = fit_law(pushes_of(law), NOMINAL)
+    assert fit.values == pytest.approx((modulus, width, cubic), rel=1e-3)
+    assert fit.worst_ratio < 1e-3
+    assert fit.used.all()
+
+
+def test_noise_is_within_the_stated_deviations_and_strays_are_left_out() -> None:
+    law = law_of(
+        NOMINAL,
+        modulus_thickness_n_per_m=1500.0,
+        slack_width_m=0.2385,
+        cubic_ratio=1.3,
+        mooney_share=0.0,
+    )
+    rows = pushes_of(law, noise_n=0.01)
+    for number, factor in ((3, 3.0), (12, 0.2)):
+        push = rows[number]
+        rows[number] = Push(push.edge_distance_m, push.depth_m, factor * push.force_n, RADIUS)
+    fit = fit_law(rows, NOMINAL)
+    assert list(np.flatnonzero(~fit.used)) == [3, 12]
+    for value, true, deviation in zip(
+        fit.values, (1500.0, 0.2385, 1.3), fit.standard_deviations, strict=True
+    ):
+        assert abs(value - true) < 4.0 * deviation
+        assert 0.0 < deviation < 0.2 * true
+
+
+def test_mooneys_share_is_found_where_the_sheet_is_stretched_far() -> None:
+    law = law_of(
+        NOMINAL,
+        modulus_thickness_n_per_m=900.0,
+        slack_width_m=0.24,
+        cubic_ratio=1.0,
+        mooney_share=0.4,
+    )
+    rows = pushes_of(law, stretches=(1.02, 1.05, 1.12, 1.2, 1.3), edges=True)
+    fit = fit_law(rows, NOMINAL, with_mooney=True)
+    assert fit.names[3] == "mooney_share"
+    assert fit.values == pytest.approx((900.0, 0.24, 1.0, 0.4), rel=0.02)
+    assert 0.0 < fit.standard_deviations[3] < 0.2
+
+
+def test_edge_forces_tell_more() -> None:
+    law = ScaledLaw(NOMINAL)
+    without = fit_law(pushes_of(law), NOMINAL)
+    along = fit_law(pushes_of(law, edges=True), NOMINAL)
+    assert along.standard_deviations[1] < without.standard_deviations[1]
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (pushes_of(ScaledLaw(NOMINAL))[:5], "6 or more"),
+        (
+            pushes_of(ScaledLaw(NOMINAL), stretches=(1.05,), depths=(0.005,) * 8),
+            r"open|known to",
+        ),
+    ],
+)
+def test_rows_that_leave_it_open_are_refused(rows: list[Push], words: str) -> None:
+    with pytest.raises(FitError, match=words):
+        fit_law(rows, NOMINAL)
+
+
+def test_a_table_keeps_what_the_law_leaves() -> None:
+    rows = [
+        Push(
+            push.edge_distance_m,
+            push.depth_m,
+            push.force_n * (1.0 + 4.0 * (push.depth_m - 0.02)),
+            RADIUS,
+        )
+        for push in pushes_of(ScaledLaw(NOMINAL))
+    ]
+    fit = fit_law(rows, NOMINAL)
+    table = table_from(fit.law, rows, fit.used, NOMINAL.width_m)
+    for push in rows:
+        stretch = push.edge_distance_m / NOMINAL.width_m
+        pressed = table.press(
+            stretch, np.array([push.depth_m]), place_m=CENTRE, finger_radius_m=RADIUS
+        )
+        assert pressed.force_n[0] == pytest.approx(push.force_n, rel=0.02)
+
+
+def test_a_table_needs_all_combinations() -> None:
+    rows = pushes_of(ScaledLaw(NOMINAL))
+    moved = Push(rows[0].edge_distance_m, 0.01, rows[1].force_n, RADIUS, place_m=(0.03, 0.0))
+    used = np.ones(len(rows) + 1, dtype=bool)
+    with pytest.raises(FitError, match="every combination"):
+        table_from(ScaledLaw(NOMINAL), [*rows, moved], used, NOMINAL.width_m)
+    apart = [push for push in rows if (push.depth_m < 0.01) == (push.edge_distance_m < 0.25)]
+    with pytest.raises(FitError, match="in common"):
+        table_from(ScaledLaw(NOMINAL), apart, used[: len(apart)], NOMINAL.width_m)
+
+
+CSV = """# measured on a bench
+edge_distance_mm, depth_mm, force_n, y_mm, edge_force_n, finger_radius_mm
+244.8, 5, 0.09, , 5.1, 7
+249.6, 10.5, 0.41, -12,,
+
+252, 20, 1.3, 0, 12, 8
+"""
+
+
+def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
+    file = tmp_path / "rows.csv"
+    file.write_text(CSV)
+    rows, lines = read_rows(file, SCENE.sheet, RADIUS)
+    assert lines == [3, 4, 6]
+    assert rows[0] == Push(pytest.approx(0.2448), 0.005, 0.09, 0.007, edge_force_n=5.1)  # type: ignore[arg-type]  # compares as a float
+    assert rows[1].place_m == pytest.approx((0.0, -0.012))
+    assert rows[1].edge_force_n is None
+    assert rows[2].finger_radius_m == pytest.approx(0.008)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "rows.csv: is empty"),
+        ("stretch_ratio,depth_mm,force_n\n", "has no rows"),
+        ("stretch_ratio,depth_mm,forse_n\n1.02,5,0.1", 'did you mean "force_n"'),
+        ("stretch_ratio,depth_mm\n1.02,5", "force_n: column is missing"),
+        ("depth_mm,force_n\n5,1", "needs one of the columns"),
+        ("stretch_ratio,depth_mm,force_n,depth_mm\n", "column is given twice"),
+        ("stretch_ratio,depth_mm,force_n\n1.02,5", "rows.csv:2: 2 values for 3 columns"),
+        ("stretch_ratio,depth_mm,force_n\n1.02,five,1", 'rows.csv:2: depth_mm: "five"'),
+        ("stretch_ratio,depth_mm,force_n\n1.02,,1", 'depth_mm: "" is not a number'),
+        ("stretch_ratio,depth_mm,force_n\n1.02,nan,1", "depth_mm: nan is not above 0"),
+        ("stretch_ratio,depth_mm,force_n\n1.02,-5,1", "-5 is not above 0"),
+        ("stretch_ratio,depth_mm,force_n\n2.5e2,5,1", "stretch_ratio: 2.5e2 is not near 1"),
+        ("stretch_ratio,depth_mm,force_n\n1.02,5000,1", "lengths are in mm"),
+        ("stretch_ratio,depth_mm,force_n,y_mm\n1.02,5,1,130", "y_mm: 130 is not on the sheet"),
+        ("stretch_ratio,depth_mm,force_n\n" + "x,5,1\n" * 25, "and 5 more"),
+    ],
+)
+def test_mistakes_in_rows_are_pointed_at(tmp_path: Path, text: str, said: str) -> None:
+    file = tmp_path / "rows.csv"
+    file.write_text(text)
+    with pytest.raises(BadInputError) as caught:
+        read_rows(file, SCENE.sheet, RADIUS)
+    assert said in str(caught.value)
+
+
+def test_a_file_that_is_not_there_or_not_text_is_said(tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="cannot be read"):
+        read_rows(tmp_path / "none.csv", SCENE.sheet, RADIUS)
+    (tmp_path / "rows.csv").write_bytes(b"\xff\xfe\x00depth")
+    with pytest.raises(BadInputError, match="UTF-8"):
+        read_rows(tmp_path / "rows.csv", SCENE.sheet, RADIUS)
+
+
+@pytest.fixture(scope="module")
+def twin_calibration() -> SheetCalibration:
+    small = SCENE.model_copy(
+        update={"working_range": SCENE.working_range.model_copy(update={"push_depth_m": 0.02})}
+    )
+    rows = twin_rows(small, places=False, noise_n=0.003, seed=2)
+    return fitted(
+        small, rows, list(range(len(rows))), source="twin", with_mooney=False, with_table=True
+    )
+
+
+def test_the_twin_is_known_by_its_pushes(twin_calibration: SheetCalibration) -> None:
+    found = twin_calibration
+    assert found.modulus_thickness_n_per_m.value == pytest.approx(1000.0, rel=0.06)
+    assert found.slack_width_m.value == pytest.approx(0.24, abs=0.0006)
+    assert found.cubic_ratio.value == pytest.approx(1.0, abs=0.2)
+    assert found.residual_rms_ratio < 0.07
+    law = law_for(SCENE.sheet, found)
+    assert isinstance(law, TableLaw)
+    for stretch, depth in ((1.03, 0.009), (1.05, 0.016)):
+        true = twin_force(SCENE.sheet, stretch, depth, CENTRE, RADIUS)
+        pressed = law.press(stretch, np.array([depth]), place_m=CENTRE, finger_radius_m=RADIUS)
+        assert pressed.force_n[0] == pytest.approx(true, rel=0.04)
+
+
+def test_the_file_gives_back_the_law(twin_calibration: SheetCalibration, tmp_path: Path) -> None:
+    file = tmp_path / "sheet.yaml"
+    save_sheet_calibration(twin_calibration, file, comment="made so")
+    assert file.read_text().splitlines()[1] == "# made so"
+    again = load_sheet_calibration(file)
+    one, two = law_for(SCENE.sheet, twin_calibration), law_for(SCENE.sheet, again)
+    depths = np.linspace(0.001, 0.04, 9)
+    answers = [
+        law.press(1.037, depths, place_m=(0.02, 0.01), finger_radius_m=RADIUS).force_n
+        for law in (one, two)
+    ]
+    assert np.array_equal(answers[0], answers[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": 9}, "version: 9, this program reads 1"),
+        ({"slack_width_m": None}, "slack_width_m"),
+        ({"left_oot": []}, "left_oot"),
+    ],
+)
+def test_a_file_that_does_not_fit_is_refused(
+    twin_calibration: SheetCalibration, tmp_path: Path, change: dict[str, Any], words: str
+) -> None:
+    file = tmp_path / "sheet.yaml"
+    file.write_text(json.dumps({**twin_calibration.model_dump(mode="json"), **change}))
+    with pytest.raises(SheetCalibrationError, match=words):
+        load_sheet_calibration(file)
+
+
+@pytest.mark.parametrize("content", ["- 1\n", "a: 1\n", "a: [\n"])
+def test_a_foreign_file_is_refused(tmp_path: Path, content: str) -> None:
+    file = tmp_path / "sheet.yaml"
+    file.write_text(content)
+    with pytest.raises(SheetCalibrationError, match=r"not YAML|not a sheet"):
+        load_sheet_calibration(file)
+    with pytest.raises(SheetCalibrationError, match="cannot be read"):
+        load_sheet_calibration(tmp_path / "none.yaml")
+
+
+def test_another_sheets_calibration_is_refused(twin_calibration: SheetCalibration) -> None:
+    other = SCENE.sheet.model_copy(update={"width_m": 0.3})
+    with pytest.raises(SheetCalibrationError, match=r"width_m 0\.24, the scene"):
+        law_for(other, twin_calibration)
+
+
+def test_the_command_fits_rows_and_tells(tmp_path: Path) -> None:
+    rows = tmp_path / "rows.csv"
+    lines = ["stretch_ratio,depth_mm,force_n"]
+    for push in pushes_of(ScaledLaw(NOMINAL), noise_n=0.002):
+        stretch = push.edge_distance_m / NOMINAL.width_m
+        lines.append(f"{stretch:.5f},{1e3 * push.depth_m:.3f},{push.force_n:.5f}")
+    lines[7] = lines[7].rsplit(",", 1)[0] + ",9.0"
+    rows.write_text("\n".join(lines))
+    file = tmp_path / "sheet.yaml"
+    arguments = ["calibrate", "sheet", "--rows", str(rows), "-o", str(file)]
+    result = CliRunner().invoke(app, [*arguments, "--json"])
+    assert result.exit_code == 0, result.output
+    told = json.loads(result.stdout)
+    assert told["modulus_thickness_n_per_m"]["value"] == pytest.approx(1000.0, rel=0.02)
+    assert [one["line"] for one in told["left_out"]] == [8]
+    assert load_sheet_calibration(file).source == str(rows)
+    shown = CliRunner().invoke(app, [*arguments, "--table"])
+    assert shown.exit_code == 0, shown.output
+    assert "19 of 20" in shown.stdout
+    assert "N/m" in shown.stdout
+    table = load_sheet_calibration(file).table
+    assert table is not None
+    assert table.stretch_ratios == pytest.approx([1.02, 1.04, 1.06, 1.09])
+
+
+@pytest.mark.parametrize("arguments", [[], ["--rows", "a.csv", "--twin", "b.yaml"]])
+def test_the_command_wants_one_source(tmp_path: Path, arguments: list[str]) -> None:
+    result = CliRunner().invoke(
+        app, ["calibrate", "sheet", "-o", str(tmp_path / "o.yaml"), *arguments]
+    )
+    assert isinstance(result.exception, CommandError)
+    assert "--rows" in str(result.exception)
