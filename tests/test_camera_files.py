@@ -22,7 +22,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from messages.scene import Scene
-from nodes.camera.devices import open_reader
+from nodes.camera.devices import ReaderThread, open_reader
 from nodes.camera.files import read_times
 from nodes.camera.pictures import DeviceError, Pictures, Reader
 from nodes.camera.sources import AnySource, ImagesSource, VideoSource
@@ -250,3 +250,39 @@ def test_a_side_by_side_video_has_the_scenes_size(scene: Scene, tmp_path: Path) 
     path = write_video(tmp_path / "both.avi", both([0]))
     (pair,) = read_all(VideoSource(kind="video", left=path), scene)
     assert pair.left.shape == pair.right.shape == (HEIGHT, WIDTH)
+
+
+def test_times_that_are_no_text_are_told_as_such(tmp_path: Path) -> None:
+    times = tmp_path / "times.csv"
+    times.write_text("t_s\n0.0\n0.1\n", encoding="utf-16")
+    with pytest.raises(DeviceError, match=r"times\.csv: cannot be read as UTF-8 CSV"):
+        read_times(times, 2)
+
+
+def test_whatever_goes_wrong_while_reading_is_told() -> None:
+    """A thread that died without a word would leave a node that looks well and gives nothing."""
+    errors: list[DeviceError] = []
+
+    def spoilt() -> Reader:
+        raise MemoryError("no room for a picture")
+
+    def tell(error: DeviceError) -> None:
+        errors.append(error)
+        if len(errors) == 2:
+            thread.stop()
+
+    thread = ReaderThread(
+        spoilt,
+        camera=load_scene().camera,
+        name="cam",
+        now=lambda: 0,
+        retry_s=0.001,
+        deliver=lambda pictures, lost: None,
+        fail=tell,
+        warn=lambda text: None,
+        finish=lambda pairs: None,
+    )
+    thread.start()
+    thread.join(5.0)
+    assert not thread.is_alive()
+    assert [str(error) for error in errors] == ["cam: MemoryError: no room for a picture"] * 2

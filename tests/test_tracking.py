@@ -375,6 +375,24 @@ def test_a_late_jump_a_doubled_point_and_an_ancient_one_change_nothing() -> None
     assert tracker.estimate is before
 
 
+@pytest.mark.parametrize("off_m", [0.003, 0.01, 0.02])
+def test_a_late_point_is_judged_as_one_in_time(off_m: float) -> None:
+    """What would have been too fast in its turn is no better for coming late."""
+    tracker = new_tracker()
+    feed(tracker, still, range(58))
+    for frame in (59, 60):
+        tracker.take(frame * FRAME_NS, still(0.0), NOISE)
+    before = tracker.estimate
+    astray = still(0.0) + np.array([off_m, 0.0, 0.0])
+    in_time = new_tracker()
+    feed(in_time, still, range(58))
+    if in_time.take(58 * FRAME_NS, astray, NOISE) == "too_fast":
+        tracker.take(58 * FRAME_NS, astray, NOISE)
+        assert tracker.estimate is before
+    else:
+        assert off_m < 0.01
+
+
 @pytest.mark.parametrize("step_s", [0.1, 5.0])
 def test_a_clock_that_steps_back_costs_a_few_frames(step_s: float) -> None:
     tracker = new_tracker()

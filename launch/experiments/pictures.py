@@ -84,10 +84,13 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
             stroke.seconds, stroke.delta_d_m * 1e3, linewidth=0.8, label="to the measured finger"
         )
         upper.plot(
-            stroke.seconds, stroke.true_delta_d_m * 1e3, linewidth=0.8, label="to the true finger"
+            stroke.true_seconds,
+            stroke.true_delta_d_m * 1e3,
+            linewidth=0.8,
+            label="to the true finger",
         )
         lower.plot(stroke.seconds, np.degrees(stroke.delta_theta_rad), linewidth=0.8)
-        lower.plot(stroke.seconds, np.degrees(stroke.true_delta_theta_rad), linewidth=0.8)
+        lower.plot(stroke.true_seconds, np.degrees(stroke.true_delta_theta_rad), linewidth=0.8)
         paper = PAPER_TABLE_1.get(seconds)
         if paper is not None:
             upper.axhline(paper["delta_d_mm"][0], linestyle="--", color="0.3", label="paper, mean")

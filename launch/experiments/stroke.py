@@ -322,18 +322,22 @@ def percentiles_ms(values_s: Floats) -> dict[str, float | None]:
 
 @dataclass(frozen=True, slots=True)
 class StrokeErrors:
-    """The stroke's errors over time: seconds (n,) since the stroke began, metres, radians.
+    """The stroke's errors over time: seconds since the stroke began, metres, radians.
 
-    arcs_m: (n, 2), how far around the object the true sheet and the true finger are.
+    seconds: (n,) of the exposures with a valid fingertip, at which the measured errors stand.
+    true_seconds: (m,) of all exposures, at which the true ones stand: a sheet that holds while the
+        finger is not seen is off all the same.
+    arcs_m: (m, 2), how far around the object the true sheet and the true finger are.
     """
 
     seconds: Floats
     delta_d_m: Floats
-    true_delta_d_m: Floats
     delta_theta_rad: Floats
-    true_delta_theta_rad: Floats
     smoother_m: Floats
     fingertip_m: Floats
+    true_seconds: Floats
+    true_delta_d_m: Floats
+    true_delta_theta_rad: Floats
     arcs_m: Floats
 
 
@@ -347,28 +351,34 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
     begin_s, finish_s = stroke_window_s(seconds)
     begin_ns = zero_ns + round(begin_s * 1e9)
     finish_ns = min(zero_ns + round(finish_s * 1e9), end_ns)
-    times = recording.fingertip.times_ns
-    keep = (times >= begin_ns) & (times <= finish_ns)
-    for edges in (*recording.measured_edges, *recording.true_edges, recording.finger):
-        keep &= edges.covers(times)
-    times = times[keep]
+
+    def in_stroke(times: NDArray[np.int64]) -> NDArray[np.int64]:
+        keep = (times >= begin_ns) & (times <= finish_ns)
+        for edges in (*recording.measured_edges, *recording.true_edges, recording.finger):
+            keep &= edges.covers(times)
+        return times[keep]
+
+    times, exposures = (
+        in_stroke(track.times_ns) for track in (recording.fingertip, recording.finger)
+    )
     if len(times) < 10:
         raise ExperimentError(f'only {len(times)} fingertips were recorded during "{label}"')
     scene = recording.scene
     delta_d, delta_theta = sheet_errors(scene, recording.fingertip, recording.measured_edges, times)
-    true_d, true_theta = sheet_errors(scene, recording.finger, recording.true_edges, times)
+    true_d, true_theta = sheet_errors(scene, recording.finger, recording.true_edges, exposures)
     smooth = smoothed(recording.measured, times)
     world_from_object = object_pose(scene)
     true_points = recording.finger.at(times)
     return StrokeErrors(
         seconds=np.asarray((times - begin_ns) * 1e-9, dtype=np.float64),
         delta_d_m=delta_d,
-        true_delta_d_m=true_d,
         delta_theta_rad=delta_theta,
-        true_delta_theta_rad=true_theta,
         smoother_m=tangential_distance(scene, world_from_object, smooth.at(times), true_points),
         fingertip_m=np.linalg.norm(recording.fingertip.at(times) - true_points, axis=1),
-        arcs_m=arcs(scene, recording.true_edges, times, true_points),
+        true_seconds=np.asarray((exposures - begin_ns) * 1e-9, dtype=np.float64),
+        true_delta_d_m=true_d,
+        true_delta_theta_rad=true_theta,
+        arcs_m=arcs(scene, recording.true_edges, exposures, recording.finger.at(exposures)),
     )
 
 
@@ -407,9 +417,10 @@ def stroke_result(
 
     lag_ms: of the true sheet behind the true finger, by cross-correlation of the hand's wander.
     """
-    lag = lag_s(errors.seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
+    lag = lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
     return {
         "seconds": seconds,
+        "valid_ratio": len(errors.seconds) / len(errors.true_seconds),
         "delta_d_mm": summary(errors.delta_d_m, 1e3),
         "delta_theta_deg": summary(errors.delta_theta_rad, np.degrees(1.0)),
         "true_delta_d_mm": summary(errors.true_delta_d_m, 1e3),

@@ -23,6 +23,9 @@ WAIT_FROM_RAD = 0.05
 WAIT_FULL_RAD = 0.12
 """How far apart they may get before it stands still; the limiter stops both at 0.2."""
 
+FURTHEST_FUTURE_S = 0.15
+"""No sheet is planned further ahead than fingertips say where they will be, and a little."""
+
 SKEW_LENGTH_M = 0.25
 """An edge that far out of line with the other counts as one radian apart."""
 
@@ -39,10 +42,12 @@ def goal_ahead(motion: SheetMotion, ahead_s: float, overdue_s: float, *, furthes
     """The target carried on by `ahead_s` (of either sign), but no further than `furthest_s`.
 
     overdue_s: since its arrival, beyond when the next was due.  A target that would have to be
-    carried on further is overdue by that much, however lately it has arrived.
+    carried on further is overdue by that much, however lately it has arrived; so is one for a
+    moment too far ahead, whose clock cannot be right.
     """
     carried_s = min(max(ahead_s, -furthest_s), furthest_s)
-    return Goal(extrapolated(motion, carried_s), max(overdue_s, ahead_s - furthest_s))
+    late_s = max(overdue_s, ahead_s - furthest_s, -ahead_s - FURTHEST_FUTURE_S)
+    return Goal(extrapolated(motion, carried_s), late_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,8 +6,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-import cv2
-
 from messages.scene import StereoCamera
 from nodes.camera.files import ImagesReader, VideoReader
 from nodes.camera.live import CameraReader
@@ -87,11 +85,11 @@ class ReaderThread(threading.Thread):
                 finally:
                     self._reader = None
                     reader.close()
-            except (DeviceError, cv2.error) as error:
+            except Exception as error:  # whatever a driver or a file does: it is told, tried again
                 if self._stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):
-                    error = DeviceError(f"{self.name}: OpenCV: {error}")
+                    error = DeviceError(f"{self.name}: {type(error).__name__}: {error}")
                 self._fail(error)
                 self._stopping.wait(self._wait_s)
                 self._wait_s = min(2.0 * self._wait_s, MAX_RETRY_S)

@@ -173,11 +173,15 @@ def read_times(path: Path, pairs: int) -> list[int]:
     """
     if not path.is_file():
         raise DeviceError(f"{path}: no such file")
-    with path.open(newline="") as file:
-        rows = csv.DictReader(file, skipinitialspace=True)
-        if "t_s" not in (rows.fieldnames or ()):
-            raise DeviceError(f"{path}: has no column t_s; its first line must name the columns")
-        texts = [(rows.line_num, row["t_s"]) for row in rows]
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = csv.DictReader(file, skipinitialspace=True)
+            columns = rows.fieldnames or ()
+            texts = [(rows.line_num, row.get("t_s")) for row in rows]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DeviceError(f"{path}: cannot be read as UTF-8 CSV: {error}") from error
+    if "t_s" not in columns:
+        raise DeviceError(f"{path}: has no column t_s; its first line must name the columns")
     if len(texts) != pairs:
         raise DeviceError(f"{path}: {len(texts)} times for {pairs} pairs; one row a pair is needed")
     times_s: list[float] = []

@@ -14,8 +14,11 @@ from nodes.planner.compliance import compliance_for
 from nodes.planner.easing import JerkBounds
 from nodes.planner.lead import next_lead_s
 from nodes.planner.motion import Plan, Planned, PlanSettings
+from nodes.planner.order import Order
 
 FIRST_LEAD_S = 0.05
+CLOCK_SLACK_S = 0.005
+"""A fingertip from further in the future than this is no measurement."""
 
 
 class PlannerParameters(NodeParameters):
@@ -59,7 +62,7 @@ class Planner(Node):
     async def setup(self) -> None:
         self._plan: Plan | None = None
         self._stretch_ratio = 1.0
-        self._last_source_ns: int | None = None
+        self._order = Order()
         self._writer = ("", 0)
         self._first_step_s = 0.0
         given = self.parameters
@@ -86,7 +89,7 @@ class Planner(Node):
         self._plan = Plan(scene, settings)
         self._stretch_ratio = scene.sheet.min_stretch_ratio
         self._first_step_s = 1.0 / scene.camera.rate_hz
-        self._last_source_ns = None
+        self._order = Order()
 
     def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
         scene = self.scene.message
@@ -101,23 +104,23 @@ class Planner(Node):
         writer = (header.clock_id, header.epoch)
         if writer != self._writer:
             # The triangulator was started anew, and its times with it.
-            self._writer, self._last_source_ns = writer, None
-        last_ns, source_ns = self._last_source_ns, header.source_ns
-        if last_ns is not None and source_ns <= last_ns:
+            self._writer, self._order = writer, Order()
+        source_ns = header.source_ns
+        step_s = self._order.step_s(source_ns, self._first_step_s)
+        if step_s is None:
             self._late += 1
             self.note = f"{self._late} fingertips came out of order and were left out"
             return
-        self._last_source_ns = source_ns
-        step_s = self._first_step_s if last_ns is None else (source_ns - last_ns) * 1e-9
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:
             planned = plan.hold(f"fingertip: {fingertip.reason}", step_s)
-        elif age_s > self.parameters.oldest_s:
+        elif not -CLOCK_SLACK_S <= age_s <= self.parameters.oldest_s:
             planned = plan.hold(f"fingertip is {age_s * 1e3:.0f} ms old", step_s)
         else:
             if self.parameters.lead_s is None:
                 before_s = self._lead_s
-                self._lead_s = next_lead_s(before_s, age_s, self.parameters.arrival_s)
+                furthest_s = (len(fingertip.ahead_world_m) - 1) * fingertip.ahead_step_s
+                self._lead_s = next_lead_s(before_s, age_s + self.parameters.arrival_s, furthest_s)
                 step_s += self._lead_s - before_s
             point, velocity = path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, self._lead_s)
             planned = plan.follow_finger(point, velocity, self._stretch_ratio, step_s)

@@ -63,6 +63,11 @@ class Expected:
     point: Floats
     reach_m: float
 
+    def holds(self, fix: Fix) -> bool:
+        """Whether a measured point can be the finger's, but for its noise."""
+        noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(fix.covariance)))
+        return float(np.linalg.norm(fix.measured - self.point)) <= self.reach_m + noise_m
+
 
 @dataclass(frozen=True, slots=True)
 class Track:
@@ -113,7 +118,10 @@ class Tracker:
         """
         if not self._alive(at_ns) or self.is_late(at_ns):
             return None
-        fix, estimate = self._history[-1]
+        return self._expected_after(*self._history[-1], at_ns)
+
+    def _expected_after(self, fix: Fix, estimate: Estimate, at_ns: int) -> Expected:
+        """Where the finger can be at a time after one of the track's points."""
         dt = (at_ns - estimate.at_ns) * 1e-9
         point = self.filter.ahead(estimate, np.array([dt]))[0]
         spread = self.filter.moments(estimate)[2]
@@ -146,8 +154,7 @@ class Tracker:
         expected = self.expected(at_ns)
         if expected is None:
             return self._challenge(fix, "unconfirmed")
-        noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(covariance)))
-        if float(np.linalg.norm(measured - expected.point)) > expected.reach_m + noise_m:
+        if not expected.holds(fix):
             return self._challenge(fix, "too_fast")
         self._challengers = []
         self._append(fix)
@@ -203,9 +210,13 @@ class Tracker:
             return self._begin(self._late)
         place = sum(entry[0].at_ns < fix.at_ns for entry in self._history)
         again = [entry[0] for entry in self._history[place:]]
-        before = self._history[place - 1][0] if place else None
-        fits = before is not None and before.reaches(fix, self.settings.max_speed_m_per_s)
-        if fits and again[0].at_ns != fix.at_ns:
+        fits = (
+            place > 0
+            and again[0].at_ns != fix.at_ns
+            and self._expected_after(*self._history[place - 1], fix.at_ns).holds(fix)
+            and fix.reaches(again[0], self.settings.max_speed_m_per_s)
+        )
+        if fits:
             self._history = self._history[:place]
             for entry in (fix, *again):
                 self._append(entry)

@@ -176,9 +176,9 @@ def _read_recording(csv_path: Path) -> Floats:
     """The columns t_s, x_mm, y_mm, z_mm (n, 4); raises FingerPathError naming line and remedy."""
     wanted = ["t_s", "x_mm", "y_mm", "z_mm"]
     try:
-        lines: Sequence[str] = csv_path.read_text().splitlines()
-    except OSError as error:
-        raise FingerPathError(f"{csv_path}: cannot be read: {error.strerror}") from error
+        lines: Sequence[str] = csv_path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise FingerPathError(f"{csv_path}: cannot be read: {error}") from error
     columns = [name.strip() for name in lines[0].split(",")] if lines else []
     if missing := [name for name in wanted if name not in columns]:
         raise FingerPathError(f"{csv_path}: no column {missing[0]}; needed are {', '.join(wanted)}")
