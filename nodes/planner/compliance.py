@@ -301,7 +301,7 @@ class Compliance:
     def retreat_m(self, depths_m: Floats | float, place_m: Place = CENTRE) -> Floats:
         """How far behind the object's tangent plane the sheet shall be, (n,); below 0: before it.
 
-        Smooth (C1) in the depth and in the place; 0 while the finger does not touch.
+        Smooth (C1) in the depth, continuous in the place; 0 while the finger does not touch.
         """
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
         result: Floats = depths - self.indentation_m(depths, place_m)
@@ -317,22 +317,22 @@ class Compliance:
         ).force_n
 
     def _weights(self, place_m: Place) -> Floats:
-        """Of the nodes (9,): the polynomial in x^2 and y^2 through them, as the sheet is even."""
-        along = [
-            _lagrange(nodes, min(abs(at), nodes[-1]))
-            for nodes, at in zip(self._nodes, place_m, strict=True)
-        ]
+        """Of the nodes (9,): linear in x^2 and y^2 between them, as the sheet is even.
+
+        None is negative, so that what holds at the nodes (pull, advance, no step back) holds
+        between them.
+        """
+        along = [_shares(nodes, abs(at)) for nodes, at in zip(self._nodes, place_m, strict=True)]
         return np.outer(*along).ravel()
 
 
-def _lagrange(nodes: Floats, at: float) -> Floats:
-    """Weights (n,) of the polynomial in the square through the nodes (n,)."""
-    squares, square = nodes**2, at * at
-    weights = np.ones(len(nodes))
-    for i, mine in enumerate(squares):
-        for j, other in enumerate(squares):
-            if i != j:
-                weights[i] *= (square - other) / (mine - other)
+def _shares(nodes: Floats, at: float) -> Floats:
+    """Weights (n,) of the nodes (n,) at a place: linear in the square, constant beyond the last."""
+    squares, square = nodes**2, min(at, float(nodes[-1])) ** 2
+    upper = int(np.clip(np.searchsorted(squares, square), 1, len(nodes) - 1))
+    share = (square - squares[upper - 1]) / (squares[upper] - squares[upper - 1])
+    weights = np.zeros(len(nodes))
+    weights[upper - 1], weights[upper] = 1.0 - share, share
     return weights
 
 

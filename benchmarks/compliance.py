@@ -1,0 +1,195 @@
+"""What the sheet presents of objects from soft to stiff, judged by the twin's membrane.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.compliance [--table] [--depth-mm 50]
+
+The object is the scene's, of several Young's moduli; its force over depth comes from the soft body.
+For each the planner's compliance chooses stretch and retreat; then the twin's sheet, stretched so
+and pushed in by what the finger is deeper than the sheet has retreated, says which force a finger
+meets.  Beside it the old way: a stretch for the object's stiffness, and no retreat.
+
+Then the same pushes at other places of the sheet, and the range of moduli that the sheet can
+present at all.  Two minutes; --table works with a table of the membrane's finite elements (half a
+minute more) where the closed form is used without it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from launch.twin_sheet import twin_force
+from messages.scene import Scene
+from nodes.fem_solver import body, precompute
+from nodes.models.sheet.laws import CENTRE, Place, SheetLaw
+from nodes.planner.compliance import (
+    FELT_N,
+    GOOD_RATIO,
+    WEBER_RATIO,
+    WEBER_RATIO_BARE,
+    Compliance,
+    ObjectCurve,
+    compliance_for,
+    fit_compliance,
+    pull_of,
+    unsureness,
+)
+from nodes.planner.sheet_force import law_for, membrane_table, rubber_of
+
+Floats = NDArray[np.float64]
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SKIN_SPACING_M = 0.0045
+LINEAR_DEPTH_M, LARGEST_DEPTH_M = 0.006, 0.010
+MODULI_PA = (500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0, 16000.0)
+DEPTHS_M = np.array([0.002, 0.005, 0.010, 0.020, 0.035, 0.050])
+PLACES: tuple[Place, ...] = (CENTRE, (0.03, 0.02), (0.055, 0.0), (0.0, 0.085), (0.045, 0.06))
+PLACES_MODULUS_PA = 3000.0
+
+
+def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
+    """The scene's object's force over depth, in front of the user, by its Young's modulus."""
+    spec = body.spec_of(scene, SKIN_SPACING_M)
+    model = precompute.load_or_compute(
+        spec, precompute.default_cache_dir(), lambda done, total, need: None
+    )
+    built = body.scene_body(
+        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, largest_depth_m=LARGEST_DEPTH_M
+    )
+    rows = built.method.force_curve(np.array([0.0, 0.0, spec.radius_m]))
+    modulus = scene.object.material.young_modulus_pa
+    return lambda wanted: ObjectCurve.from_rows(rows * [1.0, wanted / modulus])
+
+
+def presented(scene: Scene, law: SheetLaw, curve: ObjectCurve, deepest_m: float) -> Compliance:
+    """What the planner does for this curve."""
+    return fit_compliance(
+        curve,
+        law,
+        pull_of(scene.sheet, law),
+        deepest_m=deepest_m,
+        finger_radius_m=scene.finger.radius_m,
+        usable_half_height_m=scene.sheet.usable_half_height_m,
+        position_error_m=scene.tolerances.sheet_position_m,
+    )
+
+
+def errors(
+    scene: Scene, stretch: float, pushed_m: Floats, wanted_n: Floats, place: Place = CENTRE
+) -> Floats:
+    """The twin's force over the wanted, less one, with the sheet pushed in by `pushed_m` (n,)."""
+    radius = scene.finger.radius_m
+    true = [twin_force(scene.sheet, stretch, float(depth), place, radius) for depth in pushed_m]
+    error: Floats = (np.array(true) - wanted_n) / np.maximum(wanted_n, FELT_N)
+    return error
+
+
+def row(name: str, values: Floats) -> str:
+    return f"{name:<28}" + "".join(f"{100 * value:>8.1f}" for value in values)
+
+
+def verdict(error: Floats) -> str:
+    worst = float(np.abs(error).max())
+    if worst <= GOOD_RATIO:
+        return f"within {100 * GOOD_RATIO:.0f} %"
+    if worst <= WEBER_RATIO:
+        return f"within what people notice ({100 * WEBER_RATIO:.0f} %)"
+    return f"noticeable ({100 * worst:.0f} %; {100 * WEBER_RATIO:.0f}-{100 * WEBER_RATIO_BARE:.0f})"
+
+
+def materials(scene: Scene, law: SheetLaw, depths: Floats) -> None:
+    curve_of = object_curve(scene)
+    print(f"{'error, % of wanted, at':<28}" + "".join(f"{1e3 * d:>5.0f} mm" for d in depths))
+    for modulus in MODULI_PA:
+        curve = curve_of(modulus)
+        wanted = curve.force_n(depths)
+        shown = presented(scene, law, curve, float(depths[-1]))
+        error = errors(scene, shown.stretch_ratio, shown.indentation_m(depths), wanted)
+        stiffness = float(curve.force_n(np.array([LINEAR_DEPTH_M]))[0]) / LINEAR_DEPTH_M
+        old = compliance_for(stiffness, scene.sheet).stretch_ratio
+        before = errors(scene, old, depths, wanted)
+        print(
+            f"{1e-3 * modulus:g} kPa, {stiffness:.0f} N/m: stretch {shown.stretch_ratio:.3f}, "
+            f"advance {shown.centre.advance_per_depth:.2f}, clamps "
+            f"{shown.centre.edge_force_n.max():.1f} N: {verdict(error)}"
+        )
+        print("  wanted, N" + " " * 17 + "".join(f"{force:>8.3f}" for force in wanted))
+        retreat = 1e3 * shown.retreat_m(depths)
+        print("  retreat, mm" + " " * 15 + "".join(f"{one:>8.2f}" for one in retreat))
+        print(row("  stretch and retreat", error))
+        print(row(f"  stretch {old:.3f} alone", before))
+        if shown.note:
+            print(f"  {shown.note}")
+
+
+def places(scene: Scene, law: SheetLaw, depths: Floats) -> None:
+    curve = object_curve(scene)(PLACES_MODULUS_PA)
+    shown = presented(scene, law, curve, float(depths[-1]))
+    print(f"\n{1e-3 * PLACES_MODULUS_PA:g} kPa at places of the sheet, error %")
+    for place in PLACES:
+        pushed = shown.indentation_m(depths, place)
+        error = errors(scene, shown.stretch_ratio, pushed, curve.force_n(depths), place)
+        where = f"  x {1e3 * place[0]:.0f}, y {1e3 * place[1]:.0f} mm"
+        print(row(where, error) + f"   {verdict(error)}")
+
+
+def limits(scene: Scene, law: SheetLaw, deepest_m: float) -> None:
+    """The softest and the stiffest modulus, by the law itself."""
+    curve_of = object_curve(scene)
+
+    def fits(modulus: float) -> bool:
+        shown = presented(scene, law, curve_of(modulus), deepest_m)
+        return float(np.abs(shown.centre.error_ratio).max()) <= GOOD_RATIO
+
+    def sure(modulus: float) -> bool:
+        shown = presented(scene, law, curve_of(modulus), deepest_m)
+        return unsureness(shown.centre, scene.tolerances.sheet_position_m) <= WEBER_RATIO
+
+    def border(holds: Callable[[float], bool], inside: float, outside: float) -> float:
+        for _ in range(12):
+            middle = float(np.sqrt(inside * outside))
+            inside, outside = (middle, outside) if holds(middle) else (inside, middle)
+        return inside
+
+    stiffest = border(fits, 1000.0, 1e6)
+    softest = border(sure, 4000.0, 10.0)
+    for name, modulus in (("softest", softest), ("stiffest", stiffest)):
+        stiffness = curve_of(modulus).force_n(np.array([LINEAR_DEPTH_M]))[0] / LINEAR_DEPTH_M
+        print(
+            f"{name} to {1e3 * deepest_m:.0f} mm: {modulus:.0f} Pa, {stiffness:.0f} N/m at "
+            f"{1e3 * LINEAR_DEPTH_M:.0f} mm"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Presented against wanted force.")
+    parser.add_argument("--table", action="store_true", help="plan with a table of the membrane")
+    parser.add_argument("--depth-mm", type=float, default=50.0, help="deepest push")
+    asked = parser.parse_args()
+    scene = load_scene(SCENE_FILE)
+    law = law_for(scene.sheet)
+    if asked.table:
+        sheet = scene.sheet
+        law = membrane_table(
+            rubber_of(sheet),
+            stretches=np.linspace(sheet.min_stretch_ratio, sheet.max_stretch_ratio, 3),
+            xs_m=sheet.width_m * np.array([0.0, 0.13, 0.25]),
+            ys_m=sheet.height_m * np.array([0.0, 0.19, 0.36]),
+            finger_radius_m=scene.finger.radius_m,
+        )
+    depths = DEPTHS_M[1e-3 * asked.depth_mm + 1e-9 >= DEPTHS_M]
+    print(f"scene {scene.name}, law {law.name}; 0.05 N and more are compared")
+    materials(scene, law, depths)
+    places(scene, law, depths)
+    print()
+    for deepest in (0.010, 0.020, 0.050):
+        if deepest <= float(depths[-1]) + 1e-9:
+            limits(scene, law, deepest)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,258 @@
+"""What the sheet presents of an object: the whole curve, within the arms' pull, and what it says
+where it cannot; judged by the twin's membrane."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from launch.twin_sheet import twin_push
+from messages.types import SoftBody
+from nodes.models.sheet.laws import CENTRE, ScaledLaw
+from nodes.planner.compliance import (
+    ADVANCE_PER_DEPTH,
+    GOOD_RATIO,
+    RESERVE,
+    Compliance,
+    ObjectCurve,
+    Pull,
+    UnfitCurveError,
+    compliance_at,
+    fit_compliance,
+    present,
+    pull_of,
+    unsureness,
+)
+from nodes.planner.sheet_force import law_for
+
+Floats = NDArray[np.float64]
+
+SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+SHEET = SCENE.sheet
+LAW = law_for(SHEET)
+PULL = pull_of(SHEET, LAW)
+RADIUS = SCENE.finger.radius_m
+
+
+def soft_curve(scale: float, deepest: float = 0.05) -> ObjectCurve:
+    """Like the soft cylinder's: Hertz's power at first, then a straight line; 47 N/m at 1."""
+    depths = deepest * np.linspace(0.0, 1.0, 40) ** 1.5
+    forces = scale * 58.0 * (depths - 0.002 * -np.expm1(-depths / 0.002))
+    return ObjectCurve(depths, forces)
+
+
+def compliance(curve: ObjectCurve, deepest: float = 0.05, pull: Pull = PULL) -> Compliance:
+    return fit_compliance(
+        curve,
+        LAW,
+        pull,
+        deepest_m=deepest,
+        finger_radius_m=RADIUS,
+        usable_half_height_m=SHEET.usable_half_height_m,
+        position_error_m=SCENE.tolerances.sheet_position_m,
+    )
+
+
+@pytest.mark.parametrize("scale", [0.25, 0.6, 1.0])
+@pytest.mark.parametrize("place", [CENTRE, (0.02, 0.05)])
+def test_the_twins_sheet_answers_as_the_object(scale: float, place: tuple[float, float]) -> None:
+    curve = soft_curve(scale)
+    shown = compliance(curve)
+    assert shown.note == ""
+    depths = np.array([0.005, 0.015, 0.04])
+    true = [
+        twin_push(SHEET, shown.stretch_ratio, float(pushed), place, RADIUS, cells=24)
+        for pushed in shown.indentation_m(depths, place)
+    ]
+    assert [one[0] for one in true] == pytest.approx(curve.force_n(depths), rel=GOOD_RATIO)
+    assert max(one[1] for one in true) < SHEET.max_edge_force_n
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    st.floats(0.02, 20.0),
+    st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
+    st.sampled_from([0.01, 0.05]),
+)
+def test_the_retreat_is_smooth_and_bounded_whatever_the_object(
+    scale: float, place: tuple[float, float], deepest: float
+) -> None:
+    shown = compliance(soft_curve(scale), deepest)
+    depths = np.linspace(-0.005, 1.2 * deepest, 800)
+    retreat = shown.retreat_m(depths, place)
+    slopes = np.diff(retreat) / np.diff(depths)
+    assert np.isfinite(retreat).all()
+    assert (retreat[depths <= 0.0] == 0.0).all()
+    assert slopes.max() < 1.0 + 1e-6
+    # Where the cubic between two depths turns off the bound it may pass it for a moment.
+    assert slopes.min() > -1.76 * ADVANCE_PER_DEPTH
+    pushed = shown.indentation_m(depths, place)
+    assert (np.diff(pushed) >= -1e-9).all()
+    inner = slopes[(depths[1:] > 0.02 * deepest) & (depths[1:] < 0.99 * deepest)]
+    assert np.abs(np.diff(inner)).max() < 0.25
+    held = (min(abs(place[0]), 0.06), min(abs(place[1]), 0.09))
+    pressed = LAW.press(shown.stretch_ratio, pushed, place_m=held, finger_radius_m=RADIUS)
+    assert pressed.edge_force_n.max() < SHEET.max_edge_force_n
+    assert PULL.least_stretch <= shown.stretch_ratio <= PULL.largest_stretch
+
+
+@given(st.floats(0.05, 1.0))
+def test_what_fits_is_presented_exactly_by_the_law(scale: float) -> None:
+    curve = soft_curve(scale)
+    shown = compliance(curve)
+    depths = np.linspace(0.004, 0.05, 30)
+    assert shown.presented(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
+
+
+def test_between_the_nodes_of_the_places_the_law_still_holds() -> None:
+    curve = soft_curve(0.6)
+    shown = compliance(curve)
+    depths = np.array([0.006, 0.012, 0.03])
+    for place in ((0.01, 0.02), (0.045, 0.03), (-0.025, -0.075), (0.055, 0.08)):
+        assert shown.presented(depths, place) == pytest.approx(curve.force_n(depths), rel=0.02)
+
+
+def test_a_soft_object_lets_the_sheet_follow_the_finger_and_a_stiff_one_brings_it() -> None:
+    soft, stiff = compliance(soft_curve(0.1)), compliance(soft_curve(1.3))
+    assert soft.stretch_ratio < stiff.stretch_ratio
+    assert soft.retreat_m(0.04) > 0.02
+    assert soft.centre.advance_per_depth < 0.05
+    assert stiff.retreat_m(0.006) < 0.0
+    assert 0.0 < stiff.centre.advance_per_depth <= ADVANCE_PER_DEPTH + 1e-9
+
+
+def test_a_stiffer_object_is_said_to_be_and_by_how_much() -> None:
+    shown = compliance(soft_curve(4.0))
+    assert "stiffer than the sheet can present" in shown.note
+    assert "15 to 22 %" in shown.note
+    at = int(np.argmin(shown.centre.force_n - shown.centre.wanted_n))
+    error = -100 * shown.centre.error_ratio[at]
+    assert f"{error:.0f} % too soft at {1e3 * shown.centre.depths_m[at]:.0f} mm" in shown.note
+
+
+def test_what_keeps_it_from_a_stiffer_object_is_named() -> None:
+    pulled = compliance(soft_curve(1.0), pull=Pull(1.02, 1.02, 5.3))
+    assert pulled.centre.pull_bound
+    assert "may not pull harder" in pulled.note
+    strong = Pull(1.02, 1.06, 1e3)
+    eager = compliance(soft_curve(3.0), 0.01, strong)
+    assert not eager.centre.pull_bound
+    assert "towards the finger" in eager.note
+
+
+def test_a_softer_object_than_the_sheet_is_sure_of_is_said_to_be() -> None:
+    shown = compliance(soft_curve(0.02), 0.01)
+    assert "softer than the sheet presents surely" in shown.note
+    assert unsureness(shown.centre, 0.0005) > 0.15
+    assert unsureness(shown.centre, 0.0) == 0.0
+
+
+def test_the_arms_never_pull_harder_than_the_reserve_however_deep_the_push() -> None:
+    weak = SHEET.model_copy(update={"max_edge_force_n": 9.0})
+    pull = pull_of(weak, LAW)
+    assert pull.edge_force_n == pytest.approx(RESERVE * 9.0)
+    flat = LAW.press(pull.largest_stretch, np.zeros(1), place_m=CENTRE, finger_radius_m=RADIUS)
+    assert flat.edge_force_n[0] == pytest.approx(RESERVE * 9.0, rel=1e-6)
+    for scale in (0.2, 1.0, 10.0):
+        shown = compliance(soft_curve(scale), pull=pull)
+        assert shown.centre.edge_force_n.max() <= RESERVE * 9.0 * (1.0 + 1e-6)
+
+
+def test_a_sheet_that_pulls_too_hard_already_gives_way_at_once() -> None:
+    shown = present(
+        soft_curve(1.0),
+        LAW,
+        Pull(1.08, 1.08, 2.0),
+        stretch_ratio=1.08,
+        deepest_m=0.05,
+        finger_radius_m=RADIUS,
+    )
+    assert not shown.indentation_m.any()
+    assert shown.pull_bound
+    assert shown.retreat_m == pytest.approx(shown.depths_m)
+
+
+def test_the_slack_sheet_presents_what_it_can() -> None:
+    slack = compliance(soft_curve(0.5), pull=Pull(1.0, 1.0, 17.0))
+    assert slack.stretch_ratio == 1.0
+    assert np.isfinite(slack.retreat_m(np.linspace(0.0, 0.05, 50))).all()
+    assert slack.note
+
+
+def test_an_object_that_is_not_there_is_not_felt() -> None:
+    shown = compliance(ObjectCurve.linear(0.0, 0.05))
+    depths = np.linspace(0.0, 0.05, 20)
+    assert shown.presented(depths) == pytest.approx(0.0, abs=1e-12)
+    assert shown.retreat_m(depths) == pytest.approx(depths)
+
+
+def test_a_curve_elsewhere_keeps_the_stretch() -> None:
+    here = compliance(soft_curve(1.0))
+    there = compliance_at(
+        soft_curve(0.8),
+        LAW,
+        PULL,
+        stretch_ratio=here.stretch_ratio,
+        deepest_m=0.05,
+        finger_radius_m=RADIUS,
+        usable_half_height_m=SHEET.usable_half_height_m,
+        position_error_m=0.0005,
+    )
+    assert there.stretch_ratio == here.stretch_ratio
+    depths = np.array([0.005, 0.02])
+    assert there.presented(depths) == pytest.approx(soft_curve(0.8).force_n(depths), rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("depths", "forces", "words"),
+    [
+        ([0.0], [0.0], "two or more"),
+        ([0.0, 0.01], [0.0], "as many"),
+        ([0.0, np.nan], [0.0, 1.0], "finite"),
+        ([0.001, 0.01], [0.0, 1.0], "begin at 0"),
+        ([0.0, 0.01], [0.1, 1.0], "begin at 0"),
+        ([0.0, 0.01, 0.01], [0.0, 1.0, 2.0], "ascend"),
+        ([0.0, 0.01, 0.02], [0.0, 1.0, 0.5], "fall"),
+    ],
+)
+def test_curves_that_are_none_are_refused(
+    depths: list[float], forces: list[float], words: str
+) -> None:
+    with pytest.raises(UnfitCurveError, match=words):
+        ObjectCurve(np.array(depths), np.array(forces))
+
+
+def test_a_curve_comes_from_the_soft_bodys_message_and_goes_on_straight() -> None:
+    field = SoftBody.model_fields["force_curve"]
+    assert field.default_factory is not None
+    rows = np.array([[0.0, 0.0], [0.01, 0.2], [0.02, 0.5]])
+    curve = ObjectCurve.from_rows(rows)
+    assert curve.force_n(np.array([-1.0, 0.0, 0.01, 0.02])) == pytest.approx([0.0, 0.0, 0.2, 0.5])
+    beyond = curve.force_n(np.array([0.03, 0.04, 0.05]))
+    assert np.diff(beyond, 2) == pytest.approx(0.0, abs=1e-12)
+    assert beyond[0] > 0.5
+    with pytest.raises(UnfitCurveError, match="two or more"):
+        ObjectCurve.from_rows(np.zeros((0, 2)))
+
+
+def test_a_calibrated_law_serves_as_well() -> None:
+    stiffer = ScaledLaw(LAW.rubber, cubic_ratio=1.4, stretch_scale=1.004)
+    curve = soft_curve(0.8)
+    shown = fit_compliance(
+        curve,
+        stiffer,
+        pull_of(SHEET, stiffer),
+        deepest_m=0.05,
+        finger_radius_m=RADIUS,
+        usable_half_height_m=SHEET.usable_half_height_m,
+        position_error_m=0.0005,
+    )
+    depths = np.array([0.005, 0.02, 0.045])
+    assert shown.presented(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
+    assert shown.stretch_ratio < compliance(curve).stretch_ratio
