@@ -41,9 +41,10 @@ class NotDeterminedError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A fitted rig (22,), the poses of the board (pairs, 6: rotation vector, position in the left
+    """A fitted rig and how well it fits.
 
-    camera's frame), each pair's residuals left and right (n, 2) px, seen minus drawn, the standard
+    rig: (22,).  poses: of the board, (pairs, 6), rotation vector and position in the left camera's
+    frame.  Then each pair's residuals left and right (n, 2) px, seen minus drawn, the standard
     deviation of one coordinate px, and the rig's covariance (22, 22).
     """
 
@@ -137,9 +138,10 @@ def linearized(pair: BoardPair, board: Floats, rig: Floats, pose: Floats) -> Lin
 
 @dataclass(frozen=True, slots=True)
 class _Reduced:
-    """The normal equations with the poses eliminated: matrix (22, 22), side (22,), and for each
+    """The normal equations with the poses eliminated.
 
-    pose the inverse of its block (6, 6), its slope (6,) and its coupling (22, 6).
+    matrix (22, 22), side (22,), and for each pose the inverse of its block (6, 6), its slope (6,)
+    and its coupling (22, 6).
     """
 
     matrix: Floats

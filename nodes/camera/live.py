@@ -32,9 +32,10 @@ RELEASE_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One camera's picture and the middle of its exposure, ns, reckoned from the picture's arrival
+    """One camera's picture and the middle of its exposure, ns.
 
-    and, where it is believed, from the driver's stamp.
+    The middle is reckoned from the picture's arrival and, where it is believed, from the driver's
+    stamp.
     """
 
     image: Image
