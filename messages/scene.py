@@ -252,6 +252,12 @@ class StereoCamera(Part):
     gain: Finite | None = Field(
         default=None, description="in the device's own units; null: as the device has it"
     )
+    read_noise_levels: Positive = Field(
+        default=1.5, description="standard deviation of a dark pixel, of 255 levels"
+    )
+    photons_per_level: Positive = Field(
+        default=40.0, description="a level L has the shot noise sqrt(L / photons_per_level)"
+    )
     left: Lens
     right: Lens
     right_from_left: Transform
