@@ -22,6 +22,7 @@ FAMILIES: dict[str, str] = {
     "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
     "soft-body": "nodes.fem_solver.families:SOFT_BODY",
     "correction": "launch.families:CORRECTION",
+    "sheet-force": "launch.families:SHEET_FORCE",
     "mesh-normal": "nodes.planner.families:MESH_NORMAL",
 }
 """Families by their name on the command line; each node's folder describes its own."""
