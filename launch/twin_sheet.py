@@ -6,7 +6,12 @@ import numpy as np
 
 from messages.scene import SheetSpec
 from nodes.models.rigid import transform
-from nodes.twin.membrane import CELLS, Rubber, solve
+from nodes.twin.membrane import CELLS, SLACK_TENSION, Rubber, solve
+
+JUST_TAUT_TENSION = 2e-6
+"""What the twin's rubber keeps of tension where it is slack, in shear moduli.  A hundredth of what
+it keeps in the graph, where the sheet may hang: with that a small push into a sheet that is just
+not taut would meet three times its force."""
 
 
 def twin_push(
@@ -28,6 +33,7 @@ def twin_push(
         finger_tip=np.array([*place_m, -depth_m]),
         finger_radius_m=finger_radius_m,
         cells=cells,
+        slack_tension=JUST_TAUT_TENSION if stretch_ratio >= 1.0 else SLACK_TENSION,
     )
     pull = 0.5 * (pushed.left_force_n[0] - pushed.right_force_n[0])
     return float(pushed.finger_force_n[2]), float(pull)

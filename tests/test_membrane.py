@@ -57,7 +57,7 @@ class Patch:
 )
 def test_push_force_of_a_disc(stretch: float, forces_n: tuple[float, float, float]) -> None:
     axis = graded_axis(0.24, 24, 0.12)
-    mesh = membrane._Mesh(RUBBER, axis, axis)
+    mesh = membrane._Mesh(RUBBER, axis, axis, membrane.SLACK_TENSION)
     flat = np.zeros((axis.size**2, 3))
     flat[:, :2] = (mesh.rest.reshape(-1, 2) - 0.12) * [stretch, 1.0]
     flat, _ = membrane._relax(mesh, flat, None)

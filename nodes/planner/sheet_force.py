@@ -97,8 +97,8 @@ def membrane_table(
 
 
 CHART_DEPTHS_M = (0.002, 0.005, 0.010, 0.020, 0.040)
-MEMBRANE_DEPTHS_M = (0.005, 0.020)
-"""The slow one is charted at these only, at the middle stretch."""
+SLOW_DEPTHS_M = (0.005, 0.020)
+"""The slow one is charted at these only, at the middle of stretch and sheet."""
 CHART_PLACES: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
     ("off-centre", 0.13, 0.19),
@@ -147,7 +147,8 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
         place = (x * rubber.width_m, y * rubber.height_m)
         true_n = judge(sheet, stretch, depth, place, radius)
         for law in laws:
-            if law.name == "membrane" and (stretch != middle or depth not in MEMBRANE_DEPTHS_M):
+            slow = law.name == "membrane"
+            if slow and not (stretch == middle and where == "centre" and depth in SLOW_DEPTHS_M):
                 continue
             yield Trial(
                 method=law.name,

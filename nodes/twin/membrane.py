@@ -105,7 +105,8 @@ def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
 class _Mesh:
     """The assembled form of one rectangular mesh."""
 
-    def __init__(self, rubber: Rubber, x: Floats, y: Floats) -> None:
+    def __init__(self, rubber: Rubber, x: Floats, y: Floats, slack_tension: float) -> None:
+        self.slack_tension = slack_tension
         columns, rows = len(x), len(y)
         self.shape = (rows, columns)
         self.shear_modulus = rubber.young_modulus_pa / 3.0
@@ -156,12 +157,14 @@ class _Mesh:
 
     def energy(self, positions: Floats) -> float:
         _, c = self.deformation(positions)
-        return float(np.sum(self.weight * relaxed_energy(c, self.shear_modulus)))
+        return float(
+            np.sum(self.weight * relaxed_energy(c, self.shear_modulus, self.slack_tension))
+        )
 
     def forces(self, positions: Floats) -> tuple[Floats, Floats]:
         """Gradient of the energy (nodes * 3,), and the element stiffness (elements, 12, 12)."""
         f, c = self.deformation(positions)
-        stress, tangent = relaxed_stress(c, self.shear_modulus)
+        stress, tangent = relaxed_stress(c, self.shear_modulus, self.slack_tension)
         g, weight = self.gradient, self.weight
         b = np.empty((*f.shape[:2], 3, 4, 3))
         b[..., 0, :, :] = g[..., :, 0, None] * f[..., None, :, 0]
@@ -206,7 +209,7 @@ def _eigen(c: Floats) -> tuple[Floats, Floats, Floats]:
     return mean + radius, mean - radius, np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def relaxed_energy(c: Floats, shear_modulus: float) -> Floats:
+def relaxed_energy(c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION) -> Floats:
     """Energy per rest volume (...,) of C (..., 3) = [C11, C22, C12]: taut, wrinkled or slack."""
     large, small, _ = _eigen(c)
     stretched = np.maximum(large, 1.0)
@@ -214,11 +217,13 @@ def relaxed_energy(c: Floats, shear_modulus: float) -> Floats:
     determinant = np.where(taut, large * small, 1.0)
     full = large + small + 1.0 / determinant - 3.0
     uniaxial = stretched + 2.0 * stretched**-0.5 - 3.0
-    slack = SLACK_TENSION * (c[..., 0] + c[..., 1])
+    slack = slack_tension * (c[..., 0] + c[..., 1])
     return 0.5 * shear_modulus * (np.where(taut, full, uniaxial) + slack)
 
 
-def relaxed_stress(c: Floats, shear_modulus: float) -> tuple[Floats, Floats]:
+def relaxed_stress(
+    c: Floats, shear_modulus: float, slack_tension: float = SLACK_TENSION
+) -> tuple[Floats, Floats]:
     """Second Piola-Kirchhoff stress (..., 3) = [S11, S22, S12] and its tangent (..., 3, 3).
 
     The tangent takes the strain [E11, E22, 2 E12].  Derivatives of `relaxed_energy`.
@@ -253,7 +258,7 @@ def relaxed_stress(c: Floats, shear_modulus: float) -> tuple[Floats, Floats]:
     ) + (pull / np.maximum(stretched - across, 1e-9))[:, None, None] * (
         turning[:, :, None] * turning[:, None, :]
     )
-    stress += [SLACK_TENSION, SLACK_TENSION, 0.0]
+    stress += [slack_tension, slack_tension, 0.0]
     return shear_modulus * stress, shear_modulus * tangent
 
 
@@ -303,13 +308,15 @@ def solve(
     finger_tip: Floats | None = None,
     finger_radius_m: float = 0.007,
     cells: int = CELLS,
+    slack_tension: float = SLACK_TENSION,
 ) -> DeformedSheet:
     """Equilibrium of the sheet between its edges, pushed by a fingertip from the user's side.
 
     world_from_..._edge: (4, 4), origin in the clamped edge's middle, y along it.  finger_tip: the
     foremost point (3,) of the sphere, whose centre is `finger_radius_m` towards the user; None, or
-    a tip before the sheet or beside it, pushes nothing.  NotConvergedError if no
-    equilibrium was found.
+    a tip before the sheet or beside it, pushes nothing.  slack_tension: in shear moduli; with less
+    of it a sheet that hangs slack is not found, but one that is just not taut answers to small
+    pushes more truly.  NotConvergedError if no equilibrium was found.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
@@ -338,6 +345,7 @@ def solve(
         rubber,
         graded_axis(rubber.width_m, cells, focus[0]),
         graded_axis(rubber.height_m, cells, focus[1]),
+        slack_tension,
     )
     share = mesh.rest[..., 0, None] / rubber.width_m
     along = mesh.rest[..., 1, None] - 0.5 * rubber.height_m
