@@ -1,14 +1,44 @@
-"""Meshes of the scene's object, see `solid.SolidMesh` for what they hold."""
+"""Meshes of the scene's object, see `solid.SolidMesh` for what they hold.
+
+spec = mesh_spec(scene, skin_spacing_m)     # `spec.key()` names the mesh
+mesh_budget(spec)                           # nodes and memory, before any work
+mesh = build_mesh(spec)                     # in the frame of `world_from_mesh(scene)`
+"""
 
 from __future__ import annotations
 
-from nodes.fem_solver.mesh.cylinder import (
+from nodes.fem_solver.mesh.cylinder import cylinder_mesh
+from nodes.fem_solver.mesh.from_scene import (
+    MeshBudget,
+    MeshSpec,
+    build_mesh,
+    mesh_budget,
+    mesh_of_scene,
+    mesh_spec,
+    world_from_mesh,
+)
+from nodes.fem_solver.mesh.solid import (
     EDGES,
     FACES,
     SUBTRIANGLES,
     SolidMesh,
+    UnfitMeshError,
     boundary_faces,
-    cylinder_mesh,
 )
 
-__all__ = ["EDGES", "FACES", "SUBTRIANGLES", "SolidMesh", "boundary_faces", "cylinder_mesh"]
+__all__ = [
+    "EDGES",
+    "FACES",
+    "SUBTRIANGLES",
+    "MeshBudget",
+    "MeshSpec",
+    "SolidMesh",
+    "UnfitMeshError",
+    "boundary_faces",
+    "build_mesh",
+    "cylinder_mesh",
+    "mesh_budget",
+    "mesh_of_scene",
+    "mesh_spec",
+    "world_from_mesh",
+]

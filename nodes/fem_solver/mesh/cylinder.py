@@ -10,48 +10,18 @@ middle nodes lie on the true cylinder (isoparametric), all other edges are strai
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from nodes.fem_solver.mesh.solid import EDGES, SUBTRIANGLES, SolidMesh, boundary_faces
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-EDGES = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]])
-"""Corners of the edges whose middles are nodes 4..9 of a tetrahedron (VTK's order)."""
-FACES = np.array([[0, 2, 1, 6, 5, 4], [0, 1, 3, 4, 8, 7], [1, 2, 3, 5, 9, 8], [0, 3, 2, 7, 9, 6]])
-"""Nodes of the faces: three corners, counter-clockwise seen from outside, then their middles."""
-SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
-"""A six-node triangle as four linear ones over the same nodes."""
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
 """Elements grow by this much per length of depth below the side."""
 RAMP_RAD = 0.6
-
-
-@dataclass(frozen=True, slots=True)
-class SolidMesh:
-    """A solid of 10-node tetrahedra with the parts of its surface that matter.
-
-    nodes (n, 3) metres, mesh frame.  elements (e, 10).  slab (n,): number of the slice along x that
-    a node belongs to; the nodes of one element lie in at most two successive slabs, and nodes are
-    sorted by slab.  fixed (n,) bool.  skin (s,): nodes on the surface.  skin_triangles (t, 3):
-    indices into `skin`, outward.  touch (m,): nodes that a finger can load, all in `skin`, sorted.
-    touch_normals (m, 3).  touch_faces (f, 6): indices into `touch` of the six-node triangles
-    between them, outward.
-    """
-
-    nodes: Floats
-    elements: Ints
-    slab: Ints
-    fixed: NDArray[np.bool_]
-    skin: Ints
-    skin_triangles: NDArray[np.int32]
-    touch: Ints
-    touch_normals: Floats
-    touch_faces: Ints
 
 
 def cylinder_mesh(
@@ -244,13 +214,3 @@ def _with_midnodes(
         touch_normals=normals,
         touch_faces=np.searchsorted(touch, touch_faces),
     )
-
-
-def boundary_faces(elements: Ints) -> Ints:
-    """The six-node faces (f, 6) that belong to one element only, outward."""
-    faces = elements[:, FACES].reshape(-1, 6)
-    _, first, counts = np.unique(
-        np.sort(faces[:, :3], axis=1), axis=0, return_index=True, return_counts=True
-    )
-    outer: Ints = faces[np.sort(first[counts == 1])]
-    return outer

@@ -1,0 +1,218 @@
+"""Any smooth closed surface, filled from a lattice: a core of tetrahedra, drawn to the surface.
+
+After Molino, Bridson, Teran, Fedkiw ("A crystalline, red green strategy for meshing highly
+deformable objects with tetrahedra", 2003), on a bisected lattice:
+
+1. The lattice is bisected to the sizes wanted, and finer where the surface is sharply curved.
+2. Vertices that lie deep enough inside are the core, and all tetrahedra about them are taken.  So
+   every tetrahedron has a corner inside and at most one face on the hull.  Where the hull touches
+   itself in an edge or a vertex, the core is thinned out.
+3. The hull is drawn to the surface while the elements are kept in shape (`smoothing`).
+
+The same surface gives the same mesh.  Parts thinner than the finest elements are left out.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.fem_solver.mesh.bisection import CELL, bisected, lattice
+from nodes.fem_solver.mesh.curving import curved
+from nodes.fem_solver.mesh.grading import LONGEST_EDGE, Grading, longest_edges
+from nodes.fem_solver.mesh.quality import radius_ratios
+from nodes.fem_solver.mesh.smoothing import FROM_AFAR, settled
+from nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError, oriented, with_middles
+from nodes.models.shapes import Shape
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+COARSEST = 2
+"""Cells before bisection are this many of the smallest wanted elements wide."""
+FINEST = 0.5
+"""Where the surface is sharply curved, elements may be this much smaller than in front."""
+BEND = 0.8
+"""There, they are this many radii of curvature wide."""
+NEAR = 0.5
+"""A tetrahedron is at the surface if a corner is nearer to it than this share of an edge."""
+DEEP = 0.4
+"""The core's vertices lie this share of their shortest edge below the surface, or more."""
+MOST_THINNED = 0.05
+"""A core that loses more than this share of its vertices was too thin for these elements."""
+GOOD_RATIO = 0.1
+ATTEMPTS = 6
+
+
+class _Field:
+    """Depth, facing and curvature at lattice vertices; the surface is asked once for each."""
+
+    def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
+        self.shape, self.origin, self.cell_m = shape, origin, cell_m
+        self._known: dict[bytes, int] = {}
+        self._rows = np.empty((0, 5))
+
+    def place(self, vertices: Ints) -> Floats:
+        return self.origin + vertices * (self.cell_m / CELL)
+
+    def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
+        """Signed distance (n,), normal of the nearest surface (n, 3), its curvature (n,)."""
+        keys = [vertex.tobytes() for vertex in vertices]
+        new = [i for i, key in enumerate(keys) if key not in self._known]
+        if new:
+            found = self.shape.closest(self.place(vertices[new]))
+            bend = np.sqrt(np.square(found.shape_operator).sum(axis=(1, 2)))
+            rows = np.column_stack([found.height_m, found.normal, bend])
+            for number, i in enumerate(new, len(self._rows)):
+                self._known[keys[i]] = number
+            self._rows = np.concatenate([self._rows, rows])
+        rows = self._rows[[self._known[key] for key in keys]]
+        return rows[:, 0], rows[:, 1:4], rows[:, 4]
+
+
+def fitted_solid(
+    shape: Shape, low_m: Floats, high_m: Floats, grading: Grading
+) -> tuple[Floats, Ints]:
+    """Nodes (n, 3) and elements (e, 10) of the solid within the shape's surface.
+
+    low_m, high_m (3,): corners of a box that holds it.  UnfitMeshError where the shape is too thin
+    for elements of that size.
+    """
+    cell = COARSEST * grading.element_m
+    field = _Field(shape, 0.5 * (low_m + high_m), cell)
+    vertices, tetrahedra = _lattice_about(field, 0.5 * (high_m - low_m), grading)
+    distance, _, _ = field.at(vertices)
+    points = field.place(vertices)
+    core = distance < -DEEP * _shortest_edges(points, tetrahedra)
+
+    def nearest(points: Floats) -> tuple[Floats, Floats]:
+        found = shape.closest(points)
+        return found.point, found.normal
+
+    for _ in range(ATTEMPTS):
+        chosen = _without_pinches(tetrahedra, core, distance)
+        used, index = np.unique(chosen, return_inverse=True)
+        corners = points[used]
+        cells = oriented(corners, index.reshape(-1, 4))
+        hull = np.unique(hull_faces(cells))
+        corners = settled(corners, cells, hull, nearest, springs=FROM_AFAR, anchor=0.0)
+        bad = radius_ratios(corners, cells) < GOOD_RATIO
+        if not bad.any():
+            nodes, elements = with_middles(corners, cells)
+            return curved(nodes, elements, lambda points: nearest(points)[0]), elements
+        # the highest core vertex of each bad element gives way
+        ends = used[cells[bad]]
+        height = np.where(core[ends], distance[ends], -np.inf)
+        core[ends[np.arange(len(ends)), height.argmax(axis=1)]] = False
+    raise UnfitMeshError(
+        f"skin_spacing_m: no well shaped elements of {grading.element_m:.3g} m fill the object; "
+        "take a smaller spacing, or smooth the mesh over a longer object.geometry.smoothing_m"
+    )
+
+
+def bent_sizes(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
+    """Sizes (n,) of elements, m, at skin of those curvatures (n,), 1/m: not over `BEND` radii."""
+    finest = np.maximum(BEND / np.maximum(bend, 1e-9), FINEST * grading.element_m)
+    return np.asarray(np.minimum(sizes, finest))
+
+
+def hull_faces(tetrahedra: Ints) -> Ints:
+    """Corners (f, 3), sorted, of the faces that belong to one tetrahedron only."""
+    faces = np.sort(
+        tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1
+    )
+    unique, counts = np.unique(faces, axis=0, return_counts=True)
+    return np.asarray(unique[counts == 1])
+
+
+def _lattice_about(field: _Field, half_m: Floats, grading: Grading) -> tuple[Ints, Ints]:
+    """Lattice vertices (n, 3) and tetrahedra (e, 4), bisected, that cover the solid."""
+
+    def too_large(vertices: Ints, tetrahedra: Ints) -> Bools:
+        distance, normals, bend = field.at(vertices)
+        length = longest_edges(field.place(vertices), tetrahedra)
+        sizes = grading.sizes(normals, -distance)[tetrahedra].min(axis=1)
+        corners = distance[tetrahedra]
+        at_surface = np.abs(corners).min(axis=1) < NEAR * length
+        bent = bent_sizes(sizes, bend[tetrahedra].max(axis=1), grading)
+        sizes = np.where(at_surface, bent, sizes)
+        matters = at_surface | (corners.min(axis=1) < 0.0)
+        return np.asarray(matters & (length > LONGEST_EDGE * sizes))
+
+    # one more cell about the solid: no core vertex may be at the lattice's end
+    counts = np.ceil(half_m / field.cell_m).astype(np.int64) + 1
+    return bisected(*lattice((int(counts[0]), int(counts[1]), int(counts[2]))), too_large)
+
+
+def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
+    """Length (n,) of the shortest edge at each vertex."""
+    ends = tetrahedra[:, EDGES].reshape(-1, 2)
+    length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
+    shortest = np.full(len(points), np.inf)
+    np.minimum.at(shortest, ends.ravel(), np.repeat(length, 2))
+    return shortest
+
+
+def _without_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
+    """The tetrahedra (k, 4) about the core, whose hull is a surface without edges or vertices in
+    which it touches itself; core (n,) is thinned out for that, in place."""
+    before = int(core.sum())
+    while True:
+        chosen = tetrahedra[core[tetrahedra].any(axis=1)]
+        pinches = _pinches(hull_faces(chosen)) if len(chosen) else np.empty(0, dtype=np.int64)
+        if not len(pinches) and len(chosen):
+            return _largest_piece(chosen)
+        about = np.unique(chosen[np.isin(chosen, pinches).any(axis=1)])
+        about = about[core[about]]
+        if not len(about) or core.sum() < (1.0 - MOST_THINNED) * before:
+            raise UnfitMeshError(
+                "skin_spacing_m: the object is too thin for elements of this size; take a smaller "
+                "spacing"
+            )
+        core[about[distance[about].argmax()]] = False
+
+
+def _pinches(faces: Ints) -> Ints:
+    """Vertices at which a hull of faces (f, 3) touches itself: of edges of more than two faces, and
+    those about which the faces make more than one fan."""
+    edges, uses = np.unique(
+        np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1),
+        axis=0,
+        return_counts=True,
+    )
+    crowded = np.unique(edges[uses != 2])
+    if len(crowded):
+        return crowded
+    # With every edge in two faces, the faces about a vertex make closed fans.  Corners of faces
+    # are joined over the edges they share; each fan is one piece, and each vertex should have one.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    corner = np.arange(faces.size).reshape(faces.shape)
+    ends, owners = [], []
+    for i, j in ((0, 1), (1, 2), (0, 2)):
+        for here, there in ((i, j), (j, i)):
+            ends.append(np.column_stack([faces[:, here], faces[:, there]]))
+            owners.append(corner[:, here])
+    spoke, owner = np.concatenate(ends), np.concatenate(owners)
+    order = np.lexsort((spoke[:, 1], spoke[:, 0]))
+    pairs = owner[order].reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(faces.size,) * 2)
+    _, fan = connected_components(graph, directed=False)
+    fans = np.unique(np.column_stack([faces.ravel(), fan]), axis=0)[:, 0]
+    vertices, counts = np.unique(fans, return_counts=True)
+    return np.asarray(vertices[counts > 1])
+
+
+def _largest_piece(tetrahedra: Ints) -> Ints:
+    """The tetrahedra (k, 4) of the piece with most of them; pieces share no vertex."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    size = int(tetrahedra.max()) + 1
+    first = np.repeat(tetrahedra[:, 0], 3)
+    graph = coo_array((np.ones(len(first)), (first, tetrahedra[:, 1:].ravel())), shape=(size, size))
+    _, piece = connected_components(graph, directed=False)
+    labels = piece[tetrahedra[:, 0]]
+    return np.asarray(tetrahedra[labels == np.bincount(labels).argmax()])

@@ -1,0 +1,333 @@
+"""The mesh of a scene's object: what it depends on, what it will need, and the mesh itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import (
+    BaseSupport,
+    Cylinder,
+    Ellipsoid,
+    Geometry,
+    Mesh,
+    Plane,
+    RoundedBox,
+    Scene,
+    Sphere,
+    StripSupport,
+    Support,
+)
+from nodes.fem_solver.mesh.cylinder import cylinder_mesh
+from nodes.fem_solver.mesh.fitted import bent_sizes, fitted_solid
+from nodes.fem_solver.mesh.grading import Grading
+from nodes.fem_solver.mesh.mapped import below_rectangle, mapped_solid, slab_solid
+from nodes.fem_solver.mesh.quality import volumes
+from nodes.fem_solver.mesh.solid import (
+    SolidMesh,
+    UnfitMeshError,
+    boundary_faces,
+    solid_mesh,
+    touched_where,
+)
+from nodes.fem_solver.mesh.supports import held
+from nodes.models import rigid
+from nodes.models.shapes import Shape, make_shape
+from nodes.models.shapes.triangles import volume_m3
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+Vector = tuple[float, float, float]
+
+VERSION = 1
+"""Counts up whenever the same specification gives another mesh."""
+TOUCH_MARGIN_RAD = 0.45
+"""The touchable skin exceeds the working range's tilt by this much."""
+SLAB_DEPTHS = 2.0
+"""A half-space is meshed to this many of the working range's push depths."""
+LEAST_SPACINGS = 4.0
+"""The object is at least this many skin spacings thick: two elements."""
+MOST_NODES = 250_000
+BYTES_PER_NODE = 6000
+"""Peak while meshing, see docs/meshing.md."""
+SAMPLES = 16
+"""Places along each side of the bounding box at which the number of nodes is estimated."""
+INNER_FACTOR, SKIN_FACTOR, MESH_FACTOR = 2.5, 5.0, 1.7
+"""What meshes had, over the sums in `mesh_budget`; more where a surface is fitted to a lattice."""
+MOST_LOST = 0.1
+"""A mesh object of which more than this share of the volume is lost is too thin."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeshSpec:
+    """All that a mesh depends on.
+
+    towards_user: unit vector in the mesh frame.  down: of a base, in the object's frame.
+    turn_rad: by which the mesh frame is turned about the object's x, for cylinders.
+    slab_depth_m: of the slab that stands for a half-space.
+    """
+
+    geometry: Geometry
+    support: Support
+    touch_angle_rad: float
+    skin_spacing_m: float
+    towards_user: Vector
+    down: Vector
+    turn_rad: float
+    slab_depth_m: float
+
+    def key(self) -> str:
+        """Digest: equal for equal meshes."""
+        digest = hashlib.sha256(f"mesh {VERSION}".encode())
+        for part in (self.geometry, self.support):
+            for name, value in sorted(dict(part).items()):
+                if name != "origin":
+                    digest.update(name.encode())
+                    array = isinstance(value, np.ndarray)
+                    digest.update(value.tobytes() if array else json.dumps(value).encode())
+        numbers = (self.touch_angle_rad, self.skin_spacing_m, self.turn_rad, self.slab_depth_m)
+        digest.update(json.dumps([numbers, self.towards_user, self.down]).encode())
+        return digest.hexdigest()[:24]
+
+    @property
+    def grading(self) -> Grading:
+        return Grading(self.skin_spacing_m, self.touch_angle_rad, self.towards_user)
+
+
+@dataclass(frozen=True, slots=True)
+class MeshBudget:
+    """What meshing will need, about, known before it starts."""
+
+    nodes: int
+    bytes: int
+
+
+def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
+    """What the mesh of this scene's object depends on; ValueError as `world_from_mesh`."""
+    body = scene.object
+    object_from_world = rigid.inverse(_world_from_object(scene))[:3, :3]
+    mesh_from_world = rigid.inverse(world_from_mesh(scene))[:3, :3]
+    cylinder = isinstance(body.geometry, Cylinder)
+    touch_angle = scene.working_range.tilt_rad + TOUCH_MARGIN_RAD
+    if cylinder and isinstance(body.support, StripSupport):
+        touch_angle = min(touch_angle, np.pi - 0.5 * body.support.angle_rad)
+    down = body.support.down_world if isinstance(body.support, BaseSupport) else (0.0, 0.0, 0.0)
+    return MeshSpec(
+        geometry=body.geometry,
+        support=body.support,
+        touch_angle_rad=float(touch_angle),
+        skin_spacing_m=skin_spacing_m,
+        towards_user=_rounded(mesh_from_world @ np.array([0.0, 0.0, 1.0])),
+        down=_rounded(object_from_world @ np.array(down)),
+        turn_rad=_turn_rad(scene) if cylinder else 0.0,
+        slab_depth_m=SLAB_DEPTHS * scene.working_range.push_depth_m
+        if isinstance(body.geometry, Plane)
+        else 0.0,
+    )
+
+
+def world_from_mesh(scene: Scene) -> Floats:
+    """Pose of the mesh: the object's; a cylinder is turned about its axis until its z is as near to
+    the user as can be.
+
+    ValueError if a cylinder's axis points at the user, who then has no side before him to touch.
+    """
+    world_from_object = _world_from_object(scene)
+    if not isinstance(scene.object.geometry, Cylinder):
+        return world_from_object
+    turned = rigid.transform_from_rpy(np.zeros(3), [_turn_rad(scene), 0.0, 0.0])
+    return np.asarray(world_from_object @ turned)
+
+
+def _world_from_object(scene: Scene) -> Floats:
+    pose = scene.object.world_from_object
+    return rigid.transform_from_rpy(pose.position_m, pose.rpy_rad)
+
+
+def _turn_rad(scene: Scene) -> float:
+    towards_user = _world_from_object(scene)[:3, :3].T @ np.array([0.0, 0.0, 1.0])
+    if np.hypot(towards_user[1], towards_user[2]) < 0.1:
+        raise ValueError(
+            f"object.world_from_object.rpy_rad: {scene.object.world_from_object.rpy_rad} turns the "
+            "cylinder's axis towards the user; lay it across (its x axis away from the world's z)"
+        )
+    return float(np.arctan2(-towards_user[1], towards_user[2]))
+
+
+def _rounded(vector: Floats) -> Vector:
+    """A vector without the noise of rotation, so that the same scene has the same key."""
+    # adding zero turns -0.0, which prints otherwise, into 0.0
+    x, y, z = (float(value) + 0.0 for value in np.round(vector, 12))
+    return x, y, z
+
+
+def mesh_budget(spec: MeshSpec) -> MeshBudget:
+    """What `build_mesh` will need; errors as `_budget`.  Takes a second for a mesh object."""
+    return _budget(spec, make_shape(dict(spec.geometry)))
+
+
+def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
+    """About how many nodes the mesh has, within a factor of two.
+
+    Nodes are half a size apart: that gives those within by the sum of (2 / size)^3 over the volume,
+    and those on the skin by (2 / size)^2 over a shell about it.  Meshes have more, by the factors
+    above: few elements are as large as they may be.
+
+    UnfitMeshError where the spacing does not fit the object, or the mesh would have more than
+    `MOST_NODES`.
+    """
+    low, high = _box(spec)
+    spacing, thickness = spec.skin_spacing_m, float((high - low).min())
+    if isinstance(spec.geometry, Plane):
+        thickness = min(thickness, spec.geometry.width_m, spec.geometry.height_m)
+    if not 0.0 < spacing <= thickness / LEAST_SPACINGS * (1.0 + 1e-9):
+        raise UnfitMeshError(
+            f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the object's "
+            f"least extent, {thickness:g} m"
+        )
+    steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
+    grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = low + grid * (high - low)
+    if isinstance(spec.geometry, Plane):
+        depth = below_rectangle(points, spec.geometry)
+        normals = np.broadcast_to(np.array(spec.towards_user), points.shape)
+        bend = np.zeros(len(points))
+    else:
+        found = shape.closest(points)
+        depth, normals = -found.height_m, found.normal
+        bend = np.sqrt(np.square(found.shape_operator).sum(axis=(1, 2)))
+    sizes, on_skin = spec.grading.sizes(normals, depth), spec.grading.sizes(normals, 0.0 * depth)
+    if isinstance(spec.geometry, Mesh):
+        on_skin = bent_sizes(on_skin, bend, spec.grading)
+    share = float((high - low).prod()) / len(points)
+    shell = float((high - low).max()) / SAMPLES
+    inner = share * np.sum((2.0 / sizes[depth > 0.0]) ** 3)
+    skin = share / shell * np.sum((2.0 / on_skin[(depth > 0.0) & (depth <= shell)]) ** 2)
+    fitted = MESH_FACTOR if isinstance(spec.geometry, Mesh) else 1.0
+    nodes = int(fitted * (INNER_FACTOR * inner + SKIN_FACTOR * skin)) + 100
+    budget = MeshBudget(nodes, nodes * BYTES_PER_NODE)
+    if nodes > MOST_NODES:
+        raise UnfitMeshError(
+            f"skin_spacing_m: {spacing:g} asks for about {nodes} nodes "
+            f"({budget.bytes / 2**30:.1f} GiB while meshing), at most {MOST_NODES} are made; "
+            "take a larger spacing"
+        )
+    return budget
+
+
+def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
+    """Corners of the box about what is meshed."""
+    match spec.geometry:
+        case Cylinder(radius_m=radius, length_m=length):
+            half = np.array([0.5 * length, radius, radius])
+        case Sphere(radius_m=radius):
+            half = np.full(3, radius)
+        case Ellipsoid(semi_axes_m=axes):
+            half = np.array(axes)
+        case RoundedBox(size_m=size):
+            half = 0.5 * np.array(size)
+        case Plane(width_m=width, height_m=height):
+            margin = spec.slab_depth_m
+            x, y = 0.5 * width + margin, 0.5 * height + margin
+            return np.array([-x, -y, -margin]), np.array([x, y, 0.0])
+        case Mesh(vertices_m=vertices, triangles=triangles):
+            used = vertices[np.unique(triangles)]
+            return used.min(axis=0), used.max(axis=0)
+    return -half, half
+
+
+def mesh_of_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
+    """The mesh of the scene's object in the frame of `world_from_mesh`; errors as `build_mesh`."""
+    return build_mesh(mesh_spec(scene, skin_spacing_m))
+
+
+def build_mesh(spec: MeshSpec) -> SolidMesh:
+    """The mesh; UnfitMeshError (a ValueError) as `mesh_budget`, for an object too thin for these
+    elements, for a support that holds too little, or all that there is to touch.
+    """
+    geometry = spec.geometry
+    shape = make_shape(dict(geometry))
+    _budget(spec, shape)
+    if isinstance(geometry, Cylinder):
+        return _cylinder(geometry, spec)
+    if isinstance(geometry, Plane):
+        nodes, elements = slab_solid(geometry, spec.slab_depth_m, spec.grading)
+        normals = _slab_normals(nodes)
+        half = 0.5 * np.array([geometry.width_m, geometry.height_m]) + 1e-9
+        touchable = (normals[:, 2] > 0.0) & (np.abs(nodes[:, :2]) <= half).all(axis=1)
+    else:
+        if isinstance(geometry, Mesh):
+            nodes, elements = fitted_solid(shape, *_box(spec), spec.grading)
+            _require_volume(geometry, nodes, elements, spec)
+        else:
+            nodes, elements = mapped_solid(geometry, shape, spec.grading)
+        skin = np.unique(boundary_faces(elements))
+        normals = np.zeros_like(nodes)
+        normals[skin] = shape.closest(nodes[skin]).normal
+        touchable = np.ones(len(nodes), dtype=bool)
+    touchable &= spec.grading.touchable(normals)
+    skin = np.unique(boundary_faces(elements))
+    fixed = np.zeros(len(nodes), dtype=bool)
+    fixed[skin] = _held(spec, nodes[skin], normals[skin])
+    return solid_mesh(nodes, elements, touchable=touchable, fixed=fixed, normals=normals)
+
+
+def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
+    """The cylinder's own mesh: a strip's edges are nodes, other supports take the nodes there."""
+    strip = isinstance(spec.support, StripSupport)
+    mesh = cylinder_mesh(
+        radius_m=cylinder.radius_m,
+        length_m=cylinder.length_m,
+        support_angle_rad=spec.support.angle_rad
+        if isinstance(spec.support, StripSupport)
+        else 2.0 * (np.pi - spec.touch_angle_rad),
+        touch_angle_rad=spec.touch_angle_rad,
+        skin_spacing_m=spec.skin_spacing_m,
+    )
+    if strip:
+        return mesh
+    points = mesh.nodes[mesh.skin]
+    normals = np.column_stack([np.zeros(len(points)), points[:, 1:] / cylinder.radius_m])
+    fixed = np.zeros(len(mesh.nodes), dtype=bool)
+    fixed[mesh.skin] = _held(spec, points, normals)
+    return touched_where(replace(mesh, fixed=fixed), np.ones(len(mesh.nodes), dtype=bool))
+
+
+def _held(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
+    """Which skin points (n, 3) of the mesh frame are held; see `supports.held`."""
+    object_from_mesh = rigid.transform_from_rpy(np.zeros(3), [spec.turn_rad, 0.0, 0.0])[:3, :3]
+    return held(
+        spec.support,
+        points @ object_from_mesh.T,
+        normals @ object_from_mesh.T,
+        towards_user=object_from_mesh @ np.array(spec.towards_user),
+        down=np.array(spec.down),
+    )
+
+
+def _slab_normals(nodes: Floats) -> Floats:
+    """Outward normals (n, 3) at the nodes of a slab: of its top and bottom, rims included; level
+    elsewhere."""
+    normals = np.zeros_like(nodes)
+    normals[:, 0] = 1.0
+    low, high = nodes[:, 2].min(), nodes[:, 2].max()
+    near = 1e-9 * (high - low)
+    normals[nodes[:, 2] > high - near] = [0.0, 0.0, 1.0]
+    normals[nodes[:, 2] < low + near] = [0.0, 0.0, -1.0]
+    return normals
+
+
+def _require_volume(mesh: Mesh, nodes: Floats, elements: Ints, spec: MeshSpec) -> None:
+    """UnfitMeshError where too much of the object is missing: parts too thin for the elements."""
+    wanted = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
+    lost = 1.0 - float(volumes(nodes, elements).sum()) / wanted
+    if lost > MOST_LOST:
+        raise UnfitMeshError(
+            f"skin_spacing_m: {100 * lost:.0f} % of the object is too thin for elements of "
+            f"{2.0 * spec.skin_spacing_m:g} m; take a smaller spacing"
+        )

@@ -1,0 +1,151 @@
+"""Moves the corners of tetrahedra until all are well shaped and the hull lies on a surface.
+
+What is minimised is the sum over tetrahedra of w^2, with w = (|A|^2 / 3)^(3/2) / det A and A the
+map from the regular tetrahedron: the inverse of the mean ratio, 1 for a regular one of any size,
+endless for a flat one (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp,
+"Tetrahedral mesh improvement via optimization of the element condition number", 2002).  So a mesh
+that begins without inverted elements stays without.  The hull's corners are drawn to the surface by
+springs along its normals, which grow stronger from round to round, and slide along it freely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.fem_solver.mesh.quality import radius_ratios
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+Surface = Callable[[Floats], tuple[Floats, Floats]]
+"""Points (n, 3) to the nearest points of the surface (n, 3) and its outward normals there."""
+
+FROM_AFAR = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+ON_SURFACE = (300.0, 1000.0, 3000.0)
+"""Stiffness of the springs round by round, for lengths in usual edges: where the hull begins up to
+an element off the surface, and where it begins on it."""
+FLATTEST = 0.15
+"""Radius ratio of the flattest element that may come of the last, small step to the surface."""
+ROUND_STEPS = 20
+MEMORY = 8
+"""Pairs of steps and slopes that the minimiser remembers."""
+
+_REGULAR = np.array(
+    [[1.0, 0.5, 0.5], [0.0, np.sqrt(0.75), np.sqrt(1.0 / 12.0)], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]
+)
+_FROM_REGULAR = np.linalg.inv(_REGULAR)
+
+
+def settled(
+    corners: Floats,
+    tetrahedra: Ints,
+    hull: Ints,
+    surface: Surface,
+    *,
+    springs: tuple[float, ...],
+    anchor: float,
+) -> Floats:
+    """Places (n, 3) of the corners after they were moved; tetrahedra must have positive volume.
+
+    anchor: stiffness of springs that hold each corner to where it began, and so keep the grading.
+    hull: numbers of the corners to be drawn to the surface.  They end on it, but where an element
+    would become flatter than `FLATTEST`: there they stay as near as they came.
+    """
+    sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
+    unit = float(np.median(np.linalg.norm(sides, axis=1)))
+    begun = corners / unit
+    points = begun
+    for spring in springs:
+        feet, normals = surface(points[hull] * unit)
+        feet = feet / unit
+
+        def energy(
+            x: Floats, pull: tuple[Floats, Floats, float] = (feet, normals, spring)
+        ) -> tuple[float, Floats]:
+            value, gradient = _badness(x, tetrahedra)
+            feet, normals, spring = pull
+            away = ((x[hull] - feet) * normals).sum(axis=1)
+            gradient[hull] += 2.0 * spring * away[:, None] * normals
+            gradient += 2.0 * anchor * (x - begun)
+            value += spring * float(np.square(away).sum())
+            return value + anchor * float(np.square(x - begun).sum()), gradient
+
+        points = _minimised(points, energy)
+    points = points * unit
+    wanted = points.copy()
+    wanted[hull] = surface(points[hull])[0]
+    while True:
+        flat = radius_ratios(wanted, tetrahedra) < FLATTEST
+        moved = np.unique(tetrahedra[flat])
+        moved = moved[(wanted[moved] != points[moved]).any(axis=1)]
+        if not len(moved):
+            return wanted
+        wanted[moved] = points[moved]
+
+
+def _badness(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
+    """The sum of w^2 and its gradient (n, 3); infinite where a tetrahedron is inverted."""
+    first = points[tetrahedra[:, 0]]
+    edges = np.swapaxes(points[tetrahedra[:, 1:]] - first[:, None], 1, 2)
+    shape = edges @ _FROM_REGULAR
+    determinant = np.linalg.det(shape)
+    if determinant.min() <= 0.0:
+        return np.inf, np.zeros_like(points)
+    square = (shape * shape).sum((1, 2))
+    badness = (square / 3.0) ** 1.5 / determinant
+    inverse = np.swapaxes(np.linalg.inv(shape), 1, 2)
+    slope = 3.0 * shape / square[:, None, None] - inverse
+    slope *= 2.0 * np.square(badness)[:, None, None]
+    by_corner = np.swapaxes(slope @ _FROM_REGULAR.T, 1, 2)
+    gradient = np.zeros_like(points)
+    np.add.at(gradient, tetrahedra[:, 1:], by_corner)
+    np.add.at(gradient, tetrahedra[:, 0], -by_corner.sum(axis=1))
+    return float(np.square(badness).sum()), gradient
+
+
+def _minimised(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
+    """Some steps of L-BFGS with backtracking (Nocedal and Wright, Numerical Optimization, alg. 7.5;
+    scipy's own line search does not take infinite values)."""
+    value, gradient = energy(points)
+    steps: list[tuple[Floats, Floats, float]] = []
+    for _ in range(ROUND_STEPS):
+        direction = -_times_inverse_hessian(gradient, steps)
+        slope = float((direction * gradient).sum())
+        if slope >= 0.0:
+            steps, direction = [], -gradient
+            slope = -float(np.square(gradient).sum())
+        # never farther than a fifth of an edge at once
+        longest = float(np.sqrt(np.square(direction).sum(axis=1).max()))
+        way = min(1.0, 0.2 / max(longest, 1e-300))
+        while way > 1e-6:
+            new_value, new_gradient = energy(points + way * direction)
+            if new_value <= value + 1e-4 * way * slope:
+                break
+            way *= 0.5
+        else:
+            return points
+        moved, turned = way * direction, new_gradient - gradient
+        curvature = float((moved * turned).sum())
+        if curvature > 0.0:
+            steps = [*steps[1 - MEMORY :], (moved, turned, 1.0 / curvature)]
+        points, value, gradient = points + moved, new_value, new_gradient
+    return points
+
+
+def _times_inverse_hessian(gradient: Floats, steps: list[tuple[Floats, Floats, float]]) -> Floats:
+    """The two loops of L-BFGS."""
+    result = gradient.copy()
+    shares = []
+    for moved, turned, inverse in reversed(steps):
+        share = inverse * float((moved * result).sum())
+        shares.append(share)
+        result -= share * turned
+    if steps:
+        moved, turned, inverse = steps[-1]
+        result /= inverse * float((turned * turned).sum())
+    for (moved, turned, inverse), share in zip(steps, reversed(shares), strict=True):
+        result += (share - inverse * float((turned * result).sum())) * moved
+    return result
