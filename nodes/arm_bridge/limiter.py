@@ -20,7 +20,7 @@ from nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
 
-TOOL_SPEED_SHARE = 0.92
+TOOL_SPEED_SHARE = 0.88
 """Share of the tool speed that commands may use: an arm that is sent to a place at a time, and not
 a velocity, ripples about its mean speed (benchmarks/limiter.py)."""
 
