@@ -21,21 +21,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from launch.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
 from launch.plan import load_scene
 from launch.twin_sheet import twin_force
 from messages.scene import Scene
-from nodes.fem_solver import body, precompute
 from nodes.models.sheet.laws import CENTRE, Place, SheetLaw
 from nodes.planner.compliance import (
     FELT_N,
     GOOD_RATIO,
     WEBER_RATIO,
     WEBER_RATIO_BARE,
-    Compliance,
     ObjectCurve,
     compliance_for,
-    fit_compliance,
-    pull_of,
     unsureness,
 )
 from nodes.planner.sheet_force import law_for, membrane_table, rubber_of
@@ -43,8 +40,6 @@ from nodes.planner.sheet_force import law_for, membrane_table, rubber_of
 Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SKIN_SPACING_M = 0.0045
-LINEAR_DEPTH_M, LARGEST_DEPTH_M = 0.006, 0.010
 MODULI_PA = (500.0, 1000.0, 2000.0, 4000.0, 6000.0, 8000.0, 16000.0)
 DEPTHS_M = np.array([0.002, 0.005, 0.010, 0.020, 0.035, 0.050])
 PLACES: tuple[Place, ...] = (CENTRE, (0.03, 0.02), (0.055, 0.0), (0.0, 0.085), (0.045, 0.06))
@@ -52,30 +47,9 @@ PLACES_MODULUS_PA = 3000.0
 
 
 def object_curve(scene: Scene) -> Callable[[float], ObjectCurve]:
-    """The scene's object's force over depth, in front of the user, by its Young's modulus."""
-    spec = body.spec_of(scene, SKIN_SPACING_M)
-    model = precompute.load_or_compute(
-        spec, precompute.default_cache_dir(), lambda done, total, need: None
-    )
-    built = body.scene_body(
-        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, largest_depth_m=LARGEST_DEPTH_M
-    )
-    rows = built.method.force_curve(np.array([0.0, 0.0, spec.radius_m]))
-    modulus = scene.object.material.young_modulus_pa
+    """The scene's object's force over depth by its Young's modulus, to which it is proportional."""
+    rows, modulus = front_curve(scene), scene.object.material.young_modulus_pa
     return lambda wanted: ObjectCurve.from_rows(rows * [1.0, wanted / modulus])
-
-
-def presented(scene: Scene, law: SheetLaw, curve: ObjectCurve, deepest_m: float) -> Compliance:
-    """What the planner does for this curve."""
-    return fit_compliance(
-        curve,
-        law,
-        pull_of(scene.sheet, law),
-        deepest_m=deepest_m,
-        finger_radius_m=scene.finger.radius_m,
-        usable_half_height_m=scene.sheet.usable_half_height_m,
-        position_error_m=scene.tolerances.sheet_position_m,
-    )
 
 
 def errors(
@@ -107,7 +81,7 @@ def materials(scene: Scene, law: SheetLaw, depths: Floats) -> None:
     for modulus in MODULI_PA:
         curve = curve_of(modulus)
         wanted = curve.force_n(depths)
-        shown = presented(scene, law, curve, float(depths[-1]))
+        shown = scene_compliance(scene, law, curve, deepest_m=float(depths[-1]))
         error = errors(scene, shown.stretch_ratio, shown.indentation_m(depths), wanted)
         stiffness = float(curve.force_n(np.array([LINEAR_DEPTH_M]))[0]) / LINEAR_DEPTH_M
         old = compliance_for(stiffness, scene.sheet).stretch_ratio
@@ -128,7 +102,7 @@ def materials(scene: Scene, law: SheetLaw, depths: Floats) -> None:
 
 def places(scene: Scene, law: SheetLaw, depths: Floats) -> None:
     curve = object_curve(scene)(PLACES_MODULUS_PA)
-    shown = presented(scene, law, curve, float(depths[-1]))
+    shown = scene_compliance(scene, law, curve, deepest_m=float(depths[-1]))
     print(f"\n{1e-3 * PLACES_MODULUS_PA:g} kPa at places of the sheet, error %")
     for place in PLACES:
         pushed = shown.indentation_m(depths, place)
@@ -142,11 +116,11 @@ def limits(scene: Scene, law: SheetLaw, deepest_m: float) -> None:
     curve_of = object_curve(scene)
 
     def fits(modulus: float) -> bool:
-        shown = presented(scene, law, curve_of(modulus), deepest_m)
+        shown = scene_compliance(scene, law, curve_of(modulus), deepest_m=deepest_m)
         return float(np.abs(shown.centre.error_ratio).max()) <= GOOD_RATIO
 
     def sure(modulus: float) -> bool:
-        shown = presented(scene, law, curve_of(modulus), deepest_m)
+        shown = scene_compliance(scene, law, curve_of(modulus), deepest_m=deepest_m)
         return unsureness(shown.centre, scene.tolerances.sheet_position_m) <= WEBER_RATIO
 
     def border(holds: Callable[[float], bool], inside: float, outside: float) -> float:

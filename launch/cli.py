@@ -13,6 +13,7 @@ from launch.commands import (
     calibrate_sheet,
     chart,
     doctor,
+    doctor_compliance,
     experiment,
     launching,
     node,
@@ -37,6 +38,7 @@ app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(experiment.app, name="experiment")
 app.command()(experiment.demo)
 app.command()(chart.chart)
+doctor_compliance.register(doctor.app)
 app.add_typer(doctor.app, name="doctor")
 
 

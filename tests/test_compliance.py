@@ -3,6 +3,7 @@ where it cannot; judged by the twin's membrane."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
+from launch.cli import app
+from launch.commands.output import CommandError
 from launch.plan import load_scene
 from launch.twin_sheet import twin_push
 from messages.types import SoftBody
 from nodes.models.sheet.laws import CENTRE, ScaledLaw
+from nodes.models.sheet.table import TableLaw
+from nodes.planner import sheet_force
 from nodes.planner.compliance import (
     ADVANCE_PER_DEPTH,
     GOOD_RATIO,
@@ -33,7 +39,8 @@ from nodes.planner.sheet_force import law_for
 
 Floats = NDArray[np.float64]
 
-SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SCENE = load_scene(SCENE_FILE)
 SHEET = SCENE.sheet
 LAW = law_for(SHEET)
 PULL = pull_of(SHEET, LAW)
@@ -74,7 +81,7 @@ def test_the_twins_sheet_answers_as_the_object(scale: float, place: tuple[float,
     assert max(one[1] for one in true) < SHEET.max_edge_force_n
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     st.floats(0.02, 20.0),
     st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2)),
@@ -90,8 +97,7 @@ def test_the_retreat_is_smooth_and_bounded_whatever_the_object(
     assert np.isfinite(retreat).all()
     assert (retreat[depths <= 0.0] == 0.0).all()
     assert slopes.max() < 1.0 + 1e-6
-    # Where the cubic between two depths turns off the bound it may pass it for a moment.
-    assert slopes.min() > -1.76 * ADVANCE_PER_DEPTH
+    assert slopes.min() > -ADVANCE_PER_DEPTH - 1e-6
     pushed = shown.indentation_m(depths, place)
     assert (np.diff(pushed) >= -1e-9).all()
     inner = slopes[(depths[1:] > 0.02 * deepest) & (depths[1:] < 0.99 * deepest)]
@@ -102,6 +108,7 @@ def test_the_retreat_is_smooth_and_bounded_whatever_the_object(
     assert PULL.least_stretch <= shown.stretch_ratio <= PULL.largest_stretch
 
 
+@settings(max_examples=15, deadline=None)
 @given(st.floats(0.05, 1.0))
 def test_what_fits_is_presented_exactly_by_the_law(scale: float) -> None:
     curve = soft_curve(scale)
@@ -256,3 +263,69 @@ def test_a_calibrated_law_serves_as_well() -> None:
     depths = np.array([0.005, 0.02, 0.045])
     assert shown.presented(depths) == pytest.approx(curve.force_n(depths), rel=0.01)
     assert shown.stretch_ratio < compliance(curve).stretch_ratio
+
+
+@pytest.mark.parametrize(("scale", "code", "words"), [(0.8, 0, ""), (5.0, 1, "stiffer")])
+def test_the_doctor_says_whether_a_scenes_object_can_be_presented(
+    monkeypatch: pytest.MonkeyPatch, scale: float, code: int, words: str
+) -> None:
+    curve = soft_curve(scale)
+    rows = np.column_stack([curve.depths_m, curve.forces_n])
+    monkeypatch.setattr("launch.compliance.front_curve", lambda scene: rows)
+    command = ["doctor", "compliance", str(SCENE_FILE)]
+    result = CliRunner().invoke(app, [*command, "--json"])
+    assert result.exit_code == code, result.output
+    told = json.loads(result.stdout)
+    assert words in told["note"]
+    assert (told["worst_error_ratio"] <= GOOD_RATIO) == (code == 0)
+    assert told["rows"][-1]["depth_mm"] == pytest.approx(50.0)
+    shown = CliRunner().invoke(app, command)
+    assert shown.exit_code == code
+    assert "stretch" in shown.stdout
+
+
+def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
+    command = [
+        "doctor",
+        "compliance",
+        str(SCENE_FILE),
+        "--calibration",
+        str(tmp_path / "none.yaml"),
+    ]
+    result = CliRunner().invoke(app, command)
+    assert isinstance(result.exception, CommandError)
+    assert "cannot be read" in str(result.exception)
+
+
+def test_every_law_is_charted_within_the_scenes_range(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        sheet_force,
+        "membrane_table",
+        lambda rubber, **axes: TableLaw(
+            ScaledLaw(rubber),
+            axes["stretches"],
+            np.array([0.002, 0.05]),
+            axes["xs_m"],
+            axes["ys_m"],
+            np.ones((2, 2, 3, 3)),
+        ),
+    )
+    family = sheet_force.sheet_force_family(lambda *asked: 2.0)
+    trials = list(family.trials(SCENE))
+    assert {trial.method for trial in trials} == set(family.methods)
+    assert family.tolerance(SCENE) == pytest.approx(10.0)
+    assert {trial.case["place"] for trial in trials} == {
+        "centre",
+        "off-centre",
+        "near the clamp",
+        "near the free edge",
+    }
+    quick = [trial for trial in trials if trial.method != "membrane"]
+    for trial in quick:
+        pressed = trial.run()
+        assert trial.error(pressed) == pytest.approx(100 * abs(pressed.force_n[0] / 2.0 - 1.0))
+    scaled = [trial for trial in quick if trial.method == "scaled"]
+    assert all(trial.in_range for trial in scaled)
+    linear = [trial.in_range for trial in quick if trial.method == "linear"]
+    assert any(linear)
+    assert not all(linear)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
+from scipy.interpolate import BSpline, PchipInterpolator
 
 from messages.scene import SheetSpec
 from nodes.models.sheet import (
@@ -179,8 +179,14 @@ class Presented:
         return result
 
 
-DEPTH_SHARES = np.concatenate([[0.0], np.geomspace(4e-3, 1.0, 56)])
-"""Depths, over the deepest, at which the retreat is worked out: denser where contact grows."""
+_KNOTS = np.concatenate([np.zeros(3), np.geomspace(4e-3, 1.0, 56), np.ones(2)])
+DEPTH_SHARES = 0.5 * (_KNOTS[1:-2] + _KNOTS[2:-1])
+"""Depths, over the deepest, at which the retreat is worked out: denser where contact grows.
+
+They are the places of the control points of a quadratic B-spline on `_KNOTS` (Greville), which then
+is smooth (C1) and has no steeper slope than the straight lines between its control points: bounds
+on the slope at these depths hold everywhere, as they would not for a curve through the points.
+"""
 
 PULL_BEND = 0.1
 """Share of the largest indentation over which it is approached, not met with a kink."""
@@ -285,7 +291,7 @@ class Compliance:
     pull: Pull
     finger_radius_m: float
     _nodes: tuple[Floats, Floats]
-    _indentation: PchipInterpolator = field(repr=False)
+    _indentation: BSpline = field(repr=False)
 
     @property
     def deepest_m(self) -> float:
@@ -417,8 +423,8 @@ def compliance_at(
         pull=pull,
         finger_radius_m=finger_radius_m,
         _nodes=(xs, ys),
-        _indentation=PchipInterpolator(
-            at_nodes[0].depths_m, np.column_stack([one.indentation_m for one in at_nodes])
+        _indentation=BSpline(
+            deepest_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
         ),
     )
 

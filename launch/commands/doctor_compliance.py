@@ -1,0 +1,82 @@
+"""`flexsheet doctor compliance`: can a scene's sheet present its object; if not, by how much."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    print_fields,
+    print_json,
+    print_table,
+    words,
+)
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command to `flexsheet doctor`."""
+    app.command("compliance")(compliance)
+
+
+def compliance(
+    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to check.")],
+    calibration: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Of the sheet, by `flexsheet calibrate sheet`."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check that the sheet can yield as a scene's object does; exit code 1 when it cannot.
+
+    Pushed in the middle, by the planner's law: presented and wanted force to the scene's depth.
+    """
+    from launch.compliance import compliance_result, front_curve
+    from launch.plan import load_scene
+    from messages.scene import UnfitGeometryError
+    from messages.sheet_calibration import SheetCalibrationError, load_sheet_calibration
+    from nodes.planner.compliance import ObjectCurve
+    from nodes.planner.sheet_force import law_for
+
+    scene = load_scene(scene_file)
+    try:
+        law = law_for(
+            scene.sheet, None if calibration is None else load_sheet_calibration(calibration)
+        )
+        with words.status("working out the soft body"):
+            curve = ObjectCurve.from_rows(front_curve(scene))
+    except (SheetCalibrationError, UnfitGeometryError) as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    result = compliance_result(scene, law, curve)
+    if as_json:
+        print_json(result)
+    else:
+        print_table(
+            ("depth, mm", "wanted, N", "presented, N", "error, %", "sheet retreats, mm"),
+            [
+                (
+                    f"{row['depth_mm']:.0f}",
+                    f"{row['wanted_n']:.3f}",
+                    f"{row['presented_n']:.3f}",
+                    f"{100 * (row['presented_n'] / max(row['wanted_n'], 1e-9) - 1):+.1f}",
+                    f"{row['retreat_mm']:.2f}",
+                )
+                for row in result["rows"]
+            ],
+        )
+        print_fields(
+            [
+                ("stretch", f"{result['stretch_ratio']:.3f}"),
+                ("pull at the clamps", f"{result['largest_edge_force_n']:.1f} N at most"),
+                ("coming towards the finger", f"{result['advance_per_depth']:.2f} of its push"),
+                ("largest error", f"{100 * result['worst_error_ratio']:.1f} %"),
+                ("verdict", result["note"] or "presented within what is aimed for"),
+            ]
+        )
+    if result["note"]:
+        raise typer.Exit(FAILED)

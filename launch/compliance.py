@@ -1,0 +1,87 @@
+"""Whether a scene's sheet can present its object: the object's force over depth, and what fits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from nodes.fem_solver import body, precompute
+from nodes.models.sheet.laws import SheetLaw
+from nodes.planner.compliance import (
+    GOOD_RATIO,
+    WEBER_RATIO,
+    WEBER_RATIO_BARE,
+    Compliance,
+    ObjectCurve,
+    fit_compliance,
+    pull_of,
+    unsureness,
+)
+
+Floats = NDArray[np.float64]
+
+SKIN_SPACING_M = 0.0045
+LINEAR_DEPTH_M, LARGEST_DEPTH_M = 0.006, 0.010
+SHOWN_SHARES = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
+"""Depths that are told, over the deepest push."""
+
+
+def front_curve(scene: Scene) -> Floats:
+    """The object's force over depth (n, 2), m and N, where it faces the user; precomputes its soft
+    body if that is not kept from before."""
+    spec = body.spec_of(scene, SKIN_SPACING_M)
+    model = precompute.load_or_compute(
+        spec, precompute.default_cache_dir(), lambda done, total, need: None
+    )
+    built = body.scene_body(
+        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, largest_depth_m=LARGEST_DEPTH_M
+    )
+    return built.at_rest().force_curve
+
+
+def scene_compliance(
+    scene: Scene, law: SheetLaw, curve: ObjectCurve, *, deepest_m: float | None = None
+) -> Compliance:
+    """What the planner presents; deepest_m: of the push, else the scene's."""
+    return fit_compliance(
+        curve,
+        law,
+        pull_of(scene.sheet, law),
+        deepest_m=scene.working_range.push_depth_m if deepest_m is None else deepest_m,
+        finger_radius_m=scene.finger.radius_m,
+        usable_half_height_m=scene.sheet.usable_half_height_m,
+        position_error_m=scene.tolerances.sheet_position_m,
+    )
+
+
+def compliance_result(scene: Scene, law: SheetLaw, curve: ObjectCurve) -> dict[str, Any]:
+    """What `flexsheet doctor compliance --json` prints."""
+    shown = scene_compliance(scene, law, curve)
+    depths = shown.deepest_m * np.array(SHOWN_SHARES)
+    wanted, presented = curve.force_n(depths), shown.presented(depths)
+    retreat = shown.retreat_m(depths)
+    rows = [
+        {
+            "depth_mm": 1e3 * float(depth),
+            "wanted_n": float(want),
+            "presented_n": float(force),
+            "retreat_mm": 1e3 * float(back),
+        }
+        for depth, want, force, back in zip(depths, wanted, presented, retreat, strict=True)
+    ]
+    return {
+        "scene": scene.name,
+        "law": law.name,
+        "stretch_ratio": shown.stretch_ratio,
+        "largest_edge_force_n": float(shown.centre.edge_force_n.max()),
+        "advance_per_depth": shown.centre.advance_per_depth,
+        "worst_error_ratio": float(np.abs(shown.centre.error_ratio).max()),
+        "aimed_ratio": GOOD_RATIO,
+        "weber_ratio": [WEBER_RATIO, WEBER_RATIO_BARE],
+        "force_change_by_place_ratio": unsureness(shown.centre, scene.tolerances.sheet_position_m),
+        "note": shown.note,
+        "rows": rows,
+    }
