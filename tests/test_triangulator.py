@@ -155,16 +155,33 @@ async def test_a_second_mark_far_from_a_followed_one_does_not_disturb(
     assert lost.reason == "two_marks"
 
 
-async def test_another_mark_is_not_followed_before_a_finger_can_be_there(
+async def test_a_mark_where_no_finger_can_be_is_followed_only_when_it_stays_alone(
     scene: Scene, camera: TwinCamera
 ) -> None:
     bench = await Bench(camera).start(scene)
     for _ in range(3):
         await bench.show(*bench.pictures(HERE))
-    shown = [await bench.show(*bench.pictures(FAR)) for _ in range(12)]
-    assert {one.reason for one in shown[:3]} <= {"no_mark", "too_fast"}
+    far = bench.pictures(FAR)
+    shown = [await bench.show(*far) for _ in range(75)]
+    assert {one.reason for one in shown[:55]} <= {"no_mark", "too_fast", "two_marks"}
     assert shown[-1].reason == "ok"
     assert np.linalg.norm(shown[-1].position_world_m - FAR) < 3e-4
+
+
+async def test_a_mark_seen_beside_the_finger_is_not_taken_for_it(
+    scene: Scene, camera: TwinCamera
+) -> None:
+    bench = await Bench(camera).start(scene)
+    both, other = bench.pictures(HERE, FAR), bench.pictures(FAR)
+    for _ in range(3):
+        await bench.show(*bench.pictures(HERE))
+    for _ in range(8):
+        assert (await bench.show(*both)).valid
+    # The finger is hidden for longer than a track is kept, the other is not.
+    assert not any([(await bench.show(*other)).valid for _ in range(90)])
+    again = [(await bench.show(*both)) for _ in range(3)]
+    assert [one.reason for one in again] == ["unconfirmed", "unconfirmed", "ok"]
+    assert np.linalg.norm(again[-1].position_world_m - HERE) < 3e-4
 
 
 async def test_late_pictures_are_counted_and_a_new_camera_is_not_late(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,6 +110,37 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
+class Candidate:
+    """What could be the finger's mark.
+
+    looks: (2,) logarithms of its level and of its surroundings', the mean of both views.
+    """
+
+    measured: Measured
+    looks: Floats
+
+    @property
+    def point(self) -> Floats:
+        """World position (3,), m."""
+        return self.measured.point_world
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """What was found in a pair of pictures.
+
+    reason, measured: as by `locate`.
+    marks: all that look like a mark and are where the finger can be, the likeliest first.
+    others: those that look like one and are elsewhere.
+    """
+
+    reason: FingertipReason
+    measured: Measured | None
+    marks: tuple[Candidate, ...] = ()
+    others: tuple[Candidate, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class Sight:
     """What one call of `locate` has to do with: both views, and what is known beforehand."""
 
@@ -142,16 +173,46 @@ def locate(
 
     A measurement is given where two rays meet at all, even when the reason is not "ok".
     """
-    if expected is not None and not np.isfinite(expected.point).all():
-        expected = None
-    sight = Sight(
-        (left, right), (left_origin_px, right_origin_px), geometry, eyesight, volume, expected
-    )
+    images, origins = (left, right), (left_origin_px, right_origin_px)
+    sight = Sight(images, origins, geometry, eyesight, volume, _finite(expected))
+    found = _seen(sight, _windows(sight))
+    return found.reason, found.measured
+
+
+def look(
+    left: Image,
+    right: Image,
+    *,
+    geometry: StereoGeometry,
+    eyesight: Eyesight,
+    volume: tuple[Floats, Floats],
+    expected: Expected | None,
+    left_origin_px: Origin = (0, 0),
+    right_origin_px: Origin = (0, 0),
+) -> Sighting:
+    """As `locate`, and all marks that are not the one.
+
+    Where the finger is not found in its window the whole pictures are searched for them.
+    """
+    images, origins = (left, right), (left_origin_px, right_origin_px)
+    sight = Sight(images, origins, geometry, eyesight, volume, _finite(expected))
     windows = _windows(sight)
-    reason, measured = _found_in(sight, windows)
-    if reason != "ok" and _dazzled(sight, windows):
-        return "saturated", measured
-    return reason, measured
+    found = _seen(sight, windows)
+    if found.reason != "ok" and windows != (None, None):
+        found = replace(found, others=_found_in(sight, (None, None)).others)
+    return found
+
+
+def _finite(expected: Expected | None) -> Expected | None:
+    """An expected place that is no number is none."""
+    return expected if expected is not None and np.isfinite(expected.point).all() else None
+
+
+def _seen(sight: Sight, windows: tuple[Window | None, Window | None]) -> Sighting:
+    found = _found_in(sight, windows)
+    if found.reason != "ok" and _dazzled(sight, windows):
+        return replace(found, reason="saturated")
+    return found
 
 
 def _windows(sight: Sight) -> tuple[Window | None, Window | None]:
@@ -189,30 +250,31 @@ def _dazzled(sight: Sight, windows: tuple[Window | None, Window | None]) -> bool
     )
 
 
-def _found_in(
-    sight: Sight, windows: tuple[Window | None, Window | None]
-) -> tuple[FingertipReason, Measured | None]:
-    """As `locate`, in one window of each picture, or in all of it."""
+def _found_in(sight: Sight, windows: tuple[Window | None, Window | None]) -> Sighting:
+    """What is in one window of each picture, or in all of it."""
     left, right = (
         find_spots(image, sight.eyesight.looks, window)
         for image, window in zip(sight.images, windows, strict=True)
     )
     if not left and not right:
-        return "no_mark", None
+        return Sighting("no_mark", None)
     if not left or not right:
-        return "mark_in_one_view", None
+        return Sighting("mark_in_one_view", None)
     pairs = _pairs(sight, left, right)
     likely = [pair for pair in pairs if pair.lack is None]
     near = [pair for pair in likely if pair.away <= 1.0]
+    others = _sound(sight, _closely(sight, [pair for pair in likely if pair.away > 1.0]))
     if near:
-        return _chosen(sight, near)
+        return replace(_chosen(sight, near), others=others)
     if likely:
         nearest = min(likely, key=lambda pair: pair.away)
-        return "too_fast", _measured(sight, _refined(sight, [nearest])[0])
+        measured = _measured(sight, _refined(sight, [nearest])[0])
+        return Sighting("too_fast", measured, others=others)
     if not pairs:
-        return "inconsistent", None
+        return Sighting("inconsistent", None)
     nearest = min(pairs, key=lambda pair: (pair.lack != "outside_volume", pair.cost))
-    return nearest.lack or "inconsistent", _measured(sight, _refined(sight, [nearest])[0])
+    measured = _measured(sight, _refined(sight, [nearest])[0])
+    return Sighting(nearest.lack or "inconsistent", measured)
 
 
 def _pairs(sight: Sight, left: Sequence[Spot], right: Sequence[Spot]) -> list[Pair]:
@@ -260,30 +322,72 @@ def _pairs(sight: Sight, left: Sequence[Spot], right: Sequence[Spot]) -> list[Pa
     return pairs
 
 
-def _chosen(sight: Sight, likely: list[Pair]) -> tuple[FingertipReason, Measured | None]:
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """A pair whose spots were looked at closely.
+
+    flaw: what speaks against it, if anything does.
+    cost: of the pair and of the refined sizes, in squared standard deviations.
+    """
+
+    pair: Pair
+    marks: tuple[Mark, Mark]
+    flaw: FingertipReason | None
+    cost: float
+
+
+def _chosen(sight: Sight, likely: list[Pair]) -> Sighting:
     """The mark among pairs that could be one, at least one.
 
     Of several that match about as well only those stay that are discs when looked at closely.
     """
-    rivals = _rivals(likely)
-    marks = _refined(sight, rivals)
-    flaws = [_flaw(sight, pair, both) for pair, both in zip(rivals, marks, strict=True)]
-    sound = [i for i, flaw in enumerate(flaws) if flaw is None]
+    refined = _closely(sight, likely)
+    rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + MARGIN]
+    sound = sorted((one for one in rivals if one.flaw is None), key=lambda one: one.cost)
+    marks = _sound(sight, refined)
     if not sound:
-        return flaws[0] or "merged", _measured(sight, marks[0])
-    if len(sound) > 1:
-        costs = [rivals[i].cost + _fitted_cost(sight, rivals[i], marks[i]) for i in sound]
-        best = int(np.argmin(costs))
-        if any(cost < costs[best] + MARGIN for i, cost in enumerate(costs) if i != best):
-            return "two_marks", _measured(sight, marks[sound[best]])
-        sound = [sound[best]]
-    return _judged(sight, _measured(sight, marks[sound[0]]))
+        return Sighting(rivals[0].flaw or "merged", _measured(sight, rivals[0].marks), marks)
+    if len(sound) > 1 and sound[1].cost < sound[0].cost + MARGIN:
+        return Sighting("two_marks", _measured(sight, sound[0].marks), marks)
+    reason, measured = _judged(sight, _measured(sight, sound[0].marks))
+    return Sighting(reason, measured, marks)
 
 
-def _rivals(pairs: list[Pair]) -> list[Pair]:
-    """The best pair, and after it those that are not worse by the margin."""
-    order = sorted(pairs, key=lambda pair: pair.cost)
-    return [pair for pair in order if pair.cost < order[0].cost + MARGIN]
+def _closely(sight: Sight, pairs: list[Pair]) -> list[Refined]:
+    """Pairs refined, the best first."""
+    ordered = sorted(pairs, key=lambda pair: pair.cost)
+    found = []
+    for pair, marks in zip(ordered, _refined(sight, ordered), strict=True):
+        flaw = _flaw(sight, pair, marks)
+        cost = math.inf if flaw else pair.cost + _fitted_cost(sight, pair, marks)
+        found.append(Refined(pair, marks, flaw, cost))
+    return found
+
+
+def _sound(sight: Sight, refined: Sequence[Refined]) -> tuple[Candidate, ...]:
+    """The marks among refined pairs, the best first.
+
+    Spots of two marks may match across.  A pair is left out when better ones have both its spots,
+    or one clearly better one has one of them.
+    """
+    kept: list[Refined] = []
+    for one in sorted((one for one in refined if one.flaw is None), key=lambda one: one.cost):
+        left = [other for other in kept if other.pair.left is one.pair.left]
+        right = [other for other in kept if other.pair.right is one.pair.right]
+        clearly = any(other.cost + MARGIN <= one.cost for other in left + right)
+        if not clearly and not (left and right):
+            kept.append(one)
+    found = []
+    for one in kept:
+        reason, measured = _judged(sight, _measured(sight, one.marks))
+        if reason == "ok" and measured is not None:
+            found.append(Candidate(measured, _looks(one.pair)))
+    return tuple(found)
+
+
+def _looks(pair: Pair) -> Floats:
+    levels = [(spot.peak, max(spot.surround, 1.0)) for spot in (pair.left, pair.right)]
+    return np.asarray(np.log(levels).mean(axis=0))
 
 
 def _refined(sight: Sight, pairs: Sequence[Pair]) -> list[tuple[Mark, Mark]]:
@@ -343,8 +447,10 @@ def _inside(volume: tuple[Floats, Floats], point_world: Floats) -> bool:
 
 def _measured(sight: Sight, marks: tuple[Mark, Mark]) -> Measured | None:
     """The point behind two refined marks."""
-    given = sight.eyesight.noise_px
-    left, right = (mark.covariance if given is None else given**2 * np.eye(2) for mark in marks)
+    given, hidden = sight.eyesight.noise_px, _hidden_px2(marks) * np.eye(2)
+    left, right = (
+        (mark.covariance if given is None else given**2 * np.eye(2)) + hidden for mark in marks
+    )
     return measure(
         sight.geometry,
         marks[0].centre + sight.origins[0],
@@ -353,6 +459,17 @@ def _measured(sight: Sight, marks: tuple[Mark, Mark]) -> Measured | None:
         left_covariance=left,
         right_covariance=right,
     )
+
+
+def _hidden_px2(marks: tuple[Mark, Mark]) -> float:
+    """Variance of a centre, by how much one mark is smaller than its mate.
+
+    What hides a sliver of a disc, or adds one, makes it smaller or larger by half the sliver's
+    width, and moves its centre by as much.  What the method's radii are off by chance is no sliver.
+    """
+    one, other = marks
+    chance = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)
+    return max((one.radius - other.radius) ** 2 - chance**2, 0.0)
 
 
 def _judged(sight: Sight, measured: Measured | None) -> tuple[FingertipReason, Measured | None]:

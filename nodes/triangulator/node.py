@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -14,8 +15,9 @@ from messages.calibration import StereoCalibration, load_calibration
 from messages.scene import Positive, Scene
 from messages.types import Fingertip, FingertipReason, StereoPair
 from nodes.node import Input, Node, NodeParameters, Output
+from nodes.triangulator.company import Company
 from nodes.triangulator.filters import TRACKING_METHODS
-from nodes.triangulator.fingertip import Eyesight, locate
+from nodes.triangulator.fingertip import Eyesight, look
 from nodes.triangulator.mark import MARK_METHODS, MarkLooks
 from nodes.triangulator.pairs import refuse_other_pictures
 from nodes.triangulator.tracking import Tracker, TrackingSettings
@@ -96,7 +98,7 @@ class Triangulator(Node):
             forget_after_s=p.forget_after_s,
             confirm_frames=p.confirm_frames,
         )
-        self.tracker = self._new_tracker()
+        self._begin()
 
     def on_stereo(self, pair: StereoPair, header: Header) -> None:
         if self.geometry is None:
@@ -104,30 +106,34 @@ class Triangulator(Node):
         refuse_other_pictures(pair, self.geometry)
         at_ns = header.source_ns
         if header.epoch != self.epoch:  # the camera was started anew, and its times with it
-            self.epoch, self.tracker = header.epoch, self._new_tracker()
-        reason, measured = locate(
+            self.epoch = header.epoch
+            self._begin()
+        sight = partial(
+            look,
             pair.left,
             pair.right,
             geometry=self.geometry,
             eyesight=self.eyesight,
             volume=self.volume,
-            expected=self.tracker.expected(at_ns),
             left_origin_px=pair.left_origin_px,
             right_origin_px=pair.right_origin_px,
         )
+        sighting = sight(expected=self.tracker.expected(at_ns))
         is_late = self.tracker.is_late(at_ns)
-        if reason == "ok" and measured is not None:
-            reason = self.tracker.take(at_ns, measured.point_world, measured.covariance)
+        reason, measured = self.company.judge(at_ns, sighting, self.tracker)
         if is_late and reason != "ok":  # what it has to tell is in the track; a later one is out
             self.late += 1
         else:
             self.reasons[reason] += 1
             self.fingertip.publish(self._message(at_ns, reason, measured), source_ns=at_ns)
+        if reason == "ok" and self.company.is_survey_due(at_ns):  # nobody waits for it
+            self.company.survey(at_ns, sight(expected=None))
         self._note()
 
-    def _new_tracker(self) -> Tracker:
+    def _begin(self) -> None:
         method = TRACKING_METHODS[self.parameters.tracking]
-        return Tracker(method(self.tracking.max_speed_m_per_s), self.tracking)
+        self.tracker = Tracker(method(self.tracking.max_speed_m_per_s), self.tracking)
+        self.company = Company()
 
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())

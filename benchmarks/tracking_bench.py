@@ -1,0 +1,219 @@
+"""What the tracking benchmarks share: a triangulator before the twin's camera, frame by frame."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from messages.base import Header, Message
+from messages.calibration import load_calibration
+from messages.clock import VirtualClock
+from messages.scene import Scene
+from messages.topics import Topic
+from messages.types import FingerPath, Fingertip, StereoPair
+from nodes.models.rigid import rotation_from_rpy
+from nodes.triangulator.node import Triangulator, TriangulatorParameters
+from nodes.twin.clutter import Clutter
+from nodes.twin.finger import FingerMotion
+from nodes.twin.pixels import Sensor, TwinCamera
+from nodes.twin.rig import true_camera
+
+Floats = NDArray[np.float64]
+Motion = Callable[[float], Floats]
+"""The true fingertip (3,) at a time in seconds."""
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
+CALIBRATION_FILE = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
+MACHINE = "2-core Intel Xeon VM, no GPU"
+
+WRONG_FOOTED_M = 5e-3
+"""A fingertip that is called valid and is farther from the truth is of something else."""
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One picture to be taken.
+
+    time_s: middle of its exposure in truth.  stamp_s: the same by the camera's clock; None: it is
+    right.  mark: false where the finger shows none.  right_from_column: the right camera reads out
+    its pixels from there on only.
+    """
+
+    time_s: float
+    camera: TwinCamera
+    stamp_s: float | None = None
+    mark: bool = True
+    right_from_column: int = 0
+
+    @property
+    def stamp_ns(self) -> int:
+        return round(1e9 * (self.time_s if self.stamp_s is None else self.stamp_s))
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A frame's truth (3,) and what the triangulator said of it; None: it came too late."""
+
+    frame: Frame
+    truth: Floats
+    fingertip: Fingertip | None
+
+    @property
+    def valid(self) -> bool:
+        return self.fingertip is not None and self.fingertip.valid
+
+    @property
+    def reason(self) -> str:
+        return "late" if self.fingertip is None else self.fingertip.reason
+
+    @property
+    def error_m(self) -> Floats:
+        assert self.fingertip is not None
+        return self.fingertip.position_world_m - self.truth
+
+    @property
+    def covariance(self) -> Floats:
+        """(3, 3) m^2 that was published for the position."""
+        assert self.fingertip is not None
+        return self.fingertip.covariance[:3, :3]
+
+
+@dataclass
+class Observer:
+    """A triangulator that is shown pictures; calibration None: the scene's optics are exact."""
+
+    scene: Scene
+    calibration: Path | None = CALIBRATION_FILE
+    parameters: dict[str, Any] = field(default_factory=dict)
+    node: Triangulator = field(init=False)
+    _said: list[Fingertip] = field(init=False, default_factory=list)
+
+    async def start(self) -> Observer:
+        self.node = Triangulator(
+            TriangulatorParameters(calibration=self.calibration, **self.parameters),
+            name="triangulator",
+            clock=VirtualClock(),
+            send=self._keep,
+        )
+        await self.node.setup()
+        await self.node.step("scene", self.scene, Header(1, 0, 0, "virtual", "bench", 1))
+        return self
+
+    async def show(self, frame: Frame, motion: Motion) -> Seen:
+        """Take the picture and hand it over; a handler's error is raised here."""
+        exposure_s = self.scene.camera.exposure_s
+        left, right = frame.camera.picture(
+            lambda offset_s: motion(frame.time_s + offset_s),
+            exposure_s=exposure_s,
+            mark=frame.mark,
+            time_s=frame.time_s,
+        )
+        column = frame.right_from_column
+        pair = StereoPair(
+            device=self.scene.camera.device,
+            exposure_s=exposure_s,
+            dropped_frames=0,
+            left=left,
+            right=np.ascontiguousarray(right[:, column:]),
+            right_origin_px=(column, 0),
+        )
+        self._said.clear()
+        stamp_ns = frame.stamp_ns
+        await self.node.step("stereo", pair, Header(1, stamp_ns, stamp_ns, "virtual", "camera", 1))
+        if self.node.errors:
+            raise RuntimeError(f"triangulator: {self.node.last_error}")
+        return Seen(frame, motion(frame.time_s), self._said[0] if self._said else None)
+
+    async def follow(self, frames: Iterable[Frame], motion: Motion) -> list[Seen]:
+        return [await self.show(frame, motion) for frame in frames]
+
+    def _keep(self, topic: Topic, message: Message, header: Header) -> None:
+        if isinstance(message, Fingertip):
+            self._said.append(message)
+
+
+def bench_scene() -> Scene:
+    return load_scene(SCENE_FILE)
+
+
+def twin_camera(
+    scene: Scene, clutter: Clutter, *, seed: int = 1, sensor: Sensor | None = None
+) -> TwinCamera:
+    """The camera of the rig as it really stands."""
+    return TwinCamera(
+        true_camera(scene.camera),
+        finger_radius_m=scene.finger.radius_m,
+        seed=seed,
+        clutter=clutter,
+        sensor=sensor,
+    )
+
+
+def calibration_covariance(scene: Scene, file: Path = CALIBRATION_FILE) -> Floats:
+    """(3, 3) m^2 in the world: by how much the calibration says that all fingertips are off."""
+    uncertainty = load_calibration(file).uncertainty
+    if uncertainty is None:
+        raise ValueError(f"{file}: uncertainty: null; calibrate anew, so that it is known")
+    across = 0.5 * uncertainty.lateral_std_m**2
+    world_from_left = rotation_from_rpy(scene.camera.world_from_left.rpy_rad)
+    in_left = np.diag([across, across, uncertainty.depth_std_m**2])
+    return world_from_left @ in_left @ world_from_left.T
+
+
+def path_motion(path: FingerPath, scene: Scene, *, seed: int) -> Motion:
+    """A finger on a path, its time counted from the path's start, with its unsteadiness."""
+    motion = FingerMotion.resting(path.positions_world_m[0], seed=seed).followed_by(
+        0.0,
+        times_s=path.times_s,
+        points=path.positions_world_m,
+        wander_m=path.wander_m,
+        tremor_m=path.tremor_m,
+        max_speed_m_per_s=scene.finger.max_speed_m_per_s,
+        joined_by=path.joined_by,
+    )
+    return lambda time_s: motion.at(motion.ease_s + time_s).position
+
+
+def paths_motion(paths: Sequence[FingerPath], scene: Scene, *, seed: int) -> tuple[Motion, float]:
+    """A finger that goes over from each path to the next at its end, and how long it takes."""
+    motion = FingerMotion.resting(paths[0].positions_world_m[0], seed=seed)
+    starts_s, motions = [0.0], [motion]
+    for path in paths:
+        latest = motions[-1]
+        length_s = 0.0 if len(motions) == 1 else latest.ease_s + latest.path.duration_s
+        starts_s.append(starts_s[-1] + length_s)
+        motions.append(
+            latest.followed_by(
+                length_s,
+                times_s=path.times_s,
+                points=path.positions_world_m,
+                wander_m=path.wander_m,
+                tremor_m=path.tremor_m,
+                max_speed_m_per_s=scene.finger.max_speed_m_per_s,
+                joined_by=path.joined_by,
+            )
+        )
+    end_s = starts_s[-1] + motions[-1].ease_s + motions[-1].path.duration_s
+
+    def at(time_s: float) -> Floats:
+        latest = max(bisect.bisect_right(starts_s, time_s) - 1, 0)
+        return motions[latest].at(time_s - starts_s[latest]).position
+
+    return at, end_s
+
+
+def sigmas(seen: Seen, added: Floats) -> float:
+    """How many of its stated standard deviations a fingertip is off (Mahalanobis).
+
+    added: (3, 3) m^2 of what the track's own covariance leaves out, the calibration's.
+    """
+    error = seen.error_m
+    return float(np.sqrt(error @ np.linalg.solve(seen.covariance + added, error)))

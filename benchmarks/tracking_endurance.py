@@ -1,0 +1,388 @@
+"""Does the fingertip ever jump, or follow something else?  100,000 frames that try to make it.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_endurance [--frames 100000] [--json]
+
+A finger makes gestures, slow and fast, before the sheet; after half a second, in which it is seen
+alone, it is in a crowd drawn anew for every 2000 frames: beads like the mark that swing past it or
+lie still, lamps' images in one view or both, some brighter than the mark, cables before it all; its
+mark is hidden at random for up to a second, and frames are lost.  The triangulator has the shipped
+calibration.  Prints
+
+- jumps: from one valid fingertip to the next, what it went further than the finger itself did, over
+  the standard deviation that both published covariances together give: that of the whole vector
+  (root of the trace of their sum), and that along the way gone;
+- wrong-footed frames: valid, and further than 5 mm from the finger;
+- re-acquisition: from the first frame in which the mark is in full view again to the next valid
+  one.
+
+Some 10 minutes on two cores.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.tracking_bench import (
+    MACHINE,
+    WRONG_FOOTED_M,
+    Frame,
+    Motion,
+    Observer,
+    Seen,
+    bench_scene,
+    paths_motion,
+    twin_camera,
+)
+from messages.scene import Scene
+from messages.types import FingerPath
+from nodes.models.rigid import apply
+from nodes.twin.clutter import (
+    CLAMPS,
+    CLUTTER,
+    HAND,
+    MARK_RADIUS_M,
+    NAIL,
+    Clutter,
+    Highlight,
+    Occluder,
+    Path,
+    SecondMark,
+    Sheet,
+    Still,
+    Swinging,
+    together,
+)
+from nodes.twin.gestures import GESTURES
+from nodes.twin.pixels import Eye, TwinCamera
+
+Floats = NDArray[np.float64]
+
+SEQUENCE_FRAMES = 2000
+MIDDLE_M, SPREAD_M = (0.0, 0.01, 0.02), (0.05, 0.04, 0.03)
+"""Where the distractors' middles are drawn, one standard deviation: where the gestures go on."""
+
+ALONE_S = 0.5
+BLINKS_PER_S = 0.4
+LONGEST_BLINK_FRAMES = 60
+LOST_FRAMES_SHARE = 0.01
+SIGMAS = (3, 4, 5, 6)
+BEYOND_MM = (0.3, 1.0, 5.0)
+SHOWN = 30
+CLEAR_PX = 3.0
+"""What comes no nearer to the mark's edge in the picture leaves it in full view."""
+
+
+def crowd(random: np.random.Generator) -> Clutter:
+    """The lab, with things in it that could be taken for the mark or hide it."""
+
+    def place() -> tuple[float, float, float]:
+        x, y, z = random.normal(MIDDLE_M, SPREAD_M).tolist()
+        return x, y, z
+
+    def swinging(least_m: float, most_m: float, fastest_s: float, slowest_s: float) -> Swinging:
+        way = random.normal(0.0, 1.0, 3) * (1.0, 1.0, 0.3)
+        x, y, z = (random.uniform(least_m, most_m) * way / np.linalg.norm(way)).tolist()
+        period_s, phase = random.uniform(fastest_s, slowest_s), random.uniform(0.0, 2.0 * np.pi)
+        return Swinging(place(), (x, y, z), float(period_s), float(phase))
+
+    marks = [
+        SecondMark(swinging(0.06, 0.2, 2.0, 8.0), level=float(random.uniform(150.0, 235.0)))
+        for _ in range(int(random.integers(1, 3)))
+    ]
+    if random.random() < 0.5:
+        marks.append(SecondMark(Still(place()), level=float(random.uniform(150.0, 235.0))))
+    highlights = [
+        Highlight(
+            swinging(0.06, 0.2, 2.0, 6.0),
+            float(random.uniform(0.0008, 0.0035)),
+            float(random.uniform(120.0, 400.0)),
+            views=("both", "left", "right")[int(random.integers(3))],
+        )
+        for _ in range(int(random.integers(1, 4)))
+    ]
+    top_x, reach_x, period_s = random.normal(0.0, 0.05), random.uniform(0.2, 0.4), 6.0
+    phase = float(random.uniform(0.0, 2.0 * np.pi))
+    ends = [
+        Swinging((float(top_x), y, z), (float(reach_x), 0.0, 0.0), period_s, phase)
+        for y, z in ((0.35, -0.05), (-0.35, 0.35))
+    ]
+    cable = Occluder(
+        ends[0],
+        ends[1],
+        float(random.uniform(0.004, 0.012)),
+        views=("both", "left", "right")[int(random.integers(3))],
+    )
+    return together(
+        Clutter(sheet=Sheet()),
+        HAND,
+        NAIL,
+        CLAMPS,
+        Clutter(marks=tuple(marks), highlights=tuple(highlights), occluders=(cable,)),
+    )
+
+
+def gestures(scene: Scene, random: np.random.Generator) -> Iterator[FingerPath]:
+    """Gestures in any order, for ever."""
+    names = list(GESTURES)
+    while True:
+        name = names[int(random.integers(len(names)))]
+        yield GESTURES[name](scene, seed=int(random.integers(2**31)))
+
+
+def exposures(
+    scene: Scene, alone: TwinCamera, crowded: TwinCamera, count: int, random: np.random.Generator
+) -> Iterator[Frame]:
+    """So many frames at the camera's rate, some lost, the mark hidden now and then."""
+    period_s = 1.0 / scene.camera.rate_hz
+    hidden_until = -1
+    tick = taken = 0
+    while taken < count:
+        tick += 1
+        camera = alone if tick * period_s < ALONE_S else crowded
+        if camera is crowded and tick > hidden_until and random.random() < BLINKS_PER_S * period_s:
+            length = LONGEST_BLINK_FRAMES ** random.random()
+            hidden_until = tick + int(length)
+        if random.random() >= LOST_FRAMES_SHARE:
+            taken += 1
+            yield Frame(tick * period_s, camera, mark=tick > hidden_until)
+
+
+def in_full_view(camera: TwinCamera, frame: Frame, tip: Floats) -> bool:
+    """Whether nothing comes between the mark and either camera, nor runs into it."""
+    clutter = camera.clutter
+    spots: list[SecondMark | Highlight] = [*clutter.marks, *clutter.highlights]
+    things: list[tuple[str, Path, Path, float]] = [
+        (spot.views, spot.path, spot.path, spot.radius_m) for spot in spots if not spot.carried
+    ]
+    things += [(one.views, one.start, one.end, one.radius_m) for one in clutter.occluders]
+    return frame.mark and all(
+        _gap_px(eye, tip, start.at(frame.time_s), end.at(frame.time_s), radius_m) > CLEAR_PX
+        for views, start, end, radius_m in things
+        for eye in camera.eyes
+        if views in ("both", eye.side)
+    )
+
+
+def _gap_px(eye: Eye, tip: Floats, start: Floats, end: Floats, radius_m: float) -> float:
+    """Between the mark's edge and that of a straight thing, in the picture, lens left out."""
+    in_camera = apply(eye.camera_from_world, np.stack([tip, start, end]))
+    slopes = in_camera[:, :2] / in_camera[:, 2:]
+    way = slopes[2] - slopes[1]
+    share = float((slopes[0] - slopes[1]) @ way / max(way @ way, 1e-12))
+    share = min(max(share, 0.0), 1.0)
+    depth_m = in_camera[1, 2] + share * (in_camera[2, 2] - in_camera[1, 2])
+    gap = float(np.linalg.norm(slopes[1] + share * way - slopes[0]))
+    return float(eye.lens.fx_px * (gap - radius_m / depth_m - MARK_RADIUS_M / in_camera[0, 2]))
+
+
+@dataclass
+class Tally:
+    """What came of some frames."""
+
+    frames: int = 0
+    valid: int = 0
+    steps: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+    jump_sigmas: list[float] = field(default_factory=list)
+    jump_sigmas_along: list[float] = field(default_factory=list)
+    jumps_mm: list[float] = field(default_factory=list)
+    errors_mm: list[float] = field(default_factory=list)
+    jumps: list[dict[str, Any]] = field(default_factory=list)
+    wrong_footed: list[dict[str, Any]] = field(default_factory=list)
+    outages: int = 0
+    reacquired_ms: list[float] = field(default_factory=list)
+    refused_in_full_view: int = 0
+
+    def add(self, other: Tally) -> None:
+        self.frames += other.frames
+        self.valid += other.valid
+        self.steps += other.steps
+        self.reasons += other.reasons
+        self.jump_sigmas += other.jump_sigmas
+        self.jump_sigmas_along += other.jump_sigmas_along
+        self.jumps_mm += other.jumps_mm
+        self.errors_mm += other.errors_mm
+        self.jumps += other.jumps
+        self.wrong_footed += other.wrong_footed
+        self.outages += other.outages
+        self.reacquired_ms += other.reacquired_ms
+        self.refused_in_full_view += other.refused_in_full_view
+
+    def report(self) -> dict[str, Any]:
+        jump_sigmas, jumps_mm = np.array(self.jump_sigmas), np.array(self.jumps_mm)
+        along = np.array(self.jump_sigmas_along)
+        errors_mm, again_ms = np.array(self.errors_mm), np.array(self.reacquired_ms or [0.0])
+        return {
+            "frames": self.frames,
+            "valid_share": self.valid / self.frames,
+            "reasons": dict(self.reasons.most_common()),
+            "steps": self.steps,
+            "jumps_beyond_sigmas": {
+                str(limit): int((jump_sigmas > limit).sum()) for limit in SIGMAS
+            },
+            "jumps_beyond_sigmas_along": {
+                str(limit): int((along > limit).sum()) for limit in SIGMAS
+            },
+            "jumps_beyond_mm": {str(mm): int((jumps_mm > mm).sum()) for mm in BEYOND_MM},
+            "largest_jump_sigmas": float(jump_sigmas.max(initial=0.0)),
+            "largest_jump_beyond_the_finger_mm": float(jumps_mm.max(initial=0.0)),
+            "jumps": sorted(self.jumps, key=lambda jump: -jump["sigmas"])[:SHOWN],
+            "error_mm": {
+                "rms": float(np.sqrt(np.mean(errors_mm**2))),
+                "p99": float(np.quantile(errors_mm, 0.99)),
+                "max": float(errors_mm.max()),
+            },
+            "wrong_footed_frames": len(self.wrong_footed),
+            "wrong_footed": self.wrong_footed[:SHOWN],
+            "outages": self.outages,
+            "reacquired_ms": {
+                "median": float(np.median(again_ms)),
+                "p99": float(np.quantile(again_ms, 0.99)),
+                "max": float(again_ms.max()),
+            },
+            "refused_in_full_view_share": self.refused_in_full_view / self.frames,
+        }
+
+
+def tallied(seen: list[Seen], scene: Scene, seed: int) -> Tally:
+    """Judge one sequence; what comes before its first valid fingertip is no outage."""
+    tally = Tally(frames=len(seen))
+    before: Seen | None = None
+    clear_since_s: float | None = None
+    out = False
+    for one in seen:
+        tally.reasons[one.reason] += 1
+        clear = in_full_view(one.frame.camera, one.frame, one.truth)
+        if not clear:
+            clear_since_s = None
+        elif clear_since_s is None:
+            clear_since_s = one.frame.time_s
+        if not one.valid:
+            tally.refused_in_full_view += clear
+            if before is not None and not out:
+                out, tally.outages = True, tally.outages + 1
+            continue
+        tally.valid += 1
+        error_m = float(np.linalg.norm(one.error_m))
+        tally.errors_mm.append(1e3 * error_m)
+        if error_m > WRONG_FOOTED_M:
+            tally.wrong_footed.append(
+                {
+                    "seed": seed,
+                    "time_s": round(one.frame.time_s, 3),
+                    "error_mm": round(1e3 * error_m, 3),
+                }
+            )
+        if out and clear_since_s is not None:
+            tally.reacquired_ms.append(1e3 * (one.frame.time_s - clear_since_s))
+        out = False
+        if before is not None:
+            tally.steps += 1
+            beyond_m, sigma_m, sigma_along_m = _jump(before, one)
+            tally.jump_sigmas_along.append(beyond_m / sigma_along_m)
+            tally.jumps_mm.append(1e3 * beyond_m)
+            tally.jump_sigmas.append(beyond_m / sigma_m)
+            if beyond_m > SIGMAS[0] * sigma_m:
+                tally.jumps.append(
+                    {
+                        "seed": seed,
+                        "time_s": round(one.frame.time_s, 3),
+                        "sigmas": round(beyond_m / sigma_m, 1),
+                        "beyond_mm": round(1e3 * beyond_m, 3),
+                        "after_s": round(one.frame.time_s - before.frame.time_s, 3),
+                    }
+                )
+        before = one
+    return tally
+
+
+def _jump(before: Seen, after: Seen) -> tuple[float, float, float]:
+    """How much further the fingertip went than the finger did, m, and its standard deviation.
+
+    Two of them: of the difference of the two positions as a whole (root of the trace of the sum of
+    both covariances), and along its way.
+    """
+    assert before.fingertip is not None
+    assert after.fingertip is not None
+    step = after.fingertip.position_world_m - before.fingertip.position_world_m
+    way_m = float(np.linalg.norm(step))
+    along = step / max(way_m, 1e-12)
+    both = before.covariance + after.covariance
+    beyond_m = way_m - float(np.linalg.norm(after.truth - before.truth))
+    return beyond_m, float(np.sqrt(np.trace(both))), float(np.sqrt(along @ both @ along))
+
+
+async def follow(seed: int, count: int) -> tuple[list[Seen], Motion]:
+    """One sequence of frames, all of it drawn from its seed."""
+    scene, random = bench_scene(), np.random.default_rng(seed)
+    alone = twin_camera(scene, CLUTTER["lab"], seed=seed)
+    crowded = twin_camera(scene, crowd(random), seed=seed)
+    length_s = 1.1 * count / scene.camera.rate_hz
+    paths = []
+    for path in gestures(scene, random):
+        paths.append(path)
+        if sum(float(one.times_s[-1]) for one in paths) > length_s:
+            break
+    motion, _ = paths_motion(paths, scene, seed=seed)
+    observer = await Observer(scene).start()
+    return await observer.follow(exposures(scene, alone, crowded, count, random), motion), motion
+
+
+def run(seed: int, count: int) -> Tally:
+    seen, _ = asyncio.run(follow(seed, count))
+    return tallied(seen, bench_scene(), seed)
+
+
+def endure(frames: int, *, processes: int, first_seed: int = 1) -> Tally:
+    """Sequences of SEQUENCE_FRAMES, each in a process of a pool."""
+    counts = [SEQUENCE_FRAMES] * (frames // SEQUENCE_FRAMES)
+    if frames % SEQUENCE_FRAMES:
+        counts.append(frames % SEQUENCE_FRAMES)
+    seeds = range(first_seed, first_seed + len(counts))
+    total, began_s = Tally(), time.monotonic()
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, mp_context=context) as pool:
+        for tally in pool.map(run, seeds, counts):
+            total.add(tally)
+            print(
+                f"\r{total.frames} of {frames} frames, {time.monotonic() - began_s:.0f} s, "
+                f"{len(total.wrong_footed)} wrong-footed",
+                end="",
+                file=sys.stderr,
+                flush=True,
+            )
+    print(file=sys.stderr)
+    return total
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--frames", type=int, default=100_000)
+    parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--first-seed", type=int, default=1)
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    report = endure(given.frames, processes=given.processes, first_seed=given.first_seed).report()
+    if given.json:
+        print(json.dumps(report))
+        return
+    print(f"{MACHINE}")
+    for key, value in report.items():
+        print(f"{key}: {json.dumps(value)}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,553 @@
+"""How tracking fails: error against severity for each way in which a fingertip can be lost.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.tracking_limits [--quick] [--json] [NAME...]
+
+Each failure is brought about in the twin's camera: a finger is followed for half a second, then it
+comes about for a while at one severity, then it is over.  Of the frames meanwhile: the share that
+is valid, the reasons of the others, the errors of those that are valid, in mm and in their own
+stated standard deviations (the track's covariance and the calibration's), and after it the time
+from the first undisturbed picture to the next valid fingertip.  Draws `docs/charts/limits-*.svg`
+and prints a table; some ten minutes, with --quick one of six repetitions and no pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.tracking_bench import (
+    CALIBRATION_FILE,
+    MACHINE,
+    ROOT,
+    WRONG_FOOTED_M,
+    Frame,
+    Motion,
+    Observer,
+    Seen,
+    bench_scene,
+    calibration_covariance,
+    path_motion,
+    sigmas,
+    twin_camera,
+)
+from messages.scene import Scene
+from nodes.twin.clutter import (
+    CLUTTER,
+    MARK_RADIUS_M,
+    Clutter,
+    Occluder,
+    Still,
+    second_mark,
+    together,
+    touching_highlight,
+)
+from nodes.twin.finger import smoothstep
+from nodes.twin.gestures import circle, hover, reach
+from nodes.twin.pixels import Sensor, TwinCamera
+
+Floats = NDArray[np.float64]
+
+BEFORE_S, DURING_S, AFTER_S = 0.5, 0.8, 0.8
+MOVE_S = 0.4
+REPETITIONS = 6
+SCREEN_M = 0.05
+SETTLED_S = 0.1
+"""A track has begun by then."""
+
+AFTERMATH_S = 0.3
+"""What comes so soon after a gap or a step of the clock counts as disturbed by it."""
+
+CHARTS = ROOT / "docs" / "charts"
+LARGEST_DEFOCUS_APERTURE_M = 0.05
+MOSTLY = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """What is shown: frames in order of their true times, those in [begins_s, ends_s) disturbed.
+
+    calibration: None where the scene's optics are exact.
+    """
+
+    motion: Motion
+    frames: list[Frame]
+    begins_s: float
+    ends_s: float
+    scene: Scene
+    calibration: Path | None = CALIBRATION_FILE
+
+
+Setting = Callable[[Scene, float, int], Stage]
+"""The stage of a failure, at a severity, in a repetition."""
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One way to lose a fingertip.
+
+    severities: from mild to severe; for some there are two directions.
+    """
+
+    title: str
+    severity: str
+    severities: tuple[float, ...]
+    setting: Setting
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What comes out at one severity; errors are of valid fingertips, None where there are none.
+
+    wrong: valid fingertips farther than 5 mm from the finger.
+    recovery_ms: from the first undisturbed picture to the next valid fingertip, median and largest;
+        None where nothing was lost or the disturbance has no end.
+    """
+
+    severity: float
+    frames: int
+    valid_share: float
+    reasons: dict[str, int]
+    rms_mm: float | None
+    p99_mm: float | None
+    max_mm: float | None
+    worst_sigmas: float | None
+    wrong: int
+    recovery_ms: tuple[float, float] | None
+
+
+@lru_cache(maxsize=6)
+def _camera(clutter: Clutter, sensor: Sensor = Sensor()) -> TwinCamera:  # noqa: B008  frozen
+    return twin_camera(bench_scene(), together(CLUTTER["lab"], clutter), sensor=sensor)
+
+
+def clean() -> TwinCamera:
+    return _camera(Clutter())
+
+
+def times(
+    scene: Scene, until_s: float, *, since_s: float = 0.0, rate_hz: float = 0.0
+) -> list[float]:
+    """Middles of exposures, at the camera's own rate if no other is given."""
+    period_s = 1.0 / (rate_hz or scene.camera.rate_hz)
+    return [float(t) for t in np.arange(since_s, until_s - 1e-9, period_s)]
+
+
+def drawing(scene: Scene, repetition: int) -> Motion:
+    """A finger that draws circles before the sheet at 86 mm/s."""
+    motion = path_motion(circle(scene), scene, seed=repetition)
+    start_s = 1.5 + 0.7 * repetition
+    return lambda time_s: motion(start_s + time_s)
+
+
+def reaching(scene: Scene, repetition: int) -> Motion:
+    """A finger that reaches to and fro, at up to 0.35 m/s."""
+    motion = path_motion(reach(scene, seed=repetition + 1), scene, seed=repetition)
+    return lambda time_s: motion(0.1 + time_s)
+
+
+def passing(scene: Scene, motion: Motion, change: Callable[[Frame], Frame]) -> Stage:
+    """An undisturbed finger, a change of the frames for some time, and the finger again."""
+    ends_s = BEFORE_S + DURING_S
+    frames = [
+        change(frame) if BEFORE_S <= frame.time_s < ends_s else frame
+        for frame in (Frame(t, clean()) for t in times(scene, ends_s + AFTER_S))
+    ]
+    return Stage(motion, frames, BEFORE_S, ends_s, scene)
+
+
+def before(camera: TwinCamera) -> Callable[[Frame], Frame]:
+    return lambda frame: replace(frame, camera=camera)
+
+
+def hidden_in_one_view(scene: Scene, edge: float, repetition: int) -> Stage:
+    """Something dark with a straight edge, so many radii from the mark's centre, hides the rest."""
+    middle_m = edge * MARK_RADIUS_M + SCREEN_M
+    ends = [Still((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
+    screen = Occluder(ends[0], ends[1], SCREEN_M, level=30.0, carried=True, views="right")
+    camera = _camera(Clutter(occluders=(screen,)))
+    return passing(scene, drawing(scene, repetition), before(camera))
+
+
+def off_the_edge(scene: Scene, distance_px: float, repetition: int) -> Stage:
+    """The right camera reads a region out that begins so far from the mark's centre."""
+    motion = drawing(scene, repetition)
+    right = clean().eyes[1]
+
+    def cut(frame: Frame) -> Frame:
+        x_px = float(right.see(motion(frame.time_s))[0][0])
+        return replace(frame, right_from_column=round(x_px - distance_px))
+
+    return passing(scene, motion, cut)
+
+
+def with_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Stage:
+    camera = _camera(second_mark((1e-3 * distance_mm, 0.0, 0.0)))
+    return passing(scene, drawing(scene, repetition), before(camera))
+
+
+def hidden_beside_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Stage:
+    """The second mark is there all the time, and alone while the finger's is hidden."""
+    camera = _camera(second_mark((1e-3 * distance_mm, 0.0, 0.0)))
+    stage = passing(
+        scene, drawing(scene, repetition), lambda frame: replace(frame, camera=camera, mark=False)
+    )
+    frames = [
+        replace(frame, camera=camera) if frame.time_s > 0.5 * BEFORE_S else frame
+        for frame in stage.frames
+    ]
+    return replace(stage, frames=frames)
+
+
+def touched_by_a_highlight(scene: Scene, overlap: float, repetition: int) -> Stage:
+    camera = _camera(touching_highlight(overlap))
+    return passing(scene, drawing(scene, repetition), before(camera))
+
+
+def beyond_the_volume(scene: Scene, beyond_mm: float, repetition: int) -> Stage:
+    """A finger held still goes to the right, to so far beyond where fingers can be, and back."""
+    still = path_motion(hover(scene), scene, seed=repetition)
+    way_m = float(scene.finger.volume_max_m[0]) + 1e-3 * beyond_mm
+    leaves_s, returns_s = BEFORE_S + MOVE_S, BEFORE_S + MOVE_S + DURING_S
+
+    def motion(time_s: float) -> Floats:
+        out, _ = smoothstep(float(np.clip((time_s - BEFORE_S) / MOVE_S, 0.0, 1.0)))
+        back, _ = smoothstep(float(np.clip((time_s - returns_s) / MOVE_S, 0.0, 1.0)))
+        return np.asarray(still(1.0 + time_s) + np.array([way_m * (out - back), 0.0, 0.0]))
+
+    frames = [Frame(t, clean()) for t in times(scene, returns_s + MOVE_S + AFTER_S)]
+    return Stage(motion, frames, leaves_s, returns_s, scene)
+
+
+def with_a_short_baseline(scene: Scene, baseline_mm: float, repetition: int) -> Stage:
+    """A rig of perfect optics whose cameras stand so near to one another, all the time."""
+    rig = scene.camera.right_from_left.copy()
+    rig[:3, 3] *= 1e-3 * baseline_mm / np.linalg.norm(rig[:3, 3])
+    short = scene.model_copy(
+        update={"camera": scene.camera.model_copy(update={"right_from_left": rig})}
+    )
+    camera = _exact_camera(baseline_mm, short)
+    frames = [Frame(t, camera) for t in times(scene, BEFORE_S + DURING_S)]
+    motion = drawing(scene, repetition)
+    return Stage(motion, frames, SETTLED_S, np.inf, short, calibration=None)
+
+
+_EXACT: dict[float, TwinCamera] = {}
+
+
+def _exact_camera(baseline_mm: float, scene: Scene) -> TwinCamera:
+    if baseline_mm not in _EXACT:
+        _EXACT.clear()
+        _EXACT[baseline_mm] = TwinCamera(
+            scene.camera,
+            finger_radius_m=scene.finger.radius_m,
+            seed=1,
+            clutter=CLUTTER["lab"],
+        )
+    return _EXACT[baseline_mm]
+
+
+def out_of_focus(scene: Scene, defocus_px: float, repetition: int) -> Stage:
+    motion = drawing(scene, repetition)
+    depth_m = clean().eyes[0].see(motion(BEFORE_S))[1]
+    aperture = Sensor(aperture_m=LARGEST_DEFOCUS_APERTURE_M)
+    sensor = aperture.out_of_focus(defocus_px, round(depth_m, 2), scene.camera.left.fx_px)
+    return passing(scene, motion, before(_camera(Clutter(), sensor)))
+
+
+def overexposed(scene: Scene, exposure: float, repetition: int) -> Stage:
+    camera = _camera(Clutter(), Sensor(exposure=exposure))
+    return passing(scene, drawing(scene, repetition), before(camera))
+
+
+def slowed(scene: Scene, rate_hz: float, repetition: int) -> Stage:
+    """The camera's rate falls for the rest of the time."""
+    ends_s = BEFORE_S + 2.0 * DURING_S
+    moments = times(scene, BEFORE_S) + times(scene, ends_s, since_s=BEFORE_S, rate_hz=rate_hz)
+    frames = [Frame(t, clean()) for t in moments]
+    return Stage(reaching(scene, repetition), frames, BEFORE_S, np.inf, scene)
+
+
+def interrupted(scene: Scene, gap_ms: float, repetition: int) -> Stage:
+    """No pictures for a while; what comes after is what counts."""
+    again_s = BEFORE_S + 1e-3 * gap_ms
+    moments = times(scene, BEFORE_S) + times(scene, again_s + AFTER_S, since_s=again_s)
+    frames = [Frame(t, clean()) for t in moments]
+    return Stage(reaching(scene, repetition), frames, again_s, again_s + AFTERMATH_S, scene)
+
+
+def stepped(scene: Scene, step_ms: float, repetition: int) -> Stage:
+    """The camera's clock steps ahead, or back."""
+    start_s = 10.0  # so that no stamp is negative
+    frames = [
+        Frame(t, clean(), stamp_s=start_s + t + (1e-3 * step_ms if t >= BEFORE_S else 0.0))
+        for t in times(scene, BEFORE_S + AFTER_S)
+    ]
+    motion = drawing(scene, repetition)
+    return Stage(motion, frames, BEFORE_S, BEFORE_S + AFTERMATH_S, scene)
+
+
+FAILURES: dict[str, Failure] = {
+    "one-view": Failure(
+        "The mark is hidden in one view",
+        "edge of what hides it, mark radii from its centre",
+        (2.5, 2.0, 1.75, 1.5, 1.25, 1.0, 0.5, 0.0, -1.5),
+        hidden_in_one_view,
+    ),
+    "edge": Failure(
+        "The mark leaves one view",
+        "from its centre to the picture's edge, px",
+        (10.0, 8.0, 6.0, 5.0, 4.0, 3.0, 0.0, -5.0),
+        off_the_edge,
+    ),
+    "two-marks": Failure(
+        "A second mark comes and goes",
+        "its distance, mm",
+        (60.0, 30.0, 20.0, 15.0, 10.0, 8.0, 6.0, 4.0),
+        with_a_second_mark,
+    ),
+    "hidden": Failure(
+        "The mark is hidden, another is not",
+        "distance of the other, mm",
+        (60.0, 30.0, 20.0, 15.0, 12.0, 10.0, 8.0),
+        hidden_beside_a_second_mark,
+    ),
+    "highlight": Failure(
+        "A highlight runs into the mark",
+        "overlap, share of the mark's diameter",
+        (-1.0, -0.5, -0.25, -0.1, 0.0, 0.1, 0.25, 0.5, 0.75, 1.0),
+        touched_by_a_highlight,
+    ),
+    "volume": Failure(
+        "The finger leaves the volume",
+        "how far beyond its side, mm",
+        (-10.0, -3.0, -1.0, 1.0, 3.0, 10.0, 40.0),
+        beyond_the_volume,
+    ),
+    "baseline": Failure(
+        "The baseline is too short for the depth",
+        "baseline, mm, at a depth of 0.5 m",
+        (120.5, 60.0, 30.0, 15.0, 8.0, 4.0, 2.0),
+        with_a_short_baseline,
+    ),
+    "defocus": Failure(
+        "The lens is out of focus",
+        "spread of a point, px",
+        (0.3, 0.7, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0),
+        out_of_focus,
+    ),
+    "saturated": Failure(
+        "The picture saturates",
+        "exposure, as a multiple of the right one",
+        (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 8.0),
+        overexposed,
+    ),
+    "rate": Failure(
+        "The frame rate falls",
+        "frames a second",
+        (60.0, 30.0, 20.0, 15.0, 12.0, 9.0, 6.0),
+        slowed,
+    ),
+    "gap": Failure(
+        "No pictures come",
+        "for so long, ms",
+        (33.0, 50.0, 100.0, 150.0, 250.0, 500.0, 1000.0),
+        interrupted,
+    ),
+    "clock": Failure(
+        "The camera's clock steps",
+        "by so much, ms",
+        (-5000.0, -500.0, -100.0, -20.0, 20.0, 50.0, 100.0, 500.0, 5000.0),
+        stepped,
+    ),
+}
+
+
+async def perform(stage: Stage) -> list[Seen]:
+    observer = await Observer(stage.scene, calibration=stage.calibration).start()
+    return await observer.follow(stage.frames, stage.motion)
+
+
+def measure(name: str, severity: float, *, repetitions: int = REPETITIONS) -> Row:
+    """One severity of one failure."""
+    scene = bench_scene()
+    shown: list[Seen] = []
+    recoveries_ms: list[float] = []
+    added = np.zeros((3, 3))
+    for repetition in range(repetitions):
+        stage = FAILURES[name].setting(scene, severity, repetition)
+        if stage.calibration is not None:
+            added = calibration_covariance(scene)
+        seen = asyncio.run(perform(stage))
+        shown += [one for one in seen if stage.begins_s <= one.frame.time_s < stage.ends_s]
+        after = [one for one in seen if one.frame.time_s >= stage.ends_s]
+        if name in ("gap", "clock"):  # these are over when the next picture comes
+            after = [one for one in seen if one.frame.time_s >= stage.begins_s]
+        if after:
+            recoveries_ms.append(recovery_ms(after))
+    return judged(severity, shown, recoveries_ms, added)
+
+
+def recovery_ms(after: Sequence[Seen]) -> float:
+    """To the first valid fingertip; infinite if none comes."""
+    back_s = next((one.frame.time_s for one in after if one.valid), np.inf)
+    return 1e3 * (back_s - after[0].frame.time_s)
+
+
+def judged(
+    severity: float, shown: Sequence[Seen], recoveries_ms: Sequence[float], added: Floats
+) -> Row:
+    valid = [one for one in shown if one.valid]
+    errors_mm = 1e3 * np.array([float(np.linalg.norm(one.error_m)) for one in valid])
+    some = len(valid) > 0
+    return Row(
+        severity=severity,
+        frames=len(shown),
+        valid_share=len(valid) / len(shown),
+        reasons=dict(Counter(one.reason for one in shown if not one.valid).most_common()),
+        rms_mm=float(np.sqrt(np.mean(errors_mm**2))) if some else None,
+        p99_mm=float(np.quantile(errors_mm, 0.99)) if some else None,
+        max_mm=float(errors_mm.max()) if some else None,
+        worst_sigmas=max(sigmas(one, added) for one in valid) if some else None,
+        wrong=int((errors_mm > 1e3 * WRONG_FOOTED_M).sum()),
+        recovery_ms=(
+            (float(np.median(recoveries_ms)), max(recoveries_ms)) if recoveries_ms else None
+        ),
+    )
+
+
+def table(results: dict[str, list[Row]]) -> str:
+    """What docs/limits.md shows, in Markdown."""
+    lines = [
+        "| failure | severity | valid | else | error of valid ones, rms / most | most, in stated σ "
+        "| back after, median / most |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, rows in results.items():
+        for place, row in enumerate(rows):
+            failure = FAILURES[name]
+            title = f"{failure.title} ({failure.severity})" if place == 0 else ""
+            reasons = ", ".join(f"`{reason}`" for reason in list(row.reasons)[:3])
+            error, sigma, back = "–", "–", "–"
+            if row.rms_mm is not None and row.max_mm is not None:
+                error = f"{row.rms_mm:.2f} / {row.max_mm:.2f} mm"
+                sigma = f"{row.worst_sigmas:.1f}"
+            if row.recovery_ms is not None:
+                back = " / ".join(f"{ms:.0f}" for ms in row.recovery_ms) + " ms"
+            lines.append(
+                f"| {title} | {row.severity:g} | {100 * row.valid_share:.0f} % | {reasons} "
+                f"| {error} | {sigma} | {back} |"
+            )
+    return "\n".join(lines)
+
+
+def draw(name: str, rows: Sequence[Row]) -> Path:
+    """One picture: errors of what is valid above, what comes out below; fit for light and dark."""
+    import matplotlib as mpl
+
+    mpl.use("svg")
+    from matplotlib import pyplot
+
+    grey = "#808890"
+    style: dict[Any, Any] = {
+        "svg.hashsalt": "limits",
+        "font.size": 9,
+        "text.color": grey,
+        "axes.labelcolor": grey,
+        "axes.edgecolor": grey,
+        "xtick.color": grey,
+        "ytick.color": grey,
+    }
+    with mpl.rc_context(style):
+        figure, (above, below) = pyplot.subplots(
+            2, 1, sharex=True, figsize=(6.4, 4.4), height_ratios=(3, 2), layout="constrained"
+        )
+        figure.patch.set_alpha(0.0)
+        places = np.arange(len(rows))
+        for axes in (above, below):
+            axes.patch.set_alpha(0.0)
+            for side in ("top", "right"):
+                axes.spines[side].set_visible(False)
+        for key, colour, mark, label in (
+            ("max_mm", "#d97706", "v", "most"),
+            ("p99_mm", "#0891b2", "s", "99 %"),
+            ("rms_mm", "#4f7df0", "o", "rms"),
+        ):
+            values = [getattr(row, key) for row in rows]
+            heights = [np.nan if value is None else value for value in values]
+            above.plot(places, heights, mark, color=colour, label=label, linestyle="-")
+        above.axhline(0.3, color=grey, linestyle=":", linewidth=1)
+        above.set_yscale("log")
+        above.set_ylim(0.01, 10.0)
+        above.set_ylabel("error of valid fingertips, mm")
+        above.set_title(FAILURES[name].title, fontsize=10, loc="left")
+        above.legend(frameon=False, ncols=3, loc="upper right", labelcolor=grey)
+        bottom = np.zeros(len(rows))
+        totals = sum((Counter(row.reasons) for row in rows), Counter())
+        shares = [("valid", [row.valid_share for row in rows])]
+        for reason, _ in totals.most_common():
+            shares.append((reason, [row.reasons.get(reason, 0) / row.frames for row in rows]))
+        colours = ("#4f7df0", "#d97706", "#b45309", "#a855f7", "#be185d", "#65a30d", "#0891b2")
+        for place, (label, share) in enumerate(shares):
+            colour = colours[min(place, len(colours) - 1)]
+            below.bar(places, share, 0.7, bottom=bottom, color=colour, label=label)
+            bottom += np.array(share)
+        below.set_ylim(0.0, 1.0)
+        below.set_ylabel("share of frames")
+        below.set_xticks(places, [f"{row.severity:g}" for row in rows])
+        below.set_xlabel(FAILURES[name].severity)
+        below.legend(
+            frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5), labelcolor=grey, fontsize=8
+        )
+        path = CHARTS / f"limits-{name}.svg"
+        figure.savefig(path, metadata={"Date": None})
+        pyplot.close(figure)
+    return path
+
+
+def sweep(names: Iterable[str], repetitions: int) -> dict[str, list[Row]]:
+    results: dict[str, list[Row]] = {}
+    for name in names:
+        rows = []
+        for severity in FAILURES[name].severities:
+            print(f"\r{name} {severity:g}      ", end="", file=sys.stderr, flush=True)
+            rows.append(measure(name, severity, repetitions=repetitions))
+        results[name] = rows
+    print(file=sys.stderr)
+    return results
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("names", nargs="*", default=list(FAILURES), metavar="NAME")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    for name in given.names:
+        if name not in FAILURES:
+            parser.error(f'no failure "{name}"; there are: {", ".join(FAILURES)}')
+    results = sweep(given.names, 1 if given.quick else REPETITIONS)
+    if not given.quick:
+        for name, rows in results.items():
+            draw(name, rows)
+    if given.json:
+        printed: dict[str, Any] = {
+            name: [asdict(row) for row in rows] for name, rows in results.items()
+        }
+        print(json.dumps({"machine": MACHINE, "failures": printed}))
+    else:
+        print(table(results))
+
+
+if __name__ == "__main__":
+    main()
