@@ -125,12 +125,15 @@ class Observer:
             right=np.ascontiguousarray(right[:, column:]),
             right_origin_px=(column, 0),
         )
+        return Seen(frame, motion(frame.time_s), await self.hand_over(pair, frame.stamp_ns))
+
+    async def hand_over(self, pair: StereoPair, stamp_ns: int) -> Fingertip | None:
+        """What is said of a pair; None: nothing, it came too late.  Raises a handler's error."""
         self._said.clear()
-        stamp_ns = frame.stamp_ns
         await self.node.step("stereo", pair, Header(1, stamp_ns, stamp_ns, "virtual", "camera", 1))
         if self.node.errors:
             raise RuntimeError(f"triangulator: {self.node.last_error}")
-        return Seen(frame, motion(frame.time_s), self._said[0] if self._said else None)
+        return self._said[0] if self._said else None
 
     async def follow(self, frames: Iterable[Frame], motion: Motion) -> list[Seen]:
         return [await self.show(frame, motion) for frame in frames]

@@ -20,6 +20,8 @@ from nodes.triangulator.filters import TRACKING_METHODS
 from nodes.triangulator.fingertip import Eyesight, look
 from nodes.triangulator.mark import MARK_METHODS, MarkLooks
 from nodes.triangulator.pairs import refuse_other_pictures
+from nodes.triangulator.skew import sighting_unskewed
+from nodes.triangulator.subpixel import PixelNoise
 from nodes.triangulator.tracking import Tracker, TrackingSettings
 from nodes.triangulator.triangulation import TRIANGULATION_METHODS, Measured, StereoGeometry
 
@@ -65,12 +67,11 @@ class Triangulator(Node):
 
     calibration: StereoCalibration | None = None
     geometry: StereoGeometry | None = None
-    epoch = 0
-    late = 0
+    epoch, late = 0, 0
 
     async def setup(self) -> None:
-        if self.parameters.calibration is not None:
-            self.calibration = load_calibration(self.parameters.calibration)
+        if path := self.parameters.calibration:
+            self.calibration = load_calibration(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         p = self.parameters
@@ -90,6 +91,7 @@ class Triangulator(Node):
             noise_px=p.mark_noise_px,
             mark_radius_m=p.mark_radius_m,
             max_reprojection_px=p.max_reprojection_px,
+            sensor=PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level),
         )
         self.leads_s = np.arange(0.0, p.ahead_s + 1.5 * AHEAD_STEP_S, AHEAD_STEP_S)
         self.tracking = TrackingSettings(
@@ -98,7 +100,7 @@ class Triangulator(Node):
             forget_after_s=p.forget_after_s,
             confirm_frames=p.confirm_frames,
         )
-        self._begin()
+        self._begin(self.epoch)
 
     def on_stereo(self, pair: StereoPair, header: Header) -> None:
         if self.geometry is None:
@@ -106,8 +108,7 @@ class Triangulator(Node):
         refuse_other_pictures(pair, self.geometry)
         at_ns = header.source_ns
         if header.epoch != self.epoch:  # the camera was started anew, and its times with it
-            self.epoch = header.epoch
-            self._begin()
+            self._begin(header.epoch)
         sight = partial(
             look,
             pair.left,
@@ -119,6 +120,9 @@ class Triangulator(Node):
             right_origin_px=pair.right_origin_px,
         )
         sighting = sight(expected=self.tracker.expected(at_ns))
+        if pair.skew_s != 0.0:
+            motion = self.tracker.velocity_at(at_ns)
+            sighting = sighting_unskewed(sighting, self.geometry, pair.skew_s, *motion)
         is_late = self.tracker.is_late(at_ns)
         reason, measured = self.company.judge(at_ns, sighting, self.tracker)
         if is_late and reason != "ok":  # what it has to tell is in the track; a later one is out
@@ -130,8 +134,8 @@ class Triangulator(Node):
             self.company.survey(at_ns, sight(expected=None))
         self._note()
 
-    def _begin(self) -> None:
-        method = TRACKING_METHODS[self.parameters.tracking]
+    def _begin(self, epoch: int) -> None:
+        self.epoch, method = epoch, TRACKING_METHODS[self.parameters.tracking]
         self.tracker = Tracker(method(self.tracking.max_speed_m_per_s), self.tracking)
         self.company = Company()
 

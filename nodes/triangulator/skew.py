@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from nodes.triangulator.fingertip import Sighting
 from nodes.triangulator.triangulation import Measured, StereoGeometry, pixel_and_slope
 
 Floats = NDArray[np.float64]
@@ -41,4 +42,24 @@ def unskewed(
         measured,
         point_world=measured.point_world - off @ velocity,
         covariance=measured.covariance + off @ velocity_covariance @ off.T,
+    )
+
+
+def sighting_unskewed(
+    sighting: Sighting,
+    geometry: StereoGeometry,
+    skew_s: float,
+    velocity: Floats,
+    velocity_covariance: Floats,
+) -> Sighting:
+    """All that was found, each as if it were the finger; see `unskewed`."""
+
+    def mended(measured: Measured) -> Measured:
+        return unskewed(measured, geometry, skew_s, velocity, velocity_covariance)
+
+    return replace(
+        sighting,
+        measured=None if sighting.measured is None else mended(sighting.measured),
+        marks=tuple(replace(mark, measured=mended(mark.measured)) for mark in sighting.marks),
+        others=tuple(replace(mark, measured=mended(mark.measured)) for mark in sighting.others),
     )

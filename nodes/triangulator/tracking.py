@@ -145,6 +145,13 @@ class Tracker:
         ahead = self.filter.ahead(estimate, since_s + leads_s)
         return Track(ahead[0], velocity, covariance, ahead)
 
+    def velocity_at(self, at_ns: int) -> tuple[Floats, Floats]:
+        """The finger's velocity (3,) m/s and its covariance (3, 3), as far as they are known."""
+        if self.estimate is None or not self._alive(at_ns):
+            return np.zeros(3), np.eye(3) * (self.settings.max_speed_m_per_s / 3.0) ** 2
+        _, velocity, covariance = self.filter.moments(self.estimate)
+        return velocity, covariance[3:, 3:]
+
     def take(self, at_ns: int, measured: Floats, covariance: Floats) -> Verdict:
         """Judge a measured point (3,) with its covariance (3, 3), and let it in if it may."""
         fix = Fix(at_ns, measured, covariance)
