@@ -187,8 +187,8 @@ def read_times(path: Path, pairs: int) -> list[int]:
     times_s: list[float] = []
     for line, text in texts:
         try:
-            time_s = float(text)
-        except (TypeError, ValueError):
+            time_s = math.nan if text is None else float(text)
+        except ValueError:
             time_s = math.nan
         if not math.isfinite(time_s):
             raise DeviceError(f"{path}, line {line}: t_s is {text!r}, not a number of seconds")
