@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from nodes.fem_solver.mesh.bisection import CELL, bisected, lattice
 from nodes.fem_solver.mesh.curving import curved
 from nodes.fem_solver.mesh.grading import LONGEST_EDGE, Grading, longest_edges
-from nodes.fem_solver.mesh.quality import radius_ratios
+from nodes.fem_solver.mesh.quality import LEAST_RATIO, radius_ratios
 from nodes.fem_solver.mesh.smoothing import FROM_AFAR, settled
 from nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError, oriented, with_middles
 from nodes.models.shapes import Shape
@@ -41,8 +41,10 @@ DEEP = 0.4
 """The core's vertices lie this share of their shortest edge below the surface, or more."""
 MOST_THINNED = 0.05
 """A core that loses more than this share of its vertices was too thin for these elements."""
-GOOD_RATIO = 0.1
-ATTEMPTS = 6
+GOOD_RATIO = 0.2
+ATTEMPTS = 5
+"""While an element is flatter than `GOOD_RATIO` the core is thinned out there and the hull drawn
+anew, so many times at most; the best is taken."""
 
 
 class _Field:
@@ -90,25 +92,31 @@ def fitted_solid(
         found = shape.closest(points)
         return found.point, found.normal
 
+    best, best_ratio = None, LEAST_RATIO
     for _ in range(ATTEMPTS):
         chosen = _without_pinches(tetrahedra, core, distance)
         used, index = np.unique(chosen, return_inverse=True)
-        corners = points[used]
-        cells = oriented(corners, index.reshape(-1, 4))
+        begun = points[used]
+        cells = oriented(begun, index.reshape(-1, 4))
         hull = np.unique(hull_faces(cells))
-        corners = settled(corners, cells, hull, nearest, springs=FROM_AFAR, anchor=0.0)
-        bad = radius_ratios(corners, cells) < GOOD_RATIO
+        corners = settled(begun, cells, hull, nearest, springs=FROM_AFAR, anchor=0.0)
+        ratios = radius_ratios(corners, cells)
+        if ratios.min() > best_ratio:
+            best, best_ratio = (corners, cells), float(ratios.min())
+        bad = ratios < GOOD_RATIO
         if not bad.any():
-            nodes, elements = with_middles(corners, cells)
-            return curved(nodes, elements, lambda points: nearest(points)[0]), elements
+            break
         # the highest core vertex of each bad element gives way
         ends = used[cells[bad]]
         height = np.where(core[ends], distance[ends], -np.inf)
         core[ends[np.arange(len(ends)), height.argmax(axis=1)]] = False
-    raise UnfitMeshError(
-        f"skin_spacing_m: no well shaped elements of {grading.element_m:.3g} m fill the object; "
-        "take a smaller spacing, or smooth the mesh over a longer object.geometry.smoothing_m"
-    )
+    if best is None:
+        raise UnfitMeshError(
+            f"skin_spacing_m: no well shaped elements of {grading.element_m:.3g} m fill the "
+            "object; take a smaller spacing, or a longer object.geometry.smoothing_m"
+        )
+    nodes, elements = with_middles(*best)
+    return curved(nodes, elements, lambda points: nearest(points)[0]), elements
 
 
 def bent_sizes(sizes: Floats, bend: Floats, grading: Grading) -> Floats:

@@ -57,8 +57,9 @@ BYTES_PER_NODE = 6000
 """Peak while meshing, see docs/meshing.md."""
 SAMPLES = 16
 """Places along each side of the bounding box at which the number of nodes is estimated."""
-INNER_FACTOR, SKIN_FACTOR, MESH_FACTOR = 2.5, 5.0, 1.7
-"""What meshes had, over the sums in `mesh_budget`; more where a surface is fitted to a lattice."""
+INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
+CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
+"""What meshes had, over the sums in `mesh_budget`."""
 MOST_LOST = 0.1
 """A mesh object of which more than this share of the volume is lost is too thin."""
 
@@ -208,8 +209,8 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
     shell = float((high - low).max()) / SAMPLES
     inner = share * np.sum((2.0 / sizes[depth > 0.0]) ** 3)
     skin = share / shell * np.sum((2.0 / on_skin[(depth > 0.0) & (depth <= shell)]) ** 2)
-    fitted = MESH_FACTOR if isinstance(spec.geometry, Mesh) else 1.0
-    nodes = int(fitted * (INNER_FACTOR * inner + SKIN_FACTOR * skin)) + 100
+    usual = {"cylinder": CYLINDER_FACTOR, "mesh": MESH_FACTOR}.get(spec.geometry.shape, 1.0)
+    nodes = int(usual * (INNER_FACTOR * inner + SKIN_FACTOR * skin)) + 100
     budget = MeshBudget(nodes, nodes * BYTES_PER_NODE)
     if nodes > MOST_NODES:
         raise UnfitMeshError(
