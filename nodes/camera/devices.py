@@ -6,6 +6,8 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
+import cv2
+
 from messages.scene import StereoCamera
 from nodes.camera.files import ImagesReader, VideoReader
 from nodes.camera.live import CameraReader
@@ -89,7 +91,8 @@ class ReaderThread(threading.Thread):
                 if self._stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):
-                    error = DeviceError(f"{self.name}: {type(error).__name__}: {error}")
+                    kind = "OpenCV" if isinstance(error, cv2.error) else type(error).__name__
+                    error = DeviceError(f"{self.name}: {kind}: {error}")
                 self._fail(error)
                 self._stopping.wait(self._wait_s)
                 self._wait_s = min(2.0 * self._wait_s, MAX_RETRY_S)

@@ -20,9 +20,10 @@ mesh is measured (`deviation_m`).
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from nodes.models.shapes.surface import (
     SAME_M,
@@ -78,6 +79,8 @@ LEAST_SHARE = 0.1
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 
 def usual_smoothing_m(vertices: Floats, triangles: Indices) -> float:
@@ -111,6 +114,8 @@ class SmoothMeshShape:
         used = np.unique(faces)
         fine_vertices, fine = refined(vertices[used], np.searchsorted(used, faces), smoothing_m)
         self._centre, self._normal, self._operator = _jets(fine_vertices, fine, smoothing_m)
+        from scipy.spatial import cKDTree  # late, as all of scipy: processes must start quickly
+
         self._tree = cKDTree(self._centre)
         corners = fine_vertices[fine]
         middles = 0.5 * (corners + np.roll(corners, 1, axis=1))
@@ -352,6 +357,8 @@ def _put(feet: Feet, rows: Indices, other: Feet, chosen: Bools | slice = slice(N
 def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Floats, Floats]:
     """Points (j, 3), normals (j, 3) and shape operators (j, 3, 3) fitted about chosen vertices."""
     rough = vertex_normals(vertices, triangles)
+    from scipy.spatial import cKDTree
+
     tree = cKDTree(vertices)
     run = half_edges(triangles)
     order = np.argsort(run[:, 0], kind="stable")

@@ -9,9 +9,6 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -95,6 +92,9 @@ def _check_fans(triangles: Indices) -> None:
     # at each of its two ends belong together.
     ends = [(first, (second + count) % (3 * count)), ((first + count) % (3 * count), second)]
     rows, columns = (np.concatenate(side) for side in zip(*ends, strict=True))
+    from scipy.sparse import coo_array  # late, as all of scipy: processes must start quickly
+    from scipy.sparse.csgraph import connected_components
+
     joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(3 * count, 3 * count))
     fans = connected_components(joined, directed=False)[0]
     pinched = fans - len(np.unique(triangles))
@@ -264,6 +264,8 @@ def intersecting(vertices: Floats, triangles: Indices) -> int:
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
     """Pairs of balls (rows, columns) that overlap, in portions; balls of like size are searched
     together, so that one large triangle does not make all of them neighbours."""
+    from scipy.spatial import cKDTree
+
     octave = np.floor(np.log2(radius)).astype(int)
     classes = [np.flatnonzero(octave == size) for size in np.unique(octave)]
     for i, large in enumerate(classes):
@@ -339,6 +341,8 @@ class Facets:
         self.corners = vertices[triangles]
         self._centre = self.corners.mean(axis=1)
         self._reach = float(np.linalg.norm(self.corners - self._centre[:, None], axis=2).max())
+        from scipy.spatial import cKDTree
+
         self._tree = cKDTree(self._centre)
 
     def nearest(self, points: Floats) -> tuple[Indices, Floats]:
