@@ -393,6 +393,15 @@ def test_a_late_point_is_judged_as_one_in_time(off_m: float) -> None:
         assert off_m < 0.01
 
 
+def test_a_late_point_where_none_is_missing_is_left_out() -> None:
+    """A clock that steps back by about a frame would otherwise squeeze a finger's way together."""
+    tracker = new_tracker()
+    feed(tracker, steady, range(60))
+    before = tracker.estimate
+    assert tracker.take(59 * FRAME_NS - 3_000_000, steady(1.0), NOISE) == "unconfirmed"
+    assert tracker.estimate is before
+
+
 @pytest.mark.parametrize("step_s", [0.1, 5.0])
 def test_a_clock_that_steps_back_costs_a_few_frames(step_s: float) -> None:
     tracker = new_tracker()

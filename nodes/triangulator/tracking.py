@@ -210,7 +210,7 @@ class Tracker:
 
         Late points in a row, with none in between that is not, mean that the clock has stepped
         back: the track begins anew with them.  What is older than all that is remembered, was known
-        already, or lies where no finger could have been is left out.
+        already, comes where none is missing, or lies where no finger could have been is left out.
         """
         self._late = self._agreeing(self._late, fix)
         if len(self._late) >= self.settings.confirm_frames:
@@ -220,6 +220,7 @@ class Tracker:
         fits = (
             place > 0
             and again[0].at_ns != fix.at_ns
+            and self._is_missing_between(place - 1, place)
             and self._expected_after(*self._history[place - 1], fix.at_ns).holds(fix)
             and fix.reaches(again[0], self.settings.max_speed_m_per_s)
         )
@@ -228,3 +229,9 @@ class Tracker:
             for entry in (fix, *again):
                 self._append(entry)
         return "unconfirmed"
+
+    def _is_missing_between(self, before: int, after: int) -> bool:
+        """Whether so much time lies between two points of the track that one should be there."""
+        times_ns = np.array([entry[0].at_ns for entry in self._history])
+        usual_ns = float(np.median(np.diff(times_ns)))
+        return float(times_ns[after] - times_ns[before]) > 1.5 * usual_ns
