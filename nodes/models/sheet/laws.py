@@ -373,8 +373,8 @@ def depth_for_force(
 ) -> Floats:
     """Depths (n,) at which the law answers with these forces; no deeper than `deepest_m`.
 
-    One question to the law, at depths that lie denser near 0, and a monotone cubic between them
-    (of log force over log depth, which is nearly straight): within 1e-4 of the depth.
+    One question to the law, at depths that lie denser near 0, and straight lines between them (of
+    log force over log depth, which is nearly straight): within 1e-3 of the depth.
     """
     grid = deepest_m * _INVERSE_GRID
     pressed = law.press(
@@ -383,7 +383,7 @@ def depth_for_force(
     return interpolated_inverse(grid, pressed, np.asarray(forces_n, dtype=np.float64))
 
 
-_INVERSE_GRID = np.geomspace(1e-3, 1.0, 48)
+_INVERSE_GRID = np.geomspace(1e-3, 1.0, 160)
 
 
 def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats:
@@ -391,10 +391,7 @@ def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats
 
     Before the grid it goes as the first interval's power; beyond, it stays at the end.
     """
-    from scipy.interpolate import PchipInterpolator
-
-    rising = np.maximum.accumulate(values)
-    logs = np.log(np.maximum(rising, 1e-300))
+    logs = np.log(np.maximum(np.maximum.accumulate(values), 1e-300))
     keep = np.concatenate([[True], np.diff(logs) > 1e-12])
     logs, places = logs[keep], np.log(grid[keep])
     result = np.zeros(wanted.shape)
@@ -404,6 +401,6 @@ def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats
         return result
     asked = np.log(wanted[some])
     power = (places[1] - places[0]) / (logs[1] - logs[0])
-    inside = PchipInterpolator(logs, places)(np.clip(asked, logs[0], logs[-1]))
-    result[some] = np.exp(np.where(asked < logs[0], places[0] + power * (asked - logs[0]), inside))
+    before = places[0] + power * (asked - logs[0])
+    result[some] = np.exp(np.where(asked < logs[0], before, np.interp(asked, logs, places)))
     return result
