@@ -141,6 +141,12 @@ def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
     return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.arange(3)).ravel()
 
 
+def scattered(places: Ints, values: Floats, size: int) -> Floats:
+    """Values (k,) added up at their places (k,) in an array (size,)."""
+    result: Floats = np.bincount(places, values, size).astype(np.float64, copy=False)
+    return result
+
+
 def solve(stiffness: csc_matrix, held: Ints, values: Floats, loads: Floats) -> Floats:
     """Displacements (3n,) with the degrees of freedom `held` at `values`, nodal `loads` elsewhere.
 

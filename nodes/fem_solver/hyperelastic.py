@@ -1,0 +1,161 @@
+"""A compressible neo-Hookean solid on 10-node tetrahedra: energy, forces, consistent tangent.
+
+Energy per undeformed volume (Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element
+Analysis", 2nd ed., sec. 6.4.3), with Lame's constants, F the deformation gradient and J its
+determinant:
+
+    psi = mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2
+
+First Piola stress P = mu F + (lambda ln J - mu) F^-T.  It is Hooke's law for small strains, and
+grows without bound as J -> 0: no element can be turned inside out at finite energy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.fem_solver.elasticity import (
+    MeshError,
+    lame_constants,
+    quadrature,
+    scattered,
+    shape_gradients,
+)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class InvertedError(ArithmeticError):
+    """A displacement that turns an element inside out: it has no energy."""
+
+
+class NeoHookeanSolid:
+    """A mesh of neo-Hookean material; displacements are (n, 3), m."""
+
+    def __init__(
+        self, nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
+    ) -> None:
+        """nodes (n, 3), elements (e, 10).  MeshError where an element is inverted at rest,
+        ValueError as `lame_constants`."""
+        self.nodes, self.elements = nodes, elements
+        self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
+        points, weights = quadrature()
+        local = shape_gradients(points)
+        corners = nodes[elements].transpose(0, 2, 1)
+        jacobian = corners[:, None] @ local
+        determinant = np.linalg.det(jacobian)
+        if determinant.min() <= 0.0:
+            raise MeshError(
+                f"{int((determinant.min(axis=1) <= 0).sum())} of {len(elements)} elements are "
+                "inverted at rest"
+            )
+        self._gradients: Floats = local @ np.linalg.inv(jacobian)
+        self._volumes = determinant * weights
+        flat = self._gradients.transpose(0, 2, 1, 3).reshape(len(elements), 10, -1)
+        scaled = flat * np.repeat(self._volumes, 3, axis=1)[:, None]
+        self._laplacian: Floats = self._mu * (scaled @ flat.transpose(0, 2, 1))
+        self._rows = (3 * elements[:, :, None] + np.arange(3)).reshape(-1)
+
+    @property
+    def volume(self) -> float:
+        """Of the undeformed solid, m^3."""
+        return float(self._volumes.sum())
+
+    def deformation(self, displacement: Floats) -> tuple[Floats, Floats]:
+        """F (e, 8, 3, 3) and J (e, 8) at the quadrature points."""
+        moved = displacement[self.elements].transpose(0, 2, 1)
+        gradient = moved[:, None] @ self._gradients
+        gradient[..., 0, 0] += 1.0
+        gradient[..., 1, 1] += 1.0
+        gradient[..., 2, 2] += 1.0
+        return gradient, determinants(gradient)
+
+    def energy(self, displacement: Floats) -> float:
+        """Elastic energy, J; infinite where an element is turned inside out."""
+        gradient, volume_ratio = self.deformation(displacement)
+        if volume_ratio.min() <= 0.0:
+            return float("inf")
+        log = np.log(volume_ratio)
+        squared = np.einsum("eqij,eqij->eq", gradient, gradient)
+        density = 0.5 * self._mu * (squared - 3.0) - self._mu * log + 0.5 * self._lame * log * log
+        return float((self._volumes * density).sum())
+
+    def forces(self, displacement: Floats) -> Floats:
+        """Nodal forces (n, 3) of the deformed material: the gradient of the energy, N.
+
+        InvertedError where an element is turned inside out.
+        """
+        gradient, inverse, log = self._state(displacement)
+        stress = (self._lame * log - self._mu)[..., None, None] * inverse.transpose(0, 1, 3, 2)
+        stress += self._mu * gradient
+        stress *= self._volumes[..., None, None]
+        per_node = (self._gradients @ stress.transpose(0, 1, 3, 2)).sum(axis=1)
+        return scattered(self._rows, per_node.ravel(), 3 * len(self.nodes)).reshape(-1, 3)
+
+    def tangents(self, displacement: Floats) -> Floats:
+        """Element stiffness matrices (e, 30, 30): the energy's second derivative, N/m.
+
+        With h = F^-T times a shape function's gradient, the block of nodes a and b is
+        mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T, summed over the points.
+        InvertedError as `forces`.
+        """
+        _, inverse, log = self._state(displacement)
+        count = len(self.elements)
+        turned = (self._gradients @ inverse).reshape(count, -1, 30)
+        first: Floats = (turned * (self._lame * self._volumes)[..., None]).transpose(
+            0, 2, 1
+        ) @ turned
+        scaled = turned * ((self._mu - self._lame * log) * self._volumes)[..., None]
+        second = scaled.transpose(0, 2, 1) @ turned
+        blocks = first.reshape(count, 10, 3, 10, 3)
+        blocks += second.reshape(count, 10, 3, 10, 3).transpose(0, 1, 4, 3, 2)
+        for axis in range(3):
+            blocks[:, :, axis, :, axis] += self._laplacian
+        return first
+
+    def stiffen(self, matrices: Floats, share: float) -> None:
+        """Add `share` of mu times the Laplacian, positive in all directions, to tangents."""
+        blocks = matrices.reshape(-1, 10, 3, 10, 3)
+        for axis in range(3):
+            blocks[:, :, axis, :, axis] += share * self._laplacian
+
+    def smallest_volume_ratio(self, displacement: Floats) -> float:
+        """The least J at any quadrature point: 1 at rest, 0 and less where turned inside out."""
+        return float(self.deformation(displacement)[1].min())
+
+    def _state(self, displacement: Floats) -> tuple[Floats, Floats, Floats]:
+        gradient, volume_ratio = self.deformation(displacement)
+        if volume_ratio.min() <= 0.0:
+            raise InvertedError(
+                f"{int((volume_ratio.min(axis=1) <= 0).sum())} elements are turned inside out "
+                f"(least volume ratio {volume_ratio.min():.3g})"
+            )
+        return gradient, inverses(gradient, volume_ratio), np.log(volume_ratio)
+
+
+def determinants(matrices: Floats) -> Floats:
+    """Determinants (...) of 3x3 matrices (..., 3, 3), written out: faster than a general one."""
+    a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
+    result: Floats = (
+        a[..., 0] * (b[..., 1] * c[..., 2] - b[..., 2] * c[..., 1])
+        - a[..., 1] * (b[..., 0] * c[..., 2] - b[..., 2] * c[..., 0])
+        + a[..., 2] * (b[..., 0] * c[..., 1] - b[..., 1] * c[..., 0])
+    )
+    return result
+
+
+def inverses(matrices: Floats, determinant: Floats) -> Floats:
+    """Inverses (..., 3, 3) of 3x3 matrices with known determinants (...)."""
+    result = np.empty_like(matrices)
+    for i in range(3):
+        for j in range(3):
+            p, q = (j + 1) % 3, (j + 2) % 3
+            r, s = (i + 1) % 3, (i + 2) % 3
+            result[..., i, j] = (
+                matrices[..., p, r] * matrices[..., q, s]
+                - matrices[..., p, s] * matrices[..., q, r]
+            )
+    result /= determinant[..., None, None]
+    return result

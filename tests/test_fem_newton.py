@@ -1,0 +1,202 @@
+"""The full Newton with a finger: balanced, smooth, never inside out, whatever the push."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nodes.fem_solver.mesh import boundary_faces
+from nodes.fem_solver.newton import (
+    NOTHING_HELD,
+    Friction,
+    NeoHookeanBody,
+    Solved,
+    SphereObstacle,
+)
+from tests.solids import box, bricks
+
+Floats = NDArray[np.float64]
+
+MODULUS, NU, FINGER = 4000.0, 0.45, 0.007
+SIDE, HEIGHT = 0.03, 0.012
+
+
+def pad(friction: Friction = "none", divisions: tuple[int, int, int] = (5, 5, 2)) -> NeoHookeanBody:
+    """A block of 30 x 30 x 12 mm, glued to the ground, its top at z = 0."""
+    nodes, elements = box(divisions, (SIDE, SIDE, HEIGHT))
+    nodes = nodes - [0.5 * SIDE, 0.5 * SIDE, HEIGHT]
+    faces = boundary_faces(elements)
+    return NeoHookeanBody(
+        nodes,
+        elements,
+        np.isclose(nodes[:, 2], -HEIGHT),
+        faces[np.isclose(nodes[faces, 2], 0.0).all(axis=1)],
+        young_modulus_pa=MODULUS,
+        poisson_ratio=NU,
+        finger_radius_m=FINGER,
+        friction=friction,
+    )
+
+
+def centre(depth: float, x: float = 0.0012, y: float = 0.0007) -> Floats:
+    return np.array([x, y, FINGER - depth])
+
+
+def press(body: NeoHookeanBody, *centres: Floats) -> list[Solved]:
+    return list(body.follow(centres))
+
+
+@pytest.fixture(scope="module")
+def body() -> NeoHookeanBody:
+    return pad()
+
+
+@pytest.fixture(scope="module")
+def pressed(body: NeoHookeanBody) -> Solved:
+    return press(body, centre(0.0), centre(0.004))[-1]
+
+
+def test_the_body_is_in_balance_with_the_finger(body: NeoHookeanBody, pressed: Solved) -> None:
+    assert pressed.reached
+    inner = body.solid.forces(pressed.displacement)
+    outer = body.obstacle.forces(
+        body.solid.nodes + pressed.displacement, pressed.centre, NOTHING_HELD
+    )
+    free = ~body.fixed
+    assert np.abs((inner + outer)[free]).max() < 1e-7 * np.abs(outer).max()
+    # what the finger pushes, the ground takes
+    assert inner[body.fixed].sum(axis=0) == pytest.approx(pressed.force_n * [1, 1, 1], rel=1e-5)
+    assert not pressed.displacement[body.fixed].any()
+    assert pressed.force_n[2] > 0.0
+    assert 0.3 < pressed.least_volume_ratio < 1.0
+
+
+def test_no_point_of_the_skin_is_inside_the_finger(body: NeoHookeanBody, pressed: Solved) -> None:
+    _, depth, _, _ = body.obstacle.inside(body.solid.nodes + pressed.displacement, pressed.centre)
+    assert len(depth) > 10
+    assert 0.0 < depth.max() < 0.02 * FINGER
+
+
+def test_the_force_is_the_energys_derivative_along_the_finger(body: NeoHookeanBody) -> None:
+    """At the minimum, what the energy gains with the finger's place is the force: exact contact
+    mechanics, whatever the mesh."""
+    step = 1e-5
+    states = press(body, centre(0.0), centre(0.003 - step), centre(0.003), centre(0.003 + step))
+
+    def energy(state: Solved) -> float:
+        positions = body.solid.nodes + state.displacement
+        return body.solid.energy(state.displacement) + body.obstacle.energy(
+            positions, state.centre, NOTHING_HELD
+        )
+
+    slope = (energy(states[3]) - energy(states[1])) / (2 * step)
+    assert states[2].force_n[2] == pytest.approx(slope, rel=1e-4)
+
+
+def test_without_friction_every_way_there_gives_the_same(
+    body: NeoHookeanBody, pressed: Solved
+) -> None:
+    aside = press(body, centre(0.0, x=-0.004), centre(0.003, x=-0.004, y=0.003), centre(0.004))[-1]
+    deeper = press(body, centre(0.0), centre(0.006), centre(0.004))[-1]
+    for other in (aside, deeper):
+        assert np.abs(other.displacement - pressed.displacement).max() < 1e-7
+        assert other.force_n == pytest.approx(pressed.force_n, abs=1e-5 * pressed.force_n[2])
+
+
+def test_the_answer_is_smooth_in_the_fingers_place(body: NeoHookeanBody) -> None:
+    """Its change from step to step changes little: C1, as the bed's energy is made to give."""
+    step = 4e-5
+    places = [centre(0.003, x=-0.0004 + step * i) for i in range(13)]
+    states = press(body, centre(0.0, x=-0.0004), *places)[1:]
+    forces = np.array([state.force_n for state in states])
+    moves = np.diff([state.displacement for state in states], axis=0)
+    assert np.linalg.norm(moves, axis=2).max() < 2.0 * step
+    assert np.abs(np.diff(forces[:, 2])).max() < 0.01 * forces[:, 2].mean()
+    assert np.abs(np.diff(forces[:, 2], 2)).max() < 0.002 * forces[:, 2].mean()
+
+
+def test_a_sticking_finger_drags_the_skin_and_a_smooth_one_does_not() -> None:
+    there, aside = centre(0.003), centre(0.003, x=0.0032)
+    smooth = press(pad("none"), centre(0.0), there, aside)
+    sticking = press(pad("stick"), centre(0.0), there, aside)
+    assert abs(smooth[1].force_n[0]) < 0.05 * smooth[1].force_n[2]
+    assert abs(smooth[2].force_n[0]) < 0.05 * smooth[2].force_n[2]
+    # dragged by 2 mm to the right, the skin pulls to the left
+    assert sticking[2].force_n[0] < -0.15 * sticking[2].force_n[2]
+    assert sticking[1].force_n[2] > 0.98 * smooth[1].force_n[2]
+    below = np.flatnonzero(np.linalg.norm(pad().solid.nodes - [0.0012, 0.0007, 0], axis=1) < 0.002)
+    dragged = sticking[2].displacement[below, 0] - sticking[1].displacement[below, 0]
+    assert dragged.mean() == pytest.approx(0.002, rel=0.1)
+
+
+def test_a_push_deeper_than_the_body_is_bounded_flagged_and_not_inside_out() -> None:
+    body = pad(divisions=(4, 4, 2))
+    states = press(body, centre(0.0), *(centre(d) for d in (0.004, 0.008, 0.0115, 0.03)))
+    assert states[1].reached
+    assert not states[-1].reached
+    last = states[-1]
+    assert np.isfinite(last.displacement).all()
+    assert last.least_volume_ratio > 0.0
+    assert np.linalg.norm(last.displacement, axis=1).max() < 2 * HEIGHT
+    assert last.centre[2] > FINGER - 0.03
+    forces = [state.force_n[2] for state in states]
+    assert all(a <= b for a, b in itertools.pairwise(forces))
+
+
+def test_a_finger_in_the_air_moves_nothing(body: NeoHookeanBody) -> None:
+    state = press(body, centre(-0.01), centre(-1e-6))[-1]
+    assert not state.displacement.any()
+    assert not state.force_n.any()
+
+
+def test_obstacle_tangent_is_the_derivative_of_its_forces() -> None:
+    nodes, elements = box((1, 1, 1), (0.01, 0.01, 0.01))
+    faces = boundary_faces(elements)
+    obstacle = SphereObstacle(nodes, elements, faces, modulus_pa=MODULUS, radius_m=FINGER)
+    there = np.array([0.003, 0.006, 0.0166])
+    way = np.random.default_rng(5).normal(size=nodes.shape)
+    held = obstacle.hold(nodes, there + 1e-4, NOTHING_HELD)
+    matrices = np.zeros((len(elements), 30, 30))
+    obstacle.add_tangents(matrices, nodes, there, held, turned=1.0)
+    dofs = (3 * elements[:, :, None] + np.arange(3)).reshape(-1, 30)
+    turned = np.zeros(nodes.size)
+    np.add.at(turned, dofs, np.einsum("eij,ej->ei", matrices, way.ravel()[dofs]))
+    step = 1e-9
+    ahead = obstacle.forces(nodes + step * way, there, held)
+    behind = obstacle.forces(nodes - step * way, there, held)
+    change = (ahead - behind).ravel() / (2 * step)
+    assert len(held.points) > 3
+    assert np.abs(turned - change).max() < 1e-5 * np.abs(change).max()
+
+
+def test_small_pushes_follow_hertz() -> None:
+    """A sphere on a block ten contact radii deep: force, and its power 3/2.
+
+    The layer's finite thickness makes it some 5 % stiffer than a half-space (Dimitriadis et al.
+    2002), the mesh as much again.
+    """
+    lines = [1.2, 3.0, 8.0, 24.0]
+    across = 1e-3 * np.array([*(-x for x in reversed(lines)), 0.0, *lines])
+    down = 1e-3 * np.array([-24.0, -8.0, -3.0, -1.2, 0.0])
+    nodes, elements = bricks(across, across, down)
+    faces = boundary_faces(elements)
+    top = faces[np.isclose(nodes[faces, 2], 0.0).all(axis=1)]
+    radius = 0.01
+    body = NeoHookeanBody(
+        nodes,
+        elements,
+        nodes[:, 2] < -0.0239,
+        top[np.linalg.norm(nodes[top[:, 0]], axis=1) < 0.008],
+        young_modulus_pa=MODULUS,
+        poisson_ratio=0.3,
+        finger_radius_m=radius,
+    )
+    depths = (0.0003, 0.0006)
+    states = list(body.follow([np.array([0.0, 0.0, radius - d]) for d in (0.0, *depths)]))[1:]
+    hertz = [4 / 3 * MODULUS / (1 - 0.3**2) * np.sqrt(radius) * d**1.5 for d in depths]
+    got = [state.force_n[2] for state in states]
+    assert got == pytest.approx(hertz, rel=0.12)
+    assert np.log2(got[1] / got[0]) == pytest.approx(1.5, abs=0.15)
