@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test lint bench docs clean
+.PHONY: setup demo test lint bench limits docs clean
 
 setup: $(STAMP)
 	@$(BIN)/python -m launch.system
@@ -34,6 +34,12 @@ bench: setup
 	$(BIN)/python -m benchmarks.image_correction
 	$(BIN)/python -m benchmarks.recovery
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
+
+# What docs/limits.md shows of the tracking: its tables and pictures.
+limits: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
 docs: setup
 	$(BIN)/python -m messages.reference > docs/messages.md

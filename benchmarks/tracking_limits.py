@@ -7,7 +7,7 @@ comes about for a while at one severity, then it is over.  Of the frames meanwhi
 is valid, the reasons of the others, the errors of those that are valid, in mm and in their own
 stated standard deviations (the track's covariance and the calibration's), and after it the time
 from the first undisturbed picture to the next valid fingertip.  Draws `docs/charts/limits-*.svg`
-and prints a table; some ten minutes, with --quick one of six repetitions and no pictures.
+and prints tables; some ten minutes, with --quick one of six repetitions and no pictures.
 """
 
 from __future__ import annotations
@@ -70,7 +70,6 @@ AFTERMATH_S = 0.3
 
 CHARTS = ROOT / "docs" / "charts"
 LARGEST_DEFOCUS_APERTURE_M = 0.05
-MOSTLY = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -426,28 +425,32 @@ def judged(
     )
 
 
-def table(results: dict[str, list[Row]]) -> str:
-    """What docs/limits.md shows, in Markdown."""
-    lines = [
-        "| failure | severity | valid | else | error of valid ones, rms / most | most, in stated σ "
-        "| back after, median / most |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def tables(results: dict[str, list[Row]]) -> str:
+    """What docs/limits.md shows, in Markdown: a table for each failure."""
+    lines = []
     for name, rows in results.items():
-        for place, row in enumerate(rows):
-            failure = FAILURES[name]
-            title = f"{failure.title} ({failure.severity})" if place == 0 else ""
-            reasons = ", ".join(f"`{reason}`" for reason in list(row.reasons)[:3])
+        failure = FAILURES[name]
+        lines += [
+            f"### {failure.title}",
+            "",
+            f"| {failure.severity} | valid | else | error, rms / most | most, in stated σ "
+            "| back after, median / most |",
+            "|---|---|---|---|---|---|",
+        ]
+        for row in rows:
+            reasons = ", ".join(f"`{reason}`" for reason in list(row.reasons)[:3]) or "–"
             error, sigma, back = "–", "–", "–"
             if row.rms_mm is not None and row.max_mm is not None:
                 error = f"{row.rms_mm:.2f} / {row.max_mm:.2f} mm"
                 sigma = f"{row.worst_sigmas:.1f}"
             if row.recovery_ms is not None:
-                back = " / ".join(f"{ms:.0f}" for ms in row.recovery_ms) + " ms"
+                times = (f"{ms:.0f}" if np.isfinite(ms) else "never" for ms in row.recovery_ms)
+                back = " / ".join(times) + " ms"
             lines.append(
-                f"| {title} | {row.severity:g} | {100 * row.valid_share:.0f} % | {reasons} "
-                f"| {error} | {sigma} | {back} |"
+                f"| {row.severity:g} | {100 * row.valid_share:.0f} % | {reasons} | {error} "
+                f"| {sigma} | {back} |"
             )
+        lines.append("")
     return "\n".join(lines)
 
 
@@ -546,7 +549,7 @@ def main() -> None:
         }
         print(json.dumps({"machine": MACHINE, "failures": printed}))
     else:
-        print(table(results))
+        print(tables(results))
 
 
 if __name__ == "__main__":

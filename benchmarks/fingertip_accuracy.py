@@ -1,0 +1,211 @@
+"""How exact a fingertip near the sheet is, and how near that is to the best there can be.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.fingertip_accuracy [--places 120] [--json]
+
+The twin's rig sees a finger that goes slowly, 20 mm/s and a hand's tremor, at places drawn evenly
+over the screen, 60 mm to each side, and from 40 mm behind it to 40 mm before it.  Through the node,
+single pictures (before tracking) and tracked:
+
+- with the shipped calibration: all of the error;
+- with the rig's true optics: what pixels leave, beside the Cramer-Rao bound of the same pixels
+  (`nodes.twin.bound`), each per axis as root mean square over all places.
+
+Some two minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.tracking_bench import (
+    CALIBRATION_FILE,
+    MACHINE,
+    Frame,
+    Motion,
+    Observer,
+    Seen,
+    bench_scene,
+    twin_camera,
+)
+from messages.calibration import load_calibration, save_calibration
+from messages.scene import Scene
+from nodes.twin.bound import fingertip_bound
+from nodes.twin.clutter import CLUTTER
+from nodes.twin.finger import TREMOR_BAND_HZ, Sines
+from nodes.twin.gestures import TREMOR_HAND_M
+from nodes.twin.rig import true_camera
+
+Floats = NDArray[np.float64]
+
+LOW_M, HIGH_M = (-0.06, -0.06, -0.04), (0.06, 0.06, 0.04)
+SPEED_M_PER_S = 0.02
+FRAMES = 14
+"""At each place; the first ones confirm the track."""
+
+SETTLED_FRAMES = 5
+APART_S = 2.0
+"""Between one place and the next: long enough to lose the track."""
+
+
+@dataclass(frozen=True, slots=True)
+class Walk:
+    """A finger that is at one place after the other, and passes each slowly."""
+
+    places: Floats
+    ways: Floats
+    tremor: Sines
+
+    @staticmethod
+    def drawn(count: int, seed: int) -> Walk:
+        random = np.random.default_rng(seed)
+        ways = random.standard_normal((count, 3))
+        ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+        return Walk(
+            random.uniform(LOW_M, HIGH_M, (count, 3)), ways, Sines.drawn(TREMOR_BAND_HZ, random)
+        )
+
+    def at(self, time_s: float) -> Floats:
+        place = min(int(time_s / APART_S + 0.5), len(self.places) - 1)
+        along_m = SPEED_M_PER_S * (time_s - place * APART_S)
+        shake = np.sqrt(0.5) * TREMOR_HAND_M * self.tremor.at(time_s)[0]
+        return np.asarray(self.places[place] + along_m * self.ways[place] + shake)
+
+    def moments(self, period_s: float) -> list[float]:
+        steps = np.arange(FRAMES) * period_s
+        return [
+            place * APART_S + float(step) for place in range(len(self.places)) for step in steps
+        ]
+
+
+def exact_calibration(scene: Scene, folder: Path) -> Path:
+    """A calibration file of the rig as it really stands."""
+    rig = true_camera(scene.camera)
+    true = load_calibration(CALIBRATION_FILE).model_copy(
+        update={"left": rig.left, "right": rig.right, "right_from_left": rig.right_from_left}
+    )
+    save_calibration(true, folder / "true.yaml")
+    return folder / "true.yaml"
+
+
+async def follow(scene: Scene, walk: Walk, calibration: Path) -> list[Seen]:
+    camera = twin_camera(scene, CLUTTER["lab"])
+    frames = [Frame(t, camera) for t in walk.moments(1.0 / scene.camera.rate_hz)]
+    observer = await Observer(scene, calibration=calibration).start()
+    return await observer.follow(frames, walk.at)
+
+
+def bound_m2(scene: Scene, walk: Walk) -> Floats:
+    """(3,) mean over the places of the least variance per axis."""
+    camera = twin_camera(scene, CLUTTER["lab"])
+
+    def around(place: int) -> Motion:
+        return lambda offset_s: walk.at(place * APART_S + offset_s)
+
+    bounds = [
+        fingertip_bound(camera, around(place), exposure_s=scene.camera.exposure_s)
+        for place in range(len(walk.places))
+    ]
+    return np.asarray(np.mean([np.diag(bound.position_m2) for bound in bounds], axis=0))
+
+
+def single_errors(seen: Sequence[Seen]) -> Floats:
+    """(n, 3) m of single pictures that have a measured point."""
+    return np.array(
+        [
+            one.fingertip.measured_world_m - one.truth
+            for one in seen
+            if one.fingertip is not None and one.reason in ("ok", "unconfirmed")
+        ]
+    )
+
+
+def tracked_errors(seen: Sequence[Seen]) -> Floats:
+    """(n, 3) m of valid fingertips of settled tracks."""
+    settled = [one for place, one in enumerate(seen) if place % FRAMES >= SETTLED_FRAMES]
+    return np.array([one.error_m for one in settled if one.valid])
+
+
+def summary(errors_m: Floats) -> dict[str, Any]:
+    """Sizes in mm; of the whole vector and per axis (root mean squares)."""
+    off_mm = 1e3 * np.linalg.norm(errors_m, axis=1)
+    return {
+        "frames": len(errors_m),
+        "rms_mm": float(np.sqrt(np.mean(off_mm**2))),
+        "p99_mm": float(np.quantile(off_mm, 0.99)),
+        "max_mm": float(off_mm.max()),
+        "axes_mm": [1e3 * float(v) for v in np.sqrt(np.mean(errors_m**2, axis=0))],
+    }
+
+
+def measure(places: int, *, seed: int = 1) -> dict[str, Any]:
+    scene, walk = bench_scene(), Walk.drawn(places, seed)
+    shipped = asyncio.run(follow(scene, walk, CALIBRATION_FILE))
+    with tempfile.TemporaryDirectory() as folder:
+        exact = asyncio.run(follow(scene, walk, exact_calibration(scene, Path(folder))))
+    least = np.sqrt(bound_m2(scene, walk))
+    pixels = summary(single_errors(exact))
+    return {
+        "machine": MACHINE,
+        "places": places,
+        "pictures": len(shipped),
+        "valid_share": sum(one.valid for one in shipped) / len(shipped),
+        "shipped_calibration_single": summary(single_errors(shipped)),
+        "shipped_calibration_tracked": summary(tracked_errors(shipped)),
+        "true_optics_single": pixels,
+        "true_optics_tracked": summary(tracked_errors(exact)),
+        "bound_axes_mm": [1e3 * float(v) for v in least],
+        "bound_rms_mm": 1e3 * float(np.sqrt(np.sum(least**2))),
+        "ratio_axes": [float(v) for v in np.array(pixels["axes_mm"]) / (1e3 * least)],
+        "ratio": pixels["rms_mm"] / (1e3 * float(np.sqrt(np.sum(least**2)))),
+    }
+
+
+def table(found: dict[str, Any]) -> str:
+    lines = [
+        f"{found['places']} places, {found['pictures']} pictures ({found['machine']})",
+        "",
+        "| | rms | 99 % | most | rms along x / y / z |",
+        "|---|---|---|---|---|",
+    ]
+    for key, title in (
+        ("shipped_calibration_single", "shipped calibration, single pictures"),
+        ("shipped_calibration_tracked", "shipped calibration, tracked"),
+        ("true_optics_single", "true optics, single pictures"),
+        ("true_optics_tracked", "true optics, tracked"),
+    ):
+        row = found[key]
+        axes = " / ".join(f"{value:.3f}" for value in row["axes_mm"])
+        lines.append(
+            f"| {title} | {row['rms_mm']:.3f} mm | {row['p99_mm']:.3f} mm | {row['max_mm']:.3f} mm "
+            f"| {axes} mm |"
+        )
+    axes = " / ".join(f"{value:.3f}" for value in found["bound_axes_mm"])
+    lines.append(
+        f"| Cramér–Rao bound of the pixels | {found['bound_rms_mm']:.3f} mm | | | {axes} mm |"
+    )
+    ratios = " / ".join(f"{value:.2f}" for value in found["ratio_axes"])
+    lines.append(f"| single pictures over the bound | {found['ratio']:.2f} × | | | {ratios} × |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--places", type=int, default=120)
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    found = measure(given.places)
+    print(json.dumps(found) if given.json else table(found))
+
+
+if __name__ == "__main__":
+    main()
