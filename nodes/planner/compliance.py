@@ -12,6 +12,9 @@ A retreat takes work from a finger that pushes while the sheet lags behind, so i
 gives it work: with lag t and sheet stiffness k, as a damper of -k a t would.  Hence the bound a on
 the advance, and hence the choice of the stretch: the least one that presents the curve without an
 advance, or with the smallest.
+
+While a push is hardly felt the sheet does not come towards the finger: one that only strokes, and
+what the camera adds to its height, must not be answered.
 """
 
 from __future__ import annotations
@@ -49,6 +52,13 @@ that move are never exactly as far apart as planned (one sees the other a cycle 
 FELT_N = 0.05
 """Forces below this are not compared, but as if they were this large: those of the first 2 mm into
 an object of 4 kPa, which the soft body itself knows to a tenth at best."""
+
+QUIET_N, ANSWERED_N = 0.5 * FELT_N, 1.5 * FELT_N
+"""Up to the first force, the object's or the sheet's, the sheet does not come towards the finger;
+from the second on as far as it takes."""
+
+QUIET_M, ANSWERED_M = 0.5e-3, 1.5e-3
+"""The same for depths: less than half a millimetre may be a fingertip that lies on the object."""
 
 GOOD_RATIO = 0.10
 """Error of the presented force, over the wanted, that is aimed for."""
@@ -217,6 +227,8 @@ def present(
         place_m=place_m,
         finger_radius_m=finger_radius_m,
     )
+    own = law.press(stretch_ratio, depths, place_m=place_m, finger_radius_m=finger_radius_m)
+    asked = _quietly(depths, asked, np.maximum(wanted, own.force_n))
     furthest = _indentation_for_pull(
         law,
         pull.edge_force_n,
@@ -266,6 +278,20 @@ def _indentation_for_pull(
     return float(interpolated_inverse(grid, added, np.array([edge_n - flat]))[0])
 
 
+def _quietly(depths: Floats, asked: Floats, forces_n: Floats) -> Floats:
+    """Indentations (n,) as asked, but beyond the depths only as far as forces are felt (C1)."""
+    felt = _smoothstep((forces_n - QUIET_N) / (ANSWERED_N - QUIET_N))
+    deep = _smoothstep((depths - QUIET_M) / (ANSWERED_M - QUIET_M))
+    beyond = np.maximum(asked - depths, 0.0)
+    return np.asarray(asked - (1.0 - felt * deep) * beyond)
+
+
+def _smoothstep(values: Floats) -> Floats:
+    """From 0 at 0 to 1 at 1, level at both (C1)."""
+    share = np.clip(values, 0.0, 1.0)
+    return np.asarray(share * share * (3.0 - 2.0 * share))
+
+
 def _bent(asked: Floats, furthest: float) -> Floats:
     """Follows `asked`, then bends (C1) towards `furthest` and never passes it."""
     if furthest <= 0.0:
@@ -292,6 +318,7 @@ class Compliance:
     finger_radius_m: float
     _nodes: tuple[Floats, Floats]
     _indentation: BSpline = field(repr=False)
+    _growth: BSpline = field(repr=False)
 
     @property
     def deepest_m(self) -> float:
@@ -312,6 +339,14 @@ class Compliance:
         depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
         result: Floats = depths - self.indentation_m(depths, place_m)
         return result
+
+    def retreat_per_depth(self, depth_m: float, place_m: Place = CENTRE) -> float:
+        """How fast the retreat grows with the depth: from -`pull.advance_per_depth` to 1."""
+        if depth_m <= 0.0:
+            return 0.0
+        if depth_m >= self.deepest_m:
+            return 1.0
+        return 1.0 - float(self._growth(depth_m) @ self._weights(place_m))
 
     def presented(self, depths_m: Floats, place_m: Place = CENTRE) -> Floats:
         """The force (n,), N, that the sheet then answers with, by its law."""
@@ -415,6 +450,9 @@ def compliance_at(
         for x in xs
         for y in ys
     ]
+    indentation = BSpline(
+        deepest_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
+    )
     return Compliance(
         stretch_ratio=stretch_ratio,
         note=_note(at_nodes[0], position_error_m),
@@ -423,9 +461,8 @@ def compliance_at(
         pull=pull,
         finger_radius_m=finger_radius_m,
         _nodes=(xs, ys),
-        _indentation=BSpline(
-            deepest_m * _KNOTS, np.column_stack([one.indentation_m for one in at_nodes]), 2
-        ),
+        _indentation=indentation,
+        _growth=indentation.derivative(),
     )
 
 
