@@ -11,6 +11,7 @@ import hashlib
 import ipaddress
 import json
 from collections.abc import Iterable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,6 +36,11 @@ from messages.calibration import (
     refuse_other_camera,
 )
 from messages.scene import Scene
+from messages.sheet_calibration import (
+    SheetCalibrationError,
+    load_sheet_calibration,
+    refuse_other_sheet,
+)
 from messages.topics import TOPICS, Topic
 from nodes import NODES, UnknownNodeError, node_class
 from nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
@@ -591,18 +597,28 @@ def _check_inputs(
 def _check_calibrations(
     members: list[_Member], scene: Scene | None, document: Document, problems: list[Problem]
 ) -> None:
-    """Parameters named `calibration` are files of the scene's camera, at its picture size."""
-    for member in members:
-        calibration = getattr(member.parameters, "calibration", None)
+    """Parameters that name a calibration's file are read, and held against the scene."""
+
+    def check_camera(path: Path) -> None:
+        measured = load_calibration(path)
+        if scene is not None:
+            refuse_other_camera(measured, scene.camera)
+
+    def check_sheet(path: Path) -> None:
+        measured = load_sheet_calibration(path)
+        if scene is not None:
+            refuse_other_sheet(measured, scene.sheet)
+
+    checks = {"calibration": check_camera, "sheet_calibration": check_sheet}
+    for member, (name, check) in product(members, checks.items()):
+        calibration = getattr(member.parameters, name, None)
         if not isinstance(calibration, Path):
             continue
-        key = (*member.key, "parameters", "calibration")
+        key = (*member.key, "parameters", name)
         path = Path(_absolute(calibration, _base(document, key)))
         try:
-            measured = load_calibration(path)
-            if scene is not None:
-                refuse_other_camera(measured, scene.camera)
-        except (CalibrationFileError, CalibrationMismatchError) as error:
+            check(path)
+        except (CalibrationFileError, CalibrationMismatchError, SheetCalibrationError) as error:
             said = str(error) if str(path) in str(error) else f"{path}: {error}"
             problems.append(document.problem(key, said))
 

@@ -118,7 +118,12 @@ class SheetTarget(Message):
     contact_world_m: Vector3 = Field(description="point of the undeformed object that is presented")
     normal_world: Vector3
     contact_sheet_m: Vector2 = Field(description="the same point on the sheet (x, y)")
-    push_depth_m: NonNegative
+    push_depth_m: NonNegative = Field(description="of the finger in the undeformed object")
+    retreat_m: Finite = Field(
+        default=0.0,
+        description="how far behind the object's tangent plane the sheet is to be, so that it "
+        "yields as the object would; below 0: before it",
+    )
 
 
 ArmMode = Literal["disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop"]

@@ -246,6 +246,20 @@ def test_the_launch_files_of_the_house_resolve(name: str) -> None:
             assert bool(far) == bool(hosts - {node.host})
 
 
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("planner.sheet_calibration=absent.yaml", "absent.yaml: cannot be read"),
+        ("planner.sheet_calibration=calibrations/twin-bumblebee.yaml", "sheet"),
+        ("triangulator.calibration=absent.yaml", "absent.yaml"),
+    ],
+)
+def test_a_calibration_that_is_none_is_refused_before_the_start(setting: str, words: str) -> None:
+    with pytest.raises(BadInputError, match=words) as caught:
+        load_plan(ROOT / "launch" / "demo.yaml", settings=[setting])
+    assert setting.split("=", maxsplit=1)[0].split(".")[1] in str(caught.value)
+
+
 def test_values_are_read_as_yaml() -> None:
     assert parse_value("3") == 3
     assert parse_value("1.0e-3") == pytest.approx(1e-3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -56,7 +57,7 @@ def in_world(point: Floats) -> Floats:
 class Table:
     """A planner, fed by hand at 60 Hz."""
 
-    def __init__(self, scene: Scene, **parameters: float) -> None:
+    def __init__(self, scene: Scene, **parameters: Any) -> None:
         self.sent: list[SheetTarget] = []
         self.planner = Planner(
             PlannerParameters(**parameters),
@@ -100,7 +101,7 @@ class Table:
         return target
 
 
-async def table(**parameters: float) -> Table:
+async def table(**parameters: Any) -> Table:
     result = Table(SCENE, **parameters)
     await result.start()
     return result
@@ -429,6 +430,7 @@ async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
 
 
 def soft(stiffness: float) -> SoftBody:
+    """An object of that stiffness, a spring as far as it is known."""
     return SoftBody(
         mesh_id="m",
         method="test",
@@ -436,12 +438,13 @@ def soft(stiffness: float) -> SoftBody:
         push_depth_m=0.001,
         force_world_n=np.zeros(3),
         stiffness_n_per_m=stiffness,
+        force_curve=np.array([[0.0, 0.0], [0.05, 0.05 * stiffness]]),
         displacement_world_m=np.zeros((4, 3), dtype=np.float32),
     )
 
 
 async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> None:
-    desk = await table()
+    desk = await table(presents="stretch")
     position = in_world(on_cylinder(0.0, -0.001))
     await desk.rest_at(position, 10)
     await desk.planner.step("soft_body", soft(45.0), desk.header())
@@ -459,7 +462,7 @@ async def test_the_stretch_goes_to_the_objects_stiffness_at_a_bounded_rate() -> 
 
 @pytest.mark.parametrize(("stiffness", "words"), [(2.0, "softer"), (5000.0, "stiffer")])
 async def test_what_the_sheet_cannot_present_is_said(stiffness: float, words: str) -> None:
-    desk = await table()
+    desk = await table(presents="stretch")
     await desk.planner.step("soft_body", soft(stiffness), desk.header())
     assert words in desk.planner.note
     least, largest = stretch_range(SCENE.sheet)

@@ -17,6 +17,7 @@ from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.models.shapes import make_shape
 from nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
 from nodes.planner.encounter import Encounter, Presentation, Reach
+from nodes.planner.yielding import Yielding
 
 Floats = NDArray[np.float64]
 
@@ -35,13 +36,17 @@ LONGEST_STEP_S = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """One step's outcome, in the world frame; `contact_sheet_m` is (x, y) on the sheet."""
+    """One step's outcome, in the world frame; `contact_sheet_m` is (x, y) on the sheet.
+
+    retreat_m: how far behind the object's tangent plane the sheet is to be.
+    """
 
     motion: SheetMotion
     presentation: Presentation
     contact_world_m: Floats
     normal_world: Floats
     contact_sheet_m: Floats
+    retreat_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +91,14 @@ class Plan:
         )
         contact = self._encounter.contact
         self._presented = Presentation("wait", "", contact, np.zeros(6), 0.0)
+        self._retreat_m = 0.0
         home = self._world_from_object @ contact.object_from_sheet
         self._eased = EasedMotion.at_rest(
             SheetMotion(home, np.zeros(6), sheet.min_stretch_ratio, 0.0)
         )
 
     def follow_finger(
-        self, position_world: Floats, velocity_world: Floats, stretch_ratio: float, step_s: float
+        self, position_world: Floats, velocity_world: Floats, yielding: Yielding, step_s: float
     ) -> Planned:
         """The sheet `step_s` later, on its way to what a finger there (m, m/s) shall touch."""
         finger = apply(self._object_from_world, position_world)
@@ -100,14 +106,22 @@ class Plan:
         object_from_sheet = self._object_from_world @ self.motion.world_from_sheet
         shown = self._encounter.step(finger, velocity, object_from_sheet)
         self._presented = shown
+        x, y = shown.contact.on_sheet
+        self._retreat_m, per_depth = yielding.retreat(shown.push_depth_m, (float(x), float(y)))
         target = SheetMotion(
             self._world_from_object @ shown.contact.object_from_sheet,
             self._turn @ shown.twist,
-            stretch_ratio,
+            yielding.stretch_ratio,
             0.0,
         )
-        self._go_on(target, step_s)
+        deeper_m_per_s = -float(velocity @ shown.contact.normal)
+        self._go_on(withdrawn(target, self._retreat_m, per_depth * deeper_m_per_s), step_s)
         return self._planned(shown)
+
+    @property
+    def touching(self) -> bool:
+        """Whether the finger was last seen in touch with what is presented."""
+        return self._presented.phase in ("contact", "hold")
 
     def hold(self, reason: str, step_s: float) -> Planned:
         """The sheet `step_s` later when nothing is known of the finger: it comes to rest."""
@@ -144,4 +158,14 @@ class Plan:
             contact_world,
             self._world_from_object[:3, :3] @ shown.contact.normal,
             np.ascontiguousarray(on_sheet),
+            self._retreat_m,
         )
+
+
+def withdrawn(sheet: SheetMotion, retreat_m: float, rate_m_per_s: float) -> SheetMotion:
+    """The sheet's motion with the sheet further back along its normal, by so much and growing."""
+    normal = sheet.world_from_sheet[:3, 2]
+    pose, twist = sheet.world_from_sheet.copy(), sheet.twist_world.copy()
+    pose[:3, 3] -= retreat_m * normal
+    twist[:3] -= rate_m_per_s * normal + retreat_m * np.cross(twist[3:], normal)
+    return replace(sheet, world_from_sheet=pose, twist_world=twist)

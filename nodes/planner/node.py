@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pydantic import Field
 
 from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
+from messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from messages.types import Fingertip, SheetTarget, SoftBody
 from nodes.models.motion import SheetBounds
 from nodes.models.prediction import path_at
 from nodes.node import Input, Node, NodeParameters, Output
-from nodes.planner.compliance import compliance_for
 from nodes.planner.easing import JerkBounds
 from nodes.planner.lead import next_lead_s
 from nodes.planner.motion import Plan, Planned, PlanSettings
 from nodes.planner.order import Order
+from nodes.planner.sheet_force import law_for
+from nodes.planner.yielding import Presents, Yielding
 
 FIRST_LEAD_S = 0.05
 CLOCK_SLACK_S = 0.005
@@ -29,6 +33,14 @@ class PlannerParameters(NodeParameters):
     )
     arrival_s: NonNegative = Field(
         default=0.038, description="from a fingertip's publication until the sheet gets there"
+    )
+    presents: Presents = Field(
+        default="curve",
+        description="of the object: its force curve, by stretch and by yielding along the normal; "
+        "or its stiffness, by stretch alone, as the paper does",
+    )
+    sheet_calibration: Path | None = Field(
+        default=None, description="from calibrate sheet; null: ideal rubber of the scene's modulus"
     )
     touch_m: float = Field(default=0.0005, description="contact begins this near to the object")
     release_m: Positive = Field(default=0.003, description="contact ends this far from the object")
@@ -61,13 +73,17 @@ class Planner(Node):
 
     async def setup(self) -> None:
         self._plan: Plan | None = None
-        self._stretch_ratio = 1.0
+        self._yielding: Yielding | None = None
         self._order = Order()
         self._writer = ("", 0)
         self._first_step_s = 0.0
         given = self.parameters
         self._lead_s = FIRST_LEAD_S if given.lead_s is None else given.lead_s
         self._late = 0
+        path = given.sheet_calibration
+        self._calibration: SheetCalibration | None = None
+        if path is not None:
+            self._calibration = load_sheet_calibration(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         given = self.parameters
@@ -87,19 +103,19 @@ class Planner(Node):
             spin_rad=given.largest_spin_rad,
         )
         self._plan = Plan(scene, settings)
-        self._stretch_ratio = scene.sheet.min_stretch_ratio
+        law = law_for(scene.sheet, self._calibration)
+        self._yielding = Yielding(scene, law, given.presents)
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._order = Order()
 
     def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
-        scene = self.scene.message
-        if scene is not None and soft_body.stiffness_n_per_m > 0.0:
-            compliance = compliance_for(soft_body.stiffness_n_per_m, scene.sheet)
-            self._stretch_ratio, self.note = compliance.stretch_ratio, compliance.note
+        if self._yielding is not None and self._plan is not None:
+            self._yielding.take(soft_body, touching=self._plan.touching)
+            self.note = self._yielding.note
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
-        plan = self._plan
-        if plan is None:
+        plan, yielding = self._plan, self._yielding
+        if plan is None or yielding is None:
             return
         writer = (header.clock_id, header.epoch)
         if writer != self._writer:
@@ -123,7 +139,7 @@ class Planner(Node):
                 self._lead_s = next_lead_s(before_s, age_s + self.parameters.arrival_s, furthest_s)
                 step_s += self._lead_s - before_s
             point, velocity = path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, self._lead_s)
-            planned = plan.follow_finger(point, velocity, self._stretch_ratio, step_s)
+            planned = plan.follow_finger(point, velocity, yielding, step_s)
         self._publish(planned, source_ns)
 
     def _publish(self, planned: Planned, source_ns: int) -> None:
@@ -140,6 +156,7 @@ class Planner(Node):
                 normal_world=planned.normal_world,
                 contact_sheet_m=planned.contact_sheet_m,
                 push_depth_m=shown.push_depth_m,
+                retreat_m=planned.retreat_m,
             ),
             source_ns=source_ns,
         )

@@ -1,0 +1,109 @@
+"""How the sheet yields: it follows what the soft body tells of the object, place by place."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from messages.types import SoftBody
+from nodes.models.sheet.laws import Place, SheetLaw
+from nodes.planner.compliance import (
+    FELT_N,
+    Compliance,
+    ObjectCurve,
+    compliance_at,
+    compliance_for,
+    fit_compliance,
+    pull_of,
+)
+
+Floats = NDArray[np.float64]
+
+Presents = Literal["curve", "stretch"]
+
+SAME_RATIO = 0.02
+"""Curves that differ by less than this are taken for the same: a seventh of what people notice."""
+
+COMPARED_SHARES = np.array([0.04, 0.1, 0.25, 0.5, 1.0])
+"""Depths at which curves are compared, over the deepest push."""
+
+
+class Yielding:
+    """The stretch and the retreat for the object where the finger is.
+
+    presents: "curve", the object's force over depth; or "stretch", its stiffness at small pushes
+    alone, by a stretch (the paper's way).
+    """
+
+    def __init__(self, scene: Scene, law: SheetLaw, presents: Presents) -> None:
+        self.stretch_ratio = scene.sheet.min_stretch_ratio
+        self.note = ""
+        self._scene, self._law, self._presents = scene, law, presents
+        self._pull = pull_of(scene.sheet, law)
+        self._compared_m = scene.working_range.push_depth_m * COMPARED_SHARES
+        self._fitted_n: Floats | None = None
+        self._compliance: Compliance | None = None
+
+    def take(self, soft_body: SoftBody, *, touching: bool) -> None:
+        """Go over to the object as it is here.  In touch the stretch stays: edges that move would
+        be felt.  UnfitCurveError for a force curve that is none; all stays as it was then.
+        """
+        if self._presents == "stretch":
+            if soft_body.stiffness_n_per_m > 0.0:
+                choice = compliance_for(soft_body.stiffness_n_per_m, self._scene.sheet)
+                self.stretch_ratio, self.note = choice.stretch_ratio, choice.note
+            return
+        rows = soft_body.force_curve
+        if len(rows) == 0:
+            return
+        forces_n = np.interp(self._compared_m, rows[:, 0], rows[:, 1])
+        if self._fitted_n is not None and _same(forces_n, self._fitted_n):
+            return
+        self._fit(ObjectCurve.from_rows(rows), touching=touching)
+        self._fitted_n = forces_n
+
+    def _fit(self, curve: ObjectCurve, *, touching: bool) -> None:
+        scene = self._scene
+        deepest_m, radius_m = scene.working_range.push_depth_m, scene.finger.radius_m
+        half_m, error_m = scene.sheet.usable_half_height_m, scene.tolerances.sheet_position_m
+        if touching and self._compliance is not None:
+            fitted = compliance_at(
+                curve,
+                self._law,
+                self._pull,
+                stretch_ratio=self._compliance.stretch_ratio,
+                deepest_m=deepest_m,
+                finger_radius_m=radius_m,
+                usable_half_height_m=half_m,
+                position_error_m=error_m,
+            )
+        else:
+            fitted = fit_compliance(
+                curve,
+                self._law,
+                self._pull,
+                deepest_m=deepest_m,
+                finger_radius_m=radius_m,
+                usable_half_height_m=half_m,
+                position_error_m=error_m,
+            )
+        self._compliance = fitted
+        self.stretch_ratio, self.note = fitted.stretch_ratio, fitted.note
+
+    def retreat(self, depth_m: float, place_m: Place) -> tuple[float, float]:
+        """How far (m) the sheet shall be behind the object's tangent plane for a finger so deep in
+        the object, at a place (x, y) of the sheet, and how that grows with the depth."""
+        if self._compliance is None or depth_m <= 0.0:
+            return 0.0, 0.0
+        return (
+            float(self._compliance.retreat_m(depth_m, place_m)),
+            self._compliance.retreat_per_depth(depth_m, place_m),
+        )
+
+
+def _same(forces_n: Floats, others_n: Floats) -> bool:
+    difference = np.abs(forces_n - others_n) / np.maximum(others_n, FELT_N)
+    return bool((difference < SAME_RATIO).all())
