@@ -23,7 +23,8 @@ from messages.types import ArmState, EStop, Fingertip, SheetTarget
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.models.rigid import inverse, transform_from_rpy
 from nodes.models.sheet import sheet_from_edges
-from nodes.planner.node import Planner, PlannerParameters
+from nodes.planner.node import Planner
+from nodes.planner.parameters import PlannerParameters
 from nodes.twin.arms import STATE_MOVING, STATE_STOPPED
 from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from tests.fingertips import fingertip

@@ -24,7 +24,8 @@ from nodes.models.shapes import CylinderShape
 from nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
 from nodes.planner.compliance import RESERVE, compliance_for, stretch_range
 from nodes.planner.encounter import Encounter, Presentation, Reach
-from nodes.planner.node import Planner, PlannerParameters
+from nodes.planner.node import Planner
+from nodes.planner.parameters import PlannerParameters
 from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]

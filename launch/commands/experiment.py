@@ -103,10 +103,50 @@ def push(
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Errors of the picture on a pushed sheet (section VI-C, Fig. 13)."""
-    from launch.experiments.image import PUSH
+    """Errors of the picture on a pushed sheet (section VI-C, Fig. 13).
 
+    As in the paper the sheet is only tilted: it does not yield along its normal, and is dented by
+    all of the push.  `--set planner.presents=curve` has it yield.
+    """
+    from launch.experiments.image import PUSH
+    from launch.experiments.run import settings_of_type
+
+    settings = [*settings_of_type(launch_file, "planner", "presents=stretch"), *(settings or ())]
     _photograph(PUSH, _folder(output, "push") / "push.mcap", launch_file, settings, as_json=as_json)
+
+
+@app.command()
+def compliance(
+    *,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """How the force that a finger meets compares with the object's, over the push."""
+    from launch.experiments import compliance as experiment
+
+    bag = _folder(output, "compliance") / "compliance.mcap"
+    with progress_words() as progress:
+        procedure = experiment.compliance_procedure(progress)
+        _record(launch_file, settings, bag, procedure, progress)
+        result = experiment.compliance_result(bag, progress)
+    if as_json:
+        print_json(result)
+        return
+    columns = ["place", "depth, mm", "wanted, N", "presented, N", "off, %", "retreat, mm"]
+    cells = [
+        [cell if isinstance(cell, str) else f"{cell:.2f}" for cell in row.values()]
+        for row in result["rows"]
+    ]
+    print_table(columns, cells)
+    moving = result["moving"]
+    words.print(
+        f"in and out at {moving['speed_mm_per_s']:g} mm/s: {moving['rms_percent']:.0f} % rms, "
+        f"{moving['worst_percent']:.0f} % at most; people notice "
+        f"{result['noticed_percent'][0]:.0f} to {result['noticed_percent'][1]:.0f} %"
+    )
+    words.print(f"bag: {bag}")
 
 
 def _photograph(

@@ -15,9 +15,9 @@ from launch.experiments.run import (
     in_turn,
     picture_procedure,
     run_experiment,
+    settings_of_type,
     stroke_procedure,
 )
-from launch.plan import load_plan
 from messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
@@ -55,8 +55,7 @@ def run_demo(
         picture_procedure(image.TILT, [TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
         picture_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
     )
-    eyes = [node.name for node in load_plan(launch_file).nodes.values() if node.type == "twin_eye"]
-    coarse = [f"{name}.metres_per_px={METRES_PER_PX}" for name in eyes]
+    coarse = settings_of_type(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     run_experiment(launch_file, [*coarse, *settings], bag, procedure, progress)
     progress("reading the bag and drawing")
     return summarize(bag, folder, strokes=() if path is not None else SECONDS)

@@ -96,6 +96,12 @@ async def _interruptible(work: Coroutine[Any, Any, None]) -> None:
         raise ExperimentError("interrupted; all nodes have been ended") from None
 
 
+def settings_of_type(launch_file: Path, node_type: str, setting: str) -> list[str]:
+    """The setting ("parameter=value") for each node of a type, as that launch file names it."""
+    nodes = load_plan(launch_file).nodes.values()
+    return [f"{node.name}.{setting}" for node in nodes if node.type == node_type]
+
+
 def stroke_procedure(
     seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
 ) -> Procedure:

@@ -2,64 +2,22 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-from pydantic import Field
-
 from messages.base import Header
-from messages.scene import NonNegative, Positive, Scene
+from messages.scene import Scene
 from messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from messages.types import Fingertip, SheetTarget, SoftBody
-from nodes.models.motion import SheetBounds
 from nodes.models.prediction import path_at
-from nodes.node import Input, Node, NodeParameters, Output
-from nodes.planner.easing import JerkBounds
+from nodes.node import Input, Node, Output
 from nodes.planner.lead import next_lead_s
-from nodes.planner.motion import Plan, Planned, PlanSettings
+from nodes.planner.motion import Plan, Planned
 from nodes.planner.order import Order
+from nodes.planner.parameters import PlannerParameters
 from nodes.planner.sheet_force import law_for
-from nodes.planner.yielding import Presents, Yielding
+from nodes.planner.yielding import Yielding
 
 FIRST_LEAD_S = 0.05
 CLOCK_SLACK_S = 0.005
 """A fingertip from further in the future than this is no measurement."""
-
-
-class PlannerParameters(NodeParameters):
-    lead_s: NonNegative | None = Field(
-        default=None,
-        description="how far ahead of the exposure the sheet is planned; "
-        "null: as long as fingertips take, and arrival_s",
-    )
-    arrival_s: NonNegative = Field(
-        default=0.038, description="from a fingertip's publication until the sheet gets there"
-    )
-    presents: Presents = Field(
-        default="curve",
-        description="of the object: its force curve, by stretch and by yielding along the normal; "
-        "or its stiffness, by stretch alone, as the paper does",
-    )
-    sheet_calibration: Path | None = Field(
-        default=None, description="from calibrate sheet; null: ideal rubber of the scene's modulus"
-    )
-    touch_m: float = Field(default=0.0005, description="contact begins this near to the object")
-    release_m: Positive = Field(default=0.003, description="contact ends this far from the object")
-    oldest_s: Positive = Field(default=0.1, description="an older fingertip is not followed")
-    tilt_margin_rad: NonNegative = Field(
-        default=0.14, description="how far past the scene's tilt the sheet still follows"
-    )
-    largest_spin_rad: Positive = Field(
-        default=0.35, description="most that rolling may turn the sheet about its normal"
-    )
-    speed_m_per_s: Positive = 0.18
-    acceleration_m_per_s2: Positive = 2.0
-    turn_rad_per_s: Positive = 2.0
-    turn_acceleration_rad_per_s2: Positive = 10.0
-    stretch_rate_per_s: Positive = 0.03
-    stretch_acceleration_per_s2: Positive = 0.3
-    jerk_m_per_s3: Positive = 60.0
-    turn_jerk_rad_per_s3: Positive = 300.0
-    stretch_jerk_per_s3: Positive = 9.0
 
 
 class Planner(Node):
@@ -86,32 +44,21 @@ class Planner(Node):
             self._calibration = load_sheet_calibration(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
-        given = self.parameters
-        settings = PlanSettings(
-            SheetBounds(
-                given.speed_m_per_s,
-                given.acceleration_m_per_s2,
-                given.turn_rad_per_s,
-                given.turn_acceleration_rad_per_s2,
-                given.stretch_rate_per_s,
-                given.stretch_acceleration_per_s2,
-            ),
-            JerkBounds(given.jerk_m_per_s3, given.turn_jerk_rad_per_s3, given.stretch_jerk_per_s3),
-            touch_m=given.touch_m,
-            release_m=given.release_m,
-            tilt_margin_rad=given.tilt_margin_rad,
-            spin_rad=given.largest_spin_rad,
-        )
-        self._plan = Plan(scene, settings)
+        self._plan = Plan(scene, self.parameters.settings())
         law = law_for(scene.sheet, self._calibration)
-        self._yielding = Yielding(scene, law, given.presents)
+        self._yielding = Yielding(scene, law, self.parameters.presents)
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._order = Order()
 
     def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
         if self._yielding is not None and self._plan is not None:
             self._yielding.take(soft_body, touching=self._plan.touching)
-            self.note = self._yielding.note
+            self._tell()
+
+    def _tell(self) -> None:
+        late = f"{self._late} fingertips came out of order and were left out" if self._late else ""
+        presented = self._yielding.note if self._yielding is not None else ""
+        self.note = "; ".join(filter(None, (presented, late)))
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         plan, yielding = self._plan, self._yielding
@@ -125,7 +72,7 @@ class Planner(Node):
         step_s = self._order.step_s(source_ns, self._first_step_s)
         if step_s is None:
             self._late += 1
-            self.note = f"{self._late} fingertips came out of order and were left out"
+            self._tell()
             return
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:

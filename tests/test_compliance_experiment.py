@@ -1,0 +1,110 @@
+"""What a finger felt, judged from a recording: a sheet of known place and stretch comes out so."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from launch.experiments import ExperimentError
+from launch.experiments.compliance import (
+    DEPTH_SHARES,
+    HOLD_S,
+    JUDGED_S,
+    Felt,
+    Judge,
+    Press,
+    Recorded,
+    presses,
+    read_bag,
+)
+from launch.experiments.stroke import Track
+from launch.plan import load_scene
+from launch.twin_sheet import twin_force
+from messages.bag import BagWriter
+from nodes.models.rigid import inverse, transform, transform_from_rpy
+from nodes.planner.compliance import FELT_N
+
+Floats = NDArray[np.float64]
+SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+TIMES = np.array([0, 1_000_000_000], dtype=np.int64)
+STRETCH = 1.06
+CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])
+
+
+def held(press: Press, depth_m: float, retreat_m: float) -> Recorded:
+    """The finger rests at a depth; the sheet stands so far behind the object's tangent plane."""
+    tip = press.surface - depth_m * press.normal
+    y_axis = np.cross(press.normal, [1.0, 0.0, 0.0])
+    axes = np.column_stack([[1.0, 0.0, 0.0], y_axis, press.normal])
+    middle = press.surface - retreat_m * press.normal
+    half = 0.5 * STRETCH * SCENE.sheet.width_m * axes[:, 0]
+    rows = []
+    for side, arm in ((-1.0, SCENE.arms.left), (1.0, SCENE.arms.right)):
+        pose = arm.flange_from_edge
+        clamp = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        flange = transform(axes, middle + side * half) @ inverse(clamp)
+        rows.append(Track(TIMES, np.tile(flange.ravel(), (2, 1))))
+    return Recorded(
+        scene=SCENE,
+        finger=Track(TIMES, np.tile(tip, (2, 1))),
+        windows_ns={},
+        edges=(rows[0], rows[1]),
+        curve_times_ns=[0],
+        curves=[CURVE],
+    )
+
+
+@pytest.mark.parametrize("press", presses(SCENE)[::2], ids=lambda press: press.path.label)
+@pytest.mark.parametrize(("depth_m", "retreat_m"), [(0.02, 0.0), (0.045, 0.02), (0.005, -0.002)])
+def test_the_twins_sheet_says_what_was_felt(press: Press, depth_m: float, retreat_m: float) -> None:
+    felt = Judge(held(press, depth_m, retreat_m)).felt(500_000_000, press)
+    assert felt.depth_m == pytest.approx(depth_m, abs=1e-9)
+    assert felt.retreat_m == pytest.approx(retreat_m, abs=1e-9)
+    assert felt.wanted_n == pytest.approx(50.0 * depth_m, rel=1e-6)
+    alone = twin_force(
+        SCENE.sheet, STRETCH, depth_m - retreat_m, (float(press.surface[0]), 0.0), 0.007
+    )
+    assert felt.presented_n == pytest.approx(alone, rel=0.02)
+
+
+def test_a_finger_past_the_middle_is_as_deep_as_it_was_pushed() -> None:
+    press = presses(SCENE)[0]
+    deep_m = 1.3 * SCENE.object.geometry.radius_m
+    assert Judge(held(press, deep_m, 0.02)).felt(0, press).depth_m == pytest.approx(deep_m)
+
+
+def test_errors_of_what_cannot_be_felt_count_as_of_the_least_felt() -> None:
+    assert Felt(0.01, 2.0, 2.2, 0.0).error_ratio == pytest.approx(0.1)
+    assert Felt(0.0001, 0.0, 0.5 * FELT_N, 0.0).error_ratio == pytest.approx(0.5)
+
+
+def test_every_place_is_pressed_at_every_depth_and_judged_at_rest() -> None:
+    *at_places, last = presses(SCENE)
+    deepest_m = SCENE.working_range.push_depth_m
+    for press in at_places:
+        depths = [hold.depth_m for hold in press.holds]
+        assert depths == pytest.approx(deepest_m * np.array(DEPTH_SHARES))
+        for hold in press.holds:
+            assert hold.end_s - hold.begin_s == pytest.approx(JUDGED_S)
+            times = np.array([hold.end_s - HOLD_S, hold.begin_s, hold.end_s])
+            along = [
+                np.interp(times, press.path.times_s, press.path.positions_world_m[:, i])
+                for i in range(3)
+            ]
+            heights = (np.column_stack(along) - press.surface) @ press.normal
+            assert heights == pytest.approx(-hold.depth_m, abs=1e-9)
+    assert last.holds == ()
+    assert ((last.path.positions_world_m - last.surface) @ last.normal).min() == pytest.approx(
+        -deepest_m
+    )
+
+
+def test_a_bag_without_a_soft_body_is_refused(tmp_path: Path) -> None:
+    bag = tmp_path / "bare.mcap"
+    with BagWriter(bag):
+        pass
+    with pytest.raises(ExperimentError, match="no scene, or no soft body"):
+        read_bag(bag)
