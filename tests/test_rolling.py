@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from nodes.models.rigid import angle_between, moved
 from nodes.models.shapes import (
+    Convex,
     CylinderShape,
     EllipsoidShape,
     PlaneShape,
@@ -176,7 +178,7 @@ def test_what_is_presented_is_within_the_tilt_and_as_far_as_it_goes(
     tilt = math.radians(tilt_deg)
     start = shape.closest(np.array([0.0, 0.0, 0.2]))
     found = shape.closest(0.2 * unit(place), previous=start.point)
-    allowed, limited = within_tilt(shape, start.point, found, FRONT, tilt)
+    allowed, limited = within_tilt(shape, start, found, FRONT, tilt)
     leaning = angle_between(allowed.normal, FRONT)
     assert leaning <= tilt + 1e-9
     assert limited == (angle_between(found.normal, FRONT) > tilt)
@@ -221,18 +223,18 @@ def test_a_convex_object_needs_no_lift() -> None:
         assert rim_lift_m(shape, contact) < 1e-9
 
 
-class Bowl:
-    """The outside of a sphere seen from within: hollow everywhere.  Radius 60 mm, open at +z."""
+class Bowl(Convex):
+    """What `rim_lift_m` asks of a shape: here, one that is hollow all around."""
 
-    radius_m = 0.06
-
-    def signed_distance(self, points: Floats) -> Floats:
-        return np.asarray(self.radius_m - np.linalg.norm(points, axis=-1))
+    def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
+        return 0.002 * radius_m / 0.03
 
 
-def test_over_a_hollow_the_sheet_rests_on_the_rim() -> None:
-    bottom = np.array([0.0, 0.0, -Bowl.radius_m])
+def test_over_a_hollow_the_sheet_stands_off_by_the_rim_and_depth_counts_from_there() -> None:
+    bottom = np.array([0.0, 0.0, -0.06])
     contact = Contact(bottom, FRONT, -np.diag([1.0, 1.0, 0.0]) / 0.06, np.eye(3), np.zeros(2))
-    lift = rim_lift_m(Bowl(), contact)  # type: ignore[arg-type]  # asked for distances only
-    # So deep in the wall the outer ring, 30 mm out, would lie.
-    assert lift == pytest.approx(math.hypot(0.06, 0.03) - 0.06, abs=1e-9)
+    lift = rim_lift_m(Bowl(), contact)  # type: ignore[arg-type]  # asked for its rise only
+    assert lift == pytest.approx(0.002)
+    lifted = replace(contact, lift_m=lift)
+    assert lifted.object_from_sheet[:3, 3] == pytest.approx([0.0, 0.0, -0.058])
+    assert lifted.height_m(bottom) == pytest.approx(-0.002)

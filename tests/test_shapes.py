@@ -21,6 +21,7 @@ from nodes.models.shapes import (
     foot_jacobian,
     make_shape,
     principal_curvatures,
+    tightest_curvature,
 )
 
 Floats = NDArray[np.float64]
@@ -131,6 +132,29 @@ def test_the_foot_moves_as_its_jacobian_says(shape: Shape) -> None:
     )
     wrong = np.linalg.norm(0.5 * after[keep] - foot_jacobian(kept) @ moved, axis=1) > 1e-11
     assert wrong.mean() < 0.01
+
+
+@solids
+def test_one_goes_on_as_many_do(shape: Shape) -> None:
+    queries = every(7)
+    before = shape.closest(queries + 2e-4).point
+    many = shape.closest(queries, previous=before)
+    for i in np.flatnonzero(~many.undecided)[:150]:
+        one = shape.closest(queries[i], previous=before[i])
+        assert one.point == pytest.approx(many.point[i], abs=1e-11)
+        assert one.normal == pytest.approx(many.normal[i], abs=1e-9)
+        assert one.shape_operator == pytest.approx(many.shape_operator[i], rel=1e-6, abs=1e-6)
+
+
+@solids
+def test_a_convex_solid_rises_nowhere_and_its_tightest_curvature_is_known(shape: Shape) -> None:
+    found = shape.closest(every(8, 40))
+    for point, normal, operator in zip(
+        found.point, found.normal, found.shape_operator, strict=True
+    ):
+        assert shape.rise_m(point, normal, 0.03) == 0.0
+        known = principal_curvatures(operator, normal)[0].max()
+        assert tightest_curvature(operator) == pytest.approx(known, rel=1e-7, abs=1e-9)
 
 
 def test_principal_curvatures_of_known_surfaces() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -301,6 +302,37 @@ def test_one_is_as_many() -> None:
         assert one.height_m.shape == ()
         assert np.allclose(one.point, many.point[i], atol=1e-9)
         assert np.allclose(one.shape_operator, many.shape_operator[i], atol=1e-5)
+
+
+@pytest.mark.parametrize("make", [lambda: smooth_ellipsoid(AXES, 3), smooth_cube, liver])
+def test_one_goes_on_as_many_do(make: Callable[[], SmoothMeshShape]) -> None:
+    """Also from starts far off, over edges and inside: the same place by the same descent."""
+    shape = make()
+    rng = np.random.default_rng(4)
+    begun = shape.closest(rng.uniform(-0.05, 0.05, (120, 3)))
+    queries = begun.point + rng.uniform(-0.01, 0.01, (120, 1)) * begun.normal
+    before = shape.closest(queries + rng.normal(0.0, 1e-3, (120, 3))).point
+    many = shape.closest(queries, previous=before)
+    apart = []
+    for i in range(len(queries)):
+        one = shape.closest(queries[i], previous=before[i])
+        apart.append(float(np.linalg.norm(one.point - many.point[i])))
+        if apart[-1] < 1e-7:
+            assert one.normal == pytest.approx(many.normal[i], abs=1e-5)
+            bound = 1e-3 * (1.0 + np.abs(many.shape_operator[i]).max())
+            assert np.abs(one.shape_operator - many.shape_operator[i]).max() < bound
+    # At a centre of curvature rounding decides which way a descent goes.
+    assert np.mean(np.array(apart) < 1e-7) >= 0.99
+
+
+def test_a_mesh_that_is_convex_hardly_rises() -> None:
+    shape = smooth_ellipsoid(AXES, 4)
+    found = shape.closest(around(AXES, 50))
+    rises = [
+        shape.rise_m(point, normal, 0.03)
+        for point, normal in zip(found.point, found.normal, strict=True)
+    ]
+    assert max(rises) < 2e-5
 
 
 def test_what_is_no_solids_surface_is_refused() -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import hypot
 
 import numpy as np
 from numpy.typing import NDArray
 
 from messages.types import Phase
 from nodes.models.rigid import inverse
-from nodes.models.shapes import Nearest, Shape, foot_jacobian, principal_curvatures
+from nodes.models.shapes import Nearest, Shape, foot_jacobian, tightest_curvature
 from nodes.planner.rolling import (
     Contact,
     rim_lift_m,
@@ -24,6 +25,10 @@ from nodes.planner.rolling import (
 
 Floats = NDArray[np.float64]
 
+NO_SIDE = "finger inside the object, on no side of it"
+THROUGH = "finger through the object"
+PAST_EDGE = "finger past the object's edge"
+NOWHERE = "finger's place or velocity is no hand's"
 BEYOND_TILT = "finger beyond the tilt that the arms present"
 BEYOND_SPIN = "sheet turned too far about its normal; lift the finger"
 HOLLOW = "hollow place: the flat sheet rests on its rim"
@@ -36,6 +41,13 @@ INNERMOST = 0.15
 """A finger nearer to a centre of curvature than this share of the radius is on no side of it."""
 
 FLATTEST_PER_M = 1e-3
+FARTHEST_M, FASTEST_M_PER_S = 10.0, 10.0
+"""A finger farther from the object or faster than that is a mistake."""
+
+STEEPEST_RAD = 1.4
+"""No sheet is turned further from the front, whatever the scene: two normals both within it are
+never opposite, and from one to the other there is one shortest way."""
+
 HOLLOW_M = 2e-4
 """Rims lower than this are left to the sheet's own give."""
 
@@ -75,36 +87,48 @@ class Presentation:
     push_depth_m: float
 
 
+class UnpresentableError(ValueError):
+    """An object that no sheet can be presented to; the message says why and what to change."""
+
+
 class Encounter:
     """What the sheet presents to one finger, step by step."""
 
     def __init__(self, shape: Shape, home: Floats, reach: Reach) -> None:
-        """home: the sheet's axes (3, 3) when it waits, the third near `reach.front`."""
-        self._shape, self._home, self._reach = shape, home, reach
-        far = 10.0 * reach.front
-        first, _ = within_tilt(
-            shape, shape.closest(far).point, shape.closest(far), reach.front, reach.tilt_rad
-        )
+        """home: the sheet's axes (3, 3) when it waits, the third near `reach.front`.
+
+        UnpresentableError for an object that turns no side to the front.
+        """
+        tilt_rad = min(reach.tilt_rad, STEEPEST_RAD)
+        self._shape, self._home, self._reach = shape, home, replace(reach, tilt_rad=tilt_rad)
+        first = shape.closest(10.0 * reach.front)
+        if first.normal @ reach.front < np.cos(tilt_rad):
+            lean_deg = np.degrees(np.arccos(first.normal @ reach.front))
+            raise UnpresentableError(
+                f"the object's front leans {lean_deg:.0f} degrees away from the user, the sheet at "
+                f"most {np.degrees(tilt_rad):.0f}; turn it by object.world_from_object"
+            )
         self.contact = tangent(home, first, reach.half_width_m)
         self._touching = False
         self._finger = np.zeros(3)
-        self._looked_at: Floats | None = None
 
     def step(self, finger: Floats, velocity: Floats, object_from_sheet: Floats) -> Presentation:
         """What to present to a finger (3,) m that moves with `velocity` (3,) m/s.
 
         object_from_sheet: where the sheet is now; a contact that begins takes it as it is.
         """
+        if not (_size(finger) <= FARTHEST_M and _size(velocity) <= FASTEST_M_PER_S):
+            return self._hold(NOWHERE, 0.0)
         if self._touching and self.contact.height_m(finger) > self._reach.release_m:
             self._touching = False
         if self._touching:
             return self._roll(finger, velocity)
         found = self._shape.closest(finger, previous=self.contact.point)
-        if found.undecided or self._too_deep(found):
-            return self._hold("finger inside the object, on no side of it", float(-found.height_m))
+        if found.height_m < 0.0 and (found.undecided or self._too_deep(found)):
+            return self._hold(NO_SIDE, float(-found.height_m))
         rate = _foot_rate(found, velocity)
         allowed, limited = within_tilt(
-            self._shape, self.contact.point, found, self._reach.front, self._reach.tilt_rad
+            self._shape, self.contact.place, found, self._reach.front, self._reach.tilt_rad
         )
         self.contact = self._lifted(tangent(self._home, allowed, self._reach.half_width_m))
         near = self.contact.height_m(finger) <= self._reach.touch_m
@@ -117,7 +141,7 @@ class Encounter:
             if limited
             else tangent_twist(self.contact, rate, self._home, self._reach.half_width_m)
         )
-        reason = BEYOND_TILT if limited else self._hollow()
+        reason = BEYOND_TILT if limited else PAST_EDGE if found.on_edge else self._hollow()
         return Presentation("approach", reason, self.contact, twist, 0.0)
 
     def _begun(self, contact: Contact, object_from_sheet: Floats) -> Contact:
@@ -136,13 +160,13 @@ class Encounter:
         depth = max(0.0, -contact.height_m(finger))
         moved, self._finger = finger - self._finger, finger
         if depth > self._reach.deepest_m:
-            return self._hold("finger through the object", depth)
+            return self._hold(THROUGH, depth)
         found = self._shape.closest(finger, previous=contact.point)
         if found.on_edge:
-            return self._hold("finger past the object's edge", depth)
+            return self._hold(PAST_EDGE, depth)
         found, rate = self._carried(found, moved, velocity, depth)
         allowed, limited = within_tilt(
-            self._shape, contact.point, found, self._reach.front, self._reach.tilt_rad
+            self._shape, contact.place, found, self._reach.front, self._reach.tilt_rad
         )
         there, past = self._on_sheet(contact, allowed)
         if abs(spin_rad(there.axes, self._home)) > self._reach.spin_rad:
@@ -165,7 +189,7 @@ class Encounter:
         """
         normal = self.contact.normal
         along = np.eye(3) - np.outer(normal, normal)
-        bent = principal_curvatures(self.contact.shape_operator, normal)[0].max()
+        bent = tightest_curvature(self.contact.shape_operator)
         share = (DEEP - depth * max(float(bent), FLATTEST_PER_M)) / (DEEP - SHALLOW)
         share = min(max(share, 0.0), 1.0)
         rate = (1.0 - share) * (along @ velocity)
@@ -194,7 +218,7 @@ class Encounter:
 
     def _too_deep(self, found: Nearest) -> bool:
         """Whether a finger that comes anew is so far inside that it is on no side."""
-        bent = principal_curvatures(found.shape_operator, found.normal)[0].max()
+        bent = tightest_curvature(found.shape_operator)
         return bool(1.0 + found.height_m * bent < INNERMOST)
 
     def _lifted(self, contact: Contact) -> Contact:
@@ -209,8 +233,18 @@ class Encounter:
 
 
 def _foot_rate(found: Nearest, velocity: Floats) -> Floats:
-    """Rate (3,) m/s of the nearest point; none at a centre of curvature, where it would leap."""
+    """Rate (3,) m/s of the nearest point.
+
+    Near a centre of curvature, where it would leap, it is bounded as by `INNERMOST`; there it is 0.
+    """
     try:
-        return np.asarray(foot_jacobian(found) @ velocity)
+        rate = foot_jacobian(found) @ velocity
     except np.linalg.LinAlgError:
         return np.zeros(3)
+    most, size = _size(velocity) / INNERMOST, _size(rate)
+    return np.asarray(rate if size <= most else rate * (most / size))
+
+
+def _size(vector: Floats) -> float:
+    """Length of a vector (3,); NaN and infinity stay what they are."""
+    return hypot(*vector.tolist())

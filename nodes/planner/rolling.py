@@ -9,26 +9,23 @@ for any smooth shape; do Carmo, Differential Geometry of Curves and Surfaces, se
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from math import atan2, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import angle_between, transform, twist_between
+from nodes.models.rigid import angle_between, transform
 from nodes.models.shapes import Nearest, Shape
 
 Floats = NDArray[np.float64]
 
-RATE_STEP_S = 1e-3
-"""Half the time over which twists are taken as differences: finer than any motion of a hand."""
-
-SEARCH_POINTS = 9
+SEARCH_PARTS = 8
 SEARCH_ROUNDS = 3
 """The last place within the tilt is found to 1/512 of the way."""
 
-RIM_RADII_M = (0.012, 0.03)
-RIM_POINTS = 12
-"""Where it is looked whether the object rises above its own tangent plane."""
+RIM_RADIUS_M = 0.03
+"""So far around it is looked whether the object rises above its own tangent plane."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +43,12 @@ class Contact:
     axes: Floats
     on_sheet: Floats
     lift_m: float = 0.0
+
+    @property
+    def place(self) -> Nearest:
+        """The surface point, as a shape found it."""
+        nowhere = np.zeros((), dtype=bool)
+        return Nearest(self.point, self.normal, np.zeros(()), self.shape_operator, nowhere, nowhere)
 
     @property
     def object_from_sheet(self) -> Floats:
@@ -104,89 +107,80 @@ def tangent(home: Floats, found: Nearest, half_width_m: float) -> Contact:
     return Contact(found.point, found.normal, found.shape_operator, axes, np.array([x, 0.0]))
 
 
-def moved_along(contact: Contact, rate: Floats, duration_s: float) -> Nearest:
-    """The surface point to first order `duration_s` later, when it moves at `rate` (3,) m/s."""
-    point = contact.point + duration_s * rate
-    normal = _unit(contact.normal + duration_s * (contact.shape_operator @ rate))
-    nowhere = np.zeros((), dtype=bool)
-    return Nearest(point, normal, np.zeros(()), contact.shape_operator, nowhere, nowhere)
-
-
 def rolling_twist(contact: Contact, rate: Floats) -> Floats:
-    """Twist (6,) of the rolling sheet's middle while the contact moves at `rate` (3,) m/s."""
-    before, after = (
-        rolled(contact, moved_along(contact, rate, time_s)).object_from_sheet
-        for time_s in (-RATE_STEP_S, RATE_STEP_S)
-    )
-    return twist_between(before, after, 2.0 * RATE_STEP_S)
+    """Twist (6,) of the rolling sheet's middle while the contact moves at `rate` (3,) m/s.
+
+    Without spin the sheet turns by n x dn; without slip its point that touches is at rest.
+    """
+    along = rate - contact.normal * (rate @ contact.normal)
+    turning = cross(contact.normal, contact.shape_operator @ along)
+    x, y = contact.on_sheet
+    to_middle = contact.lift_m * contact.normal - x * contact.axes[:, 0] - y * contact.axes[:, 1]
+    return np.concatenate([cross(turning, to_middle), turning])
 
 
 def tangent_twist(contact: Contact, rate: Floats, home: Floats, half_width_m: float) -> Floats:
-    """Twist (6,) of the sheet held ready while the point under the finger moves at `rate`."""
-    before, after = (
-        replace(
-            tangent(home, moved_along(contact, rate, time_s), half_width_m), lift_m=contact.lift_m
-        ).object_from_sheet
-        for time_s in (-RATE_STEP_S, RATE_STEP_S)
-    )
-    return twist_between(before, after, 2.0 * RATE_STEP_S)
+    """Twist (6,) of the sheet held ready while the point under the finger moves at `rate`.
+
+    Its axes stay turned from `home` by the least rotation, which spins them about the normal n by
+    -(h x n) dn / (1 + h n) besides n x dn, h the third of home.
+    """
+    point, normal, axes = contact.point, contact.normal, contact.axes
+    along = rate - normal * (rate @ normal)
+    turn_rate = contact.shape_operator @ along
+    front = home[:, 2]
+    spin = -(cross(front, normal) @ turn_rate) / (1.0 + front @ normal)
+    turning = cross(normal, turn_rate) + spin * normal
+    x_axis_rate = cross(turning, axes[:, 0])
+    ahead = float(axes[:, 0] @ point)
+    x = min(max(ahead, -half_width_m), half_width_m)
+    x_rate = x_axis_rate @ point + axes[:, 0] @ along if x == ahead else 0.0
+    shift = along - x_rate * axes[:, 0] - x * x_axis_rate + contact.lift_m * turn_rate
+    return np.concatenate([shift, turning])
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """The cross product (3,), at a fraction of the library's cost."""
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def spin_rad(axes: Floats, home: Floats) -> float:
     """How far the sheet is turned about its normal from how it would be held ready there."""
     ready = turned(home, axes[:, 2])
-    return float(np.arctan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0]))
+    return atan2(axes[:, 0] @ ready[:, 1], axes[:, 0] @ ready[:, 0])
 
 
 def within_tilt(
-    shape: Shape, start: Floats, found: Nearest, front: Floats, tilt_rad: float
+    shape: Shape, start: Nearest, found: Nearest, front: Floats, tilt_rad: float
 ) -> tuple[Nearest, bool]:
     """The last point towards `found` whose normal is within the tilt, and whether it is another.
 
-    start: surface point (3,) to come from, itself within the tilt.  The way is looked at along the
+    start: surface point to come from, itself within the tilt.  The way is looked at along the
     straight line from there, point by point, so that the side is kept on which the sheet is.
     """
     most = np.cos(tilt_rad)
     if found.normal @ front >= most:
         return found, False
-    begin, end = 0.0, 1.0
-    best = shape.closest(start, previous=start)
+    begin, step = 0.0, 1.0
+    best, way = start, found.point - start.point
     for _ in range(SEARCH_ROUNDS):
-        shares = np.linspace(begin, end, SEARCH_POINTS)[1:]
-        places = start + shares[:, None] * (found.point - start)
-        there = shape.closest(places, previous=np.tile(start, (len(places), 1)))
-        outside = ~(there.normal @ front >= most)
-        inside = int(np.argmax(outside)) if outside.any() else len(shares)
-        if inside:
-            best = _pick(there, inside - 1)
-        step = (end - begin) / (SEARCH_POINTS - 1)
-        begin = begin + inside * step
-        end = min(begin + step, 1.0)
+        step /= SEARCH_PARTS
+        for _ in range(SEARCH_PARTS - 1):
+            there = shape.closest(start.point + (begin + step) * way, previous=best.point)
+            if not there.normal @ front >= most:
+                break
+            best, begin = there, begin + step
     return best, True
 
 
 def rim_lift_m(shape: Shape, contact: Contact) -> float:
     """How far the tangent plane must stand off its point to clear the object around it (m).
 
-    0 where the object is not hollow.  Looked at on two rings about the point, as wide as the part
-    of the sheet that a finger pulls down with it.
+    0 where the object is not hollow.  Around is as far as a finger pulls the sheet down with it.
     """
-    turns = np.arange(RIM_POINTS) * (2.0 * np.pi / RIM_POINTS)
-    ring = np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    places = np.concatenate([radius * ring for radius in RIM_RADII_M]) @ contact.axes[:, :2].T
-    return max(0.0, -float(shape.signed_distance(contact.point + places).min()))
-
-
-def _pick(found: Nearest, index: int) -> Nearest:
-    return Nearest(
-        found.point[index],
-        found.normal[index],
-        found.height_m[index],
-        found.shape_operator[index],
-        found.on_edge[index],
-        found.undecided[index],
-    )
+    return shape.rise_m(contact.point, contact.normal, RIM_RADIUS_M)
 
 
 def _unit(vector: Floats) -> Floats:
-    return np.asarray(vector / np.linalg.norm(vector))
+    return np.asarray(vector / sqrt(vector @ vector))

@@ -13,7 +13,14 @@ from nodes.models.shapes.solids import (
     RoundedBoxShape,
     SphereShape,
 )
-from nodes.models.shapes.surface import Nearest, Shape, foot_jacobian, principal_curvatures
+from nodes.models.shapes.surface import (
+    Convex,
+    Nearest,
+    Shape,
+    foot_jacobian,
+    principal_curvatures,
+    tightest_curvature,
+)
 from nodes.models.shapes.triangles import MeshError
 
 SHAPES: dict[str, type[Shape]] = {
@@ -38,6 +45,7 @@ def make_shape(geometry: Mapping[str, Any]) -> Shape:
 
 __all__ = [
     "SHAPES",
+    "Convex",
     "CylinderShape",
     "EllipsoidShape",
     "MeshError",
@@ -50,4 +58,5 @@ __all__ = [
     "foot_jacobian",
     "make_shape",
     "principal_curvatures",
+    "tightest_curvature",
 ]

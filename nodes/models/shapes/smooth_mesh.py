@@ -31,9 +31,11 @@ from nodes.models.shapes.surface import (
     Feet,
     Floats,
     Nearest,
+    Triple,
     checked,
     checked_previous,
     descend,
+    descend_one,
     positive,
 )
 from nodes.models.shapes.triangles import (
@@ -63,6 +65,8 @@ first, jets that face apart pull at f: an edge.  By more than the second: f = 0 
 thin part, which is no surface."""
 LEAST_SUPPORT = 0.1
 """On the mesh the weights add up to several times this; less is beyond such a rim as well."""
+MEMBERS_KNOWN = 0.1
+"""So many `rho` from where the supports around were looked up, they still are all."""
 STRIDE_RATIO = 0.4
 """A descent goes at most this many `rho` a step, so that it never leaves the supports."""
 REST_RATIO = 1e-3
@@ -76,6 +80,8 @@ MOST_WAYS = 6
 """So many places besides the first are tried for the nearest of all."""
 LEAST_SHARE = 0.1
 """Close to a centre of curvature, where I + h A is less than this, any foot of a jet is rough."""
+RIM_SHARE = 0.8
+"""From this share of a circle's radius on, what rises in it counts less and less."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -186,7 +192,10 @@ class SmoothMeshShape:
         """The feet of queries (n, 3), going on from those found before, and which are undecided."""
         if before is None:
             return self._nearest_of_all(queries)
-        feet = self._descend(queries, before)
+        if len(queries) == 1:
+            feet = self._descend_one(queries[0], before[0])
+        else:
+            feet = self._descend(queries, before)
         undecided = np.zeros(len(queries), dtype=bool)
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
@@ -274,9 +283,29 @@ class SmoothMeshShape:
         feet = descend(
             self._level, queries, starts, stride_m=STRIDE_RATIO * rho, rest_m=REST_RATIO * rho
         )
-        beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
-        feet.is_nearest[beyond_rim | (feet.support < LEAST_SUPPORT)] = False
-        return feet
+        return _on_surface_only(feet)
+
+    def _descend_one(self, query: Floats, start: Floats) -> Feet:
+        rho = self.smoothing_m
+        feet = descend_one(
+            _LevelNear(self, start),
+            query,
+            start,
+            stride_m=STRIDE_RATIO * rho,
+            rest_m=REST_RATIO * rho,
+        )
+        return _on_surface_only(feet)
+
+    def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
+        """See `Shape`; to the jets' own places, which lie closer than `smoothing_m`."""
+        offset = self._centre[:-1] - point
+        height = offset @ normal
+        across = np.einsum("ji,ji->j", offset, offset) - height * height
+        within = np.flatnonzero((height > 0.0) & (across < radius_m * radius_m))
+        if not len(within):
+            return 0.0
+        share = (1.0 - np.sqrt(np.maximum(across[within], 0.0)) / radius_m) / (1.0 - RIM_SHARE)
+        return float((height[within] * np.minimum(share, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
         """Roughly the points (n, 3) nearest to queries of the quadratics of single jets (n,)."""
@@ -295,7 +324,7 @@ class SmoothMeshShape:
     def _support_table(self, cover: Floats) -> tuple[Indices, Indices]:
         """For each jet those (padded with one that is infinitely far) whose supports reach the
         points to which it is the nearest, within `cover` (j,) of it, and how many they are."""
-        reach = self.smoothing_m + cover + 0.1 * self.smoothing_m
+        reach = self.smoothing_m + cover + MEMBERS_KNOWN * self.smoothing_m
         lists = self._tree.query_ball_point(self._centre, reach)
         counts = np.array([len(one) for one in lists])
         table = np.full((len(lists), int(counts.max())), len(lists))
@@ -344,6 +373,71 @@ class SmoothMeshShape:
         count = len(points)
         hessian += (weight[:, None] @ operator.reshape(count, -1, 9)).reshape(count, 3, 3)
         return value, gradient, hessian / total[:, None, None], np.where(alone, 0.0, total)
+
+    def surroundings(self, point: Floats) -> tuple[int, Indices, Floats, Floats, Floats]:
+        """The jet nearest to a point (3,), all whose supports may reach places around it, and their
+        centres (k, 3), normals (k, 3) and shape operators (k, 3, 3)."""
+        nearest = int(self._tree.query(point)[1])
+        members = self._table[nearest, : self._counts[nearest]]
+        return (
+            nearest,
+            members,
+            self._centre[members],
+            self._normal[members],
+            self._operator[members],
+        )
+
+
+class _LevelNear:
+    """`SmoothMeshShape._level` for the single points of one descent, see `LevelAt`.
+
+    Jets are looked up anew only after a longer way.
+    """
+
+    __slots__ = ("_asked_at", "_jets", "_shape")
+
+    def __init__(self, shape: SmoothMeshShape, start: Floats) -> None:
+        self._shape, self._asked_at = shape, start
+        self._jets = shape.surroundings(start)
+
+    def __call__(self, point: Triple) -> tuple[float, list[float], list[list[float]], float]:
+        here, rho = np.array(point), self._shape.smoothing_m
+        square, gone = rho**2, here - self._asked_at
+        if gone @ gone > MEMBERS_KNOWN**2 * square:
+            self._asked_at, self._jets = here, self._shape.surroundings(here)
+        nearest, members, centre, normal, operator = self._jets
+        offset = here - centre
+        height = np.einsum("ki,ki->k", offset, normal)
+        away = np.einsum("ki,ki->k", offset, offset) + FLATNESS * height * height
+        inside = np.maximum(1.0 - away / square, 0.0)
+        inside_2 = inside * inside
+        weight = inside_2 * inside_2
+        support = total = float(weight.sum())
+        if total < 1e-12:
+            weight, total, support = (members == nearest).astype(np.float64), 1.0, 0.0
+        bent = np.einsum("kij,kj->ki", operator, offset)
+        distance = height + 0.5 * np.einsum("ki,ki->k", offset, bent)
+        slope = normal + bent
+        lean = offset + (FLATNESS * height)[:, None] * normal
+        fall = (-8.0 / square) * inside_2 * inside
+        value = float(weight @ distance) / total
+        excess = distance - value
+        pull = fall * excess
+        gradient = (pull @ lean + weight @ slope) / total
+        curl = (48.0 / square**2) * inside_2 * excess
+        mixed = (lean * fall[:, None]).T @ slope - gradient[:, None] * (fall @ lean)
+        hessian = (lean * curl[:, None]).T @ lean + mixed + mixed.T
+        hessian += FLATNESS * ((normal * pull[:, None]).T @ normal)
+        hessian += (weight @ operator.reshape(-1, 9)).reshape(3, 3)
+        hessian += float(pull.sum()) * _IDENTITY
+        return value, gradient.tolist(), (hessian / total).tolist(), support
+
+
+def _on_surface_only(feet: Feet) -> Feet:
+    """The feet, those that f = 0 beyond a rim brought forth not called nearest."""
+    beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
+    feet.is_nearest[beyond_rim | (feet.support < LEAST_SUPPORT)] = False
+    return feet
 
 
 def _put(feet: Feet, rows: Indices, other: Feet, chosen: Bools | slice = slice(None)) -> None:

@@ -11,11 +11,14 @@ from nodes.models.shapes.surface import (
     FRONT,
     SAME_M,
     Bools,
+    Convex,
     Floats,
     Nearest,
+    Triple,
     checked,
     checked_previous,
     descend,
+    descend_one,
     positive,
 )
 
@@ -23,7 +26,7 @@ _IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True, slots=True)
-class CylinderShape:
+class CylinderShape(Convex):
     """Circular cylinder about the x axis, centred on the origin.
 
     Only its side is touchable: the sheet is held along x, so a finger beyond an end cap is given
@@ -64,7 +67,7 @@ class CylinderShape:
 
 
 @dataclass(frozen=True, slots=True)
-class SphereShape:
+class SphereShape(Convex):
     """Sphere about the origin."""
 
     radius_m: float
@@ -87,7 +90,7 @@ class SphereShape:
 
 
 @dataclass(frozen=True, slots=True)
-class PlaneShape:
+class PlaneShape(Convex):
     """The half-space z <= 0, touchable on a rectangle of its face about the origin."""
 
     width_m: float
@@ -116,7 +119,7 @@ class PlaneShape:
 
 
 @dataclass(frozen=True, slots=True)
-class EllipsoidShape:
+class EllipsoidShape(Convex):
     """Ellipsoid about the origin, its semi-axes along x, y, z."""
 
     semi_axes_m: tuple[float, float, float]
@@ -139,7 +142,13 @@ class EllipsoidShape:
             blind = np.linalg.norm(starts, axis=-1, keepdims=True) < SAME_M
             starts = np.where(blind, FRONT * self.semi_axes_m, starts)
             least = min(self.semi_axes_m)
-            feet = descend(self._level, flat, starts, stride_m=0.5 * least, rest_m=1e-7 * least)
+            stride_m, rest_m = 0.5 * least, 1e-7 * least
+            if len(flat) == 1:
+                feet = descend_one(
+                    self._level_at, flat[0], starts[0], stride_m=stride_m, rest_m=rest_m
+                )
+            else:
+                feet = descend(self._level, flat, starts, stride_m=stride_m, rest_m=rest_m)
             point = feet.point
             lost = ~feet.is_nearest
             if lost.any():
@@ -172,6 +181,15 @@ class EllipsoidShape:
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
         hessian = np.broadcast_to(np.diag(inverse), (len(points), 3, 3))
         return value, gradient, hessian, np.ones(len(points))
+
+    def _level_at(
+        self, point: Triple
+    ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
+        """The same, see `LevelAt`."""
+        (x, y, z), (a, b, c) = point, self.semi_axes_m
+        p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
+        value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
+        return value, (x * p, y * q, z * r), ((p, 0.0, 0.0), (0.0, q, 0.0), (0.0, 0.0, r)), 1.0
 
     def _undecided(self, queries: Floats) -> Bools:
         """Whether queries lie where two surface points are as near: on a plane of symmetry, within
@@ -216,7 +234,7 @@ class EllipsoidShape:
 
 
 @dataclass(frozen=True, slots=True)
-class RoundedBoxShape:
+class RoundedBoxShape(Convex):
     """Box about the origin whose edges and corners are rounded by a ball.
 
     size_m: full extents along x, y, z, rounding included; edge_radius_m: at most half the least.

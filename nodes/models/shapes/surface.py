@@ -9,8 +9,9 @@ Differential Geometry of Curves and Surfaces, ch. 3).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import atan2, cos, hypot, sin, sqrt
 from typing import Protocol
 
 import numpy as np
@@ -69,6 +70,25 @@ class Shape(Protocol):
         """Distance (m) to the whole solid's surface, negative inside; errors as `closest`."""
         ...
 
+    def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
+        """How far the object rises above its tangent plane at a surface point (3,), within
+        `radius_m` of the point along that plane; 0 where it is not hollow.
+
+        It is continuous in the point and the normal: what stands near the rim of that circle counts
+        less and less.
+        """
+        ...
+
+
+class Convex:
+    """A solid that nowhere rises above its tangent planes."""
+
+    __slots__ = ()
+
+    def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
+        """See `Shape`."""
+        return 0.0
+
 
 def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats, Floats]:
     """Principal curvatures (..., 2), rising (1/m), and their directions (..., 2, 3).
@@ -80,6 +100,16 @@ def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats
     outer = normal[..., :, None] * normal[..., None, :]
     values, vectors = np.linalg.eigh(shape_operator + 2.0 * bound[..., None, None] * outer)
     return values[..., :2], np.swapaxes(vectors, -1, -2)[..., :2, :]
+
+
+def tightest_curvature(shape_operator: Floats) -> float:
+    """The larger principal curvature (1/m) of one shape operator (3, 3).
+
+    Of the two, with k1 + k2 the trace and k1^2 + k2^2 the squares' sum.
+    """
+    total = float(np.einsum("ii", shape_operator))
+    squares = float(np.einsum("ij,ij", shape_operator, shape_operator))
+    return 0.5 * (total + sqrt(max(2.0 * squares - total * total, 0.0)))
 
 
 def foot_jacobian(found: Nearest) -> Floats:
@@ -203,3 +233,93 @@ def descend(
 
 
 _IDENTITY = np.eye(3)
+
+Triple = tuple[float, float, float]
+LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[float]], float]]
+"""As `LevelSet`, of a single point, in plain numbers."""
+
+
+def descend_one(
+    level: LevelAt, query: Floats, start: Floats, *, stride_m: float, rest_m: float
+) -> Feet:
+    """`descend` for one query (3,), at a fraction of its cost; the feet are of length one.
+
+    Written out in the tangent plane's two directions, since arrays of three numbers cost more than
+    their sums.
+    """
+    qx, qy, qz = query.tolist()
+    x, y, z = start.tolist()
+    is_nearest = False
+    for _ in range(MOST_STEPS):
+        value, (gx, gy, gz), hessian, support = level((x, y, z))
+        square = max(gx * gx + gy * gy + gz * gz, 1e-300)
+        length = sqrt(square)
+        ux, uy, uz = gx / length, gy / length, gz / length
+        e, f = _tangents(ux, uy, uz)
+        he, hf = _times(hessian, e), _times(hessian, f)
+        ox, oy, oz = qx - x, qy - y, qz - z
+        multiplier = (ox * gx + oy * gy + oz * gz) / square
+        fall = -value / length
+        # The Hessian's parts along the tangents, and those between them and the normal.
+        h11, h12, h22 = _dot(e, he), _dot(f, he), _dot(f, hf)
+        h1n, h2n = _dot((ux, uy, uz), he), _dot((ux, uy, uz), hf)
+        slope = (
+            _dot(e, (ox, oy, oz)) - multiplier * fall * h1n,
+            _dot(f, (ox, oy, oz)) - multiplier * fall * h2n,
+        )
+        t1, t2, low = _downhill(
+            1.0 + multiplier * h11, multiplier * h12, 1.0 + multiplier * h22, slope
+        )
+        size = sqrt(t1 * t1 + t2 * t2 + fall * fall)
+        share = min(1.0, stride_m / max(size, 1e-300))
+        t1, t2, fall = share * t1, share * t2, share * fall
+        x += t1 * e[0] + t2 * f[0] + fall * ux
+        y += t1 * e[1] + t2 * f[1] + fall * uy
+        z += t1 * e[2] + t2 * f[2] + fall * uz
+        if size <= (rest_m if low >= LEAST_BEND else 1e-3 * rest_m):
+            is_nearest = low > 0.0
+            break
+    basis = np.array([e, f])
+    inner = np.array([[h11, h12], [h12, h22]]) / length
+    # By the last step's part within the first's tangent plane, as the operator is.
+    turned = np.array([ux, uy, uz]) + np.array([t1, t2]) @ inner @ basis
+    return Feet(
+        np.array([[x, y, z]]),
+        (turned / sqrt(turned @ turned))[None],
+        (basis.T @ inner @ basis)[None],
+        np.array([length]),
+        np.array([support]),
+        np.array([is_nearest]),
+    )
+
+
+def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
+    """Two unit vectors that make a basis with a third (Duff et al., Building an Orthonormal Basis,
+    Revisited, 2017)."""
+    side = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (side + z)
+    b = x * y * a
+    return (1.0 + side * x * x * a, side * b, -side * x), (b, side + y * y * a, -y)
+
+
+def _downhill(
+    b11: float, b12: float, b22: float, slope: tuple[float, float]
+) -> tuple[float, float, float]:
+    """The Newton step of a symmetric 2x2 system, its eigenvalues' sizes kept from zero, and the
+    smaller eigenvalue."""
+    middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
+    turn = 0.5 * atan2(2.0 * b12, b11 - b22)
+    c, s = cos(turn), sin(turn)
+    along_high = (c * slope[0] + s * slope[1]) / max(abs(middle + spread), LEAST_BEND)
+    along_low = (c * slope[1] - s * slope[0]) / max(abs(middle - spread), LEAST_BEND)
+    return c * along_high - s * along_low, s * along_high + c * along_low, middle - spread
+
+
+def _dot(a: Triple, b: Triple) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _times(matrix: Sequence[Sequence[float]], vector: Triple) -> Triple:
+    x, y, z = vector
+    (a, b, c), (d, e, f), (g, h, i) = matrix
+    return a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z

@@ -1,0 +1,138 @@
+"""A plan fed by hand at the camera's rate, over any object, for tests of what the sheet does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from messages.scene import Scene
+from nodes.models.motion import SheetBounds
+from nodes.models.rigid import apply, inverse, transform_from_rpy, twist_between
+from nodes.planner.easing import JerkBounds
+from nodes.planner.motion import Plan, Planned, PlanSettings
+from nodes.planner.node import PlannerParameters
+
+Floats = NDArray[np.float64]
+ROOT = Path(__file__).resolve().parent.parent
+STEP_S = 1.0 / 60.0
+STILL = np.zeros(3)
+
+
+def scene_with(
+    geometry: Mapping[str, Any],
+    position_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Scene:
+    """The paper's scene with another object, by default in the world's own frame."""
+    text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
+    values: dict[str, Any] = YAML(typ="safe").load(text)
+    values["object"] |= {
+        "geometry": dict(geometry),
+        "world_from_object": {"position_m": list(position_m), "rpy_rad": list(rpy_rad)},
+    }
+    return Scene.model_validate(values)
+
+
+def settings_of(given: PlannerParameters) -> PlanSettings:
+    """As the node makes them of its parameters."""
+    return PlanSettings(
+        SheetBounds(
+            given.speed_m_per_s,
+            given.acceleration_m_per_s2,
+            given.turn_rad_per_s,
+            given.turn_acceleration_rad_per_s2,
+            given.stretch_rate_per_s,
+            given.stretch_acceleration_per_s2,
+        ),
+        JerkBounds(given.jerk_m_per_s3, given.turn_jerk_rad_per_s3, given.stretch_jerk_per_s3),
+        touch_m=given.touch_m,
+        release_m=given.release_m,
+        tilt_margin_rad=given.tilt_margin_rad,
+        spin_rad=given.largest_spin_rad,
+    )
+
+
+class Desk:
+    """A plan about a scene's object; fingers and answers in the object's frame."""
+
+    def __init__(self, scene: Scene, **parameters: float) -> None:
+        self.given = PlannerParameters(**parameters)
+        self.plan = Plan(scene, settings_of(self.given))
+        pose = scene.object.world_from_object
+        self.world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self.stretch_ratio = scene.sheet.min_stretch_ratio
+        self.seen: list[Planned] = []
+
+    def see(self, finger: Floats, velocity: Floats = STILL) -> Planned:
+        """The sheet's next step for a finger (3,) with a velocity (3,)."""
+        planned = self.plan.follow_finger(
+            apply(self.world_from_object, finger),
+            self.world_from_object[:3, :3] @ velocity,
+            self.stretch_ratio,
+            STEP_S,
+        )
+        self.seen.append(planned)
+        return planned
+
+    def lose(self) -> Planned:
+        """The next step when nothing is known of the finger."""
+        planned = self.plan.hold("lost", STEP_S)
+        self.seen.append(planned)
+        return planned
+
+    def rest(self, finger: Floats, steps: int = 150) -> Planned:
+        """The finger still there for so many steps."""
+        for _ in range(steps):
+            planned = self.see(finger)
+        return planned
+
+    def follow(self, fingers: Floats) -> list[Planned]:
+        """Along fingers (n, 3), one a step, that move evenly enough for their differences."""
+        velocities = np.gradient(fingers, STEP_S, axis=0)
+        return [self.see(*one) for one in zip(fingers, velocities, strict=True)]
+
+    def object_from_sheet(self, planned: Planned) -> Floats:
+        """Where the sheet is planned to be, (4, 4)."""
+        return np.asarray(inverse(self.world_from_object) @ planned.motion.world_from_sheet)
+
+    def assert_bounded(self) -> None:
+        """No step so far was faster, sharper or jerkier than the parameters allow."""
+        sheets = [planned.motion for planned in self.seen]
+        rates = np.array(
+            [
+                [
+                    *twist_between(a.world_from_sheet, b.world_from_sheet, STEP_S),
+                    (b.stretch_ratio - a.stretch_ratio) / STEP_S,
+                ]
+                for a, b in pairwise(sheets)
+            ]
+        )
+        given = self.given
+        bounds = (
+            (given.speed_m_per_s, given.acceleration_m_per_s2, given.jerk_m_per_s3),
+            (
+                given.turn_rad_per_s,
+                given.turn_acceleration_rad_per_s2,
+                given.turn_jerk_rad_per_s3,
+            ),
+            (
+                given.stretch_rate_per_s,
+                given.stretch_acceleration_per_s2,
+                given.stretch_jerk_per_s3,
+            ),
+        )
+        assert np.isfinite(rates).all()
+        for part, most in zip((slice(0, 3), slice(3, 6), slice(6, 7)), bounds, strict=True):
+            # Speeds are let go of as smoothly as they are taken up: a twentieth may be over.
+            for order, (bound, over) in enumerate(
+                zip(most, (1.05, 1e-6 + 1, 1e-6 + 1), strict=True)
+            ):
+                changes = np.diff(rates[:, part], n=order, axis=0) / STEP_S**order
+                size = np.linalg.norm(changes, axis=1).max(initial=0.0)
+                assert size <= bound * over, (part, order, size, bound)
