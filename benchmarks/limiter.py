@@ -41,7 +41,14 @@ from nodes.arm_bridge.goal import Goal
 from nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, limited, within_range
 from nodes.models.motion import SheetMotion
 from nodes.models.rigid import transform, transform_from_rpy
-from nodes.twin.arms import ACCELERATION_RAD_PER_S2, RANGE_RAD, SPEED_RAD_PER_S, Servo, forward
+from nodes.twin.arms import (
+    ACCELERATION_RAD_PER_S2,
+    RANGE_RAD,
+    SPEED_RAD_PER_S,
+    Servo,
+    forward,
+    slowed,
+)
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -170,9 +177,7 @@ class Judged:
         """Undo the step of frozen arms; let stopping ones brake instead."""
         servo, still, braking = self.servo, moving < 0, moving == 0
         servo.joints_rad[still], servo.velocity_rad_per_s[still] = joints[still], 0.0
-        slower = np.sign(velocity) * np.maximum(
-            np.abs(velocity) - ACCELERATION_RAD_PER_S2 * step_s, 0.0
-        )
+        slower = slowed(velocity, step_s)
         servo.velocity_rad_per_s[braking] = slower[braking]
         servo.joints_rad[braking] = (joints + slower * step_s)[braking]
 

@@ -171,6 +171,51 @@ def test_hold_brakes_and_a_counter_may_wrap() -> None:
     assert arm.servo.velocity_rad_per_s == pytest.approx(np.zeros(6), abs=1e-12)
 
 
+velocities = arrays(np.float64, 6, elements=st.floats(-1.0, 1.0)).map(SPEED_RAD_PER_S.__mul__)
+
+
+@settings(max_examples=50, deadline=None)
+@given(velocity=velocities)
+def test_a_stop_keeps_to_the_path_and_ends_as_soon_as_the_slowest_joint_can(
+    velocity: Floats,
+) -> None:
+    servo = Servo(JOINTS.copy(), 0.025)
+    servo.velocity_rad_per_s = velocity
+    stopping_s = float((np.abs(velocity) / ACCELERATION_RAD_PER_S2).max())
+    for _ in range(int(np.ceil(stopping_s / 1e-3)) + 1):
+        before = servo.velocity_rad_per_s
+        servo.advance(JOINTS, 1e-3, braking=True)
+        change = np.abs(servo.velocity_rad_per_s - before)
+        assert (change <= ACCELERATION_RAD_PER_S2 * 1e-3 * (1 + 1e-9)).all()
+        gone = servo.joints_rad - JOINTS
+        along = velocity * float(gone @ velocity) / max(float(velocity @ velocity), 1e-300)
+        assert gone == pytest.approx(along, abs=1e-12)
+    assert servo.velocity_rad_per_s == pytest.approx(np.zeros(6), abs=1e-12)
+
+
+@pytest.mark.parametrize("how", ["stop", "idle", "watchdog", "fault"])
+def test_however_an_arm_is_stopped_it_stays_on_its_way(how: str) -> None:
+    """Fast and slow joints end together: a straight line in the joints remains one."""
+    arm, way = controller(), np.array([0.08, -0.01, 0.02, 0.1, -0.05, 0.03])
+    for number in range(20):
+        assert arm.take(command(number + 2, JOINTS + way * number / 10.0))
+        arm.advance(0.007)
+    speed = arm.servo.velocity_rad_per_s
+    if how == "watchdog":
+        arm.advance(0.3)
+        assert arm.faults == FAULT_WATCHDOG
+    else:
+        assert arm.take(
+            command(50, JOINTS + 3.0) if how == "fault" else command(50, mode=3 * (how == "stop"))
+        )
+        before = arm.servo.joints_rad
+        arm.advance(0.3)
+        gone = arm.servo.joints_rad - before
+        assert gone == pytest.approx(speed * (gone @ speed) / (speed @ speed), abs=1e-9)
+        assert np.abs(gone).max() > 1e-3
+    assert arm.servo.velocity_rad_per_s == pytest.approx(np.zeros(6), abs=1e-12)
+
+
 async def test_the_node_switches_its_arms_on_with_the_first_scene() -> None:
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
     clock, sent = VirtualClock(), []

@@ -141,6 +141,13 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
     return np.concatenate([wanted[:3, 3] - present[:3, 3], spin])
 
 
+def slowed(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
+    """Joint velocities (..., 6) after braking for a while: all in proportion, along their path."""
+    stopping_s = (np.abs(velocity_rad_per_s) / ACCELERATION_RAD_PER_S2).max(axis=-1, keepdims=True)
+    left = np.maximum(stopping_s - duration_s, 0.0) / np.maximum(stopping_s, 1e-12)
+    return np.asarray(velocity_rad_per_s * left)
+
+
 @dataclass(slots=True)
 class Servo:
     """Six joints that follow set-points like critically damped second-order servos.
@@ -160,19 +167,19 @@ class Servo:
         self.driven_rad = self.joints_rad.copy()
 
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
-        """Move on by `duration_s` in steps of at most a millisecond; braking stops where it can."""
+        """Move on by `duration_s` in steps of at most a millisecond; braking stops on the way."""
         steps = max(1, int(np.ceil(duration_s / 1e-3)))
         step_s = duration_s / steps
         natural = 2.0 / self.lag_s
         for _ in range(steps):
             if braking:
-                pull = -self.velocity_rad_per_s / step_s
+                speed = slowed(self.velocity_rad_per_s, step_s)
             else:
                 pull = natural * (
                     natural * (wanted_rad - self.joints_rad) - 2.0 * self.velocity_rad_per_s
                 )
-            pull = np.clip(pull, -ACCELERATION_RAD_PER_S2, ACCELERATION_RAD_PER_S2)
-            speed = self.velocity_rad_per_s + pull * step_s
+                pull = np.clip(pull, -ACCELERATION_RAD_PER_S2, ACCELERATION_RAD_PER_S2)
+                speed = self.velocity_rad_per_s + pull * step_s
             self.velocity_rad_per_s = np.clip(speed, -SPEED_RAD_PER_S, SPEED_RAD_PER_S)
             self.joints_rad = self.joints_rad + self.velocity_rad_per_s * step_s
         play = 0.5 * self.backlash_rad
