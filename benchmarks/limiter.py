@@ -6,7 +6,8 @@ Nine commands in ten are joint goals: NaN, leaps, edges of the range, alternatin
 velocities, spinning wrists, pushes at the tool's speed, and sequences that hypothesis hunted for;
 they go through the limiter and from there into the twin's joint servos.  The others are sheet
 targets for two bridges' controls that share a sheet: leaps, nonsense, late targets, frozen and
-lagging arms, e-stops, resets.  Commands come as unevenly as bridges send them.
+lagging arms, e-stops, resets; whether there is a way to them they are told unseen.  Commands come
+as unevenly as bridges send them.
 
 Judged are the commands, and each millisecond of the simulated joints, by the twin's kinematics.
 Two things are counted apart: commands that brake harder than the acceleration because range or tool
@@ -458,6 +459,7 @@ class Bridge:
     def state(self, joints_rad: Floats, age_s: float) -> OtherArm:
         """What the other bridge hears of it."""
         return OtherArm(
+            joints_rad,
             self.geometry.world_from_flange(joints_rad),
             self.geometry.world_from_flange(self.control.commanded_rad),
             self.control.mode,
@@ -551,6 +553,8 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
             command = control.step(bridge.geometry, pair_goals[number // 2], seen, step_s)
             if command.mode == "move":
                 tally.pass_ns.append(time.thread_time_ns() - began_ns)
+            if control.question is not None:
+                control.take_way(control.question, None)
             judge_bridge(
                 tally,
                 bridge.geometry,

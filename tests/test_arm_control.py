@@ -62,12 +62,15 @@ class Arm:
 
     def cycle(self, goal: Goal | None, other: OtherArm | None, step_s: float = STEP_S) -> None:
         self.command = self.control.step(self.geometry, goal, other, step_s)
+        if self.control.question is not None:
+            self.control.take_way(self.control.question, None)
         if self.command.mode == "move":
             self.joints = self.command.joints_rad
         self.control.take_measurement(self.joints, ())
 
     def as_other(self, age_s: float = 0.005) -> OtherArm:
         return OtherArm(
+            self.joints,
             self.geometry.world_from_flange(self.joints),
             self.geometry.world_from_flange(self.control.commanded_rad),
             self.control.mode,
@@ -103,12 +106,12 @@ def on_time(motion: SheetMotion) -> Goal:
 
 def test_the_first_command_is_the_measured_pose() -> None:
     arms = pair()
-    arms[0].control.step(arms[0].geometry, None, arms[1].as_other(), STEP_S)
-    command = arms[0].control.step(
-        arms[0].geometry, on_time(sheet_at(0.05)), arms[1].as_other(), STEP_S
-    )
-    assert command.mode == "move"
-    assert (command.joints_rad == arms[0].joints).all()
+    arms[0].cycle(on_time(sheet_at(0.05)), arms[1].as_other())
+    assert arms[0].command.mode == "stop"
+    before = arms[0].joints
+    arms[0].cycle(on_time(sheet_at(0.05)), arms[1].as_other())
+    assert arms[0].command.mode == "move"
+    assert (arms[0].command.joints_rad == before).all()
 
 
 def test_before_the_arm_answers_it_is_told_to_be_idle() -> None:
@@ -163,7 +166,17 @@ poses = st.builds(
 @given(one=poses, other=poses, target=poses)
 @settings(max_examples=200, deadline=None)
 def test_never_do_both_arms_wait(one: Floats, other: Floats, target: Floats) -> None:
-    assert max(pace(one, other, target), pace(other, one, target)) == 1.0
+    shares = pace(one, other, target, left=True), pace(other, one, target, left=False)
+    assert max(shares) == 1.0
+
+
+@given(sheet=poses, target=poses, stretch=st.floats(0.5, 1.5))
+@settings(max_examples=200, deadline=None)
+def test_arms_that_are_together_do_not_wait_wherever_they_go(
+    sheet: Floats, target: Floats, stretch: float
+) -> None:
+    left, right = edge_poses(sheet, 0.24 * stretch)
+    assert pace(left, right, target, left=True) == pace(right, left, target, left=False) == 1.0
 
 
 @pytest.mark.parametrize(("lead", "share"), [(0.03, 1.0), (0.085, 0.5), (0.2, 0.0)])
@@ -171,8 +184,8 @@ def test_the_leading_arm_slows_by_its_lead_and_the_other_not(lead: float, share:
     target = transform_from_rpy([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     ahead = transform_from_rpy([-0.12, 0.0, 0.0], [0.3 + lead, 0.0, 0.0])
     behind = transform_from_rpy([0.12, 0.0, 0.0], [0.3, 0.0, 0.0])
-    assert pace(ahead, behind, target) == pytest.approx(share)
-    assert pace(behind, ahead, target) == 1.0
+    assert pace(ahead, behind, target, left=True) == pytest.approx(share)
+    assert pace(behind, ahead, target, left=False) == 1.0
 
 
 def test_a_moving_target_is_followed_without_lag() -> None:

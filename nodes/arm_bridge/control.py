@@ -15,9 +15,7 @@ from numpy.typing import NDArray
 from messages.types import ArmMode, ArmState, EStop
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, pace, slowed
-from nodes.arm_bridge.kinematics import (
-    UnreachableError,
-)
+from nodes.arm_bridge.kinematics import UnreachableError
 from nodes.arm_bridge.limiter import (
     braked,
     limited,
@@ -26,6 +24,7 @@ from nodes.arm_bridge.limiter import (
     step_trouble,
     with_tool_speed,
 )
+from nodes.arm_bridge.way import START_BOUNDS, Way, lag
 from nodes.models.motion import (
     EdgeBound,
     SheetBounds,
@@ -33,10 +32,7 @@ from nodes.models.motion import (
     coast_sheet,
     follow_sheet,
 )
-from nodes.models.rigid import (
-    is_rigid,
-    vector_from_rotation,
-)
+from nodes.models.rigid import is_rigid
 
 Floats = NDArray[np.float64]
 
@@ -52,15 +48,6 @@ FOLLOW_BOUNDS = SheetBounds(
     turn_acceleration_rad_per_s2=16.0,
     stretch_rate_per_s=0.1,
     stretch_acceleration_per_s2=1.0,
-)
-# From a standstill to the target, with a person perhaps at the sheet: a quarter of the tool speed.
-START_BOUNDS = SheetBounds(
-    speed_m_per_s=0.06,
-    acceleration_m_per_s2=0.3,
-    turn_rad_per_s=0.5,
-    turn_acceleration_rad_per_s2=2.5,
-    stretch_rate_per_s=0.03,
-    stretch_acceleration_per_s2=0.2,
 )
 # Letting go is no haste either, but a taut sheet is what hurts: slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
@@ -84,6 +71,10 @@ JUMP_RAD = 0.35
 """Joints that would have to go further than this at once are on another branch of solutions."""
 
 
+LOOK_AGAIN_S = 0.5
+"""How long a barred way stays barred before it is looked at again, the target having moved on."""
+
+
 @dataclass(frozen=True, slots=True)
 class Patience:
     """How late things may be before the arm holds, and before it stops (seconds)."""
@@ -94,8 +85,9 @@ class Patience:
 
 @dataclass(frozen=True, slots=True)
 class OtherArm:
-    """The other arm as its bridge tells: world poses of its flange, and whether it is well."""
+    """The other arm as its bridge tells: joints (6,), flange in the world, whether it is well."""
 
+    joints_rad: Floats
     world_from_flange: Floats
     world_from_flange_commanded: Floats
     mode: ArmMode
@@ -106,6 +98,7 @@ class OtherArm:
     def from_state(cls, state: ArmState, age_s: float) -> OtherArm:
         """What the other bridge's message says, `age_s` after it came."""
         return cls(
+            state.joints_rad,
             state.world_from_flange,
             state.world_from_flange_commanded,
             state.mode,
@@ -115,9 +108,9 @@ class OtherArm:
 
     @property
     def is_somewhere(self) -> bool:
-        """Whether its poses are numbers; else it is as good as silent."""
-        poses = (self.world_from_flange, self.world_from_flange_commanded)
-        return all(bool(np.isfinite(pose).all()) for pose in poses)
+        """Whether joints and poses are numbers; else it is as good as silent."""
+        places = (self.joints_rad, self.world_from_flange, self.world_from_flange_commanded)
+        return all(bool(np.isfinite(place).all()) for place in places)
 
     @property
     def estopped(self) -> bool:
@@ -147,6 +140,7 @@ class ArmControl:
 
     mode, faults and reason are for people and for the other arm: faults hold what is wrong with
     this arm (latched until `reset`, but for a lost connection), reason why it does not follow.
+    question: the way of which it wants to know, by `take_way`, whether it is clear; None: of none.
     """
 
     def __init__(self, patience: Patience, *, largest_lag_rad: float) -> None:
@@ -157,6 +151,10 @@ class ArmControl:
         self.measured_rad: Floats | None = None
         self.last_measured_rad: Floats | None = None
         self.commanded_rad = np.zeros(6)
+        self.question: Way | None = None
+        self._clear_way: Way | None = None
+        self._barred: tuple[str, float] | None = None
+        self._together = False
         self._patience = patience
         self._largest_lag_rad = largest_lag_rad
         self._velocity = np.zeros(6)
@@ -224,6 +222,7 @@ class ArmControl:
     def interrupt(self) -> None:
         """Come to rest and begin anew: the scene has changed under the motion."""
         self._interrupted = True
+        self.question = self._clear_way = self._barred = None
         if self.mode in ("follow", "hold"):
             self.mode = "stopping"
 
@@ -301,7 +300,7 @@ class ArmControl:
             self._interrupted = self._interrupted and not self.at_rest
             return self._stop("idle", "comes to rest", geometry, step_s)
         if self._sheet is None:
-            return self._begin(geometry, other, measured)
+            return self._set_out(geometry, goal, other, measured, step_s)
         return self._follow(goal, self._sheet, geometry, other, step_s)
 
     def _follow(
@@ -318,12 +317,15 @@ class ArmControl:
             self.mode, self.reason = "hold", "sheet target or other arm late"
             sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
         else:
-            self.mode, self.reason = "follow", ""
+            self._together = self._together or other.mode == "follow"
+            self.mode, self.reason = "follow", "" if self._together else "waits for the other arm"
             share = pace(
                 geometry.world_from_edge(self.commanded_rad),
                 other.world_from_flange_commanded @ geometry.other_flange_from_edge,
                 goal.motion.world_from_sheet,
+                left=geometry.left,
             )
+            share = share if self._together else 0.0
             sheet = self._towards(goal.motion, sheet, geometry.edge_bound, share, step_s)
         return self._carry(sheet, geometry, other, step_s)
 
@@ -347,15 +349,46 @@ class ArmControl:
             if trouble is not None:
                 self.faults = (f"measured: {trouble}",)
 
-    def _begin(self, geometry: ArmGeometry, other: OtherArm, measured: Floats) -> Command:
-        """The first command of a motion is the measured pose."""
-        self._start_at(measured)
-        self._sheet = geometry.sheet_between(
+    def _set_out(
+        self,
+        geometry: ArmGeometry,
+        goal: Goal,
+        other: OtherArm,
+        measured: Floats,
+        step_s: float,
+    ) -> Command:
+        """Begin if the way to the target is known to be clear; else stand, and ask whether it is.
+
+        The other bridge asks the same of the same two arms.  Neither moves before both follow.
+        """
+        sheet = geometry.sheet_between(
             geometry.world_from_edge(measured),
             other.world_from_flange @ geometry.other_flange_from_edge,
         )
+        if self._clear_way is not None and self._clear_way.leads_to(goal.motion):
+            return self._begin(sheet, measured)
+        reason = "looks whether the way is clear"
+        if self._barred is not None:
+            reason, since_s = self._barred
+            self._barred = reason, since_s + step_s
+        if self.question is None and (self._barred is None or self._barred[1] > LOOK_AGAIN_S):
+            self.question = Way(sheet, goal.motion, measured, other.joints_rad)
+        return self._stop("hold", reason, geometry, step_s)
+
+    def take_way(self, way: Way, trouble: str | None) -> None:
+        """The answer to the question; to one that is no longer asked it is thrown away."""
+        if way is not self.question:
+            return
+        self.question = None
+        self._clear_way = way if trouble is None else None
+        self._barred = None if trouble is None else (trouble, 0.0)
+
+    def _begin(self, sheet: SheetMotion, measured: Floats) -> Command:
+        """The first command of a motion is the measured pose."""
+        self._start_at(measured)
+        self._sheet = sheet
         self._has_pulled = True
-        self.mode, self.reason = "follow", ""
+        self.mode, self.reason = "follow", "waits for the other arm"
         return Command("move", measured)
 
     def _towards(
@@ -370,7 +403,7 @@ class ArmControl:
 
         share: of the speeds, less than 1 for the arm that is ahead of the other.
         """
-        distance, angle = _lag(sheet, target)
+        distance, angle = lag(sheet, target)
         if (
             distance < SETTLED_M
             and angle < SETTLED_RAD
@@ -470,8 +503,7 @@ class ArmControl:
         self, rest_mode: ArmMode, reason: str, geometry: ArmGeometry, step_s: float
     ) -> Command:
         """Brake along the path; at rest stay in `rest_mode`."""
-        self._sheet = self._goal_rad = self._relax_from = None
-        self._settled = False
+        self._leave_way()
         self.reason = reason
         if self.at_rest:
             self.mode = rest_mode
@@ -513,17 +545,13 @@ class ArmControl:
 
     def _forget_motion(self) -> None:
         self._velocity = np.zeros(6)
-        self._sheet = self._goal_rad = self._relax_from = None
-        self._settled = False
+        self._leave_way()
+
+    def _leave_way(self) -> None:
+        self._sheet = self._goal_rad = self._relax_from = self._clear_way = None
+        self._settled = self._together = False
 
 
 def _is_sound(motion: SheetMotion) -> bool:
     rates = (*motion.twist_world, motion.stretch_ratio, motion.stretch_rate_per_s)
     return is_rigid(motion.world_from_sheet) and bool(np.isfinite(rates).all())
-
-
-def _lag(sheet: SheetMotion, target: SheetMotion) -> tuple[float, float]:
-    """Distance (m) and angle (rad) between two sheet poses."""
-    turn = target.world_from_sheet[:3, :3] @ sheet.world_from_sheet[:3, :3].T
-    shift = target.world_from_sheet[:3, 3] - sheet.world_from_sheet[:3, 3]
-    return float(np.linalg.norm(shift)), float(np.linalg.norm(vector_from_rotation(turn)))

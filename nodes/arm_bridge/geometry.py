@@ -35,6 +35,7 @@ class ArmGeometry:
     """Where an arm of the scene stands, how it holds its edge, and what limits it."""
 
     def __init__(self, scene: Scene, side: Side) -> None:
+        self.side: Side = side
         self.left = side == "left"
         arm, other = scene.arms.left, scene.arms.right
         if not self.left:

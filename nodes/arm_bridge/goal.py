@@ -6,6 +6,7 @@ Plain functions: poses 4x4 in the world, turns in rad, lengths in m, times in s 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from messages.base import Header
 from messages.types import SheetTarget
 from nodes.models.motion import SheetBounds, SheetMotion, extrapolated
-from nodes.models.rigid import vector_from_rotation
+from nodes.models.rigid import transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
 
@@ -81,18 +82,20 @@ def goal_of(
     return goal_ahead(motion, ahead_s, overdue_s, furthest_s=timing.furthest_s)
 
 
-def pace(own_edge: Floats, other_edge: Floats, target: Floats) -> float:
+def pace(own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool) -> float:
     """Share (0..1) of its speed with which an arm goes on, so that it waits for one behind it.
 
-    own_edge, other_edge: world poses of the commanded edges; target: world_from_sheet.  Each bridge
-    moves the sheet by its own cycle, and a cycle late on one side is a turn of the sheet's edges to
-    one another.  The arm that leads on the way from between both to the target slows in proportion
-    to its lead.  What one arm leads the other trails, so they never wait for each other.
+    own_edge, other_edge: world poses of the commanded edges, the own one on the sheet's left or
+    right; target: world_from_sheet.  Each bridge moves the sheet by its own cycle, and a cycle late
+    on one side is a turn of the sheet's edges to one another.  The arm that leads on the way to the
+    target slows in proportion to its lead.  What one arm leads the other trails, so they never wait
+    for each other.
     """
-    across = target[:3, 0]
-    lead = _between(other_edge, own_edge, across)
-    way = _between(own_edge, target, across) + _between(other_edge, target, across)
-    apart = float(np.linalg.norm(lead))
+    across = other_edge[:3, 3] - own_edge[:3, 3]
+    half = (0.5 if left else -0.5) * sqrt(float(across @ across))
+    own, other = _middle(own_edge, half), _middle(other_edge, -half)
+    lead, way = _between(other, own), _between(own, target) + _between(other, target)
+    apart = sqrt(float(lead @ lead))
     if apart <= WAIT_FROM_RAD or float(lead @ way) <= 0.0:
         return 1.0
     return max(0.0, (WAIT_FULL_RAD - apart) / (WAIT_FULL_RAD - WAIT_FROM_RAD))
@@ -110,12 +113,15 @@ def slowed(bounds: SheetBounds, share: float) -> SheetBounds:
     )
 
 
-def _between(pose: Floats, other: Floats, across: Floats) -> Floats:
+def _middle(edge: Floats, along_m: float) -> Floats:
+    """The sheet's pose as one edge has it: its middle lies so far along the edge's x axis."""
+    return transform(edge[:3, :3], edge[:3, 3] + along_m * edge[:3, 0])
+
+
+def _between(pose: Floats, other: Floats) -> Floats:
     """The way (6,) from one pose to another: turn (rad), then shift over SKEW_LENGTH_M.
 
-    across: unit vector (3,) from edge to edge; shift along it is left out, for the edges are a
-    sheet's width apart.  The way back is the negative, exactly.
+    The way back is the negative, exactly.
     """
     turn = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
-    shift = other[:3, 3] - pose[:3, 3]
-    return np.concatenate([turn, (shift - across * (across @ shift)) / SKEW_LENGTH_M])
+    return np.concatenate([turn, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

@@ -20,9 +20,10 @@ from nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
 
-TOOL_SPEED_SHARE = 0.88
+TOOL_SPEED_SHARE = 0.85
 """Share of the tool speed that commands may use: an arm that is sent to a place at a time, and not
-a velocity, ripples about its mean speed (benchmarks/limiter.py)."""
+a velocity, ripples about its mean speed.  Most where wrist joints turn fast against one another:
+each ripples by its own speed, of which little is left at the tool (benchmarks/limiter.py)."""
 
 EVEN_STEP_S = 0.01
 """After a longer gap than that a command leads no further than in this time: what a late one makes

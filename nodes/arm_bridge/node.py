@@ -16,7 +16,8 @@ from nodes.arm_bridge.goal import Goal, Timing, goal_of
 from nodes.arm_bridge.link import ArmLinkError, ArmSilentError
 from nodes.arm_bridge.link_drivers import Driver, link_for
 from nodes.arm_bridge.pacing import Pace
-from nodes.arm_bridge.report import arm_state
+from nodes.arm_bridge.report import Exchanged, arm_state
+from nodes.arm_bridge.way import Lookout
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
 
@@ -30,7 +31,9 @@ class ArmBridgeParameters(NodeParameters):
     servo_lag_s: NonNegative = Field(
         default=0.03, description="how far the arm trails a command that moves evenly"
     )
-    target_period_s: Positive = Field(default=1 / 60, description="older than that is late")
+    target_period_s: Positive | None = Field(
+        default=None, description="older than that is late; null: the period of the scene's camera"
+    )
     hold_after_s: Positive = 0.02
     stop_after_s: Positive = 0.1
     furthest_extrapolation_s: Positive = 0.06
@@ -54,12 +57,8 @@ class ArmBridge(Node):
         patience = Patience(given.hold_after_s, given.stop_after_s)
         self._control = ArmControl(patience, largest_lag_rad=given.largest_lag_rad)
         self._geometry: ArmGeometry | None = None
-        self._cycle_ns = self._sent_ns = self._measured_ns = 0
-        self._used: tuple[Header | None, int] = (None, 0)
-        self._exchange_s, self._failures = 0.0, 0
-        due_s, furthest_s = given.target_period_s, given.furthest_extrapolation_s
-        self._timing = Timing(given.servo_lag_s, due_s, furthest_s)
-        self._pace, self._cycling = Pace(1.0 / given.rate_hz, due_s), asyncio.Lock()
+        self._newest, self._cycle_ns, self._failures = Exchanged(), 0, 0
+        self._cycling = asyncio.Lock()
 
     async def close(self) -> None:
         """Bid the arm stop; if that fails, its own watchdog stops it."""
@@ -74,8 +73,14 @@ class ArmBridge(Node):
             self._link.close()
 
     def on_scene(self, scene: Scene, header: Header) -> None:
+        given = self.parameters
         self._control.interrupt()
-        self._geometry = ArmGeometry(scene, self.parameters.side)
+        other_side: Side = "right" if given.side == "left" else "left"
+        self._geometry = ArmGeometry(scene, given.side)
+        self._lookout = Lookout(self._geometry, ArmGeometry(scene, other_side))
+        due_s = given.target_period_s or 1.0 / scene.camera.rate_hz
+        self._timing = Timing(given.servo_lag_s, due_s, given.furthest_extrapolation_s)
+        self._pace = Pace(1.0 / given.rate_hz, due_s)
 
     def on_estop(self, estop: EStop, header: Header) -> None:
         if refusal := self._control.take_estop(estop, (header.clock_id, header.source_ns)):
@@ -84,37 +89,42 @@ class ArmBridge(Node):
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
         """A target is passed on when it comes: at the next beat it would be 7 ms older."""
         async with self._cycling:
-            if self._used[0] is not header:
+            if self._geometry is not None and self._newest.target is not header:
                 await asyncio.sleep(self._pace.wait_s(self.clock.now_ns(), self._cycle_ns))
-                await self._serve()
+                await self._serve(self._geometry)
 
     @periodic("rate_hz")
     async def cycle(self) -> None:
         """Between targets, and without any, the arm hears from us at this rate."""
-        now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
-        if self._pace.is_beat(now_ns, self._cycle_ns, target_ns) and not self._cycling.locked():
-            async with self._cycling:
-                await self._serve()
-
-    async def _serve(self) -> None:
-        now_ns = self.clock.now_ns()
         if self._geometry is None:
             self.note = "waits for a scene"
             return
+        now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
+        if self._pace.is_beat(now_ns, self._cycle_ns, target_ns) and not self._cycling.locked():
+            async with self._cycling:
+                await self._serve(self._geometry)
+
+    async def _serve(self, geometry: ArmGeometry) -> None:
+        now_ns = self.clock.now_ns()
         step_s, self._cycle_ns = self._pace.step_s(now_ns, self._cycle_ns), now_ns
         if self._link.due(now_ns):
-            await self._exchange(self._geometry, step_s)
+            await self._exchange(geometry, step_s)
         what, why = self._control.mode, self._control.reason
         self.note = f"{what} {why}; {self._failures} failed exchanges"
-        self._publish(self._geometry)
+        if self._control.last_measured_rad is not None:
+            now_ns, newest = self.clock.now_ns(), self._newest
+            state = arm_state(self._control, geometry, self._other(), newest, now_ns)
+            self.arm.publish(state, source_ns=newest.measured_ns)
 
     async def _exchange(self, geometry: ArmGeometry, step_s: float) -> None:
-        control = self._control
+        control, newest = self._control, self._newest
         command = control.step(geometry, self._goal(), self._other(), step_s)
+        if answer := self._lookout.answer(control.question):
+            control.take_way(*answer)
         # A target that comes while the arm answers is not behind the command that it answers.
-        self._used = (self.sheet_target.header, self.sheet_target.received_ns)
+        newest.target, newest.received_ns = self.sheet_target.header, self.sheet_target.received_ns
         mode, joints_rad, now_ns = command.mode, command.joints_rad, self.clock.now_ns()
-        self._sent_ns = now_ns
+        newest.sent_ns = now_ns
         try:
             status = await self._link.exchange(mode=mode, joints_rad=joints_rad, now_ns=now_ns)
         except ArmLinkError as error:
@@ -122,8 +132,7 @@ class ArmBridge(Node):
             if control.fail_exchange(str(error), silent=isinstance(error, ArmSilentError)):
                 self.log.warning("arm lost", problem=str(error))
             return
-        self._measured_ns = self.clock.now_ns()
-        self._exchange_s = (self._measured_ns - self._sent_ns) * 1e-9
+        newest.answered(self.clock.now_ns())
         control.take_measurement(status.joints_rad, status.faults)
 
     def _goal(self) -> Goal | None:
@@ -143,17 +152,3 @@ class ArmBridge(Node):
     def _other(self) -> OtherArm | None:
         state = self.other_arm.message
         return None if state is None else OtherArm.from_state(state, self.other_arm.age_s())
-
-    def _publish(self, geometry: ArmGeometry) -> None:
-        header, received_ns = self._used
-        if self._control.last_measured_rad is not None:
-            state = arm_state(
-                self._control,
-                geometry,
-                self._other(),
-                target_source_ns=header.source_ns if header else 0,
-                command_age_s=(self.clock.now_ns() - received_ns) * 1e-9 if header else None,
-                command_sent_ns=self._sent_ns,
-                cycle_s=self._exchange_s,
-            )
-            self.arm.publish(state, source_ns=self._measured_ns)

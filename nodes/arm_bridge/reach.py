@@ -68,6 +68,9 @@ LARGEST_STEP_RAD = 0.05
 
 FINEST_SHARE = 1e-6
 
+ROUNDING = 1e-9
+"""What a margin may shrink by without the limit being broken further."""
+
 DETOURS_M = (
     (0.0, 0.0, 0.05),
     (0.0, 0.0, 0.1),
@@ -320,8 +323,14 @@ class PathError(ValueError):
     share: of the straight way, 0..1.
     """
 
-    def __init__(self, text: str, *, side: Side, limit: str, share: float) -> None:
-        super().__init__(text)
+    def __init__(
+        self, why: str, *, side: Side, limit: str, share: float, world_from_sheet: Floats
+    ) -> None:
+        x, y, z = 1e3 * world_from_sheet[:3, 3]
+        super().__init__(
+            f"{side} arm, at {100 * share:.0f} % of the way, "
+            f"sheet at ({x:.0f}, {y:.0f}, {z:.0f}) mm: {why}"
+        )
         self.side: Side = side
         self.limit = limit
         self.share = share
@@ -350,11 +359,32 @@ def coordinated_path(
         corners = [start, goal] if via is None else [start, *_shifted((start, goal), via), goal]
         for at_left, at_right in starts:
             try:
-                return _along(left, right, corners, Step(start, at_left, at_right), via)
+                track = _track(left, right, corners, Step(start, at_left, at_right))
+                return _checked(left, right, track, via)
             except PathError as error:
                 first = first or error
     assert first is not None
     raise first
+
+
+def path_through(
+    left: ArmGeometry,
+    right: ArmGeometry,
+    corners: Sequence[SheetMotion],
+    *,
+    left_rad: Floats,
+    right_rad: Floats,
+) -> SheetPath:
+    """The way for both arms through all corners, straight between each two; else PathError.
+
+    left_rad, right_rad: joints (6,) at the first of them.
+    """
+    begin = Step(
+        corners[0],
+        _joints_there(left, corners[0], left_rad, share=0.0),
+        _joints_there(right, corners[0], right_rad, share=0.0),
+    )
+    return _checked(left, right, _track(left, right, corners, begin), None)
 
 
 def _shifted(
@@ -373,14 +403,10 @@ def _shifted(
     ]
 
 
-def _along(
-    left: ArmGeometry,
-    right: ArmGeometry,
-    corners: Sequence[SheetMotion],
-    begin: Step,
-    via: tuple[float, float, float] | None,
-) -> SheetPath:
-    """The path through all corners, each part straight; PathError."""
+def _track(
+    left: ArmGeometry, right: ArmGeometry, corners: Sequence[SheetMotion], begin: Step
+) -> list[Step]:
+    """Places through all corners, each part straight, so near that no joint leaps; PathError."""
     track = [begin]
     for number, (near, far) in enumerate(pairwise(corners)):
         share, step = 0.0, 0.25
@@ -407,7 +433,7 @@ def _along(
                 arm, other = (left, right) if at_left else (right, left)
                 joints = before.left_rad if at_left else before.right_rad
                 raise _leap(arm, other, place, joints, share=whole)
-    return _checked(left, right, track, via)
+    return track
 
 
 def _leap(
@@ -423,9 +449,8 @@ def _leap(
     binding = int(reach.binding[0])
     limit = "leap" if binding < 0 else LIMITS[binding]
     why = "its joints would leap" if binding < 0 else f"its branch ends: {limit}"
-    side: Side = "left" if arm.left else "right"
     return PathError(
-        f"{side} arm, at {100 * share:.0f} % of the way: {why}", side=side, limit=limit, share=share
+        why, side=arm.side, limit=limit, share=share, world_from_sheet=there.world_from_sheet
     )
 
 
@@ -457,13 +482,13 @@ def _joints_there(
         pose = flange_poses(arm, _places([place]))[0]
         return next_joints(arm.base_from_world @ pose, near_rad)
     except UnreachableError as error:
-        side: Side = "left" if arm.left else "right"
         limit = error.limit if error.limit == "reach" else f"{error.limit} range"
         raise PathError(
-            f"{side} arm, at {100 * share:.0f} % of the way: {error}",
-            side=side,
+            str(error),
+            side=arm.side,
             limit=limit,
             share=share,
+            world_from_sheet=place.world_from_sheet,
         ) from error
 
 
@@ -491,7 +516,10 @@ def _checked(
     track: Sequence[Step],
     via: tuple[float, float, float] | None,
 ) -> SheetPath:
-    """The path if every place on it keeps all limits of both arms; PathError names the first."""
+    """The path if every place on it keeps all limits of both arms; PathError names the first.
+
+    A limit that is not kept at the start need only not be broken further until the goal.
+    """
     places = _places([step.sheet for step in track])
     joints = (
         np.array([step.left_rad for step in track]),
@@ -499,22 +527,25 @@ def _checked(
     )
     flanges = [flange_poses(arm, places) for arm in (left, right)]
     times = np.zeros(len(track))
-    for index, (arm, side) in enumerate(((left, "left"), (right, "right"))):
+    for index, arm in enumerate((left, right)):
         branch = branch_of(joints[index][0])
         own, other = flanges[index], flanges[1 - index]
         margins = _margins(
             arm, branch, joints=joints[index], flanges=own, others=other, places=places
         )
+        for margin in margins.values():
+            if margin[0] < 0.0:
+                margin[:-1] -= margin[0] - ROUNDING
         reach = ArmReach(branch, joints[index], margins)
         broken = np.flatnonzero(~reach.reached)
         if len(broken):
             limit = LIMITS[int(reach.binding[broken[0]])]
-            share = float(broken[0]) / max(len(track) - 1, 1)
             raise PathError(
-                f"{side} arm: {limit} is not kept at {100 * share:.0f} % of the way",
-                side="left" if arm.left else "right",
+                f"{limit} is not kept",
+                side=arm.side,
                 limit=limit,
-                share=share,
+                share=float(broken[0]) / max(len(track) - 1, 1),
+                world_from_sheet=places.world_from_sheet[broken[0]],
             )
         steps = np.abs(np.diff(joints[index], axis=0)) / arm.joint_limits.speed_rad_per_s
         points = _tool_points(arm, own)

@@ -1,0 +1,332 @@
+"""Whether there is a way for both arms, before they begin: asked, answered, and what follows."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from messages.base import Header
+from messages.clock import VirtualClock
+from messages.types import SheetTarget, Side
+from nodes.arm_bridge import way as way_module
+from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from nodes.arm_bridge.way import Lookout, Way, rehearsed, trouble_on_way
+from nodes.models.motion import SheetMotion
+from nodes.models.rigid import transform_from_rpy
+from tests.test_arm_control import (
+    HOME,
+    SCENE,
+    STEP_S,
+    Arm,
+    on_time,
+    pair,
+    run,
+    sheet_at,
+)
+from tests.test_arm_loop import Rig, running_rig
+from tests.test_arm_loop import until as until_within
+
+Floats = NDArray[np.float64]
+until = partial(until_within, within_s=25.0)
+LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
+FAR = replace(HOME, world_from_sheet=transform_from_rpy([0.12, 0.0, 0.0], [0.0, 0.0, 0.0]))
+"""The sheet so far to the right that the left arm's J3 ends."""
+
+
+def way_between(start: SheetMotion, goal: SheetMotion) -> Way:
+    """As the left bridge asks."""
+    own, other = (Arm.holding(side, start).joints for side in ("left", "right"))
+    return Way(start, goal, own, other)
+
+
+def mirrored(way: Way) -> Way:
+    """As the right bridge asks it."""
+    return replace(way, own_rad=way.other_rad, other_rad=way.own_rad)
+
+
+def run_asking(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
+    """As `run`, but each arm's question is looked into, in no time."""
+    for _ in range(cycles):
+        for arm, other in (arms, arms[::-1]):
+            control = arm.control
+            command = control.step(arm.geometry, on_time(goal), other.as_other(), STEP_S)
+            if control.question is not None:
+                trouble = trouble_on_way(arm.geometry, other.geometry, control.question)
+                control.take_way(control.question, trouble)
+            if command.mode == "move":
+                arm.joints = command.joints_rad
+            control.take_measurement(arm.joints, ())
+
+
+def sheet_of(arms: tuple[Arm, Arm]) -> SheetMotion:
+    return arms[0].geometry.sheet_between(arms[0].edge, arms[1].edge)
+
+
+def test_a_barred_way_is_named_and_nothing_moves() -> None:
+    arms = pair()
+    places = [arm.joints.copy() for arm in arms]
+    run_asking(arms, FAR, 30)
+    for arm, place in zip(arms, places, strict=True):
+        assert (arm.control.mode, arm.control.faults) == ("hold", ())
+        assert (arm.joints == place).all()
+        reason = arm.control.reason
+        assert reason.startswith("no way: left arm, at ")
+        assert "% of the way, sheet at (" in reason
+        assert "J3 at 5" in reason
+    assert arms[0].control.reason == arms[1].control.reason
+
+
+def test_a_target_within_reach_again_is_gone_to() -> None:
+    arms = pair()
+    run_asking(arms, FAR, 30)
+    goal = sheet_at(0.02, tilt=0.3)
+    run_asking(arms, goal, 30)
+    assert {arm.control.mode for arm in arms} == {"hold"}, "it is looked at again every half second"
+    run_asking(arms, goal, 400)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+    assert sheet_of(arms).world_from_sheet == pytest.approx(goal.world_from_sheet, abs=1e-6)
+
+
+@pytest.mark.parametrize("barred", [0, 1])
+def test_where_only_one_bridge_finds_the_way_clear_neither_moves(barred: int) -> None:
+    arms = pair()
+    places = [arm.joints.copy() for arm in arms]
+    for _ in range(100):
+        for number, (arm, other) in enumerate((arms, arms[::-1])):
+            control = arm.control
+            command = control.step(arm.geometry, on_time(sheet_at(0.03)), other.as_other(), STEP_S)
+            if control.question is not None:
+                control.take_way(control.question, "no way" if number == barred else None)
+            if command.mode == "move":
+                arm.joints = command.joints_rad
+            control.take_measurement(arm.joints, ())
+    assert arms[barred].control.mode == "hold"
+    assert arms[1 - barred].control.reason == "waits for the other arm"
+    for arm, place in zip(arms, places, strict=True):
+        assert arm.joints == pytest.approx(place, abs=1e-12)
+
+
+def test_it_is_asked_before_the_first_motion_and_after_each_stop_and_not_in_between() -> None:
+    arms = pair()
+    control = arms[0].control
+    asked: list[Way] = []
+    for goal in (sheet_at(0.03), None, sheet_at(0.05), None, sheet_at(0.01)):
+        for _ in range(120):
+            for arm, other in (arms, arms[::-1]):
+                arm.command = arm.control.step(
+                    arm.geometry, None if goal is None else on_time(goal), other.as_other(), STEP_S
+                )
+                if (question := arm.control.question) is not None:
+                    asked += [question] if arm.control is control else []
+                    arm.control.take_way(question, None)
+                if arm.command.mode == "move":
+                    arm.joints = arm.command.joints_rad
+                arm.control.take_measurement(arm.joints, ())
+    assert [round(float(way.goal.world_from_sheet[1, 3]), 6) for way in asked] == [0.03, 0.05, 0.01]
+    assert asked[1].start.world_from_sheet[1, 3] == pytest.approx(0.03, abs=1e-3)
+
+
+def test_an_answer_to_a_question_no_longer_asked_is_thrown_away() -> None:
+    arms = pair()
+    control = arms[0].control
+
+    def step(goal: SheetMotion) -> None:
+        control.step(arms[0].geometry, on_time(goal), arms[1].as_other(), STEP_S)
+
+    step(HOME)
+    old = control.question
+    assert old is not None
+    control.interrupt()
+    step(HOME)
+    step(HOME)
+    control.take_way(old, None)
+    step(HOME)
+    assert control.reason == "looks whether the way is clear"
+    assert control.question is not None
+    control.take_way(control.question, None)
+    step(sheet_at(0.1))
+    assert control.mode == "hold", "the target has gone elsewhere since"
+    assert control.question is not None
+    control.take_way(control.question, None)
+    step(sheet_at(0.101))
+    assert control.mode == "follow"
+
+
+def test_an_answer_that_comes_when_nothing_is_to_be_begun_is_not_kept() -> None:
+    arms = pair()
+    control, geometry = arms[0].control, arms[0].geometry
+    control.step(geometry, on_time(HOME), arms[1].as_other(), STEP_S)
+    assert control.question is not None
+    control.take_way(control.question, None)
+    control.step(geometry, None, arms[1].as_other(), STEP_S)
+    control.step(geometry, on_time(HOME), arms[1].as_other(), STEP_S)
+    assert control.mode == "hold"
+    assert control.question is not None
+
+
+def test_the_sheet_goes_as_it_was_rehearsed() -> None:
+    arms, goal = pair(), sheet_at(0.05, z=0.04, tilt=0.9, stretch=1.07)
+    corners = rehearsed(HOME, goal, LEFT.edge_bound)
+    numbers = np.linspace(0, len(corners) - 1, 40 * len(corners))
+    columns = [
+        np.array([corner.world_from_sheet[1, 3] for corner in corners]),
+        np.array([corner.world_from_sheet[2, 3] for corner in corners]),
+        np.array([np.arcsin(corner.world_from_sheet[2, 1]) for corner in corners]),
+        np.array([corner.stretch_ratio for corner in corners]),
+    ]
+    line = np.stack(
+        [np.interp(numbers, np.arange(len(corners)), column) for column in columns], axis=1
+    )
+    weights = np.array([1.0, 1.0, 0.1, 0.24])
+    furthest = 0.0
+    for _ in range(500):
+        run(arms, on_time(goal), 1)
+        sheet = sheet_of(arms)
+        tilt = np.arcsin(sheet.world_from_sheet[2, 1])
+        spot = np.array([*sheet.world_from_sheet[1:3, 3], tilt, sheet.stretch_ratio])
+        furthest = max(furthest, float(np.linalg.norm((line - spot) * weights, axis=1).min()))
+    assert sheet_of(arms).world_from_sheet == pytest.approx(goal.world_from_sheet, abs=1e-6)
+    assert furthest < 0.002
+
+
+shift = st.tuples(st.floats(-0.12, 0.12), st.floats(-0.15, 0.15), st.floats(-0.15, 0.2))
+lean = st.tuples(st.floats(-1.2, 1.2), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
+
+
+@settings(max_examples=10, deadline=None)
+@given(shift=shift, lean=lean, stretch=st.floats(0.9, 1.1))
+def test_a_way_that_is_clear_is_gone_without_a_fault_and_both_bridges_agree(
+    shift: tuple[float, ...], lean: tuple[float, ...], stretch: float
+) -> None:
+    goal = SheetMotion(transform_from_rpy(shift, lean), np.zeros(6), stretch, 0.0)
+    way = way_between(HOME, goal)
+    trouble = trouble_on_way(LEFT, RIGHT, way)
+    assert trouble == trouble_on_way(RIGHT, LEFT, mirrored(way))
+    if trouble is not None:
+        assert trouble.startswith(("no way: left arm", "no way: right arm"))
+        return
+    arms = pair()
+    for _ in range(60):
+        run(arms, on_time(goal), 15)
+        assert {arm.control.mode for arm in arms} == {"follow"}
+        if np.abs(sheet_of(arms).world_from_sheet - goal.world_from_sheet).max() < 1e-3:
+            break
+    assert sheet_of(arms).world_from_sheet == pytest.approx(goal.world_from_sheet, abs=2e-3)
+
+
+def test_from_beyond_a_limit_there_is_a_way_back_but_none_further() -> None:
+    beyond = sheet_at(stretch=1.0872)
+    assert trouble_on_way(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.05))) is None
+    further = trouble_on_way(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.0875)))
+    assert further is not None
+    assert "edge force is not kept" in further
+
+
+@pytest.mark.parametrize("broken", [np.nan, np.inf])
+def test_numbers_that_are_none_bar_the_way(broken: float) -> None:
+    pose = np.eye(4)
+    pose[1, 3] = broken
+    way = way_between(HOME, HOME)
+    for start, goal in ((pose, np.eye(4)), (np.eye(4), pose)):
+        asked = replace(
+            way,
+            start=replace(HOME, world_from_sheet=start),
+            goal=replace(HOME, world_from_sheet=goal),
+        )
+        assert trouble_on_way(LEFT, RIGHT, asked) is not None
+
+
+async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    threads: list[int] = []
+    go_on = threading.Event()
+
+    def slow(arm: ArmGeometry, other: ArmGeometry, way: Way) -> str | None:
+        threads.append(threading.get_ident())
+        assert go_on.wait(10.0)
+        return "barred"
+
+    monkeypatch.setattr(way_module, "trouble_on_way", slow)
+    lookout, way = Lookout(LEFT, RIGHT), way_between(HOME, HOME)
+    assert lookout.answer(None) is None
+    for _ in range(5):
+        assert lookout.answer(way) is None
+        await asyncio.sleep(0)
+    go_on.set()
+    await asyncio.get_running_loop().shutdown_default_executor()
+    await asyncio.sleep(0)
+    assert lookout.answer(way) == (way, "barred")
+    assert len(threads) == 1
+    assert threads[0] != threading.get_ident()
+    assert lookout.answer(None) is None
+
+
+@pytest.mark.parametrize(
+    ("given_s", "rate_hz", "due_s"), [(None, 120.0, 1 / 120), (0.02, 60, 0.02)]
+)
+async def test_targets_are_due_at_the_cameras_rate_unless_told_otherwise(
+    given_s: float | None, rate_hz: float, due_s: float
+) -> None:
+    node = ArmBridge(
+        ArmBridgeParameters(side="left", target_period_s=given_s),
+        name="bridge",
+        clock=VirtualClock(),
+        send=lambda topic, message, header: None,
+        topics={"arm": "arm_left", "other_arm": "arm_right"},
+    )
+    await node.setup()
+    camera = SCENE.camera.model_copy(update={"rate_hz": rate_hz})
+    scene = SCENE.model_copy(update={"camera": camera})
+    await node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
+    assert node.errors == 0, node.last_error
+    assert (node._timing.target_period_s, node._pace.target_period_s) == (due_s, due_s)
+    await node.close()
+
+
+async def aim(rig: Rig, nodes: dict[str, ArmBridge], sheet: SheetMotion) -> None:
+    """Hand both bridges that target, over and over."""
+    while True:
+        target = SheetTarget(
+            phase="wait",
+            reason="",
+            valid_at_ns=rig.clock.now_ns(),
+            world_from_sheet=sheet.world_from_sheet,
+            twist_world=sheet.twist_world,
+            stretch_ratio=sheet.stretch_ratio,
+            contact_world_m=np.zeros(3),
+            normal_world=np.array([0.0, 0.0, 1.0]),
+            contact_sheet_m=np.zeros(2),
+            push_depth_m=0.0,
+        )
+        for side in ("left", "right"):
+            nodes[side].deliver("sheet_target", target, rig.header(rig.clock.now_ns()))
+        await asyncio.sleep(1 / 60)
+
+
+async def test_the_twins_arms_stand_before_a_barred_way_and_go_a_clear_one() -> None:
+    sides: tuple[Side, Side] = ("left", "right")
+    async with running_rig(hold_after_s=0.1, stop_after_s=0.6) as (rig, nodes):
+        servos = [nodes["twin"].servers[side].controller.servo for side in sides]
+        places = [servo.joints_rad.copy() for servo in servos]
+        task = asyncio.create_task(aim(rig, nodes, FAR))
+        await until(lambda: all("no way" in nodes[side].note for side in sides))
+        assert {rig.newest(side).mode for side in sides} == {"hold"}
+        assert nodes["left"].note.split(";")[0] == nodes["right"].note.split(";")[0]
+        assert "left arm, at " in nodes["left"].note
+        for servo, place in zip(servos, places, strict=True):
+            assert (servo.joints_rad == place).all()
+        task.cancel()
+        task = asyncio.create_task(aim(rig, nodes, sheet_at(0.01)))
+        await until(lambda: {rig.newest(side).mode for side in sides} == {"follow"})
+        await until(lambda: abs(servos[0].joints_rad - places[0]).max() > 0.01)
+        task.cancel()
