@@ -19,9 +19,10 @@ NODE_FLAG = "--node"
 def main() -> None:
     """Run the command, or with `--node CONFIG` one node (the launcher starts those)."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
-        from launch.child import follow_launcher
+        from launch.child import follow_launcher, give_way
 
         follow_launcher()
+        give_way()
         from nodes.runner import main as run_node
 
         sys.exit(run_node(sys.argv[2]))

@@ -1,4 +1,4 @@
-"""What a node's process does so as not to outlive its launcher."""
+"""What a node's process does first: it ends with its launcher, and gives way as it is told."""
 
 from __future__ import annotations
 
@@ -8,10 +8,20 @@ import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
 PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
 """File descriptor of a pipe that nobody writes to: it reads as closed when the launcher is gone."""
+
+NICE_VARIABLE = "FLEXSHEET_NICE"
+
+AUTOGROUP = Path("/proc/self/autogroup")
+"""Where Linux weighs sessions against one another, a process's own niceness counts for little: each
+node is a session of its own, and the session has to be told."""
+
+AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
+"""Without privileges the kernel lets one be told in a tenth of a second, of all that ask."""
 
 GRACE_S = 3.0
 _PR_SET_PDEATHSIG = 1
@@ -38,3 +48,24 @@ def _end_with(lifeline: int) -> None:
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(GRACE_S)
     os.killpg(os.getpgrp(), signal.SIGKILL)
+
+
+def give_way() -> None:
+    """Take the niceness that the launch file gives this node, as a process and as a session.
+
+    OSError where the system does not let it.
+    """
+    nice = int(os.environ.get(NICE_VARIABLE, "0"))
+    if nice == 0:
+        return
+    os.setpriority(os.PRIO_PROCESS, 0, nice)
+    if not AUTOGROUP.exists():
+        return
+    for left in reversed(range(AUTOGROUP_TRIES)):
+        try:
+            AUTOGROUP.write_text(str(nice))
+            return
+        except BlockingIOError:
+            if left == 0:
+                raise
+            time.sleep(AUTOGROUP_WAIT_S)

@@ -51,6 +51,9 @@ MAIN = "main"
 LAUNCHER, TOOLS = "launch", "tools"
 """Writers that are no nodes: the launching process, and command-line tools and experiments."""
 
+RECORDER_NICE = 5
+"""What it reads waits for it in queues; nothing else waits."""
+
 RUN_DIRECTORY = "@run"
 """Stands for the run's directory in endpoints and parameters; known only when the run starts."""
 
@@ -95,6 +98,9 @@ class NodeSpec(Strict):
     )
     restart: RestartSpec = RestartSpec()
     start_deadline_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
+    nice: int = Field(
+        default=0, ge=0, le=19, description="how much it gives way to others on a busy computer"
+    )
 
 
 class LaunchFile(Strict):
@@ -148,6 +154,7 @@ class PlannedNode(Strict):
     outputs: tuple[PlannedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
+    nice: int
 
 
 class Plan(Strict):
@@ -398,7 +405,7 @@ def _members(spec: LaunchFile, document: Document, problems: list[Problem]) -> l
                 )
             )
         else:
-            recorder = NodeSpec(type="recorder", parameters=spec.record)
+            recorder = NodeSpec(type="recorder", parameters=spec.record, nice=RECORDER_NICE)
             members.append(_Member("recorder", recorder, ("record",)))
     return members
 
@@ -713,6 +720,7 @@ def _planned(
         + member.unconnected_ports("output"),
         restart=member.spec.restart,
         start_deadline_s=member.spec.start_deadline_s,
+        nice=member.spec.nice,
     )
 
 

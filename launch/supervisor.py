@@ -24,7 +24,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from launch.child import LIFELINE_VARIABLE, PARENT_VARIABLE
+from launch.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from launch.documents import BadInputError, Problem, read_document
 from launch.plan import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort, is_loopback
 from launch.runs import RUN_VARIABLE, Run, create_run, is_free, sweep
@@ -383,6 +383,7 @@ class RunningGraph:
             RUN_VARIABLE: self.run.id,
             PARENT_VARIABLE: str(os.getpid()),
             LIFELINE_VARIABLE: str(self._lifeline[0]),
+            NICE_VARIABLE: str(node.nice),
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }
