@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from messages.scene import Scene
-from nodes.models.motion import SheetBounds
 from nodes.models.rigid import apply, inverse, transform_from_rpy, twist_between
-from nodes.planner.easing import JerkBounds
-from nodes.planner.motion import Plan, Planned, PlanSettings
-from nodes.planner.node import PlannerParameters
+from nodes.planner.motion import Plan, Planned
+from nodes.planner.parameters import PlannerParameters
+from nodes.planner.sheet_force import law_for
+from nodes.planner.yielding import Yielding
 
 Floats = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent
@@ -39,34 +39,15 @@ def scene_with(
     return Scene.model_validate(values)
 
 
-def settings_of(given: PlannerParameters) -> PlanSettings:
-    """As the node makes them of its parameters."""
-    return PlanSettings(
-        SheetBounds(
-            given.speed_m_per_s,
-            given.acceleration_m_per_s2,
-            given.turn_rad_per_s,
-            given.turn_acceleration_rad_per_s2,
-            given.stretch_rate_per_s,
-            given.stretch_acceleration_per_s2,
-        ),
-        JerkBounds(given.jerk_m_per_s3, given.turn_jerk_rad_per_s3, given.stretch_jerk_per_s3),
-        touch_m=given.touch_m,
-        release_m=given.release_m,
-        tilt_margin_rad=given.tilt_margin_rad,
-        spin_rad=given.largest_spin_rad,
-    )
-
-
 class Desk:
     """A plan about a scene's object; fingers and answers in the object's frame."""
 
     def __init__(self, scene: Scene, **parameters: float) -> None:
         self.given = PlannerParameters(**parameters)
-        self.plan = Plan(scene, settings_of(self.given))
+        self.plan = Plan(scene, self.given.settings())
+        self.yielding = Yielding(scene, law_for(scene.sheet), "curve")
         pose = scene.object.world_from_object
         self.world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
-        self.stretch_ratio = scene.sheet.min_stretch_ratio
         self.seen: list[Planned] = []
 
     def see(self, finger: Floats, velocity: Floats = STILL) -> Planned:
@@ -74,7 +55,7 @@ class Desk:
         planned = self.plan.follow_finger(
             apply(self.world_from_object, finger),
             self.world_from_object[:3, :3] @ velocity,
-            self.stretch_ratio,
+            self.yielding,
             STEP_S,
         )
         self.seen.append(planned)
