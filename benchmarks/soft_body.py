@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from launch.plan import load_scene
 from messages.scene import Scene, cylinder_of
-from nodes.fem_solver import body, contact, precompute
+from nodes.fem_solver import body, precompute
+from nodes.fem_solver.place import locate
 
 Floats = NDArray[np.float64]
 
@@ -52,19 +53,17 @@ def places(heading_rad: float) -> Iterator[tuple[float, float]]:
         yield FROM_M[0] + way * np.cos(heading_rad), FROM_M[1] + way * np.sin(heading_rad)
 
 
-def slide(built: body.SceneBody, spec: precompute.SoftBodySpec, depth_m: float) -> Slides:
+def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
     """Slide in every direction at one depth."""
     forces, stiffness, took, jump = [], [], [], 0.0
     for heading in HEADINGS_RAD:
         before: NDArray[np.float32] | None = None
         for along, around in places(float(heading)):
-            angle = around / spec.radius_m
+            angle = around / radius_m
             normal = np.array([0.0, np.sin(angle), np.cos(angle)])
-            point = (spec.radius_m - depth_m) * normal + np.array([along, 0.0, 0.0])
+            point = (radius_m - depth_m) * normal + np.array([along, 0.0, 0.0])
             start = time.perf_counter()
-            push = contact.push_on_cylinder(
-                point, radius_m=spec.radius_m, length_m=spec.length_m, normal=normal
-            )
+            push, _ = locate(built.shape, point, None)
             answer = built.method.respond(push)
             took.append(time.perf_counter() - start)
             forces.append(answer.force_n @ normal)
@@ -88,7 +87,8 @@ def measure(scene: Scene, spacing_m: float) -> None:
     """Precompute one mesh, cold and warm, slide over it, print."""
     spec = body.spec_of(scene, spacing_m)
     if spacing_m == min(SPACINGS_M):
-        spec = replace(spec, touch_angle_rad=FINEST_TOUCH_ANGLE_RAD)
+        mesh = replace(spec.mesh, touch_angle_rad=FINEST_TOUCH_ANGLE_RAD)
+        spec = replace(spec, mesh=mesh)
     with tempfile.TemporaryDirectory() as folder:
         times = [time.perf_counter()]
         for _ in range(2):
@@ -104,7 +104,7 @@ def measure(scene: Scene, spacing_m: float) -> None:
         flush=True,
     )
     for depth_m in DEPTHS_M:
-        slides = slide(built, spec, depth_m)
+        slides = slide(built, cylinder_of(scene).radius_m, depth_m)
         mean_n, stiffness = slides.force_n.mean(), slides.stiffness_n_per_m
         median_s, p99_s = np.quantile(slides.step_s, [0.5, 0.99])
         print(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene
-from nodes.fem_solver import body, precompute
+from nodes.fem_solver import body, cache, precompute
 from nodes.models.sheet.laws import SheetLaw
 from nodes.planner.compliance import (
     GOOD_RATIO,
@@ -34,7 +34,7 @@ def front_curve(scene: Scene) -> Floats:
     body if that is not kept from before."""
     spec = body.spec_of(scene, SKIN_SPACING_M)
     model = precompute.load_or_compute(
-        spec, precompute.default_cache_dir(), lambda done, total, need: None
+        spec, cache.default_cache_dir(), lambda done, total, need: None
     )
     built = body.scene_body(
         scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, largest_depth_m=LARGEST_DEPTH_M

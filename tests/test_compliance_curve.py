@@ -11,7 +11,8 @@ from ruamel.yaml import YAML
 
 from messages.scene import Scene
 from nodes.fem_solver.body import SceneBody, scene_body, spec_of
-from nodes.fem_solver.contact import CURVE_SHARES, Push, curve_depths
+from nodes.fem_solver.contact import CURVE_SHARES, curve_depths
+from nodes.fem_solver.place import Push
 from nodes.fem_solver.precompute import compute
 
 Floats = NDArray[np.float64]
@@ -40,7 +41,7 @@ def test_the_depths_reach_from_the_touch_to_the_deepest_push() -> None:
 def test_the_curve_is_what_pushes_then_give(soft: SceneBody) -> None:
     angle = 0.2
     normal = np.array([0.0, np.sin(angle), np.cos(angle)])
-    surface = np.array([0.004, 0.0, 0.0]) + soft.spec.radius_m * normal
+    surface = np.array([0.004, 0.0, 0.0]) + soft.front[2] * normal
     curve = soft.method.force_curve(surface)
     assert (curve[0] == 0.0).all()
     assert (np.diff(curve[:, 1]) >= 0.0).all()
@@ -52,7 +53,7 @@ def test_the_curve_is_what_pushes_then_give(soft: SceneBody) -> None:
 
 
 def test_the_curve_is_said_in_the_air_and_changes_smoothly_along_the_skin(soft: SceneBody) -> None:
-    place = np.array([0.0, 0.0, soft.spec.radius_m])
+    place = np.array([0.0, 0.0, soft.front[2]])
     message = soft.message(soft.respond(np.array([0.0, 0.0, 0.05]), None)[0])
     assert message.force_curve == pytest.approx(soft.method.force_curve(place))
     assert message.push_depth_m == 0.0
@@ -63,7 +64,7 @@ def test_the_curve_is_said_in_the_air_and_changes_smoothly_along_the_skin(soft: 
 
 
 def test_the_stiffness_is_the_curves_secant(soft: SceneBody) -> None:
-    place = np.array([0.004, 0.0, soft.spec.radius_m])
+    place = np.array([0.004, 0.0, soft.front[2]])
     curve = soft.method.force_curve(place)
     secant = curve[len(CURVE_SHARES), 1] / LINEAR
     assert soft.method.stiffness_n_per_m(place) == pytest.approx(secant)

@@ -13,28 +13,22 @@ from scipy.optimize import minimize
 
 from nodes.fem_solver.contact import (
     LinearSoftBody,
-    Push,
     Response,
     SphereContact,
-    approach_normal,
-    push_on_cylinder,
     saturated,
     solve_bed,
     triangle_points,
 )
-from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec, compute
+from nodes.fem_solver.place import Entry, Push, locate
+from nodes.fem_solver.precompute import SoftBodyModel, compute
+from nodes.models.shapes import CylinderShape
+from tests.soft_bodies import cylinder_spec
 
 Floats = NDArray[np.float64]
 
 RADIUS, LENGTH, FINGER = 0.0353553, 0.12, 0.007
-SPEC = SoftBodySpec(
-    radius_m=RADIUS,
-    length_m=LENGTH,
-    support_angle_rad=np.pi / 2,
-    touch_angle_rad=1.5,
-    skin_spacing_m=0.006,
-    poisson_ratio=0.45,
-)
+SPEC = cylinder_spec(RADIUS, LENGTH, touch_angle_rad=1.5, skin_spacing_m=0.006)
+SHAPE = CylinderShape(RADIUS, LENGTH)
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +39,12 @@ def model() -> SoftBodyModel:
 def soft_body(model: SoftBodyModel, modulus: float = 4000.0) -> LinearSoftBody:
     return LinearSoftBody(
         model.response,
+        SHAPE,
+        model.response.rest[model.bounds],
         young_modulus_pa=modulus,
         finger_radius_m=FINGER,
         linear_depth_m=0.006,
         largest_depth_m=0.010,
-        touch_angle_rad=1.3,
     )
 
 
@@ -61,7 +56,8 @@ def body(model: SoftBodyModel) -> LinearSoftBody:
 def push(x: float, angle: float, depth: float) -> Push:
     normal = np.array([0.0, np.sin(angle), np.cos(angle)])
     point = (RADIUS - depth) * normal + np.array([x, 0.0, 0.0])
-    return push_on_cylinder(point, radius_m=RADIUS, length_m=LENGTH, normal=normal)
+    beyond = max(0.0, abs(x) - 0.5 * LENGTH)
+    return Push(point + depth * normal, normal, depth, beyond)
 
 
 def largest_move(a: Response, b: Response) -> float:
@@ -160,11 +156,8 @@ def test_deep_pushes_are_flagged_bounded_and_never_inverted(
     held = None
     last = 0.0
     for depth in np.linspace(0.0, 0.065, 66):  # straight in from the front and out behind the axis
-        point = np.array([0.004, 0.003, RADIUS - depth])
-        held = approach_normal(point, RADIUS, held)
-        answer = body.respond(
-            push_on_cylinder(point, radius_m=RADIUS, length_m=LENGTH, normal=held)
-        )
+        there, held = locate(SHAPE, np.array([0.004, 0.003, RADIUS - depth]), held)
+        answer = body.respond(there)
         assert np.isfinite(answer.displacement).all()
         assert np.linalg.norm(answer.displacement, axis=1).max() < 0.0101
         turned = np.einsum("ij,ij->i", normals(rest), normals(rest + answer.displacement))
@@ -194,22 +187,17 @@ def test_every_finite_place_has_an_answer(
     body: LinearSoftBody, point: tuple[float, float, float]
 ) -> None:
     where = np.array(point)
-    normal = approach_normal(where, RADIUS, None)
-    assert np.linalg.norm(normal) == pytest.approx(1.0)
-    answer = body.respond(push_on_cylinder(where, radius_m=RADIUS, length_m=LENGTH, normal=normal))
+    there, _ = locate(SHAPE, where, None)
+    assert np.linalg.norm(there.normal) == pytest.approx(1.0)
+    answer = body.respond(there)
     assert np.isfinite(answer.displacement).all()
     assert np.isfinite(answer.force_n).all()
     assert answer.stiffness_n_per_m > 0.0
 
 
-def test_a_place_that_is_no_number_is_refused(body: LinearSoftBody) -> None:
+def test_a_place_that_is_no_number_is_refused() -> None:
     with pytest.raises(ValueError, match="not finite"):
-        push_on_cylinder(
-            np.array([0.0, np.nan, 0.0]),
-            radius_m=RADIUS,
-            length_m=LENGTH,
-            normal=np.array([0.0, 0.0, 1.0]),
-        )
+        locate(SHAPE, np.array([0.0, np.nan, 0.0]), None)
 
 
 def test_sliding_off_the_end_lets_go_without_a_jump(body: LinearSoftBody) -> None:
@@ -229,12 +217,29 @@ def test_sliding_around_towards_the_support_lets_go_without_a_jump(body: LinearS
 
 
 def test_a_finger_pushed_through_the_axis_keeps_its_side() -> None:
-    held = approach_normal(np.array([0.0, 0.01, 0.03]), RADIUS, None)
-    assert held == pytest.approx(np.array([0.0, 1.0, 3.0]) / np.sqrt(10))
-    for point in ([0.0, 0.0, 0.0], [0.0, -0.003, -0.01], [0.0, -0.006, -0.02]):
-        assert approach_normal(np.array(point), RADIUS, held) is held
+    first, held = locate(SHAPE, np.array([0.0, 0.01, 0.03]), None)
+    assert first.normal == pytest.approx(np.array([0.0, 1.0, 3.0]) / np.sqrt(10))
+    for point in ([0.0, 0.0, 0.0], [0.0, -0.003, -0.01], [0.0, -0.01, -0.03]):
+        there, held = locate(SHAPE, np.array(point), held)
+        assert there.normal == pytest.approx(first.normal)
+        assert there.surface - there.depth_m * there.normal == pytest.approx(np.array(point))
     # once outside, the nearest side counts again
-    assert approach_normal(np.array([0.0, 0.0, -0.05]), RADIUS, held)[2] == -1.0
+    outside, held = locate(SHAPE, np.array([0.0, 0.0, -0.05]), held)
+    assert outside.normal[2] == -1.0
+    assert held is None
+
+
+@given(angle=st.floats(-1.4, 1.4), depth=st.floats(0.0, 0.02), x=st.floats(-0.05, 0.05))
+def test_to_twenty_millimetres_the_place_follows_from_the_finger_alone(
+    angle: float, depth: float, x: float
+) -> None:
+    normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+    point = (RADIUS - depth) * normal + np.array([x, 0.0, 0.0])
+    fresh, _ = locate(SHAPE, point, None)
+    aside = np.array([0.0, np.sin(angle + 0.5), np.cos(angle + 0.5)])
+    after, _ = locate(SHAPE, point, Entry(RADIUS * aside, aside))
+    assert after.depth_m == pytest.approx(depth, abs=1e-12)
+    assert np.array_equal(after.surface, fresh.surface)
 
 
 @given(seed=st.integers(0, 2**32 - 1), stiff=st.floats(0.0, 4.0))
@@ -274,16 +279,17 @@ def test_depths_in_the_wrong_order_are_refused(model: SoftBodyModel) -> None:
     with pytest.raises(ValueError, match="largest_depth_m"):
         LinearSoftBody(
             model.response,
+            SHAPE,
+            model.response.rest[model.bounds],
             young_modulus_pa=4000.0,
             finger_radius_m=FINGER,
             linear_depth_m=0.01,
             largest_depth_m=0.006,
-            touch_angle_rad=1.3,
         )
 
 
 def test_a_finger_much_smaller_than_the_mesh_still_finds_it(model: SoftBodyModel) -> None:
-    contact = SphereContact(model.response, young_modulus_pa=4000.0, finger_radius_m=0.002)
+    contact = SphereContact(model.response, SHAPE, young_modulus_pa=4000.0, finger_radius_m=0.002)
     for i in range(40):
         found = contact.solve(push(0.001 * i, 0.02 * i, 0.001), 0.001)
         assert found is not None

@@ -20,7 +20,6 @@ from nodes.fem_solver.elasticity import (
     solve,
     stiffness_matrix,
 )
-from nodes.fem_solver.factor import SlabCholesky
 from nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces, cylinder_mesh
 
 Floats = NDArray[np.float64]
@@ -221,18 +220,6 @@ def test_cantilever_bends_as_a_timoshenko_beam() -> None:
     theory = length**3 / (3 * modulus * inertia) + length / (5 / 6 * shear * side**2)
     # the clamped root cannot thin out as the beam of the theory does: a little stiffer
     assert 0.98 * theory < got < theory
-
-
-def test_slab_factor_solves_as_the_sparse_one() -> None:
-    mesh = cylinder(0.008)
-    matrix = stiffness_matrix(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
-    loads = np.zeros((matrix.shape[0], 4))
-    loads[degrees_of_freedom(mesh.touch[[3, 50, -1]])[[2, 4, 7]], [0, 1, 2]] = 1.0  # one: no load
-    got = SlabCholesky(matrix, mesh.slab, mesh.fixed).solve(loads)
-    held = degrees_of_freedom(np.flatnonzero(mesh.fixed))
-    for column in range(4):
-        wanted = solve(matrix, held, np.zeros(len(held)), loads[:, column])
-        assert np.abs(got[:, column] - wanted).max() <= 1e-10 * np.abs(got).max()
 
 
 @pytest.mark.parametrize("nu", [0.5, 0.49999, 1.0, -1.0, float("nan")])

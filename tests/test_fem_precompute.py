@@ -13,30 +13,25 @@ import numpy as np
 import pytest
 
 from nodes.fem_solver import precompute
+from nodes.fem_solver.cache import Parts, default_cache_dir
 from nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
+from nodes.fem_solver.mesh import build_mesh
+from nodes.fem_solver.multifrontal import Dissection
 from nodes.fem_solver.precompute import (
     Budget,
     Interrupted,
     SoftBodyModel,
-    SoftBodySpec,
     budget,
     cache_path,
     compute,
-    default_cache_dir,
     load,
     load_or_compute,
-    mesh_of,
+    parts_of,
     save,
 )
+from tests.soft_bodies import cylinder_spec
 
-SPEC = SoftBodySpec(
-    radius_m=0.02,
-    length_m=0.06,
-    support_angle_rad=1.5,
-    touch_angle_rad=1.2,
-    skin_spacing_m=0.005,
-    poisson_ratio=0.45,
-)
+SPEC = cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.005)
 
 
 def quiet(done: int, total: int, need: Budget) -> None:
@@ -50,12 +45,12 @@ def model() -> SoftBodyModel:
 
 def same(a: SoftBodyModel, b: SoftBodyModel) -> bool:
     pairs = [(getattr(a.response, f.name), getattr(b.response, f.name)) for f in fields(a.response)]
-    pairs.append((a.triangles, b.triangles))
+    pairs += [(a.triangles, b.triangles), (a.bounds, b.bounds)]
     return all(x.dtype == y.dtype and np.array_equal(x, y) for x, y in pairs)
 
 
 def test_each_column_is_the_solution_under_its_load(model: SoftBodyModel) -> None:
-    mesh = mesh_of(SPEC)
+    mesh = build_mesh(SPEC.mesh)
     matrix = stiffness_matrix(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
     held = degrees_of_freedom(np.flatnonzero(mesh.fixed))
     for number in (0, len(mesh.touch) // 2, len(mesh.touch) - 1):
@@ -93,8 +88,14 @@ def test_the_second_start_computes_nothing(model: SoftBodyModel, tmp_path: Path)
 
 
 def test_every_part_of_the_specification_has_its_own_file() -> None:
-    specs = [SPEC] + [replace(SPEC, **{f.name: getattr(SPEC, f.name) * 0.9}) for f in fields(SPEC)]
-    assert len({spec.key() for spec in specs}) == len(specs)
+    others = [
+        replace(SPEC, poisson_ratio=0.4),
+        cylinder_spec(0.021, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.005),
+        cylinder_spec(0.02, 0.061, touch_angle_rad=1.2, skin_spacing_m=0.005),
+        cylinder_spec(0.02, 0.06, touch_angle_rad=1.1, skin_spacing_m=0.005),
+        cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.004),
+    ]
+    assert len({spec.key() for spec in (SPEC, *others)}) == len(others) + 1
     assert replace(SPEC).key() == SPEC.key()
 
 
@@ -146,14 +147,43 @@ def test_progress_runs_from_nothing_to_all() -> None:
 
 
 @pytest.mark.parametrize("stop_at", [0.0, 0.1, 0.9])
-def test_an_interrupted_computation_leaves_no_file(tmp_path: Path, stop_at: float) -> None:
+def test_an_interrupted_computation_goes_on_where_it_stopped(
+    model: SoftBodyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop_at: float
+) -> None:
+    monkeypatch.setattr(precompute, "CHUNK_LOADS", 20)
+
     def stop(done: int, total: int, need: Budget) -> None:
         if done >= stop_at * total:
             raise Interrupted
 
     with pytest.raises(Interrupted):
         load_or_compute(SPEC, tmp_path, stop)
-    assert list(tmp_path.iterdir()) == []
+    assert load(SPEC, tmp_path) is None
+    parts = sorted(parts_of(SPEC, tmp_path).folder.glob("*"))
+    assert len(parts) > 2 or stop_at < 0.5
+    assert all(part.suffix == ".npz" for part in parts)
+    stamps = [part.stat().st_mtime_ns for part in parts]
+    kept: list[str] = []
+    monkeypatch.setattr(Parts, "save", lambda self, name, arrays: kept.append(name))
+    whole = load_or_compute(SPEC, tmp_path, quiet)
+    assert np.allclose(whole.response.compliance, model.response.compliance, rtol=1e-9)
+    assert len(kept) == -(-len(model.response.touch) // 20) - len(stamps)
+    assert [path.name for path in tmp_path.iterdir()] == [cache_path(SPEC, tmp_path).name]
+
+
+def test_a_damaged_part_is_computed_anew(model: SoftBodyModel, tmp_path: Path) -> None:
+    def stop(done: int, total: int, need: Budget) -> None:
+        if done == total:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        load_or_compute(SPEC, tmp_path, stop)
+    (part,) = parts_of(SPEC, tmp_path).folder.iterdir()
+    content = bytearray(part.read_bytes())
+    content[len(content) // 2] ^= 1
+    part.write_bytes(content)
+    whole = load_or_compute(SPEC, tmp_path, quiet)
+    assert np.allclose(whole.response.table, model.response.table, rtol=1e-5, atol=1e-9)
 
 
 def test_a_write_that_fails_leaves_no_file(
@@ -182,8 +212,9 @@ def test_what_a_killed_process_left_is_swept(model: SoftBodyModel, tmp_path: Pat
 
 
 def test_too_little_memory_is_said_before_it_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    fine = replace(SPEC, skin_spacing_m=0.002)
-    need = budget(mesh_of(fine))
+    fine = cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.003)
+    mesh = build_mesh(fine.mesh)
+    need = budget(mesh, Dissection(mesh.nodes, mesh.elements, mesh.fixed))
     assert need.table_bytes > need.loads * need.skin_nodes * 12
     assert str(need.loads) in need.text()
 
@@ -191,10 +222,9 @@ def test_too_little_memory_is_said_before_it_is_taken(monkeypatch: pytest.Monkey
         available = need.working_bytes
 
     monkeypatch.setattr("psutil.virtual_memory", Little)
-    seen: list[int] = []
+    monkeypatch.setattr(Dissection, "factor", None)  # not reached
     with pytest.raises(MemoryError, match="skin_spacing_m"):
-        compute(fine, lambda done, total, need: seen.append(done))
-    assert seen == []
+        compute(fine, quiet)
 
 
 def test_the_cache_is_where_the_desktop_wants_it(

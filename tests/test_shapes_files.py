@@ -14,12 +14,9 @@ from launch.documents import BadInputError
 from launch.meshes import MOST_BYTES, read_mesh
 from launch.plan import load_plan, load_scene
 from messages.base import Header
-from messages.clock import VirtualClock
 from messages.scene import Mesh, Scene, UnfitGeometryError, cylinder_of
 from messages.topics import TOPICS
 from messages.wire import decode, encode
-from nodes.fem_solver.body import spec_of
-from nodes.fem_solver.node import FemSolver, FemSolverParameters
 from nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape, make_shape
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -212,22 +209,8 @@ def test_the_real_mesh_is_taken_as_it_is() -> None:
 
 
 def test_who_handles_cylinders_only_says_so(tmp_path: Path) -> None:
-    scene = mesh_scene(tmp_path)
-    for ask in (cylinder_of, lambda one: spec_of(one, 0.003)):
-        with pytest.raises(
-            UnfitGeometryError, match=r'object.geometry.shape: "mesh" .* "cylinder"'
-        ):
-            ask(scene)
-
-
-async def test_a_node_that_cannot_handle_the_shape_reports_it(tmp_path: Path) -> None:
-    solver = FemSolver(
-        FemSolverParameters(), name="fem_solver", clock=VirtualClock(), send=lambda *sent: None
-    )
-    await solver.setup()
-    await solver.step("scene", mesh_scene(tmp_path), HEADER)
-    assert solver.errors == 1
-    assert "object.geometry.shape" in solver.last_error
+    with pytest.raises(UnfitGeometryError, match=r'object.geometry.shape: "mesh" .* "cylinder"'):
+        cylinder_of(mesh_scene(tmp_path))
 
 
 def test_the_message_is_enough_to_make_the_shape(tmp_path: Path) -> None:

@@ -8,90 +8,62 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene, cylinder_of
+from messages.scene import Scene
 from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver.contact import (
-    LinearSoftBody,
-    Push,
-    Response,
-    SoftBodyMethod,
-    approach_normal,
-    push_on_cylinder,
-)
+from nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
+from nodes.fem_solver.mesh import mesh_spec, world_from_mesh
+from nodes.fem_solver.place import Entry, locate
 from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from nodes.models import rigid
 from nodes.models.prediction import path_at
+from nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
 
-TOUCH_MARGIN_RAD = 0.45
-"""The touchable part of the side exceeds the working range's tilt by this much on either side."""
-PAD_RATIO = 1.1
-"""Half width of the contact patch at the end of the linear range, in finger radii."""
-
 
 def spec_of(scene: Scene, skin_spacing_m: float) -> SoftBodySpec:
-    """What has to be precomputed for this scene's object."""
-    body, cylinder = scene.object, cylinder_of(scene)
-    free = np.pi - 0.5 * body.support_angle_rad
-    return SoftBodySpec(
-        radius_m=cylinder.radius_m,
-        length_m=cylinder.length_m,
-        support_angle_rad=body.support_angle_rad,
-        touch_angle_rad=float(min(scene.working_range.tilt_rad + TOUCH_MARGIN_RAD, free)),
-        skin_spacing_m=skin_spacing_m,
-        poisson_ratio=body.material.poisson_ratio,
-    )
+    """What has to be precomputed for this scene's object; ValueError as `mesh_spec`."""
+    return SoftBodySpec(mesh_spec(scene, skin_spacing_m), scene.object.material.poisson_ratio)
 
 
-def world_from_mesh(scene: Scene) -> Floats:
-    """Pose of the mesh: the object's, turned about its axis until the support faces world -z.
-
-    ValueError if the axis points at the user, who then has no side before him to touch.
-    """
-    pose = scene.object.world_from_object
-    world_from_object = rigid.transform_from_rpy(pose.position_m, pose.rpy_rad)
-    towards_user = world_from_object[:3, :3].T @ np.array([0.0, 0.0, 1.0])
-    if np.hypot(towards_user[1], towards_user[2]) < 0.1:
-        raise ValueError(
-            f"object.world_from_object.rpy_rad: {pose.rpy_rad} turns the cylinder's axis towards "
-            "the user; lay it across (its x axis away from the world's z)"
-        )
-    turn = float(np.arctan2(-towards_user[1], towards_user[2]))
-    return world_from_object @ rigid.transform_from_rpy(np.zeros(3), [turn, 0.0, 0.0])
+def front_of(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
+    """The surface point (3,) nearest to a user far off; rest (s, 3): skin nodes."""
+    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
+    away = 2.0 * float(np.ptp(rest, axis=0).max())
+    return shape.closest(middle + away * np.array(spec.mesh.towards_user)).point
 
 
 @dataclass(frozen=True, slots=True)
 class SceneBody:
-    """The soft body standing in its scene."""
+    """The soft body standing in its scene.
+
+    front (3,): the surface point nearest to the user, mesh frame.
+    """
 
     method: SoftBodyMethod
     spec: SoftBodySpec
+    shape: Shape
+    front: Floats
     world_from_mesh: Floats
     skin: Skin
 
-    def respond(self, point_world: Floats, held_normal: Floats | None) -> tuple[Response, Floats]:
-        """Answer to a fingertip at `point_world` (3,), and the normal (mesh frame) that it pushes
-        against, to be handed in as `held_normal` the next time."""
-        point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
-        normal = approach_normal(point, self.spec.radius_m, held_normal)
-        return self.method.respond(self._push(point, normal)), normal
+    def respond(self, point_world: Floats, held: Entry | None) -> tuple[Response, Entry | None]:
+        """Answer to a fingertip at `point_world` (3,), and where it is in the body, to be handed in
+        as `held` the next time.  ValueError for a point that is not finite."""
+        push, entry = locate(
+            self.shape, rigid.apply(rigid.inverse(self.world_from_mesh), point_world), held
+        )
+        return self.method.respond(push), entry
 
     def at_rest(self) -> Response:
         """The untouched body; its stiffness is that of the place nearest to the user."""
-        front = np.array([0.0, 0.0, self.spec.radius_m])
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
-            stiffness_n_per_m=self.method.stiffness_n_per_m(front),
-            force_curve=self.method.force_curve(front),
+            stiffness_n_per_m=self.method.stiffness_n_per_m(self.front),
+            force_curve=self.method.force_curve(self.front),
             push_depth_m=0.0,
             in_range=True,
-        )
-
-    def _push(self, point: Floats, normal: Floats) -> Push:
-        return push_on_cylinder(
-            point, radius_m=self.spec.radius_m, length_m=self.spec.length_m, normal=normal
         )
 
     def message(self, response: Response) -> SoftBody:
@@ -120,22 +92,32 @@ def scene_body(
 ) -> SceneBody:
     """The soft body of a scene from its precomputed model; ValueError as its parts."""
     pose = world_from_mesh(scene)
+    shape = make_shape(dict(scene.object.geometry))
+    rest = model.response.rest
     method = LinearSoftBody(
         model.response,
+        shape,
+        rest[model.bounds],
         young_modulus_pa=scene.object.material.young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         linear_depth_m=linear_depth_m,
         largest_depth_m=largest_depth_m,
-        touch_angle_rad=spec.touch_angle_rad - PAD_RATIO * scene.finger.radius_m / spec.radius_m,
         push_depth_m=scene.working_range.push_depth_m,
     )
     pose_digest = hashlib.sha256(pose.tobytes()).hexdigest()[:8]
     skin = Skin(
         mesh_id=f"{spec.key()[:12]}-{pose_digest}",
-        vertices_world_m=rigid.apply(pose, model.response.rest).astype(np.float32),
+        vertices_world_m=rigid.apply(pose, rest).astype(np.float32),
         triangles=model.triangles,
     )
-    return SceneBody(method=method, spec=spec, world_from_mesh=pose, skin=skin)
+    return SceneBody(
+        method=method,
+        spec=spec,
+        shape=shape,
+        front=front_of(shape, spec, rest),
+        world_from_mesh=pose,
+        skin=skin,
+    )
 
 
 def faded(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:

@@ -21,6 +21,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from nodes.fem_solver.place import Push
+from nodes.models.shapes import Shape
+
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -31,6 +34,10 @@ POINT_SPACING_RATIO = 0.4
 """Largest spacing of the contact points, in finger radii."""
 FLANK_RATIO = 0.9
 """Beyond this part of the radius the fingertip goes on as a cone, tangent to the sphere."""
+FACING = (0.2, 0.6)
+"""Cosines between the skin's normal and the push at which none, and all of its reach counts."""
+PAD_RATIO = 1.1
+"""Half width of the contact patch at the end of the linear range, in finger radii."""
 FULL_STEPS = 8
 MAX_ITERATIONS = 40
 CURVE_SHARES = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
@@ -54,20 +61,6 @@ class SkinResponse:
     faces: Ints
     compliance: Floats
     table: Floats32
-
-
-@dataclass(frozen=True, slots=True)
-class Push:
-    """Where a fingertip meets the undeformed object.
-
-    normal: outward, of the surface point that is pushed.  depth_m: of the fingertip below it, along
-    the normal; negative outside.  beyond_m: how far the fingertip is past the end of the surface.
-    """
-
-    surface: Floats
-    normal: Floats
-    depth_m: float
-    beyond_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,39 +112,6 @@ class Contact:
     force_n: Floats
 
 
-def approach_normal(point: Floats, radius_m: float, held: Floats | None) -> Floats:
-    """The outward normal that a finger at `point` (3,) pushes against, on a cylinder about x.
-
-    That of the nearest surface point, except deep inside (below half the radius), and on the far
-    side of where the finger went in: there `held`, the normal it came in by, stays; without one,
-    +z, towards the user.  So a finger pushed through the axis does not come out of the other side.
-    """
-    distance = float(np.hypot(point[1], point[2]))
-    if distance > 0.5 * radius_m:
-        radial = np.array([0.0, point[1], point[2]]) / distance
-        if held is None or distance >= radius_m or radial @ held > 0.0:
-            return radial
-    return np.array([0.0, 0.0, 1.0]) if held is None else held
-
-
-def push_on_cylinder(point: Floats, *, radius_m: float, length_m: float, normal: Floats) -> Push:
-    """The push of a fingertip at `point` (3,) against a cylinder about x, along `normal`.
-
-    ValueError for a point that is not finite.
-    """
-    if not np.isfinite(point).all():
-        raise ValueError(f"fingertip {point} is not finite")
-    along = float(point @ normal)
-    across2 = float(point[1] ** 2 + point[2] ** 2) - along**2
-    depth = float(np.sqrt(max(radius_m**2 - across2, 0.0))) - along
-    return Push(
-        surface=point + depth * normal,
-        normal=normal,
-        depth_m=depth,
-        beyond_m=max(0.0, abs(float(point[0])) - 0.5 * length_m),
-    )
-
-
 def saturated(depth_m: float, linear_m: float, largest_m: float) -> float:
     """A depth that follows `depth_m` to `linear_m` and then bends (C1) towards `largest_m`."""
     if depth_m <= linear_m:
@@ -186,11 +146,13 @@ class SphereContact:
     def __init__(
         self,
         response: SkinResponse,
+        shape: Shape,
         *,
         young_modulus_pa: float,
         finger_radius_m: float,
         bed_ratio: float = BED_RATIO,
     ) -> None:
+        """shape: the smooth surface that the response's faces approximate, in its frame."""
         self._response = response
         self._radius = finger_radius_m
         self._compliance = response.compliance / young_modulus_pa
@@ -198,9 +160,10 @@ class SphereContact:
         longest = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).max())
         divisions = max(2, int(np.ceil(longest / (POINT_SPACING_RATIO * finger_radius_m))))
         self._shape, _ = triangle_points(divisions)
-        self._points = self._shape @ corners
-        normals = self._shape @ response.normals[response.faces]
-        self._normals = normals / np.linalg.norm(normals, axis=2, keepdims=True)
+        # the finger is tracked above the smooth surface: contact is with that, not with the faces
+        found = shape.closest((self._shape @ corners).reshape(-1, 3))
+        self._points = found.point.reshape(len(corners), -1, 3)
+        self._normals = found.normal.reshape(len(corners), -1, 3)
         sides = corners[:, 1:3] - corners[:, :1]
         areas = 0.5 * np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
         bed = bed_ratio * young_modulus_pa / finger_radius_m
@@ -208,12 +171,13 @@ class SphereContact:
         self._centres = corners.mean(axis=1)
         self._size = np.linalg.norm(corners - self._centres[:, None], axis=2).max(axis=1)
 
-    def reach(self, points: Floats, normals: Floats, centre: Floats) -> Floats:
+    def reach(self, points: Floats, normals: Floats, centre: Floats, way: Floats) -> Floats:
         """How far the rigid finger with its sphere at `centre` reaches below each point, (q,) m.
 
-        points, normals (q, 3).  Beyond `FLANK_RATIO` of the radius the sphere is continued by its
-        tangent cone, so that every point has a finite, C1 answer; it is negative where the finger
-        is clear of the skin.
+        points, normals (q, 3); way (3,): outward normal that the finger came in against.  Skin that
+        faces across that way, on another side of the body, is not reached.  Beyond `FLANK_RATIO` of
+        the radius the sphere is continued by its tangent cone, so that every point has a finite, C1
+        answer; it is negative where the finger is clear of the skin.
         """
         offset = centre - points
         along = np.einsum("qi,qi->q", offset, normals)
@@ -221,7 +185,9 @@ class SphereContact:
         across = np.sqrt(np.maximum(across2, 0.0))
         inner = np.minimum(across, FLANK_RATIO * self._radius)
         height = np.sqrt(self._radius**2 - inner * inner)
-        result: Floats = height - inner / height * (across - inner) - along
+        facing = np.clip((normals @ way - FACING[0]) / (FACING[1] - FACING[0]), 0.0, 1.0)
+        below = height - inner / height * (across - inner) - along
+        result: Floats = below * facing * facing * (3.0 - 2.0 * facing)
         return result
 
     def solve(self, push: Push, depth_m: float) -> Contact | None:
@@ -235,7 +201,10 @@ class SphereContact:
             return None
         count = len(self._shape)
         below = self.reach(
-            self._points[near].reshape(-1, 3), self._normals[near].reshape(-1, 3), centre
+            self._points[near].reshape(-1, 3),
+            self._normals[near].reshape(-1, 3),
+            centre,
+            push.normal,
         )
         reached = np.flatnonzero(below > 0.0)
         if not len(reached):
@@ -307,15 +276,17 @@ class LinearSoftBody:
     def __init__(
         self,
         response: SkinResponse,
+        shape: Shape,
+        bounds: Floats,
         *,
         young_modulus_pa: float,
         finger_radius_m: float,
         linear_depth_m: float,
         largest_depth_m: float,
-        touch_angle_rad: float,
         push_depth_m: float | None = None,
     ) -> None:
-        """push_depth_m: how deep the force curve goes; None: to `largest_depth_m`.
+        """bounds (b, 3): skin nodes that cannot be touched; pushes next to them are out of range.
+        push_depth_m: how deep the force curve goes; None: to `largest_depth_m`.
 
         ValueError unless 0 < linear_depth_m < largest_depth_m.
         """
@@ -325,12 +296,12 @@ class LinearSoftBody:
                 f"largest_depth_m: {largest_depth_m:g}"
             )
         self.contact = SphereContact(
-            response, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
+            response, shape, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
         )
         self._response = response
         self._modulus = young_modulus_pa
         self._linear, self._largest = linear_depth_m, largest_depth_m
-        self._touch_angle = touch_angle_rad
+        self._bounds, self._pad2 = bounds, (PAD_RATIO * finger_radius_m) ** 2
         self.at_rest: Floats32 = np.zeros(response.rest.shape, dtype=np.float32)
         corners = np.unique(response.faces[:, :3])
         self._places = response.rest[response.touch[corners]]
@@ -353,8 +324,8 @@ class LinearSoftBody:
         curve = self.force_curve(push.surface)
         stiffness = float(curve[len(CURVE_SHARES), 1]) / self._linear
         if contact is None:
-            return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, True)
-        angle = abs(float(np.arctan2(push.normal[1], push.normal[2])))
+            clear = push.depth_m <= 0.0 or push.beyond_m > 0.0
+            return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, clear)
         return Response(
             displacement=self._displacement(contact),
             force_n=contact.force_n * (push.depth_m / depth if push.depth_m > depth else 1.0),
@@ -363,8 +334,14 @@ class LinearSoftBody:
             push_depth_m=max(0.0, push.depth_m - push.beyond_m),
             in_range=push.depth_m <= self._linear
             and push.beyond_m == 0.0
-            and angle <= self._touch_angle,
+            and self._off_bounds(push.surface),
         )
+
+    def _off_bounds(self, surface: Floats) -> bool:
+        """Whether a contact patch there is all on skin that can be touched."""
+        if not len(self._bounds):
+            return True
+        return bool(np.square(self._bounds - surface).sum(axis=1).min() >= self._pad2)
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
         """Force over depth at the end of the linear range, at the touchable place near `surface`.

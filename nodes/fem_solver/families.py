@@ -11,17 +11,14 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from messages.scene import Scene
+from messages.scene import Cylinder, Scene, cylinder_of
 from nodes.fem_solver.body import spec_of
-from nodes.fem_solver.contact import LinearSoftBody, Push, Response, push_on_cylinder
-from nodes.fem_solver.precompute import (
-    Budget,
-    SoftBodyModel,
-    SoftBodySpec,
-    default_cache_dir,
-    load_or_compute,
-)
+from nodes.fem_solver.cache import default_cache_dir
+from nodes.fem_solver.contact import LinearSoftBody, Response
+from nodes.fem_solver.place import Push
+from nodes.fem_solver.precompute import Budget, SoftBodyModel, SoftBodySpec, load_or_compute
 from nodes.methods import Family, Trial
+from nodes.models.shapes import make_shape
 
 Floats = NDArray[np.float64]
 
@@ -45,8 +42,9 @@ def soft_body_trials(
     cache_dir: Path,
 ) -> Iterator[Trial]:
     """Each mesh at each depth, judged by the largest error (mm) of a skin node off the finger."""
-    spec = spec_of(scene, reference_spacing_m)
-    reference_spec = replace(spec, touch_angle_rad=min(REFERENCE_TOUCH_RAD, spec.touch_angle_rad))
+    spec, cylinder = spec_of(scene, reference_spacing_m), cylinder_of(scene)
+    touch_rad = min(REFERENCE_TOUCH_RAD, spec.mesh.touch_angle_rad)
+    reference_spec = replace(spec, mesh=replace(spec.mesh, touch_angle_rad=touch_rad))
     reference_model = _model(reference_spec, cache_dir)
     # past its range the linear model is charted as it is, without the saturation of the screen
     reference = _method(reference_model, scene, 2 * LARGEST_DEPTH_M)
@@ -54,7 +52,7 @@ def soft_body_trials(
         model = _model(spec_of(scene, spacing), cache_dir)
         method = _method(model, scene, 2 * LARGEST_DEPTH_M)
         for depth in DEPTHS_M:
-            push = _push(spec, depth)
+            push = _push(cylinder, depth)
             wanted = reference.respond(push)
             yield Trial(
                 method=name,
@@ -64,7 +62,7 @@ def soft_body_trials(
                 error=partial(
                     _error_mm,
                     model=model,
-                    wanted=_interpolated(reference_model, wanted, model.response.rest, spec),
+                    wanted=_interpolated(reference_model, wanted, model.response.rest, cylinder),
                     centre=push.surface,
                     rim_m=RIM_RATIO * scene.finger.radius_m,
                 ),
@@ -76,7 +74,7 @@ def _model(spec: SoftBodySpec, cache_dir: Path) -> SoftBodyModel:
     def say(done: int, total: int, need: Budget) -> None:
         if done == 0:
             structlog.get_logger().info(
-                "precomputing a soft body", spacing_m=spec.skin_spacing_m, need=need.text()
+                "precomputing a soft body", spacing_m=spec.mesh.skin_spacing_m, need=need.text()
             )
 
     return load_or_compute(spec, cache_dir, say)
@@ -85,19 +83,19 @@ def _model(spec: SoftBodySpec, cache_dir: Path) -> SoftBodyModel:
 def _method(model: SoftBodyModel, scene: Scene, linear_depth_m: float) -> LinearSoftBody:
     return LinearSoftBody(
         model.response,
+        make_shape(dict(scene.object.geometry)),
+        model.response.rest[model.bounds],
         young_modulus_pa=scene.object.material.young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         linear_depth_m=linear_depth_m,
         largest_depth_m=2 * linear_depth_m,
-        touch_angle_rad=np.pi,
     )
 
 
-def _push(spec: SoftBodySpec, depth_m: float) -> Push:
-    angle = PLACE_M[1] / spec.radius_m
+def _push(cylinder: Cylinder, depth_m: float) -> Push:
+    angle = PLACE_M[1] / cylinder.radius_m
     normal = np.array([0.0, np.sin(angle), np.cos(angle)])
-    point = (spec.radius_m - depth_m) * normal + np.array([PLACE_M[0], 0.0, 0.0])
-    return push_on_cylinder(point, radius_m=spec.radius_m, length_m=spec.length_m, normal=normal)
+    return Push(cylinder.radius_m * normal + np.array([PLACE_M[0], 0.0, 0.0]), normal, depth_m)
 
 
 def _unrolled(points: Floats, radius_m: float) -> Floats:
@@ -106,22 +104,22 @@ def _unrolled(points: Floats, radius_m: float) -> Floats:
 
 
 def _interpolated(
-    model: SoftBodyModel, response: Response, points: Floats, spec: SoftBodySpec
+    model: SoftBodyModel, response: Response, points: Floats, cylinder: Cylinder
 ) -> Floats:
     """A response at other skin points (n, 3); NaN where these are not on the front of the side."""
     from scipy.interpolate import CloughTocher2DInterpolator
 
     def on_front(rest: Floats) -> NDArray[np.bool_]:
-        side = np.hypot(rest[:, 1], rest[:, 2]) > (1.0 - 1e-9) * spec.radius_m
-        return side & (rest[:, 2] > -0.5 * spec.radius_m)
+        side = np.hypot(rest[:, 1], rest[:, 2]) > (1.0 - 1e-9) * cylinder.radius_m
+        return side & (rest[:, 2] > -0.5 * cylinder.radius_m)
 
     known = on_front(model.response.rest)
     field = CloughTocher2DInterpolator(
-        _unrolled(model.response.rest[known], spec.radius_m), response.displacement[known]
+        _unrolled(model.response.rest[known], cylinder.radius_m), response.displacement[known]
     )
     result = np.full(points.shape, np.nan)
     asked = on_front(points)
-    result[asked] = field(_unrolled(points[asked], spec.radius_m))
+    result[asked] = field(_unrolled(points[asked], cylinder.radius_m))
     return result
 
 

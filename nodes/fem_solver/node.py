@@ -11,8 +11,9 @@ from pydantic import Field
 from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver import body, precompute
-from nodes.fem_solver.contact import Floats, Response
+from nodes.fem_solver import body, cache, precompute
+from nodes.fem_solver.contact import Response
+from nodes.fem_solver.place import Entry
 from nodes.node import Input, Node, NodeParameters, Output
 
 
@@ -41,7 +42,7 @@ class FemSolver(Node):
 
     async def setup(self) -> None:
         self._stop = threading.Event()
-        self._model: tuple[precompute.SoftBodySpec, precompute.SoftBodyModel] | None = None
+        self._model: tuple[str, precompute.SoftBodyModel] | None = None
         self._body: body.SceneBody | None = None
         self._forget()
         self.note = "waiting for a scene"
@@ -49,7 +50,7 @@ class FemSolver(Node):
     def _forget(self) -> None:
         self._last: Response | None = None
         self._last_ns = 0
-        self._normal: Floats | None = None
+        self._entry: Entry | None = None
 
     async def close(self) -> None:
         self._stop.set()
@@ -71,9 +72,9 @@ class FemSolver(Node):
     def _build(self, scene: Scene) -> body.SceneBody:
         """In a thread of its own: takes seconds when nothing is in the cache."""
         spec = body.spec_of(scene, self.parameters.skin_spacing_m)
-        if self._model is None or self._model[0] != spec:
-            path = self.parameters.cache_dir or precompute.default_cache_dir()
-            self._model = spec, precompute.load_or_compute(spec, path, self._progress)
+        if self._model is None or self._model[0] != spec.key():
+            path = self.parameters.cache_dir or cache.default_cache_dir()
+            self._model = spec.key(), precompute.load_or_compute(spec, path, self._progress)
         return body.scene_body(
             scene,
             spec,
@@ -92,7 +93,7 @@ class FemSolver(Node):
             return
         if fingertip.valid:
             point = body.position_at(fingertip, self.parameters.lead_s)
-            response, self._normal = self._body.respond(point, self._normal)
+            response, self._entry = self._body.respond(point, self._entry)
             self._last, self._last_ns = response, header.source_ns
         elif self._last is None:
             response = self._body.at_rest()

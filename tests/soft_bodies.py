@@ -1,0 +1,32 @@
+"""Specifications of soft bodies for tests, without a scene."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from messages.scene import Cylinder, StripSupport
+from nodes.fem_solver.mesh import MeshSpec
+from nodes.fem_solver.precompute import SoftBodySpec
+
+
+def cylinder_spec(
+    radius_m: float,
+    length_m: float,
+    *,
+    touch_angle_rad: float,
+    skin_spacing_m: float,
+    support_angle_rad: float = 0.5 * np.pi,
+    poisson_ratio: float = 0.45,
+) -> SoftBodySpec:
+    """A cylinder that lies across, held at its back."""
+    mesh = MeshSpec(
+        geometry=Cylinder(radius_m=radius_m, length_m=length_m),
+        support=StripSupport(angle_rad=support_angle_rad),
+        touch_angle_rad=touch_angle_rad,
+        skin_spacing_m=skin_spacing_m,
+        towards_user=(0.0, 0.0, 1.0),
+        down=(0.0, 0.0, 0.0),
+        turn_rad=0.0,
+        slab_depth_m=0.0,
+    )
+    return SoftBodySpec(mesh, poisson_ratio)

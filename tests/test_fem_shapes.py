@@ -1,0 +1,159 @@
+"""Every shape of a scene yields under the finger: dented where it is pushed, smoothly, bounded."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from ruamel.yaml import YAML
+
+from messages.base import Header, Message
+from messages.clock import VirtualClock
+from messages.scene import Scene
+from messages.topics import Topic
+from messages.types import Skin, SoftBody
+from nodes.fem_solver.body import SceneBody, scene_body, spec_of
+from nodes.fem_solver.contact import Response
+from nodes.fem_solver.node import FemSolver, FemSolverParameters
+from nodes.fem_solver.precompute import compute, foreseen
+from nodes.models import rigid
+from tests.fingertips import fingertip
+
+Floats = NDArray[np.float64]
+
+SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
+BASE = {"kind": "base", "height_m": 0.01}
+
+
+def scene(geometry: dict[str, Any], height_m: float, support: dict[str, Any]) -> Scene:
+    """The demo's scene with another object, its front at the world's origin."""
+    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    del content["object"]["support_angle_rad"]
+    content["object"] |= {
+        "geometry": geometry,
+        "support": support,
+        "world_from_object": {"position_m": [0.0, 0.0, -height_m], "rpy_rad": [0.0, 0.0, 0.0]},
+    }
+    return Scene.model_validate(content)
+
+
+def ball_of_triangles() -> dict[str, Any]:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    return {
+        "shape": "mesh",
+        "vertices_m": np.array(ball.vertices),
+        "triangles": np.array(ball.faces, dtype=np.int32),
+        "smoothing_m": 0.012,
+        "origin": "a ball",
+    }
+
+
+SCENES = {
+    "sphere": scene({"shape": "sphere", "radius_m": 0.03}, 0.03, BASE),
+    "ellipsoid": scene({"shape": "ellipsoid", "semi_axes_m": [0.04, 0.03, 0.025]}, 0.025, BASE),
+    "rounded_box": scene(
+        {"shape": "rounded_box", "size_m": [0.08, 0.06, 0.04], "edge_radius_m": 0.01},
+        0.02,
+        {"kind": "strip", "angle_rad": 1.0},
+    ),
+    "plane": scene({"shape": "plane", "width_m": 0.06, "height_m": 0.05}, 0.0, BASE),
+    "mesh": scene(ball_of_triangles(), 0.03, BASE),
+}
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def soft(request: pytest.FixtureRequest) -> SceneBody:
+    chosen = SCENES[request.param]
+    spec = spec_of(chosen, 0.006)
+    model = compute(spec, lambda done, total, need: None)
+    expected, table = foreseen(spec), model.response.table
+    # said beforehand, and not far off
+    assert 0.5 * len(table) < expected.loads < 4.0 * len(table)
+    return scene_body(chosen, spec, model, linear_depth_m=0.006, largest_depth_m=0.010)
+
+
+def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Floats]:
+    """The answer to a finger at a depth below the surface near (x, y), and the normal there."""
+    found = soft.shape.closest(soft.front + np.array([x, y, 0.0]))
+    point = found.point - depth * found.normal
+    return soft.respond(rigid.apply(soft.world_from_mesh, point), None)[0], found.normal
+
+
+def test_a_push_dents_the_skin_where_it_is(soft: SceneBody) -> None:
+    answer, normal = pushed(soft, 0.003, 0.002, 0.004)
+    assert answer.in_range
+    assert answer.push_depth_m == pytest.approx(0.004)
+    inward = -(answer.displacement @ normal.astype(np.float32))
+    assert 0.003 < inward.max() < 0.0045
+    where = soft.skin.vertices_world_m[int(inward.argmax())]
+    assert np.linalg.norm(where[:2] - [0.003, 0.002]) < 0.007
+    # within a factor of two of Hertz on a half-space
+    hertz = 4.0 / 3.0 * 4000.0 / (1.0 - 0.45**2) * 0.007**0.5 * 0.004**1.5
+    assert 0.5 * hertz < answer.force_n @ normal < 2.0 * hertz
+    aside = answer.force_n - (answer.force_n @ normal) * normal
+    assert np.linalg.norm(aside) < 0.15 * answer.force_n @ normal
+
+
+@pytest.mark.parametrize("depth", [0.003, 0.008, 0.015])
+def test_a_slide_moves_no_skin_node_by_a_jump(soft: SceneBody, depth: float) -> None:
+    answers = [pushed(soft, 0.001 + 1.6e-5 * i, 1.2e-5 * i, depth)[0] for i in range(200)]
+    jumps = [
+        np.linalg.norm(a.displacement - b.displacement, axis=1).max()
+        for a, b in itertools.pairwise(answers)
+    ]
+    assert max(jumps) < 0.1e-3
+    forces = np.array([np.linalg.norm(answer.force_n) for answer in answers])
+    assert np.abs(np.diff(forces)).max() < 0.01 * forces.mean()
+
+
+def test_what_the_finger_did_before_does_not_count(soft: SceneBody) -> None:
+    there = rigid.apply(soft.world_from_mesh, soft.front - [0.0, 0.0, 0.005])
+    first, held = soft.respond(there, None)
+    _, held = soft.respond(there + np.array([0.004, 0.002, -0.003]), held)
+    again, _ = soft.respond(there, held)
+    assert np.abs(again.displacement - first.displacement).max() < 1e-7
+
+
+def test_a_deep_push_is_bounded_and_flagged(soft: SceneBody) -> None:
+    held = None
+    for depth in np.linspace(0.0, 0.035, 36):
+        there = soft.front - np.array([0.0, 0.0, depth])
+        answer, held = soft.respond(rigid.apply(soft.world_from_mesh, there), held)
+        assert np.linalg.norm(answer.displacement, axis=1).max() < 0.012
+        assert np.isfinite(answer.force_n).all()
+    assert not answer.in_range
+
+
+def test_the_force_curve_is_said_before_the_touch(soft: SceneBody) -> None:
+    curve = soft.at_rest().force_curve
+    assert (np.diff(curve[:, 1]) >= 0.0).all()
+    answer, normal = pushed(soft, 0.0, 0.0, 0.006)
+    assert np.interp(0.006, *curve.T) == pytest.approx(answer.force_n @ normal, rel=0.1)
+
+
+async def test_the_node_answers_for_any_shape(tmp_path: Path) -> None:
+    sent: list[tuple[Topic, Message]] = []
+    node = FemSolver(
+        FemSolverParameters(skin_spacing_m=0.007, cache_dir=tmp_path),
+        name="fem_solver",
+        clock=VirtualClock(),
+        send=lambda topic, message, header: sent.append((topic, message)),
+    )
+    await node.setup()
+    header = Header(1, 0, 0, "virtual", "test", 0)
+    await node.step("scene", SCENES["sphere"], header)
+    tip = fingertip(np.array([0.0, 0.0, -0.004]), np.zeros(3), reason="ok")
+    await node.step("fingertip", tip, header)
+    await node.close()
+    assert node.errors == 0, node.last_error
+    skin, answer = sent[0][1], sent[1][1]
+    assert isinstance(skin, Skin)
+    assert isinstance(answer, SoftBody)
+    assert answer.in_range
+    assert answer.force_world_n[2] > 0.03
+    assert answer.displacement_world_m.shape == skin.vertices_world_m.shape
