@@ -18,7 +18,7 @@ from messages.types import ArmState, EStop, Side
 from nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, goal_ahead, pace
-from nodes.arm_bridge.kinematics import KINEMATICS
+from nodes.arm_bridge.kinematics import KINEMATICS, forward
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.methods import measure
 from nodes.models.motion import SheetMotion
@@ -602,3 +602,14 @@ def test_only_a_reset_clears_a_fault() -> None:
         assert arms[0].control.faults == ("drill",)
     assert arms[0].control.reset()
     assert arms[0].control.faults == ()
+
+
+def test_poses_that_are_kept_for_a_cycle_are_those_of_the_joints_asked_for() -> None:
+    geometry, joints = ArmGeometry(SCENE, "left"), GUESS.copy()
+    first = geometry.world_from_flange(joints)
+    joints[1] += 0.1
+    second = geometry.world_from_flange(joints)
+    assert second == pytest.approx(geometry.world_from_base @ forward(joints), abs=1e-15)
+    second[:] = np.nan
+    assert geometry.world_from_flange(GUESS) == pytest.approx(first, abs=0.0)
+    assert np.isfinite(geometry.world_from_flange(joints)).all()

@@ -403,13 +403,11 @@ class ArmControl:
 
         share: of the speeds, less than 1 for the arm that is ahead of the other.
         """
-        distance, angle = lag(sheet, target)
-        if (
-            distance < SETTLED_M
-            and angle < SETTLED_RAD
-            and abs(target.stretch_ratio - sheet.stretch_ratio) < SETTLED_STRETCH
-        ):
-            self._settled = True
+        if not self._settled:
+            distance, angle = lag(sheet, target)
+            longer = abs(target.stretch_ratio - sheet.stretch_ratio)
+            near = distance < SETTLED_M and angle < SETTLED_RAD
+            self._settled = near and longer < SETTLED_STRETCH
         bounds = FOLLOW_BOUNDS if self._settled else START_BOUNDS
         return follow_sheet(sheet, target, bounds=slowed(bounds, share), edges=edges, step_s=step_s)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from math import sqrt
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +28,14 @@ RANGE_MARGIN_RAD = np.radians(2.0)
 
 EDGE_SPEED_SHARE = 0.95
 """Share of the tool speed that the sheet's motion may use; beyond it the joints are cut."""
+
+
+@lru_cache(maxsize=16)
+def _base_from_flange(joints_rad: tuple[float, ...]) -> Floats:
+    """`forward`, once for all who ask for the same joints in a cycle; not to be written to."""
+    pose = forward(joints_rad)
+    pose.flags.writeable = False
+    return pose
 
 
 def _transform(pose: Pose) -> Floats:
@@ -73,14 +84,14 @@ class ArmGeometry:
         )
 
     def world_from_flange(self, joints_rad: Floats) -> Floats:
-        return self.world_from_base @ forward(joints_rad)
+        return self.world_from_base @ _base_from_flange(tuple(joints_rad.tolist()))
 
     def world_from_edge(self, joints_rad: Floats) -> Floats:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
         """Middle and both ends of the clamped edge, and the flange (4, 3), in the base frame."""
-        return apply(forward(joints_rad), self._tool_points)
+        return apply(_base_from_flange(tuple(joints_rad.tolist())), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
         """Joints that bring this arm's edge to the sheet's, a step from the present joints.
@@ -108,7 +119,7 @@ class ArmGeometry:
             return None, None
         other_edge = world_from_other_flange @ self.other_flange_from_edge
         across = other_edge[:3, 3] - self.world_from_edge(joints_rad)[:3, 3]
-        distance, limits = float(np.linalg.norm(across)), self.sheet_limits
+        distance, limits = sqrt(float(across @ across)), self.sheet_limits
         force = edge_force_n(
             distance / limits.width_m,
             young_modulus_pa=limits.young_modulus_pa,

@@ -94,9 +94,12 @@ def pace(own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool) ->
     across = other_edge[:3, 3] - own_edge[:3, 3]
     half = (0.5 if left else -0.5) * sqrt(float(across @ across))
     own, other = _middle(own_edge, half), _middle(other_edge, -half)
-    lead, way = _between(other, own), _between(own, target) + _between(other, target)
+    lead = _between(other, own)
     apart = sqrt(float(lead @ lead))
-    if apart <= WAIT_FROM_RAD or float(lead @ way) <= 0.0:
+    if apart <= WAIT_FROM_RAD:
+        return 1.0
+    way = _between(own, target) + _between(other, target)
+    if float(lead @ way) <= 0.0:
         return 1.0
     return max(0.0, (WAIT_FULL_RAD - apart) / (WAIT_FULL_RAD - WAIT_FROM_RAD))
 

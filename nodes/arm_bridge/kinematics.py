@@ -123,23 +123,24 @@ def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
 
 def forward(joints_rad: ArrayLike) -> Floats:
     """base_from_flange (4, 4) of joints (6,)."""
-    q1, q2, q3, q4, q5, q6 = (float(angle) for angle in np.asarray(joints_rad))
+    q1, q2, q3, q4, q5, q6 = np.asarray(joints_rad, dtype=np.float64).tolist()
     s2, c2, s23, c23 = sin(q2), cos(q2), sin(q2 + q3), cos(q2 + q3)
     out = UPPER_ARM_M * s2 - ELBOW_SHIFT_M * c23 + FOREARM_M * s23
     up = SHOULDER_HEIGHT_M + UPPER_ARM_M * c2 + ELBOW_SHIFT_M * s23 + FOREARM_M * c23
-    s4, c4, s5, c5, s6, c6 = sin(q4), cos(q4), sin(q5), cos(q5), sin(q6), cos(q6)
-    wrist = np.array(
-        [
-            [c4 * c5 * c6 - s4 * s6, -c4 * c5 * s6 - s4 * c6, c4 * s5],
-            [s4 * c5 * c6 + c4 * s6, -s4 * c5 * s6 + c4 * c6, s4 * s5],
-            [-s5 * c6, s5 * s6, c5],
-        ]
-    )
-    rotation = _arm_rotation(q1, q2 + q3) @ wrist
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = FLANGE_M * rotation[:, 2] + np.array([out * cos(q1), out * sin(q1), up])
-    return pose
+    s1, c1, s4, c4 = sin(q1), cos(q1), sin(q4), cos(q4)
+    s5, c5, s6, c6 = sin(q5), cos(q5), sin(q6), cos(q6)
+    rows = []
+    # The flange's axes as the forearm sees them, turned about y by J2 + J3, then about z by J1.
+    for x, y, z in (
+        (c4 * c5 * c6 - s4 * s6, s4 * c5 * c6 + c4 * s6, -s5 * c6),
+        (-c4 * c5 * s6 - s4 * c6, -s4 * c5 * s6 + c4 * c6, s5 * s6),
+        (c4 * s5, s4 * s5, c5),
+    ):
+        ahead = c23 * x + s23 * z
+        rows.append((c1 * ahead - s1 * y, s1 * ahead + c1 * y, c23 * z - s23 * x, 0.0))
+    x, y, z, _ = rows[2]
+    rows.append((out * c1 + FLANGE_M * x, out * s1 + FLANGE_M * y, up + FLANGE_M * z, 1.0))
+    return np.array(rows).T
 
 
 def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
@@ -149,7 +150,7 @@ def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[flo
     a joint free it is taken from `present_rad` (6,).  Angles are within a turn of zero.  Empty when
     the wrist centre is too far or too near.
     """
-    present = [float(angle) for angle in np.asarray(present_rad)]
+    present = np.asarray(present_rad, dtype=np.float64).tolist()
     rotation = base_from_flange[:3, :3]
     x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
     radius, height = hypot(x, y), z - SHOULDER_HEIGHT_M
@@ -184,7 +185,7 @@ def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floa
     Nearest is by the largest change of any joint; J6 may lie up to 200 degrees either way, so that
     a whole turn more or less is tried too.  UnreachableError when no branch is in range.
     """
-    present = [float(angle) for angle in np.asarray(present_rad)]
+    present = np.asarray(present_rad, dtype=np.float64).tolist()
     nearest, least = None, inf
     solutions = branches(base_from_flange, present)
     for solution in solutions:
@@ -215,7 +216,7 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     Where the branch ends at a joint's range, another is taken if there is one, as by
     `inverse_kinematics`, which raises UnreachableError.
     """
-    present = [float(angle) for angle in np.asarray(present_rad)]
+    present = np.asarray(present_rad, dtype=np.float64).tolist()
     rotation = base_from_flange[:3, :3]
     x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
     q1 = present[0] + _held_turn(

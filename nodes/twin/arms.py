@@ -15,6 +15,8 @@ import zlib
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import reduce
+from itertools import accumulate
 from typing import Any, Literal
 
 import numpy as np
@@ -69,6 +71,7 @@ ACCELERATION_RAD_PER_S2 = 8.0 * SPEED_RAD_PER_S
 _COMMAND = struct.Struct(">HHIIHH6fI")
 _STATUS = struct.Struct(">HHIIIHH6fII")
 _STATUS_AT = 100
+_READ_AND_WRITE = 23
 _IDLE, _MOVE, _HOLD, _STOP = range(4)
 STATE_IDLE, STATE_MOVING, STATE_HOLDING, STATE_STOPPED, STATE_FAULT = range(5)
 FAULT_RANGE, FAULT_STEP, FAULT_FINITE, FAULT_WATCHDOG, FAULT_SERVO = 1, 2, 4, 8, 16
@@ -79,35 +82,24 @@ def _skew(axis: Floats) -> Floats:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
-# Each joint's turn is 1 + sin C + (1 - cos) C C (Rodrigues), about a point.
-_JOINTS = [
-    (_skew(axis), _skew(axis) @ _skew(axis), point)
-    for axis, point in zip(_AXES, _POINTS, strict=True)
-]
+# Each joint's turn is 1 + sin C + (1 - cos) C C (Rodrigues) about a point: (6, 4, 4) of C, and C C.
+_CROSS, _SQUARE = np.zeros((6, 4, 4)), np.zeros((6, 4, 4))
+for _joint, (_axis, _point) in enumerate(zip(_AXES, _POINTS, strict=True)):
+    _CROSS[_joint, :3] = np.column_stack([_skew(_axis), -_skew(_axis) @ _point])
+    _SQUARE[_joint, :3] = _skew(_axis) @ _CROSS[_joint, :3]
+_HOME = np.eye(4)
+_HOME[:3, 3] = _FLANGE_AT_ZERO
 
 
 def forward(joints_rad: Floats) -> Floats:
     """base_from_flange (4, 4) of joints (6,): exp(S1 q1) ... exp(S6 q6) M."""
-    return _flange(*_chain(joints_rad)[0])
+    return reduce(np.matmul, (*_turns(joints_rad), _HOME))
 
 
-def _chain(joints_rad: Floats) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:
-    """Rotation and position after all joints, and the same ahead of each."""
-    rotation, position = np.eye(3), np.zeros(3)
-    ahead = []
-    for (cross, square, point), angle in zip(_JOINTS, joints_rad.tolist(), strict=True):
-        ahead.append((rotation, position))
-        change = math.sin(angle) * cross + (1.0 - math.cos(angle)) * square
-        position = position - rotation @ (change @ point)
-        rotation = rotation + rotation @ change
-    return (rotation, position), ahead
-
-
-def _flange(rotation: Floats, position: Floats) -> Floats:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation
-    pose[:3, 3] = position + rotation @ _FLANGE_AT_ZERO
-    return pose
+def _turns(joints_rad: Floats) -> Floats:
+    """exp(S q) of each joint (6, 4, 4)."""
+    angles = joints_rad[:, None, None]
+    return np.asarray(np.eye(4) + np.sin(angles) * _CROSS + (1.0 - np.cos(angles)) * _SQUARE)
 
 
 def joints_for(base_from_flange: Floats, guess_rad: Floats) -> Floats:
@@ -117,13 +109,14 @@ def joints_for(base_from_flange: Floats, guess_rad: Floats) -> Floats:
     """
     joints = guess_rad.copy()
     for _ in range(200):
-        last, ahead = _chain(joints)
-        pose = _flange(*last)
+        *ahead, last = accumulate((np.eye(4), *_turns(joints)), np.matmul)
+        pose = last @ _HOME
         error = _pose_error(base_from_flange, pose)
         if np.abs(error).max() < 1e-10:
             break
-        axes = np.array([turn @ axis for (turn, _), axis in zip(ahead, _AXES, strict=True)])
-        places = np.array([at + turn @ p for (turn, at), p in zip(ahead, _POINTS, strict=True)])
+        frames = np.array(ahead)
+        axes = np.einsum("nij,nj->ni", frames[:, :3, :3], _AXES)
+        places = np.einsum("nij,nj->ni", frames[:, :3, :3], _POINTS) + frames[:, :3, 3]
         slope = np.vstack([np.cross(axes, pose[:3, 3] - places).T, axes.T])
         step = np.linalg.solve(slope.T @ slope + 1e-8 * np.eye(6), slope.T @ error)
         joints = np.clip(joints + np.clip(step, -0.3, 0.3), RANGE_RAD[:, 0], RANGE_RAD[:, 1])
@@ -139,6 +132,11 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
     )
     return np.concatenate([wanted[:3, 3] - present[:3, 3], spin])
+
+
+def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
+    """As numpy.clip, at a fifth of its cost for six numbers."""
+    return np.minimum(np.maximum(values, lowest), highest)
 
 
 def slowed(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
@@ -168,6 +166,8 @@ class Servo:
 
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
         """Move on by `duration_s` in steps of at most a millisecond; braking stops on the way."""
+        if braking and not self.velocity_rad_per_s.any():
+            return
         steps = max(1, int(np.ceil(duration_s / 1e-3)))
         step_s = duration_s / steps
         natural = 2.0 / self.lag_s
@@ -178,12 +178,12 @@ class Servo:
                 pull = natural * (
                     natural * (wanted_rad - self.joints_rad) - 2.0 * self.velocity_rad_per_s
                 )
-                pull = np.clip(pull, -ACCELERATION_RAD_PER_S2, ACCELERATION_RAD_PER_S2)
+                pull = _between(pull, -ACCELERATION_RAD_PER_S2, ACCELERATION_RAD_PER_S2)
                 speed = self.velocity_rad_per_s + pull * step_s
-            self.velocity_rad_per_s = np.clip(speed, -SPEED_RAD_PER_S, SPEED_RAD_PER_S)
+            self.velocity_rad_per_s = _between(speed, -SPEED_RAD_PER_S, SPEED_RAD_PER_S)
             self.joints_rad = self.joints_rad + self.velocity_rad_per_s * step_s
         play = 0.5 * self.backlash_rad
-        self.driven_rad = np.clip(self.driven_rad, self.joints_rad - play, self.joints_rad + play)
+        self.driven_rad = _between(self.driven_rad, self.joints_rad - play, self.joints_rad + play)
 
 
 class Controller:
@@ -323,7 +323,7 @@ class ArmServer:
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
     ) -> None:
-        """`before` is called ahead of each command, to bring the arm's motion up to date."""
+        """`before` is called ahead of each request, to bring the arm's motion up to date."""
         self.controller = controller
         self._address = (host, port)
         self._before = before
@@ -372,7 +372,9 @@ class ArmServer:
             return ExcCodes.DEVICE_FAILURE
         if fault == "slow" and written:
             await asyncio.sleep(LATE_S)
-        self._before()
+        # Of a read and write in one, the write comes first and has brought the arm up to date.
+        if written or function_code != _READ_AND_WRITE:
+            self._before()
         if written:
             if address != 0 or not self.controller.take([int(value) for value in written]):
                 return ExcCodes.ILLEGAL_VALUE

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -53,7 +54,8 @@ class TwinArmsNode(Node):
     async def setup(self) -> None:
         self.servers: dict[str, ArmServer | MxtServer] = {}
         self._world_from_base: dict[str, Floats] = {}
-        self._moved_ns = self._started_ns = 0
+        self._moved_ns: dict[str, int] = {}
+        self._started_ns = 0
 
     async def close(self) -> None:
         for server in self.servers.values():
@@ -66,18 +68,19 @@ class TwinArmsNode(Node):
             self._world_from_base[side] = transform_from_rpy(base.position_m, base.rpy_rad)
         if len(self.servers) == len(arms):
             return
-        self._moved_ns = self._started_ns = self.clock.now_ns()
+        self._started_ns = self.clock.now_ns()
         for number, (side, spec) in enumerate(arms.items()):
             if side in self.servers:
                 continue
             port = self.parameters.left_port if side == "left" else self.parameters.right_port
-            server = self._server(self._start_joints(side, spec, scene), port, number)
+            self._moved_ns[side] = self._started_ns
+            server = self._server(side, self._start_joints(side, spec, scene), port, number)
             await server.start()
             self.servers[side] = server
 
-    def _server(self, joints_rad: Floats, port: int, seed: int) -> ArmServer | MxtServer:
+    def _server(self, side: str, joints_rad: Floats, port: int, seed: int) -> ArmServer | MxtServer:
         """An arm at those joints, behind a server of the protocol."""
-        given = self.parameters
+        given, before = self.parameters, partial(self._advance, side)
         if given.protocol == "mxt":
             mxt = MxtController(
                 joints_rad,
@@ -89,7 +92,7 @@ class TwinArmsNode(Node):
                 restart_after_s=given.restart_after_s,
                 seed=seed,
             )
-            return MxtServer(mxt, host=given.host, port=port, before=self._advance)
+            return MxtServer(mxt, host=given.host, port=port, before=before)
         controller = Controller(
             joints_rad,
             servo_lag_s=given.servo_lag_s,
@@ -99,7 +102,7 @@ class TwinArmsNode(Node):
             cycle_s=given.cycle_s,
             seed=seed,
         )
-        return ArmServer(controller, host=given.host, port=port, before=self._advance)
+        return ArmServer(controller, host=given.host, port=port, before=before)
 
     def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
         """Joints that hold the sheet in the imaginary screen, just stretched."""
@@ -109,23 +112,23 @@ class TwinArmsNode(Node):
         flange = edge @ inverse(transform_from_rpy(clamp.position_m, clamp.rpy_rad))
         return joints_for(inverse(self._world_from_base[side]) @ flange, START_GUESS_RAD)
 
-    def _advance(self) -> None:
-        """Bring both arms to the present instant."""
+    def _advance(self, side: str) -> None:
+        """Bring an arm to the present instant."""
         now_ns = self.clock.now_ns()
-        duration_s = (now_ns - self._moved_ns) * 1e-9
-        self._moved_ns = now_ns
-        if duration_s > 0.0:
-            for server in self.servers.values():
-                server.controller.advance(duration_s)
+        duration_s = (now_ns - self._moved_ns[side]) * 1e-9
+        self._moved_ns[side] = now_ns
+        if duration_s > 0.0 and side in self.servers:
+            self.servers[side].controller.advance(duration_s)
 
     @periodic("rate_hz")
     async def cycle(self) -> None:
         if len(self.servers) < 2:
             self.note = "waits for a scene"
             return
-        self._advance()
-        given = self.parameters
-        if given.fault != "none" and self._moved_ns - self._started_ns > given.fault_after_s * 1e9:
+        for side in self.servers:
+            self._advance(side)
+        given, since_ns = self.parameters, self.clock.now_ns() - self._started_ns
+        if given.fault != "none" and since_ns > given.fault_after_s * 1e9:
             self.servers[given.fault_side].controller.fault = given.fault
         joints = {side: server.controller.servo.driven_rad for side, server in self.servers.items()}
         self.twin__arms.publish(
