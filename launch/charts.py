@@ -24,6 +24,7 @@ FAMILIES: dict[str, str] = {
     "correction": "launch.families:CORRECTION",
     "sheet-force": "launch.families:SHEET_FORCE",
     "mesh-normal": "nodes.planner.families:MESH_NORMAL",
+    "rolling": "nodes.planner.families:ROLLING",
 }
 """Families by their name on the command line; each node's folder describes its own."""
 

@@ -48,7 +48,9 @@ class Desk:
         self.yielding = Yielding(scene, law_for(scene.sheet), "curve")
         pose = scene.object.world_from_object
         self.world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self.tilt_rad = scene.working_range.tilt_rad + self.given.tilt_margin_rad
         self.seen: list[Planned] = []
+        self.home = self.plan.motion
 
     def see(self, finger: Floats, velocity: Floats = STILL) -> Planned:
         """The sheet's next step for a finger (3,) with a velocity (3,)."""
@@ -84,7 +86,7 @@ class Desk:
 
     def assert_bounded(self) -> None:
         """No step so far was faster, sharper or jerkier than the parameters allow."""
-        sheets = [planned.motion for planned in self.seen]
+        sheets = [self.home, self.home, self.home, *(planned.motion for planned in self.seen)]
         rates = np.array(
             [
                 [

@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -13,15 +14,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from launch.meshes import read_mesh
 from messages.scene import Mesh
 from nodes.models.rigid import angle_between
-from nodes.models.shapes import EllipsoidShape, Shape, make_shape
+from nodes.models.shapes import EllipsoidShape, MeshError, Shape, SmoothMeshShape, make_shape
+from nodes.planner import encounter
+from nodes.planner.encounter import Encounter, Presentation, Reach, UnpresentableError
 from nodes.planner.families import ellipsoid_mesh
 from nodes.planner.motion import Planned
-from tests.plans import STEP_S, Desk, scene_with
+from tests.plans import STEP_S, STILL, Desk, scene_with
 
 Floats = NDArray[np.float64]
 LIVER = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "mesh" / "liver.obj"
@@ -94,13 +99,38 @@ def bowl() -> dict[str, Any]:
     return as_mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int64), 0.008)
 
 
-MESHES: dict[str, Callable[[], dict[str, Any]]] = {"meshed": meshed, "lobes": lobes, "bowl": bowl}
+@lru_cache
+def cube() -> dict[str, Any]:
+    """A cube of 80 mm, as six sides of two triangles."""
+    import trimesh
+
+    box = trimesh.creation.box(extents=(0.08, 0.08, 0.08))
+    return as_mesh(np.asarray(box.vertices), np.asarray(box.faces, dtype=np.int64), 0.01)
+
+
+@lru_cache
+def liver() -> dict[str, Any]:
+    if not LIVER.is_file():
+        pytest.skip(f"the real mesh is not there: {LIVER}")
+    return dict(read_mesh(LIVER, 0.01, None))
+
+
+MESHES: dict[str, Callable[[], dict[str, Any]]] = {
+    "meshed": meshed,
+    "lobes": lobes,
+    "bowl": bowl,
+    "cube": cube,
+    "liver": liver,
+}
+DOME_UP = (0.5 * math.pi, 0.0, 0.0)
+"""Turns the liver's dome, where its y is up, to the user."""
 
 
 @lru_cache
 def desk_about(name: str) -> tuple[Desk, Shape]:
     geometry = SOLIDS[name] if name in SOLIDS else MESHES[name]()
-    return Desk(scene_with(geometry)), make_shape(geometry)
+    rpy_rad = DOME_UP if name == "liver" else (0.0, 0.0, 0.0)
+    return Desk(scene_with(geometry, rpy_rad=rpy_rad)), make_shape(geometry)
 
 
 def fresh(name: str) -> tuple[Desk, Shape]:
@@ -247,19 +277,6 @@ def test_on_a_mesh_the_sheets_normal_is_the_smooth_surfaces(heading: tuple[float
     desk.assert_bounded()
 
 
-@lru_cache
-def liver() -> dict[str, Any]:
-    if not LIVER.is_file():
-        pytest.skip(f"the real mesh is not there: {LIVER}")
-    return dict(read_mesh(LIVER, 0.01, None))
-
-
-@lru_cache
-def desk_on_liver() -> tuple[Desk, Shape]:
-    """Its dome, where y is up, turned to the user."""
-    return Desk(scene_with(liver(), rpy_rad=(0.5 * math.pi, 0.0, 0.0))), make_shape(liver())
-
-
 LIVER_STARTS = ((-0.012, 0.1, 0.006), (0.0, 0.1, 0.0), (-0.02, 0.1, -0.004))
 
 
@@ -269,8 +286,348 @@ def test_on_the_real_mesh_the_sheets_normal_is_the_smooth_surfaces(
     start: tuple[float, ...], heading: tuple[float, ...]
 ) -> None:
     """Within 0.5 degrees along a stroke of 12 mm, with bounded acceleration and jerk."""
-    desk, shape = desk_on_liver()
-    desk.seen = []
+    desk, shape = fresh("liver")
     errors = normal_errors_deg(desk, shape, np.array(start), np.array(heading), 0.012)
     assert errors.max() < 0.5
     desk.assert_bounded()
+
+
+# Where it cannot go on
+
+
+def reach(**changes: float) -> Reach:
+    given: dict[str, Any] = {
+        "front": FRONT,
+        "tilt_rad": 1.2,
+        "spin_rad": 0.3,
+        "half_width_m": 0.09,
+        "half_height_m": 0.09,
+        "touch_m": 0.0005,
+        "release_m": 0.003,
+        "deepest_m": 0.07,
+    }
+    return Reach(**given | changes)
+
+
+def shown_to(shape: Shape, finger: Floats, **changes: float) -> Presentation:
+    """What is presented to a finger that is there from the first."""
+    met = Encounter(shape, np.eye(3), reach(**changes))
+    return met.step(finger, STILL, met.contact.object_from_sheet)
+
+
+ANYWHERE = ("cylinder", "sphere", "ellipsoid", "plane", "box", "meshed", "lobes", "bowl")
+places = st.tuples(*[st.floats(-0.12, 0.12)] * 3)
+moves = st.lists(
+    st.tuples(places, st.integers(1, 15), st.sampled_from(["leap", "glide", "lost", "wild"])),
+    min_size=1,
+    max_size=5,
+)
+
+
+@pytest.mark.parametrize("name", ANYWHERE)
+@given(moves=moves)
+@settings(max_examples=8, deadline=None)
+def test_no_transition_is_a_step_wherever_the_finger_goes(
+    name: str, moves: list[tuple[tuple[float, float, float], int, str]]
+) -> None:
+    """Leaps, losses, insides, ends: speed, acceleration and jerk of the sheet are bounded."""
+    desk, _ = fresh(name)
+    here = np.array([0.0, 0.0, 0.1])
+    for place, steps, way in moves:
+        there = np.array(place)
+        for step in range(1, steps + 1):
+            finger = there if way == "leap" else here + (there - here) * step / steps
+            rate = (there - here) / (steps * STEP_S)
+            if way == "lost":
+                desk.lose()
+            else:
+                desk.see(finger, 8.0 * np.sign(rate) if way == "wild" else 0.1 * rate)
+        here = there
+    desk.assert_bounded()
+    for planned in desk.seen:
+        shown = planned.presentation
+        assert np.isfinite(shown.twist).all()
+        assert shown.push_depth_m >= 0.0
+        assert angle_between(shown.contact.normal, FRONT) <= desk.tilt_rad + 1e-6
+        if shown.phase == "hold":
+            assert shown.reason
+            assert (shown.twist == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "finger"),
+    [
+        ("cylinder", (0.01, 0.0, 0.0)),
+        ("sphere", (0.0, 0.0, 0.0)),
+        ("ellipsoid", (0.0, 0.0, 0.0)),
+        ("ellipsoid", (0.002, 0.0, 0.001)),
+        ("box", (0.02, 0.0, 0.0)),
+    ],
+)
+def test_a_finger_inside_on_no_side_is_held_and_not_met(
+    name: str, finger: tuple[float, float, float]
+) -> None:
+    """On an axis, a centre, a medial plane: nothing is presented until the finger comes out."""
+    desk, shape = fresh(name)
+    home = desk.plan.motion.world_from_sheet
+    held = desk.rest(np.array(finger), 20)
+    assert held.presentation.phase == "hold"
+    assert held.presentation.reason == encounter.NO_SIDE
+    assert held.motion.world_from_sheet == pytest.approx(home, abs=1e-12)
+    front = shape.closest(np.array([0.0, 0.0, 0.2]))
+    out = touch(desk, front.point, front.normal)
+    assert out.presentation.phase == "contact"
+    desk.assert_bounded()
+
+
+def test_pushed_to_the_middle_the_side_is_kept_for_every_shape() -> None:
+    """Where all sides are as near the sheet stays the one that is touched, trembling or not."""
+    noise = np.random.default_rng(2)
+    for name in ("cylinder", "sphere", "ellipsoid", "plane", "box", "meshed", "lobes"):
+        desk, shape = fresh(name)
+        front = shape.closest(np.array([0.0, 0.0, 0.2]))
+        before = touch(desk, front.point, front.normal)
+        assert before.presentation.phase == "contact"
+        deepest = min(0.05, front.point[2])
+        for depth in np.linspace(0.001, deepest, 150):
+            trembling = noise.normal(0.0, 1e-4, 3)
+            after = desk.see(front.point - depth * front.normal + trembling)
+            if after.presentation.phase != "contact":
+                # A mesh's saddle is an edge deep below it; the sheet then waits where it is.
+                assert after.presentation.phase == "hold"
+        assert angle_between(after.motion.world_from_sheet[:3, 2], front.normal) < 0.06
+        desk.assert_bounded()
+
+
+def test_between_two_lobes_the_nearer_is_presented_and_the_other_only_once_it_must_be() -> None:
+    desk, _ = fresh("lobes")
+    over = np.array([0.0, 0.0, 0.06])
+    ways = np.concatenate([np.linspace(0.03, -0.03, 240), np.linspace(-0.03, 0.03, 240)])
+    sides = []
+    for y in ways:
+        planned = desk.see(over + np.array([0.0, y, 0.0]), np.array([0.0, -0.25, 0.0]))
+        assert planned.presentation.phase == "approach"
+        sides.append(planned.presentation.contact.point[1] > 0.0)
+    changes = np.flatnonzero(np.diff(sides))
+    # Once each way, and late rather than early: no to and fro at the middle.
+    assert len(changes) == 2
+    assert ways[changes[0]] <= 0.001
+    assert ways[changes[1] + 1] >= -0.001
+    still = [desk.see(over + 1e-5 * np.array([0.0, (-1.0) ** i, 0.0])) for i in range(60)]
+    assert len({one.presentation.contact.point[1] > 0.0 for one in still}) == 1
+    desk.assert_bounded()
+
+
+def test_at_a_meshs_sharp_edge_the_sheet_holds_until_the_finger_is_back() -> None:
+    desk, _ = fresh("cube")
+    start, depth = np.array([0.0, 0.02, 0.04]), np.array([0.0, 0.0, -0.001])
+    touch(desk, start, FRONT)
+    way = eased_path([start + depth, np.array([0.0, 0.044, 0.038])], 90)
+    for finger in way:
+        out = desk.see(finger)
+        if out.presentation.phase == "hold":
+            break
+    assert out.presentation.reason == encounter.PAST_EDGE
+    held = desk.rest(finger, 60)
+    assert held.presentation.reason == encounter.PAST_EDGE
+    assert held.motion.twist_world == pytest.approx(np.zeros(6), abs=1e-9)
+    back = desk.rest(start + depth, 120)
+    assert back.presentation.phase == "contact"
+    assert back.motion.world_from_sheet[:3, 2] == pytest.approx(FRONT, abs=1e-6)
+    desk.assert_bounded()
+
+
+def test_over_an_edge_the_sheet_is_presented_but_no_touch_begins() -> None:
+    met = shown_to(make_shape(SOLIDS["cylinder"]), np.array([0.07, 0.0, RADIUS - 0.0005]))
+    assert met.phase == "approach"
+    assert met.reason == encounter.PAST_EDGE
+
+
+def test_a_hollow_is_said_and_the_sheet_rests_on_its_rim() -> None:
+    """The rim of z = r^2 / 2R stands r^2 / 2R over the bottom; it counts in full to 24 mm."""
+    desk, shape = fresh("bowl")
+    bottom = shape.closest(np.array([0.0, 0.0, 0.02]))
+    waiting = desk.rest(np.array([0.0, 0.0, 0.04]), 200)
+    assert waiting.presentation.reason == encounter.HOLLOW
+    stands = desk.object_from_sheet(waiting)[2, 3] - bottom.point[2]
+    assert stands == pytest.approx(0.024**2 / 0.12, abs=3e-4)
+    # Over the rim, where the block falls away to the sides, it is tangent to what is touched.
+    touched = desk.rest(np.array([0.0, 0.0, stands - 0.001]), 60)
+    assert touched.presentation.phase == "contact"
+    assert touched.presentation.push_depth_m == pytest.approx(0.001, abs=3e-4)
+    desk.follow(eased_path([np.array([0, 0, stands - 0.001]), np.array([0, 0.03, 0.0065])], 120))
+    lifts = [planned.presentation.contact.lift_m for planned in desk.seen]
+    assert np.abs(np.diff(lifts)).max() < 4e-4
+    desk.assert_bounded()
+
+
+@pytest.mark.parametrize(
+    ("name", "axis", "words"), [("plane", 0, "width"), ("plane", 1, "height"), ("box", 0, "width")]
+)
+def test_out_of_sheet_it_holds_and_is_met_at_its_middle_again_after_a_lift(
+    name: str, axis: int, words: str
+) -> None:
+    """The finger goes to the end of the sheet, lifts, and comes again elsewhere."""
+    desk, shape = fresh(name)
+    most = (0.09, 0.09)[axis]
+    begin, along = np.zeros(3), np.zeros(3)
+    # A sheet held ready stays over the object's middle along x: met off it, its end is near.
+    along[axis], begin[1 - axis] = 1.0, 0.0
+    start = shape.closest(begin + 0.2 * FRONT)
+    first = touch(desk, start.point, start.normal)
+    pose = desk.object_from_sheet(first)
+    # Shifted by hand, as if it had been rolled so far: most of it is used up.
+    met = desk.plan._encounter
+    shifted = met.contact.on_sheet.copy()
+    shifted[axis] = most - 0.01
+    met.contact = replace(met.contact, on_sheet=shifted)
+    desk.rest(start.point - 0.001 * start.normal, 200)
+    end = start.point + 0.03 * along - 0.001 * start.normal
+    out = desk.follow(eased_path([start.point - 0.001 * start.normal, end], 120))
+    assert phases(out)[-1] == "hold"
+    assert words in out[-1].presentation.reason
+    assert abs(out[-1].presentation.contact.on_sheet[axis]) <= most
+    lifted = desk.rest(end + 0.03 * start.normal, 200)
+    assert lifted.presentation.phase == "approach"
+    again = touch(desk, start.point, start.normal)
+    assert again.presentation.phase == "contact"
+    assert desk.object_from_sheet(again) == pytest.approx(pose, abs=1e-5)
+    desk.assert_bounded()
+
+
+def test_released_and_met_elsewhere_the_sheet_goes_there_at_once_and_smoothly() -> None:
+    for name in ("sphere", "ellipsoid", "box", "meshed"):
+        desk, shape = fresh(name)
+        one, other = (
+            shape.closest(np.array([x, y, 0.2])) for x, y in ((-0.01, 0.06), (0.015, -0.06))
+        )
+        assert touch(desk, one.point, one.normal).presentation.phase == "contact"
+        away = eased_path([one.point, one.point + 0.03 * one.normal, other.point], 40)
+        flown = desk.follow(away + 0.01 * FRONT)
+        assert "approach" in phases(flown)
+        again = touch(desk, other.point, other.normal)
+        assert again.presentation.phase == "contact"
+        assert desk.object_from_sheet(again)[:3, 2] == pytest.approx(other.normal, abs=1e-3)
+        assert again.contact_sheet_m[1] == pytest.approx(0.0, abs=1e-3)
+        desk.assert_bounded()
+
+
+@pytest.mark.parametrize(
+    ("finger", "velocity"),
+    [
+        ((math.nan, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((0.0, math.inf, 0.0), (0.0, 0.0, 0.0)),
+        ((1e9, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        ((0.0, 0.0, 0.05), (math.nan, 0.0, 0.0)),
+        ((0.0, 0.0, 0.05), (0.0, -math.inf, 0.0)),
+        ((0.0, 0.0, 0.05), (1e300, 0.0, 0.0)),
+    ],
+)
+@pytest.mark.parametrize("touching", [False, True])
+def test_a_finger_that_is_none_is_held(
+    finger: tuple[float, ...], velocity: tuple[float, ...], touching: bool
+) -> None:
+    desk, _ = fresh("sphere")
+    if touching:
+        desk.rest(np.array([0.0, 0.0, 0.049]), 60)
+    before = desk.plan.motion.world_from_sheet
+    with np.errstate(all="ignore"):
+        held = desk.see(np.array(finger), np.array(velocity))
+    assert held.presentation.phase == "hold"
+    assert held.presentation.reason == encounter.NOWHERE
+    assert held.motion.world_from_sheet == pytest.approx(before, abs=1e-3)
+    after = desk.rest(np.array([0.0, 0.0, 0.049]), 60)
+    assert after.presentation.phase == "contact"
+    desk.assert_bounded()
+
+
+@pytest.mark.parametrize(
+    ("geometry", "words"),
+    [
+        ({"shape": "cylinder", "radius_m": 0.0, "length_m": 0.1}, "radius_m"),
+        ({"shape": "sphere", "radius_m": -0.01}, "radius_m"),
+        ({"shape": "sphere", "radius_m": math.nan}, "radius_m"),
+        ({"shape": "plane", "width_m": math.inf, "height_m": 0.1}, "width_m"),
+        ({"shape": "ellipsoid", "semi_axes_m": (0.03, 0.0, 0.02)}, "semi_axes_m"),
+        ({"shape": "rounded_box", "size_m": (0.1, 0.1, 0.1), "edge_radius_m": 0.06}, "edge_radius"),
+        (
+            {
+                "shape": "mesh",
+                "vertices_m": np.zeros((0, 3)),
+                "triangles": np.zeros((0, 3), dtype=np.int64),
+                "smoothing_m": 0.003,
+            },
+            "bounds no solid",
+        ),
+    ],
+)
+def test_a_shape_that_is_none_is_refused_with_the_measure(
+    geometry: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ValueError, match=words):
+        make_shape(geometry)
+
+
+def test_an_inverted_mesh_is_refused() -> None:
+    vertices, triangles = ellipsoid_mesh(2)
+    with pytest.raises(MeshError, match="inside out"):
+        SmoothMeshShape(vertices, triangles[:, ::-1], 0.01)
+
+
+@pytest.mark.parametrize("turn_rad", [math.pi, 1.5])
+def test_an_object_that_turns_no_side_to_the_user_is_refused(turn_rad: float) -> None:
+    with pytest.raises(UnpresentableError, match=r"leans .* turn it by object.world_from_object"):
+        Desk(scene_with(SOLIDS["plane"], rpy_rad=(turn_rad, 0.0, 0.0)))
+
+
+def test_a_tilt_beyond_a_right_angle_is_cut() -> None:
+    """Two normals that both may be presented are never opposite."""
+    shape = make_shape(SOLIDS["sphere"])
+    for lean in (1.3, -1.3):
+        met = shown_to(shape, 0.08 * np.array([0.0, math.sin(2 * lean), -0.9]), tilt_rad=3.0)
+        assert angle_between(met.contact.normal, FRONT) <= encounter.STEEPEST_RAD + 1e-9
+        assert np.isfinite(met.contact.object_from_sheet).all()
+
+
+# Stroking and pushing together
+
+
+def sheet_way_m(planned: list[Planned]) -> float:
+    """How far the contact has gone on the sheet, step by step."""
+    places = np.array([one.presentation.contact.on_sheet for one in planned])
+    return float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+
+
+def object_way_m(planned: list[Planned]) -> float:
+    """How far it has gone on the object."""
+    points = np.array([one.presentation.contact.point for one in planned])
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+@pytest.mark.parametrize("name", ["cylinder", "sphere", "ellipsoid", "box", "meshed"])
+@pytest.mark.parametrize("deepest_share", [0.1, 0.4, 0.8])
+def test_stroking_while_pushing_neither_steps_nor_slips(name: str, deepest_share: float) -> None:
+    """A finger that strokes to and fro and pushes in and out at once, to a share of the radius."""
+    desk, shape = fresh(name)
+    front = shape.closest(np.array([0.0, 0.0, 0.2]))
+    thick = front.point[2]
+    touch(desk, front.point, front.normal)
+    times = STEP_S * np.arange(600)
+    across = 0.008 * np.sin(2.0 * np.pi * 0.2 * times)
+    depth = 0.001 + (deepest_share * thick - 0.001) * np.sin(np.pi * 0.3 * times) ** 2
+    fingers = np.column_stack([0.3 * across, across, thick - depth])
+    # Over a round object the surface falls away from the front: depth counts from there.
+    sag = thick - shape.closest(fingers * [1, 1, 0] + [0.0, 0.0, thick]).point[:, 2]
+    fingers[:, 2] -= sag
+    sent = desk.follow(fingers)
+    assert set(phases(sent)) == {"contact"}, reasons(sent)
+    # No slip: what the contact goes on the object it goes on the sheet.
+    assert sheet_way_m(sent) == pytest.approx(object_way_m(sent), rel=2e-3, abs=2e-5)
+    # No step: the contact moves by no more than a small multiple of what the finger moves.
+    points = np.array([one.presentation.contact.point for one in sent])
+    moved_m = np.linalg.norm(np.diff(fingers, axis=0), axis=1)
+    assert (np.linalg.norm(np.diff(points, axis=0), axis=1) <= 8.0 * moved_m + 1e-5).all()
+    desk.assert_bounded()
+    # Back where it began, the sheet is where it was: pushing has not shifted it.
+    back = desk.rest(front.point - 0.001 * front.normal, 120)
+    assert desk.object_from_sheet(back)[:3, 2] == pytest.approx(front.normal, abs=2e-3)

@@ -111,6 +111,7 @@ class Encounter:
         self.contact = tangent(home, first, reach.half_width_m)
         self._touching = False
         self._finger = np.zeros(3)
+        self._foot = first.point
 
     def step(self, finger: Floats, velocity: Floats, object_from_sheet: Floats) -> Presentation:
         """What to present to a finger (3,) m that moves with `velocity` (3,) m/s.
@@ -123,7 +124,8 @@ class Encounter:
             self._touching = False
         if self._touching:
             return self._roll(finger, velocity)
-        found = self._shape.closest(finger, previous=self.contact.point)
+        found = self._shape.closest(finger, previous=self._foot)
+        self._foot = found.point
         if found.height_m < 0.0 and (found.undecided or self._too_deep(found)):
             return self._hold(NO_SIDE, float(-found.height_m))
         rate = _foot_rate(found, velocity)
@@ -161,7 +163,8 @@ class Encounter:
         moved, self._finger = finger - self._finger, finger
         if depth > self._reach.deepest_m:
             return self._hold(THROUGH, depth)
-        found = self._shape.closest(finger, previous=contact.point)
+        found = self._shape.closest(finger, previous=self._foot)
+        self._foot = found.point
         if found.on_edge:
             return self._hold(PAST_EDGE, depth)
         found, rate = self._carried(found, moved, velocity, depth)
@@ -174,6 +177,8 @@ class Encounter:
         self.contact = self._lifted(there)
         if past or limited:
             return self._hold(past or BEYOND_TILT, depth)
+        # Deep inside, where nearest means little, the side is kept that the sheet is on.
+        self._foot = self.contact.point
         twist = rolling_twist(self.contact, rate)
         return Presentation("contact", self._hollow(), self.contact, twist, depth)
 

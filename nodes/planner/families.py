@@ -1,22 +1,35 @@
-"""Ways to a mesh's normal as a method family: how long a query takes, how far off the normal is.
+"""Method families of the planner: ways to a mesh's normal, and ways to roll.
 
-Judged on an ellipsoid of a liver's size whose normals are known, meshed at several densities.  The
-tolerance is the tilt that moves the end of the sheet's usable height by the scene's tolerance of
-the sheet's position.
+Mesh normals: how long a query takes, how far off the normal is.  Judged on an ellipsoid of a
+liver's size whose normals are known, meshed at several densities.  The tolerance is the tilt that
+moves the end of the sheet's usable height by the scene's tolerance of the sheet's position.
+
+Rolling: how long a step takes, and how far the sheet is from where it should be after a stroke over
+the object: at the corners of its usable part, against rolling in steps a fiftieth as long.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene
 from nodes.methods import Case, Family, Trial
-from nodes.models.shapes import EllipsoidShape, SmoothMeshShape
+from nodes.models.rigid import apply
+from nodes.models.shapes import (
+    CylinderShape,
+    EllipsoidShape,
+    Shape,
+    SmoothMeshShape,
+    SphereShape,
+    tightest_curvature,
+)
 from nodes.models.shapes.smooth_mesh import usual_smoothing_m
 from nodes.models.shapes.triangles import Facets, half_edges, triangle_normals, vertex_normals
+from nodes.planner.rolling import Contact, rolled, tangent, turned
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -134,4 +147,141 @@ MESH_NORMAL = Family(
     tolerance=lambda scene: float(
         np.degrees(scene.tolerances.sheet_position_m / scene.sheet.usable_half_height_m)
     ),
+)
+
+
+RollStep = Callable[[Shape, Contact, Floats], Contact]
+"""A shape, the contact before and a finger (3,) to the contact after."""
+
+ROLLED_SHAPES: dict[str, Callable[[], Shape]] = {
+    "cylinder": lambda: CylinderShape(0.0353553, 0.12),
+    "sphere": lambda: SphereShape(0.05),
+    "ellipsoid": lambda: EllipsoidShape((0.06, 0.04, 0.05)),
+    "mesh": lambda: SmoothMeshShape(*ellipsoid_mesh(4), 0.0035),
+}
+STROKE_M, STROKE_DEPTH_M = 0.02, 0.001
+ROLL_HZ, FINER = 60.0, 50
+WIDE_M = 1.0
+FRONT = np.array([0.0, 0.0, 1.0])
+HEADING = np.array([0.6, 0.8, 0.0])
+
+
+def roll_as_a_cylinder(shape: Shape, before: Contact, finger: Floats) -> Contact:
+    """The paper's own: the angle about an axis along x says all (its Fig. 7b).
+
+    The radius is that of the tightest bend where the sheet is.
+    """
+    radius = 1.0 / tightest_curvature(before.shape_operator)
+    centre = before.point - radius * before.normal
+    angle = np.arctan2(finger[1] - centre[1], finger[2] - centre[2])
+    begun = np.arctan2(before.normal[1], before.normal[2])
+    normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+    axes = np.column_stack([[1.0, 0.0, 0.0], [0.0, normal[2], -normal[1]], normal])
+    point = np.array([finger[0], *(centre + radius * normal)[1:]])
+    way = np.array([point[0] - before.point[0], radius * (angle - begun)])
+    return Contact(point, normal, before.shape_operator, axes, before.on_sheet + way)
+
+
+def roll_not_at_all(shape: Shape, before: Contact, finger: Floats) -> Contact:
+    """Tangent at the nearest point, always by the sheet's middle: as it is held ready."""
+    return tangent(np.eye(3), shape.closest(finger, previous=before.point), WIDE_M)
+
+
+def roll_by_chords(shape: Shape, before: Contact, finger: Floats) -> Contact:
+    """Parallel transport of the axes, but the way on the sheet is the chord, seen from before."""
+    found = shape.closest(finger, previous=before.point)
+    axes = turned(before.axes, found.normal)
+    way = (found.point - before.point) @ before.axes[:, :2]
+    return Contact(found.point, found.normal, found.shape_operator, axes, before.on_sheet + way)
+
+
+def roll(shape: Shape, before: Contact, finger: Floats) -> Contact:
+    """The planner's own, see `rolling.rolled`."""
+    return rolled(before, shape.closest(finger, previous=before.point))
+
+
+ROLLS: dict[str, RollStep] = {
+    "as_a_cylinder": roll_as_a_cylinder,
+    "projection": roll_not_at_all,
+    "chords": roll_by_chords,
+    "transport": roll,
+}
+
+
+def stroke_on(shape: Shape, step_m: float) -> Floats:
+    """Fingers (n, 3) along a straightest way from the front, to and beside the sheet's axes."""
+    found = shape.closest(10.0 * FRONT)
+    heading, fingers = HEADING, [found.point - STROKE_DEPTH_M * found.normal]
+    for _ in range(round(STROKE_M / step_m)):
+        heading = heading - found.normal * (found.normal @ heading)
+        heading = heading / np.linalg.norm(heading)
+        found = shape.closest(found.point + step_m * heading, previous=found.point)
+        fingers.append(found.point - STROKE_DEPTH_M * found.normal)
+    return np.array(fingers)
+
+
+def rolled_along(step: RollStep, shape: Shape, fingers: Floats) -> Contact:
+    """The contact at the end of a stroke."""
+    contact = tangent(np.eye(3), shape.closest(fingers[0]), WIDE_M)
+    for finger in fingers[1:]:
+        contact = step(shape, contact, finger)
+    return contact
+
+
+def rolling_trials(scene: Scene) -> Iterator[Trial]:
+    """Every way on every shape, at the scene's speed and at half of it."""
+    half = np.array([0.5 * scene.sheet.width_m, scene.sheet.usable_half_height_m])
+    corners = np.array([[x * half[0], y * half[1], 0.0] for x in (-1, 1) for y in (-1, 1)])
+    finest_m = scene.working_range.speed_m_per_s / ROLL_HZ / FINER
+    for name, make in ROLLED_SHAPES.items():
+        shape = make()
+        finest = stroke_on(shape, finest_m)
+        for share in (0.5, 1.0):
+            every = round(share * FINER)
+            fingers = finest[::every]
+            true = rolled_along(roll, shape, finest[: (len(fingers) - 1) * every + 1])
+            speed = share * scene.working_range.speed_m_per_s
+            for method, step in ROLLS.items():
+                yield _roll_trial(
+                    method,
+                    shape,
+                    fingers,
+                    case={"shape": name, "speed_mm_per_s": 1e3 * speed},
+                    true=true,
+                    corners=corners,
+                    # A projection forgets where on the sheet the finger is.
+                    in_range=step in (roll, roll_by_chords)
+                    or (step is roll_as_a_cylinder and name == "cylinder"),
+                )
+
+
+def _roll_trial(
+    method: str,
+    shape: Shape,
+    fingers: Floats,
+    *,
+    case: Case,
+    true: Contact,
+    corners: Floats,
+    in_range: bool,
+) -> Trial:
+    """Timed is one step, judged is the whole stroke."""
+    step = ROLLS[method]
+    begun = tangent(np.eye(3), shape.closest(fingers[0]), WIDE_M)
+    wanted = apply(true.object_from_sheet, corners)
+
+    def error_mm(_: Contact) -> float:
+        reached = rolled_along(step, shape, fingers).object_from_sheet
+        return float(1e3 * np.linalg.norm(apply(reached, corners) - wanted, axis=1).max())
+
+    return Trial(method, case, partial(step, shape, begun, fingers[1]), error_mm, in_range)
+
+
+ROLLING = Family(
+    name="rolling",
+    unit="mm",
+    reference="rolling in steps a fiftieth as long, at the usable sheet's corners after 20 mm",
+    methods=tuple(ROLLS),
+    trials=rolling_trials,
+    tolerance=lambda scene: 1e3 * scene.tolerances.sheet_position_m,
 )

@@ -20,9 +20,8 @@ from nodes.models.shapes import Nearest, Shape
 
 Floats = NDArray[np.float64]
 
-SEARCH_PARTS = 8
-SEARCH_ROUNDS = 3
-"""The last place within the tilt is found to 1/512 of the way."""
+FINEST = 1.0 / 512.0
+"""Share of the way to which the last place within the tilt is found."""
 
 RIM_RADIUS_M = 0.03
 """So far around it is looked whether the object rises above its own tangent plane."""
@@ -156,21 +155,22 @@ def within_tilt(
 ) -> tuple[Nearest, bool]:
     """The last point towards `found` whose normal is within the tilt, and whether it is another.
 
-    start: surface point to come from, itself within the tilt.  The way is looked at along the
-    straight line from there, point by point, so that the side is kept on which the sheet is.
+    start: surface point to come from, itself within the tilt.  The way is felt along the straight
+    line from there, in steps that grow, so that the side is kept on which the sheet is; a sheet
+    that is at the tilt already learns so from the first.
     """
     most = np.cos(tilt_rad)
     if found.normal @ front >= most:
         return found, False
-    begin, step = 0.0, 1.0
+    reached, step = 0.0, FINEST
     best, way = start, found.point - start.point
-    for _ in range(SEARCH_ROUNDS):
-        step /= SEARCH_PARTS
-        for _ in range(SEARCH_PARTS - 1):
-            there = shape.closest(start.point + (begin + step) * way, previous=best.point)
-            if not there.normal @ front >= most:
-                break
-            best, begin = there, begin + step
+    while step >= FINEST:
+        there = shape.closest(start.point + (reached + step) * way, previous=start.point)
+        if there.normal @ front >= most:
+            best, reached = there, reached + step
+            step = min(2.0 * step, 1.0 - reached)
+        else:
+            step *= 0.25
     return best, True
 
 

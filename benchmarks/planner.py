@@ -1,0 +1,218 @@
+"""How long one step of the planner takes, for every shape, and how fast a finger it follows.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.planner [MESH METRES_PER_UNIT]
+
+A finger hovers, touches, strokes while it pushes, lifts, and goes on behind the object, where the
+sheet holds.  Each step of `Plan.follow_finger` is timed, easing and all, the best of some repeats
+of the same path (what else the machine does is no part of it), by phase; beside it the share of a
+tenth of the arms' 7.1 ms cycle.  Then, for strokes of rising speed along the object's tightest
+bends, the fastest at which the sheet's normal stays within half a degree.  Under three minutes.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.meshes import read_mesh
+from launch.plan import load_scene
+from messages.scene import Mesh, Pose, Scene
+from messages.types import SoftBody
+from nodes.models.rigid import angle_between
+from nodes.models.shapes import Shape, make_shape
+from nodes.planner.families import ellipsoid_mesh
+from nodes.planner.motion import Plan, Planned
+from nodes.planner.parameters import PlannerParameters
+from nodes.planner.sheet_force import law_for
+from nodes.planner.yielding import Yielding
+
+Floats = NDArray[np.float64]
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+CYCLE_S = 7.1e-3
+STEP_S = 1.0 / 60.0
+REPEATS = 7
+PHASES = ("approach", "contact", "hold")
+SPEEDS_M_PER_S = np.geomspace(0.004, 0.2, 24)
+WAY_M = 0.016
+GOOD_DEG = 0.5
+FRONT = np.array([0.0, 0.0, 1.0])
+
+
+def geometries() -> dict[str, Mapping[str, Any]]:
+    """By name; the mesh is of an ellipsoid unless one is given."""
+    named: dict[str, Mapping[str, Any]] = {
+        "cylinder": {"shape": "cylinder", "radius_m": 0.0353553, "length_m": 0.12},
+        "sphere": {"shape": "sphere", "radius_m": 0.05},
+        "ellipsoid": {"shape": "ellipsoid", "semi_axes_m": (0.06, 0.04, 0.05)},
+        "plane": {"shape": "plane", "width_m": 0.2, "height_m": 0.16},
+        "rounded box": {
+            "shape": "rounded_box",
+            "size_m": (0.1, 0.08, 0.06),
+            "edge_radius_m": 0.02,
+        },
+    }
+    vertices, triangles = ellipsoid_mesh(4)
+    named["ellipsoid's mesh"] = dict(
+        Mesh(
+            vertices_m=vertices,
+            triangles=triangles.astype(np.int32),
+            smoothing_m=0.0035,
+            origin="benchmark",
+        )
+    )
+    if len(sys.argv) == 3:
+        named[Path(sys.argv[1]).stem] = dict(read_mesh(Path(sys.argv[1]), float(sys.argv[2]), None))
+    return named
+
+
+def plan_about(scene: Scene, geometry: Mapping[str, Any]) -> Plan:
+    """As the planner makes it of its own parameters, the object in the world's frame."""
+    here = Pose(position_m=np.zeros(3), rpy_rad=np.zeros(3))
+    body = scene.object.model_validate(
+        {**dict(scene.object), "geometry": dict(geometry), "world_from_object": here}
+    )
+    return Plan(scene.model_copy(update={"object": body}), PlannerParameters().settings())
+
+
+def yielding_in(scene: Scene) -> Yielding:
+    """For an object that answers with 60 N/m, and 30 % more for each 10 mm."""
+    depths = np.linspace(0.0, scene.working_range.push_depth_m, 20)
+    told = SoftBody(
+        mesh_id="benchmark",
+        method="benchmark",
+        in_range=True,
+        push_depth_m=0.0,
+        force_world_n=np.zeros(3),
+        stiffness_n_per_m=60.0,
+        force_curve=np.column_stack([depths, 60.0 * depths * (1.0 + 30.0 * depths)]),
+        displacement_world_m=np.zeros((0, 3), dtype=np.float32),
+    )
+    yielding = Yielding(scene, law_for(scene.sheet), "curve")
+    yielding.take(told, touching=False)
+    return yielding
+
+
+def anew(plan: Plan) -> Plan:
+    """The same plan with nothing done yet: a mesh's takes a second to make."""
+    other = copy.copy(plan)
+    other._encounter = copy.copy(plan._encounter)  # it changes by assignment only
+    return other
+
+
+def straightest(shape: Shape, heading: Floats, step_m: float, steps: int) -> tuple[Floats, Floats]:
+    """Points and normals (n, 3) along a straightest way from the front."""
+    found = shape.closest(10.0 * FRONT)
+    way = [(found.point, found.normal)]
+    for _ in range(steps):
+        heading = heading - found.normal * (found.normal @ heading)
+        heading = heading / np.linalg.norm(heading)
+        found = shape.closest(found.point + step_m * heading, previous=found.point)
+        way.append((found.point, found.normal))
+    points, normals = (np.array(part) for part in zip(*way, strict=True))
+    return points, normals
+
+
+def session(shape: Shape) -> Floats:
+    """Fingers (n, 3): hover, touch, stroke to and fro while pushing, lift, go behind."""
+    points, normals = straightest(shape, np.array([0.5, 0.8, 0.1]), 3e-4, 60)
+    down = np.linspace(0.04, -0.001, 80)[:, None]
+    there = np.concatenate([points, points[::-1]])
+    out = np.concatenate([normals, normals[::-1]])
+    depth = 0.003 + 0.002 * np.sin(np.linspace(0.0, 12.0, len(there)))
+    behind = np.column_stack(
+        [np.zeros(60), np.linspace(0.0, 0.16, 60), np.linspace(points[0, 2] + 0.04, -0.16, 60)]
+    )
+    touch = points[0] + down * normals[0]
+    return np.concatenate([touch, there - depth[:, None] * out, touch[::-1], behind])
+
+
+def follow(plan: Plan, fingers: Floats, yielding: Yielding) -> Iterator[tuple[float, Planned]]:
+    """Each step's time (s) and outcome."""
+    velocities = np.gradient(fingers, STEP_S, axis=0)
+    for finger, velocity in zip(fingers, velocities, strict=True):
+        start = time.perf_counter()
+        planned = plan.follow_finger(finger, velocity, yielding, STEP_S)
+        yield time.perf_counter() - start, planned
+
+
+def time_steps(name: str, plan: Plan, shape: Shape, yielding: Yielding) -> None:
+    fingers = session(shape)
+    times = np.full(len(fingers), np.inf)
+    for _ in range(REPEATS):
+        steps = list(follow(anew(plan), fingers, yielding))
+        times = np.minimum(times, [took for took, _ in steps])
+    phases = np.array([planned.presentation.phase for _, planned in steps])
+    cells = []
+    for phase in PHASES:
+        some = 1e3 * times[phases == phase]
+        cells.append(f"{np.median(some):.2f} / {np.quantile(some, 0.99):.2f}" if len(some) else "–")
+    p99 = float(np.quantile(times, 0.99))
+    print(f"| {name} | {' | '.join(cells)} | {1e3 * p99:.2f} | {p99 / (0.1 * CYCLE_S):.0%} |")
+
+
+def normal_error_deg(
+    plan: Plan, shape: Shape, heading: Floats, speed: float, yielding: Yielding
+) -> float:
+    """The largest along a stroke of `WAY_M` at that speed, sped up and slowed over its ends."""
+    step_m = 2e-4
+    points, normals = straightest(shape, heading, step_m, round(WAY_M / step_m))
+    count = max(8, round(1.875 * WAY_M / speed / STEP_S))
+    share = np.linspace(0.0, 1.0, count)
+    smooth = share**3 * (10.0 - 15.0 * share + 6.0 * share**2)
+    place = smooth * (len(points) - 1)
+    surface = points - 0.001 * normals
+    fingers = np.column_stack(
+        [np.interp(place, np.arange(len(points)), axis) for axis in surface.T]
+    )
+    still = np.repeat(fingers[:1], 90, axis=0)
+    above = still + 0.02 * normals[0]
+    steps = list(follow(anew(plan), np.concatenate([above, still, fingers]), yielding))
+    found = shape.closest(fingers, previous=np.repeat(points[:1], count, axis=0))
+    return float(
+        np.degrees(
+            max(
+                angle_between(planned.motion.world_from_sheet[:3, 2], normal)
+                for (_, planned), normal in zip(steps[180:], found.normal, strict=True)
+            )
+        )
+    )
+
+
+def main() -> None:
+    scene = load_scene(SCENE_FILE)
+    yielding = yielding_in(scene)
+    shapes = {
+        name: (plan_about(scene, geometry), make_shape(geometry))
+        for name, geometry in geometries().items()
+    }
+    print("One step, p50 / p99 in ms\n")
+    print(f"| shape | {' | '.join(PHASES)} | p99 of all | of a tenth of the arms' cycle |")
+    print("|" + "---|" * (len(PHASES) + 3))
+    for name, (plan, shape) in shapes.items():
+        time_steps(name, plan, shape, yielding)
+    print("\nStrokes of 16 mm: peak speed to which the normal is within 0.5°\n")
+    print("| shape | around, mm/s | along, mm/s |")
+    print("|---|---|---|")
+    for name, (plan, shape) in shapes.items():
+        cells = []
+        for heading in (np.array([0.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])):
+            good = 0.0
+            for speed in SPEEDS_M_PER_S:
+                if normal_error_deg(plan, shape, heading, speed, yielding) > GOOD_DEG:
+                    break
+                good = float(speed)
+            most = "≥ " if good == SPEEDS_M_PER_S[-1] else ""
+            cells.append(f"{most}{1e3 * good:.0f}")
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
