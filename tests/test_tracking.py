@@ -150,15 +150,17 @@ def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
     generator = np.random.default_rng(5)
     tremor = filter_.tremor or Tremor(filter_.unfollowed_m)
     dt, squares = 1.0 / 60.0, []
-    # Truth: acceleration as a decaying random walk, and tremor as the damped swing.
+    # Truth: acceleration as a decaying random walk, and tremor as damped swings.
     velocity, acceleration, place = np.zeros(3), np.zeros(3), np.zeros(3)
-    swing = generator.standard_normal((2, 3)) * np.sqrt(np.diag(tremor.stationary))[:, None]
+    swing = (
+        generator.standard_normal((tremor.size, 3)) * np.sqrt(np.diag(tremor.stationary))[:, None]
+    )
     carry = tremor.transition(dt)
     kick = np.linalg.cholesky(tremor.stationary - carry @ tremor.stationary @ carry.T)
     estimate: Estimate | None = None
     for frame in range(3000):
         at_ns = round(frame * dt * 1e9)
-        truth = place + swing[0]
+        truth = place + swing[::2].sum(axis=0)
         seen = truth + np.sqrt(np.diag(NOISE)) * generator.standard_normal(3)
         estimate = (
             filter_.started(at_ns, seen, NOISE)
@@ -173,7 +175,7 @@ def test_errors_are_as_large_as_the_filter_thinks(name: str) -> None:
         velocity = velocity + dt * acceleration
         acceleration = acceleration * np.exp(-filter_.forgetting_per_s * dt)
         acceleration += filter_.noise * np.sqrt(dt) * generator.standard_normal(3)
-        swing = carry @ swing + kick @ generator.standard_normal((2, 3))
+        swing = carry @ swing + kick @ generator.standard_normal((tremor.size, 3))
     # Tremor that counts as white noise makes a filter more careful than it need be.
     assert (0.6 if filter_.tremor else 0.3) < np.mean(squares) < 1.4
 
@@ -191,7 +193,7 @@ def test_tremor_is_predicted_by_the_hand_and_not_the_wrong_way_by_the_others() -
         return float(np.sqrt(np.mean(np.square(errors))))
 
     left_out_m = 5e-5 / np.sqrt(2)
-    assert error_m("hand") < 0.9 * left_out_m
+    assert error_m("hand") < 0.75 * left_out_m
     assert left_out_m < error_m("constant_velocity") < 2.0 * left_out_m
 
 
@@ -212,10 +214,13 @@ def test_a_start_and_a_stop_are_followed_within_a_few_frames() -> None:
 
 def test_tremor_dies_out_when_nothing_keeps_it_up() -> None:
     tremor = Tremor(5e-5)
-    assert tremor.transition(0.0) == pytest.approx(np.eye(2))
+    assert tremor.transition(0.0) == pytest.approx(np.eye(tremor.size))
     twice = tremor.transition(0.02) @ tremor.transition(0.02)
     assert twice == pytest.approx(tremor.transition(0.04), abs=1e-9)
-    assert np.abs(tremor.transition(3.0)[0, 0]) < 1e-5
+    assert np.abs(tremor.transition(3.0)).max() < 0.05 * np.abs(tremor.transition(0.0167)).max()
+    leads_s = np.array([0.0, 0.013, 0.05])
+    for lead_s, row in zip(leads_s, tremor.displacements(leads_s), strict=True):
+        assert row == pytest.approx(tremor.transition(float(lead_s))[::2].sum(axis=0))
     for dt in (0.001, 0.0167, 0.3):
         carry = tremor.transition(dt)
         gained = tremor.stationary - carry @ tremor.stationary @ carry.T

@@ -21,7 +21,7 @@ class PlannerParameters(NodeParameters):
         "null: as long as fingertips take, and arrival_s",
     )
     arrival_s: NonNegative = Field(
-        default=0.038, description="from a fingertip's publication until the sheet gets there"
+        default=0.036, description="from a fingertip's publication until the sheet gets there"
     )
     presents: Presents = Field(
         default="curve",
@@ -43,11 +43,11 @@ class PlannerParameters(NodeParameters):
     speed_m_per_s: Positive = 0.18
     acceleration_m_per_s2: Positive = 2.0
     turn_rad_per_s: Positive = 2.0
-    turn_acceleration_rad_per_s2: Positive = 10.0
+    turn_acceleration_rad_per_s2: Positive = 12.0
     stretch_rate_per_s: Positive = 0.03
     stretch_acceleration_per_s2: Positive = 0.3
     jerk_m_per_s3: Positive = 60.0
-    turn_jerk_rad_per_s3: Positive = 300.0
+    turn_jerk_rad_per_s3: Positive = 1000.0
     stretch_jerk_per_s3: Positive = 9.0
 
     def settings(self) -> PlanSettings:

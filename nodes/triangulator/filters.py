@@ -156,36 +156,64 @@ def _with_unknown_velocity(position_covariance: Floats, max_speed: float) -> Flo
 
 @dataclass(frozen=True, slots=True)
 class Tremor:
-    """Physiological tremor as a damped swing that noise keeps up.
+    """Physiological tremor: noise in a band, as slightly damped swings side by side in it.
 
-    amplitude_m: standard deviation per axis.  Its spectrum has its peak at `frequency_hz`, and
-    2 damping frequency_hz of width at half power.
+    amplitude_m: standard deviation per axis, of all swings together.  A few swings that noise keeps
+    up stand for the band as the grid of frequencies does in the multiple Fourier linear combiner
+    (Veluvolu, Ang, Sensors 11, 2011), and are as good to predict.
     """
 
     amplitude_m: float
-    frequency_hz: float = 10.0
-    damping: float = 0.08
+    band_hz: tuple[float, float] = (8.0, 12.0)
+    swings: int = 4
+    damping: float = 0.02
+
+    @property
+    def size(self) -> int:
+        """Of its state per axis: position and velocity of each swing in turn."""
+        return 2 * self.swings
+
+    @property
+    def _natural(self) -> Floats:
+        """Natural frequencies (swings,) rad/s, in the middle of equal parts of the band."""
+        low, high = self.band_hz
+        shares = (np.arange(self.swings) + 0.5) / self.swings
+        return np.asarray(2.0 * np.pi * (low + shares * (high - low)))
 
     @property
     def stationary(self) -> Floats:
-        """Covariance (2, 2) of its position and velocity when nothing is known of it."""
-        variance = self.amplitude_m**2
-        return np.diag([variance, variance * (2.0 * np.pi * self.frequency_hz) ** 2])
+        """Covariance (size, size) of its state when nothing is known of it."""
+        variance = self.amplitude_m**2 / self.swings
+        return (
+            np.diag(np.stack([np.ones(self.swings), self._natural**2], axis=1).ravel()) * variance
+        )
 
     def transition(self, dt: float) -> Floats:
-        """(position, velocity) after dt, in closed form (2, 2)."""
-        natural = 2.0 * np.pi * self.frequency_hz
+        """From its state to that after dt, in closed form (size, size)."""
+        natural = self._natural
+        stays, sine, decay = self._swung(np.array([dt]))
+        positions, velocities = np.arange(0, self.size, 2), np.arange(1, self.size, 2)
+        result = np.zeros((self.size, self.size))
+        result[positions, positions] = stays[0]
+        result[positions, velocities] = sine[0]
+        result[velocities, positions] = -(natural**2) * sine[0]
+        result[velocities, velocities] = stays[0] - 2.0 * decay * sine[0]
+        return result
+
+    def displacements(self, leads_s: Floats) -> Floats:
+        """What each part of the state adds to the displacement after leads (n,): (n, size)."""
+        stays, sine, _ = self._swung(leads_s)
+        return np.stack([stays, sine], axis=2).reshape(len(leads_s), self.size)
+
+    def _swung(self, times_s: Floats) -> tuple[Floats, Floats, Floats]:
+        """After times (n,): shares of displacement and velocity that are left (n, swings), and the
+        rates (swings,) at which swings die out."""
+        natural = self._natural
         decay, swing = self.damping * natural, natural * np.sqrt(1.0 - self.damping**2)
-        cosine, sine = np.cos(swing * dt), np.sin(swing * dt) / swing
-        return np.asarray(
-            np.exp(-decay * dt)
-            * np.array(
-                [
-                    [cosine + decay * sine, sine],
-                    [-(natural**2) * sine, cosine - decay * sine],
-                ]
-            )
-        )
+        angles = times_s[:, None] * swing
+        left = np.exp(-times_s[:, None] * decay)
+        sine = left * np.sin(angles) / swing
+        return left * np.cos(angles) + decay * sine, sine, decay
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,8 +232,8 @@ class Kalman:
     unfollowed_m: standard deviation of a tremor that is not followed; it counts as noise of what is
         measured, and as part of how far the finger may be from the estimate.
 
-    The state is derivative by derivative, each (3,): position, velocity, (acceleration,) then the
-    tremor's displacement and velocity.
+    The state is derivative by derivative, each (3,): position, velocity, (acceleration,) then each
+    swing's displacement and velocity.
     """
 
     order: int
@@ -219,10 +247,9 @@ class Kalman:
     _observed: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        row = np.zeros((1, self.order + (2 if self.tremor else 0)))
+        row = np.zeros((1, self.order + (self.tremor.size if self.tremor else 0)))
         row[0, 0] = 1.0
-        if self.tremor:
-            row[0, self.order] = 1.0
+        row[0, self.order :: 2] = 1.0
         object.__setattr__(self, "_observed", np.kron(row, np.eye(3)))
 
     def started(self, at_ns: int, measured: Floats, covariance: Floats) -> Estimate:
@@ -234,7 +261,8 @@ class Kalman:
         if self.order == 3:
             full[6:9, 6:9] = np.eye(3) * (self.max_acceleration_m_per_s2 / 3.0) ** 2
         if self.tremor:
-            full[-6:, -6:] = np.kron(self.tremor.stationary, np.eye(3))
+            swings = slice(3 * self.order, None)
+            full[swings, swings] = np.kron(self.tremor.stationary, np.eye(3))
         return Estimate(at_ns, state, full)
 
     def updated(
@@ -263,8 +291,9 @@ class Kalman:
         noise = np.zeros_like(axis)
         noise[: self.order, : self.order] = self.noise**2 * _white_noise(self.order, dt)
         if self.tremor:
-            swing, rest = axis[-2:, -2:], self.tremor.stationary
-            noise[-2:, -2:] = rest - swing @ rest @ swing.T
+            rows = slice(self.order, None)
+            swing, rest = axis[rows, rows], self.tremor.stationary
+            noise[rows, rows] = rest - swing @ rest @ swing.T
         full = step @ before.covariance @ step.T + np.kron(noise, np.eye(3))
         return step @ before.state, full
 
@@ -273,7 +302,7 @@ class Kalman:
         axis = np.zeros((size, size))
         axis[: self.order, : self.order] = _integration(self.order, dt, self.forgetting_per_s)
         if self.tremor:
-            axis[-2:, -2:] = self.tremor.transition(dt)
+            axis[self.order :, self.order :] = self.tremor.transition(dt)
         return axis
 
     def _agility(self, innovation: Floats, dt: float) -> float:
@@ -296,8 +325,7 @@ class Kalman:
         carried = [_integration(self.order, float(t), self.forgetting_per_s)[0] for t in leads_s]
         points = np.stack(carried) @ axes[: self.order]
         if self.tremor:
-            swings = np.stack([self.tremor.transition(float(lead))[0] for lead in leads_s])
-            points += swings @ axes[-2:]
+            points += self.tremor.displacements(leads_s) @ axes[self.order :]
         return np.asarray(points)
 
 
@@ -345,7 +373,7 @@ TRACKING_METHODS: dict[str, Callable[[float], Filter]] = {
         3, 0.1, 10.0, max_speed, forgetting_per_s=10.0, unfollowed_m=2.0 * HAND_TREMOR_M
     ),
     "hand": lambda max_speed: Kalman(
-        3, 0.1, 10.0, max_speed, forgetting_per_s=10.0, tremor=Tremor(HAND_TREMOR_M)
+        3, 0.08, 10.0, max_speed, forgetting_per_s=10.0, tremor=Tremor(HAND_TREMOR_M)
     ),
 }
 """Filters by name, for a finger's greatest speed (m/s).  Their noises are those that predict a
