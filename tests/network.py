@@ -1,9 +1,13 @@
-"""A cable that can be cut: a TCP relay on the loopback."""
+"""Cables that can be cut: a TCP relay on the loopback, and computers at a switch."""
 
 from __future__ import annotations
 
 import asyncio
+import os
+import subprocess
+import sys
 from contextlib import suppress
+from pathlib import Path
 
 
 class Cut:
@@ -51,3 +55,73 @@ class Cut:
                 if not self.half_open:
                     writer.write(data)
         writer.transport.abort()
+
+
+class Computers:
+    """Computers at one switch: network namespaces of this machine, whose cables can be drawn.
+
+    Needs the right to make such namespaces; `missing` says what is not there, or None.
+    """
+
+    def __init__(self, *names: str) -> None:
+        self.address = {name: f"10.77.0.{number}" for number, name in enumerate(names, start=1)}
+        self._tag = f"fs{os.getpid()}"
+        self._switch = f"{self._tag}-switch"
+
+    @staticmethod
+    def missing() -> str | None:
+        name = f"fs{os.getpid()}-try"
+        try:
+            _ip("netns", "add", name)
+            _ip("netns", "del", name)
+        except (OSError, subprocess.CalledProcessError) as error:
+            return f"no network namespaces can be made here: {error}"
+        return None
+
+    def __enter__(self) -> Computers:
+        _ip("netns", "add", self._switch)
+        _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
+        _ip("-n", self._switch, "link", "set", "bridge", "up")
+        for name, address in self.address.items():
+            space = self._space(name)
+            _ip("netns", "add", space)
+            _ip(
+                "-n",
+                self._switch,
+                "link",
+                "add",
+                name,
+                "type",
+                "veth",
+                "peer",
+                "eth",
+                "netns",
+                space,
+            )
+            _ip("-n", self._switch, "link", "set", name, "master", "bridge", "up")
+            _ip("-n", space, "link", "set", "lo", "up")
+            _ip("-n", space, "addr", "add", f"{address}/24", "dev", "eth")
+            _ip("-n", space, "link", "set", "eth", "up")
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for name in (*map(self._space, self.address), self._switch):
+            _ip("netns", "del", name)
+
+    def plug(self, name: str, *, into_switch: bool) -> None:
+        """Draw a computer's cable, or put it in again."""
+        _ip("-n", self._switch, "link", "set", name, "up" if into_switch else "down")
+
+    def start(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
+        """Run this Python with those arguments on a computer."""
+        return subprocess.Popen(
+            ["ip", "netns", "exec", self._space(name), sys.executable, *arguments],
+            cwd=Path(__file__).parent.parent,
+        )
+
+    def _space(self, name: str) -> str:
+        return f"{self._tag}-{name}"
+
+
+def _ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True)

@@ -613,3 +613,84 @@ def test_poses_that_are_kept_for_a_cycle_are_those_of_the_joints_asked_for() -> 
     second[:] = np.nan
     assert geometry.world_from_flange(GUESS) == pytest.approx(first, abs=0.0)
     assert np.isfinite(geometry.world_from_flange(joints)).all()
+
+
+def test_a_slack_sheet_is_held_as_told_until_the_flanges_come_too_near() -> None:
+    arms = pair()
+    run(arms, on_time(sheet_at(stretch=0.97)), 400)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+    assert distance(arms) == pytest.approx(0.97 * 0.24, abs=1e-6)
+    other = arms[1].as_other()
+    assert arms[0].geometry.sheet_state(arms[0].joints, other.world_from_flange)[1] == 0.0
+    run(arms, on_time(sheet_at(stretch=0.3)), 1200)
+    assert not {arm.control.mode for arm in arms} & {"follow", "hold"}
+    assert any("flanges" in text for arm in arms for text in arm.control.faults)
+    apart = [arm.geometry.world_from_flange(arm.joints)[:3, 3] for arm in arms]
+    assert np.linalg.norm(apart[0] - apart[1]) >= SCENE.arms.min_distance_m - 1e-4
+
+
+@pytest.mark.parametrize(
+    ("shift", "turn", "words"),
+    [
+        ((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), "edges turned by 14.3 degrees"),
+        ((0.0, 0.06, 0.0), (0.0, 0.0, 0.0), "edge skewed by"),
+        ((0.03, 0.0, 0.0), (0.0, 0.0, 0.0), "sheet of"),
+        ((0.0154, 0.0, 0.0), (0.0, 0.0, 0.0), "edge force 20"),
+    ],
+)
+def test_a_sheet_measured_twisted_or_too_taut_stops_both_at_once(
+    shift: tuple[float, ...], turn: tuple[float, ...], words: str
+) -> None:
+    """Something has dragged the other arm off its command: both bridges see it."""
+    arms = pair()
+    run(arms, on_time(HOME), 60)
+    moved = transform_from_rpy(shift, turn)
+    edge = arms[1].geometry.world_from_edge(arms[1].joints)
+    dragged = edge.copy()
+    dragged[:3, :3], dragged[:3, 3] = moved[:3, :3] @ edge[:3, :3], edge[:3, 3] + moved[:3, 3]
+    flange = dragged @ np.linalg.inv(arms[1].geometry.flange_from_edge)
+    other = replace(arms[1].as_other(), world_from_flange=flange)
+    arms[0].cycle(on_time(HOME), other)
+    assert arms[0].control.mode != "follow"
+    assert arms[0].control.faults[0].startswith(f"measured: {words}")
+    arms[1].cycle(on_time(HOME), arms[0].as_other())
+    assert arms[1].control.reason.startswith("other arm: measured: ")
+    assert arms[1].control.mode != "follow"
+
+
+def lifted(y: float, aside_rad: float) -> SheetMotion:
+    """The sheet turned aside a little, at a height; at 0.16 m both forearms are level: J5 = 0."""
+    pose = transform_from_rpy([0.0, y, 0.0], [0.0, aside_rad, 0.0])
+    return replace(HOME, world_from_sheet=pose)
+
+
+@pytest.mark.parametrize(
+    ("aside_rad", "through", "ends"),
+    [(0.0, True, ""), (0.005, True, ""), (0.02, False, "leap"), (0.05, False, "")],
+)
+def test_past_the_wrists_singularity_both_go_on_together_or_both_stop(
+    aside_rad: float, *, through: bool, ends: str
+) -> None:
+    """J5 goes through zero, or past it at a distance: no joint too fast, no twisted sheet."""
+    arms, speed = pair(lifted(0.1, aside_rad)), 0.05
+    run(arms, on_time(lifted(0.1, aside_rad)), 60)
+    fifth, widest = [], 0.0
+    for number in range(int(0.0645 / speed / STEP_S)):
+        motion = lifted(0.1 + speed * number * STEP_S, aside_rad)
+        twist = np.array([0.0, speed, 0.0, 0.0, 0.0, 0.0])
+        before = [arm.joints for arm in arms]
+        run(arms, on_time(replace(motion, twist_world=twist)), 1)
+        for arm, joints in zip(arms, before, strict=True):
+            rates = np.abs(arm.joints - joints) / STEP_S
+            assert (rates <= arm.geometry.joint_limits.speed_rad_per_s * (1 + 1e-9)).all()
+        turn = vector_from_rotation(arms[0].edge[:3, :3].T @ arms[1].edge[:3, :3])
+        widest = max(widest, float(np.linalg.norm(turn)))
+        fifth.append([float(arm.joints[4]) for arm in arms])
+    assert widest <= arms[0].geometry.sheet_limits.max_twist_rad
+    assert np.degrees(np.abs(fifth).min()) < 6.0
+    assert (np.sign(fifth[0]) == -np.sign(fifth[-1])).all() == through
+    if ends:
+        assert {ends in arm.control.reason for arm in arms} == {True}
+        assert not {arm.control.mode for arm in arms} & {"follow", "hold"}
+    else:
+        assert {arm.control.mode for arm in arms} == {"follow"}

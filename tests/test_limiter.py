@@ -203,11 +203,41 @@ def test_flanges_outside_the_workspace_or_too_near_are_in_trouble() -> None:
     assert "flanges 100 mm apart" in near
 
 
-@pytest.mark.parametrize("step_s", [0.0, -0.007, float("nan"), float("inf")])
-def test_a_step_that_is_no_duration_is_an_error(step_s: float) -> None:
+@given(st.one_of(st.floats(max_value=0.99e-6), st.floats(min_value=10.1), st.just(float("nan"))))
+def test_a_step_that_is_no_duration_of_one_is_an_error(step_s: float) -> None:
     joints = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
-    with pytest.raises(ValueError, match="has no speed"):
+    with pytest.raises(ValueError, match=r"a command covers 1e-06 to 10\.0 s"):
         step(joints, np.zeros(6), joints, np.zeros(6), step_s)
+
+
+whatever = st.one_of(
+    st.floats(),
+    st.floats(-4.0, 4.0),
+    st.sampled_from([np.nan, np.inf, -np.inf, 1e308, -1e308, 5e-324, -5e-324, -0.0]),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    joints=arrays(np.float64, 6, elements=st.floats(-4.0, 4.0)),
+    share=arrays(np.float64, 6, elements=st.floats(-1.0, 1.0)),
+    goal=arrays(np.float64, 6, elements=whatever),
+    along=arrays(np.float64, 6, elements=whatever),
+    step_s=st.one_of(st.floats(1e-6, 10.0), st.floats(1e-3, 0.05)),
+)
+def test_from_any_state_no_goal_and_no_step_leads_out_of_bounds(
+    joints: Floats, share: Floats, goal: Floats, along: Floats, step_s: float
+) -> None:
+    """NaN, infinite, huge and denormal goals; joints out of range, from where only the way back is
+    open; any speeds, be they such that the arm cannot stop in range."""
+    velocity = step(joints, share * LIMITS.speed_rad_per_s, goal, along, step_s)
+    after = joints + velocity * step_s
+    assert np.isfinite(velocity).all()
+    assert (np.abs(velocity) <= LIMITS.speed_rad_per_s * (1 + 1e-9)).all()
+    assert (after >= np.minimum(LIMITS.lowest_rad, joints) - 1e-9).all()
+    assert (after <= np.maximum(LIMITS.highest_rad, joints) + 1e-9).all()
+    way = np.linalg.norm(tool_points(after) - tool_points(joints), axis=1).max()
+    assert way <= TOOL_SPEED * min(step_s, EVEN_STEP_S) * (1 + 1e-6) + 1e-15
 
 
 def test_after_a_long_gap_a_command_leads_no_further_than_after_an_even_one() -> None:

@@ -23,6 +23,7 @@ from nodes.arm_bridge.limiter import (
     sheet_trouble,
     step_trouble,
     with_tool_speed,
+    within_range,
 )
 from nodes.arm_bridge.way import START_BOUNDS, Way, lag
 from nodes.models.motion import (
@@ -507,10 +508,17 @@ class ArmControl:
             self.mode = rest_mode
             return Command("idle" if rest_mode == "idle" else "stop", self.commanded_rad)
         self.mode = "stopping"
+        slower = braked(self._velocity, limits=geometry.joint_limits, step_s=step_s)
         velocity = with_tool_speed(
             self.commanded_rad,
             self._velocity,
-            braked(self._velocity, limits=geometry.joint_limits, step_s=step_s),
+            within_range(
+                self.commanded_rad,
+                self._velocity,
+                slower,
+                limits=geometry.joint_limits,
+                step_s=step_s,
+            ),
             tool_points=geometry.tool_points,
             max_tool_speed=geometry.max_tool_speed,
             limits=geometry.joint_limits,

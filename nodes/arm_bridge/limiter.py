@@ -20,7 +20,7 @@ from nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
 
-TOOL_SPEED_SHARE = 0.85
+TOOL_SPEED_SHARE = 0.82
 """Share of the tool speed that commands may use: an arm that is sent to a place at a time, and not
 a velocity, ripples about its mean speed.  Most where wrist joints turn fast against one another:
 each ripples by its own speed, of which little is left at the tool (benchmarks/limiter.py)."""
@@ -28,6 +28,9 @@ each ripples by its own speed, of which little is left at the tool (benchmarks/l
 EVEN_STEP_S = 0.01
 """After a longer gap than that a command leads no further than in this time: what a late one makes
 up at once, the arm would do faster than it may."""
+
+SHORTEST_STEP_S, LONGEST_STEP_S = 1e-6, 10.0
+"""What a command may cover; speeds over less are rounding errors, and over more no control."""
 
 LEAST_SHARE = 0.02
 """Below this share of the way from braking to the wanted velocity it is not worth looking."""
@@ -79,19 +82,20 @@ def limited(
     velocity is what the last call returned.  tool_points: joints to points (n, 3) in metres, none
     of which may exceed `max_tool_speed`.  Whatever the goal, joints_rad + result * step_s is in
     range, and speed and tool speed are kept.  So is the acceleration, unless range or tool speed
-    could not be kept otherwise.  ValueError when step_s is no duration.
+    could not be kept otherwise.  ValueError when step_s is no duration of a step.
     """
-    if not 0.0 < step_s < np.inf:
-        raise ValueError(f"a step of {step_s} s has no speed")
+    if not SHORTEST_STEP_S <= step_s <= LONGEST_STEP_S:
+        raise ValueError(
+            f"a step of {step_s} s: a command covers {SHORTEST_STEP_S} to {LONGEST_STEP_S} s"
+        )
     if np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all():
         wanted = towards(joints_rad, goal_rad, goal_velocity, limits=limits, step_s=step_s)
-        wanted = within_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s)
     else:
         wanted = braked(velocity, limits=limits, step_s=step_s)
     return with_tool_speed(
         joints_rad,
         velocity,
-        wanted,
+        within_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s),
         tool_points=tool_points,
         max_tool_speed=max_tool_speed,
         limits=limits,

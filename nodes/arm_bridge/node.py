@@ -25,7 +25,7 @@ class ArmBridgeParameters(NodeParameters):
     side: Side
     host: str = "127.0.0.1"
     port: int = Field(default=5020, ge=1, le=65535)
-    rate_hz: Positive = 140.0
+    rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0)
     driver: Driver = "modbus"
     timeout_s: Positive | None = Field(default=None, description="null: the driver's own")
     servo_lag_s: NonNegative = Field(

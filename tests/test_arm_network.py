@@ -1,0 +1,147 @@
+"""The network between the computers is cut in mid-stroke: real sockets on real interfaces."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+import signal
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from messages.base import Header
+from messages.bus import Subscriber
+from messages.topics import topic_named
+from messages.types import ArmState
+from nodes.node import PortCounts
+from nodes.runner import NodeConfig, PortConfig
+from tests.network import Computers
+from tests.test_arm_loop import until as until_within
+
+until = partial(until_within, within_s=40.0)
+PATIENT = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
+PATIENT_TWIN = {"watchdog_s": 0.8}
+SIDES = ("left", "right")
+LONGEST_M = 0.24 * 1.09
+
+
+@dataclass
+class Watch:
+    """What both bridges say."""
+
+    states: dict[str, list[ArmState]] = field(default_factory=lambda: {side: [] for side in SIDES})
+
+    def take(self, side: str, state: ArmState, _: Header) -> None:
+        self.states[side].append(state)
+
+    def modes(self) -> set[str]:
+        return {self.states[side][-1].mode if self.states[side] else "none" for side in SIDES}
+
+    async def lasts(self, count: int) -> dict[str, list[ArmState]]:
+        """The next so many states of each arm."""
+        began = {side: len(self.states[side]) for side in SIDES}
+        await until(lambda: all(len(self.states[side]) >= began[side] + count for side in SIDES))
+        return {side: self.states[side][began[side] :] for side in SIDES}
+
+
+def config(name: str, type_: str, inputs: Any, outputs: Any, **parameters: Any) -> str:
+    def ports(given: dict[str, tuple[str, tuple[str, ...]]]) -> tuple[PortConfig, ...]:
+        return tuple(
+            PortConfig(port=port, topic=topic, endpoints=endpoints)
+            for port, (topic, endpoints) in given.items()
+        )
+
+    return NodeConfig(
+        name=name,
+        type=type_,
+        parameters=parameters,
+        inputs=ports(inputs),
+        outputs=ports(outputs),
+        plan_hash="test",
+        run_dir="",
+    ).model_dump_json()
+
+
+@asynccontextmanager
+async def three_computers() -> AsyncIterator[tuple[Computers, Watch]]:
+    """main strokes; left and right have an arm and its bridge each.  Yields when both follow."""
+    if missing := Computers.missing():
+        pytest.skip(missing)
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    watch, started, subscribers = Watch(), [], []
+    with Computers("main", *SIDES) as computers:
+        tcp = {name: f"tcp://{address}" for name, address in computers.address.items()}
+        scene, target = f"{tcp['main']}:7000", f"{tcp['main']}:7001"
+        told = {side: f"{tcp[side]}:7002" for side in SIDES}
+        outputs = {"scene": ("scene", (scene,)), "sheet_target": ("sheet_target", (target,))}
+        jobs = {"main": [config("stroker", "tests.arm_computer:Stroker", {}, outputs)]}
+        for side, other in (SIDES, SIDES[::-1]):
+            ports = {f"{one}_port": 5020 + number for number, one in enumerate(SIDES)}
+            seen = {"scene": ("scene", (scene,))}
+            jobs[side] = [
+                config(f"twin_{side}", "twin_arms", seen, {}, **ports, **PATIENT_TWIN),
+                config(
+                    f"arm_{side}_bridge",
+                    "arm_bridge",
+                    seen
+                    | {
+                        "sheet_target": ("sheet_target", (target,)),
+                        "other_arm": (f"arm_{other}", (told[other],)),
+                    },
+                    {"arm": (f"arm_{side}", (f"ipc://{folder}/{side}", told[side]))},
+                    side=side,
+                    port=ports[f"{side}_port"],
+                    **PATIENT,
+                ),
+            ]
+        try:
+            for name, configs in jobs.items():
+                started.append(computers.start(name, "-m", "tests.arm_computer", *configs))
+            for side in SIDES:
+                take = partial(watch.take, side)
+                topic = topic_named(f"arm_{side}")
+                subscribers.append(
+                    Subscriber(topic, [f"ipc://{folder}/{side}"], take, PortCounts())
+                )
+                subscribers[-1].start()
+            await until(lambda: watch.modes() == {"follow"})
+            yield computers, watch
+        finally:
+            for subscriber in subscribers:
+                subscriber.close()
+            for process in started:
+                process.send_signal(signal.SIGTERM)
+            codes = [await asyncio.to_thread(process.wait) for process in started]
+            shutil.rmtree(folder)
+    assert codes == [0] * len(started)
+
+
+@pytest.mark.timeout(180)
+async def test_a_cable_drawn_in_mid_stroke_holds_then_stops_both_arms_until_it_is_back() -> None:
+    async with three_computers() as (computers, watch):
+        for cut in ("main", "left"):
+            before = await watch.lasts(60)
+            assert {state.mode for states in before.values() for state in states} >= {"follow"}
+            leaning = np.ptp([state.joints_rad for state in before["left"]], axis=0)
+            assert leaning.max() > 0.01, "it is in mid-stroke"
+            began = {side: len(watch.states[side]) for side in SIDES}
+            computers.plug(cut, into_switch=False)
+            await until(lambda: watch.modes() == {"idle"})
+            for side in SIDES:
+                modes = [state.mode for state in watch.states[side][began[side] :]]
+                assert modes.index("hold") < modes.index("idle"), (cut, side)
+            for states in (await watch.lasts(30)).values():
+                assert {(state.mode, state.faults) for state in states} == {("idle", ())}
+                assert np.ptp([state.joints_rad for state in states], axis=0).max() < 1e-4
+            computers.plug(cut, into_switch=True)
+            await until(lambda: watch.modes() == {"follow"})
+        everything = [state for states in watch.states.values() for state in states]
+        assert max(state.edge_distance_m or 0.0 for state in everything) <= LONGEST_M
+        assert {state.faults for state in everything if state.mode != "disconnected"} == {()}
