@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -20,6 +21,7 @@ from launch.experiments.compliance import (
     presses,
     read_bag,
 )
+from launch.experiments.pictures import draw_compliance
 from launch.experiments.stroke import Track
 from launch.plan import load_scene
 from launch.twin_sheet import twin_force
@@ -108,3 +110,19 @@ def test_a_bag_without_a_soft_body_is_refused(tmp_path: Path) -> None:
         pass
     with pytest.raises(ExperimentError, match="no scene, or no soft body"):
         read_bag(bag)
+
+
+def test_the_picture_shows_each_place(tmp_path: Path) -> None:
+    rows = [
+        {"place": place, "depth_mm": depth, "wanted_n": 0.05 * depth, "presented_n": 0.052 * depth}
+        for place in ("at 0, 0 mm", "at 25, 0 mm")
+        for depth in (5.0, 20.0)
+    ]
+    moving = {
+        "speed_mm_per_s": 50.0,
+        "rows": [{"depth_mm": 3.0, "wanted_n": 0.1, "presented_n": 0.2}],
+    }
+    picture = tmp_path / "compliance.png"
+    draw_compliance({"rows": rows, "moving": moving, "noticed_percent": [15, 22]}, picture)
+    height, width = cv2.imread(str(picture)).shape[:2]
+    assert width > 1.5 * height

@@ -125,14 +125,17 @@ def compliance(
 ) -> None:
     """How the force that a finger meets compares with the object's, over the push."""
     from launch.experiments import compliance as experiment
+    from launch.experiments.pictures import draw_compliance
 
-    bag = _folder(output, "compliance") / "compliance.mcap"
+    folder = _folder(output, "compliance")
+    bag, picture = folder / "compliance.mcap", folder / "compliance.png"
     with progress_words() as progress:
         procedure = experiment.compliance_procedure(progress)
         _record(launch_file, settings, bag, procedure, progress)
         result = experiment.compliance_result(bag, progress)
+        draw_compliance(result, picture)
     if as_json:
-        print_json(result)
+        print_json({**result, "picture": str(picture)})
         return
     columns = ["place", "depth, mm", "wanted, N", "presented, N", "off, %", "retreat, mm"]
     cells = [
@@ -147,6 +150,7 @@ def compliance(
         f"{result['noticed_percent'][0]:.0f} to {result['noticed_percent'][1]:.0f} %"
     )
     words.print(f"bag: {bag}")
+    words.print(f"picture: {picture}")
 
 
 def _photograph(

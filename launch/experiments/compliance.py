@@ -270,7 +270,14 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
         "moving": {
             "speed_mm_per_s": 1e3 * PUSH_M_PER_S,
-            "samples": len(moving),
+            "rows": [
+                {
+                    "depth_mm": 1e3 * one.depth_m,
+                    "wanted_n": one.wanted_n,
+                    "presented_n": one.presented_n,
+                }
+                for one in moving
+            ],
             "rms_percent": float(np.sqrt(np.mean(errors_moving**2))),
             "worst_percent": float(np.abs(errors_moving).max()),
         },

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -125,4 +126,46 @@ def draw_latency(recording: Recording, path: Path) -> None:
     axes.set_xlabel("ms since the middle of the exposure: 1-99 % (bar), median (line)")
     axes.set_title("Where the milliseconds go")
     axes.grid(visible=True, axis="x", alpha=0.2)
+    figure.savefig(path, dpi=110)
+
+
+def draw_compliance(result: dict[str, Any], path: Path) -> None:
+    """Force over depth, wanted and felt, a panel per place, and what people would notice."""
+    places = list(dict.fromkeys(row["place"] for row in result["rows"]))
+    figure = Figure(figsize=(4.2 * len(places), 4.4), layout="constrained")
+    panels = figure.subplots(1, len(places), squeeze=False, sharey=True)[0]
+    sure, surer = (0.01 * percent for percent in result["noticed_percent"])
+    moving = result["moving"]["rows"]
+    for panel, place in zip(panels, places, strict=True):
+        rows = [row for row in result["rows"] if row["place"] == place]
+        depths = np.array([0.0, *(row["depth_mm"] for row in rows)])
+        wanted = np.array([0.0, *(row["wanted_n"] for row in rows)])
+        for share, strength in ((surer, 0.12), (sure, 0.18)):
+            panel.fill_between(
+                depths,
+                (1.0 - share) * wanted,
+                (1.0 + share) * wanted,
+                color="C0",
+                alpha=strength,
+                linewidth=0,
+                label=f"within {100 * share:.0f} %: not noticed",
+            )
+        panel.plot(depths, wanted, color="C0", label="the object's")
+        if place == places[0]:
+            panel.plot(
+                [row["depth_mm"] for row in moving],
+                [row["presented_n"] for row in moving],
+                ".",
+                color="0.5",
+                markersize=3,
+                label=f"felt at {result['moving']['speed_mm_per_s']:.0f} mm/s, in and out",
+            )
+        presented = [row["presented_n"] for row in rows]
+        panel.plot(depths[1:], presented, "o", color="C1", label="felt, held still")
+        panel.set_title(place)
+        panel.set_xlabel("depth of the finger, mm")
+        panel.grid(visible=True, alpha=0.2)
+    panels[0].set_ylabel("force, N")
+    panels[0].legend(fontsize=8)
+    figure.suptitle("What a finger feels of the object, by the twin's sheet")
     figure.savefig(path, dpi=110)
