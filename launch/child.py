@@ -51,14 +51,14 @@ def _end_with(lifeline: int) -> None:
 
 
 def give_way() -> None:
-    """Take the niceness that the launch file gives this node, as a process and as a session.
+    """Be nicer than the launcher by what the launch file gives this node, and so its session.
 
     OSError where the system does not let it.
     """
     nice = int(os.environ.get(NICE_VARIABLE, "0"))
     if nice == 0:
         return
-    os.setpriority(os.PRIO_PROCESS, 0, nice)
+    os.nice(nice)
     if not AUTOGROUP.exists():
         return
     for left in reversed(range(AUTOGROUP_TRIES)):

@@ -154,7 +154,7 @@ class PlannedNode(Strict):
     outputs: tuple[PlannedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
-    nice: int
+    nice: int = Field(default=0, description="bags from before there was one have none")
 
 
 class Plan(Strict):

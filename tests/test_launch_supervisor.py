@@ -89,6 +89,23 @@ def assert_nothing_left(folder: Path) -> None:
     assert sockets_in(folder) == []
 
 
+def session_niceness(pid: int) -> int | None:
+    """None where the kernel does not weigh sessions."""
+    autogroup = Path(f"/proc/{pid}/autogroup")
+    return int(autogroup.read_text().split()[-1]) if autogroup.exists() else None
+
+
+async def test_a_nice_node_gives_way_as_a_process_and_as_a_session(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(), quiet=beacon(nice=7, topics={"twin__finger": None}))
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready()
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        for name, more in (("beacon", 0), ("quiet", 7)):
+            pid = graph.pids[name]
+            assert psutil.Process(pid).nice() == min(own + more, 19)
+            assert session_niceness(pid) in (None, more)
+
+
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:
     descriptors, threads = set(os.listdir("/proc/self/fd")), threading.active_count()
     plan = plan_of(tmp_path, beacon=beacon(), listener=LISTENER)
