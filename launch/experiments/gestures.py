@@ -20,7 +20,7 @@ from launch.experiments.lag import lag_s
 from launch.experiments.run import Procedure, Progress
 from launch.plan import load_plan
 from messages.bag import BagReader
-from messages.scene import Scene
+from messages.scene import Scene, UnfitGeometryError
 from messages.types import FingerPath, Fingertip, TwinFinger
 from nodes.models.prediction import path_at
 from nodes.twin import gestures as twin_gestures
@@ -52,7 +52,7 @@ def gesture_path(name: str, scene: Scene) -> FingerPath:
     """The path of a gesture on the scene's object, labelled with its name."""
     try:
         return GESTURES[name](scene).model_copy(update={"label": name})
-    except FingerPathError as error:
+    except (FingerPathError, UnfitGeometryError) as error:
         raise ExperimentError(f'scene "{scene.name}": {error}') from None
 
 

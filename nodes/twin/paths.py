@@ -1,24 +1,40 @@
 """Where a finger's path is laid: over the scene's object, within reach; and recorded paths.
 
-A place is (along, arc, height), metres: along the object's axis, around its surface from where it
-faces the user, and out of the surface.  Motions are thought out in places and laid on the object of
-whatever scene there is.
+A place is (along, arc, height), metres: along the object's x axis over its surface, around it from
+there, and out of it; the place (0, 0, 0) is the object's front, where it faces the user.  Motions
+are thought out in places and laid on the object of whatever scene there is.
 """
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import RectBivariateSpline
 
-from messages.scene import Scene, cylinder_of
+from messages.scene import Scene
 from messages.types import FingerPath
-from nodes.models.rigid import apply, inverse, transform_from_rpy
+from nodes.models.rigid import apply, transform_from_rpy
+from nodes.models.shapes import Nearest, Shape, make_shape
 from nodes.twin.finger import FingerPathError, SmoothPath
 
 Floats = NDArray[np.float64]
+FAR_M = 2.0
+FARTHEST_M = 0.5
+STRIDE_M = 0.001
+GRID_M = 0.003
+"""How far straightest ways go, in what strides, and how far apart the grid's places lie."""
+
+WITHIN_ENDS = 0.8
+OF_WIDTH = 0.7
+OF_HEIGHT = 0.9
+"""Of an object that ends, of the sheet's width and of its usable half-height this is stroked."""
+
+MOST_GROUNDS = 4
+_GROUNDS: dict[bytes, Ground] = {}
 
 SPEED_SHARE = 0.8
 """Of a finger's largest speed, that a path may ask for: unsteadiness comes on top."""
@@ -29,31 +45,151 @@ PRESS_SHARE = 1.0 / 6.0
 
 def over_surface(scene: Scene, places: Floats) -> Floats:
     """World points (n, 3) of places (n, 3) on the scene's object."""
-    cylinder = cylinder_of(scene)
-    angle = places[:, 1] / cylinder.radius_m
-    radius = cylinder.radius_m + places[:, 2]
-    in_object = np.stack([places[:, 0], radius * np.sin(angle), radius * np.cos(angle)], axis=1)
-    pose = scene.object.world_from_object
-    world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
-    towards_user = inverse(world_from_object)[:3, :3] @ np.array([0.0, 0.0, 1.0])
-    turn = np.arctan2(towards_user[1], towards_user[2])
-    cosine, sine = np.cos(turn), np.sin(turn)
-    object_from_facing = np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])
-    return apply(world_from_object, in_object @ object_from_facing.T)
+    return _ground_of(scene).points(places)
 
 
 def touchable(scene: Scene) -> tuple[float, float]:
     """How far (m) along and around the surface a finger can stroke, from end to end.
 
-    0.8 of the object's length; the arc that the working range's tilt and the sheet's usable height
-    allow.
+    As far to both sides of the front as the object goes (0.8 of its length), the working range's
+    tilt allows, and the sheet is usable: around the object, one that is met at its middle.
     """
-    cylinder = cylinder_of(scene)
-    arc_m = min(
-        2.0 * scene.sheet.usable_half_height_m,
-        2.0 * cylinder.radius_m * min(scene.working_range.tilt_rad, 0.5 * np.pi),
-    )
-    return 0.8 * cylinder.length_m, arc_m
+    return _ground_of(scene).touchable_m
+
+
+class Ground:
+    """The surface of a scene's object, its places laid out from its front.
+
+    Places are measured along straightest ways (geodesics): first along the object's x axis, then at
+    right angles to that.  They are worked out on a grid, joined by bicubic splines, and put back on
+    the surface, so that a path over them is as smooth as the surface.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        """FingerPathError for an object that turns no side to the user."""
+        pose = scene.object.world_from_object
+        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._shape = make_shape(dict(scene.object.geometry))
+        towards_user = self._world_from_object[:3, :3].T[:, 2]
+        front = _front(self._shape, towards_user)
+        most = np.cos(min(scene.working_range.tilt_rad, 0.5 * np.pi))
+        if front.normal @ towards_user < most:
+            raise FingerPathError(
+                f'scene "{scene.name}": the object turns no side to the user that may be touched; '
+                "turn it by object.world_from_object"
+            )
+        along = np.array([1.0, 0.0, 0.0])
+        across = np.cross(front.normal, along)
+        if np.linalg.norm(across) < 0.1:  # its x axis points to the user
+            across = np.array([0.0, 1.0, 0.0])
+        ways = []
+        for heading in (np.cross(across, front.normal), across):
+            sides = [self._reach_m(front, sign * heading, towards_user, most) for sign in (1, -1)]
+            ways.append((2.0 * min(end for end, _ in sides), any(edge for _, edge in sides)))
+        (length_m, ends), (around_m, ends_around) = ways
+        self.touchable_m = (
+            min((WITHIN_ENDS if ends else 1.0) * length_m, OF_WIDTH * scene.sheet.width_m),
+            min(
+                (WITHIN_ENDS if ends_around else 1.0) * around_m,
+                OF_HEIGHT * scene.sheet.usable_half_height_m,
+            ),
+        )
+        self._lay_out(front, np.cross(across, front.normal))
+
+    def points(self, places: Floats) -> Floats:
+        """World points (n, 3) of places (n, 3); beyond what is touchable the last that is near."""
+        along, arc = places[:, 0], places[:, 1]
+        rough = np.column_stack([spline(along, arc, grid=False) for spline in self._splines])
+        found = self._shape.closest(rough)
+        return apply(self._world_from_object, found.point + places[:, 2:] * found.normal)
+
+    def _reach_m(
+        self, front: Nearest, heading: Floats, towards_user: Floats, most: float
+    ) -> tuple[float, bool]:
+        """How far one can go on from the front until it leans too much or ends, and whether it
+        ends."""
+        here, way_m = front, 0.0
+        while way_m < FARTHEST_M:
+            heading = heading - here.normal * (heading @ here.normal)
+            heading = heading / np.linalg.norm(heading)
+            there = self._shape.closest(here.point + STRIDE_M * heading, previous=here.point)
+            if there.on_edge or there.normal @ towards_user < most:
+                gone = float(np.linalg.norm(there.point - here.point))
+                leans, leaned = (one.normal @ towards_user for one in (there, here))
+                share = 1.0 if there.on_edge else np.arccos(most) - np.arccos(min(leaned, 1.0))
+                if not there.on_edge:
+                    share /= np.arccos(leans) - np.arccos(min(leaned, 1.0))
+                return way_m + float(share) * gone, bool(there.on_edge)
+            way_m += STRIDE_M
+            here = there
+        return way_m, False
+
+    def _lay_out(self, front: Nearest, heading: Floats) -> None:
+        """Splines of the surface over (along, arc), to a quarter beyond what is touchable."""
+        ticks = [
+            np.linspace(-half, half, max(9, 2 * int(np.ceil(half / GRID_M)) + 1))
+            for half in (0.625 * size for size in self.touchable_m)
+        ]
+        line = _walk(self._shape, front.point[None], heading[None], ticks[0])
+        points, normals = line[0][:, 0], line[1][:, 0]
+        headings = np.gradient(points, axis=0)
+        grid, _ = _walk(self._shape, points, np.cross(normals, headings), ticks[1])
+        self._splines = [
+            RectBivariateSpline(*ticks, grid[:, :, axis].T, s=0.0) for axis in range(3)
+        ]
+
+
+def _front(shape: Shape, towards_user: Floats) -> Nearest:
+    """Where the object faces the user: what is nearest to one far away, else (where that is an end
+    of it) what he sees through its origin."""
+    far = shape.closest(FAR_M * towards_user)
+    if not far.on_edge:
+        return far
+    place = FAR_M * towards_user
+    for _ in range(200):
+        way = float(shape.signed_distance(place))
+        if way < 1e-9:
+            break
+        place = place - way * towards_user
+    return shape.closest(place)
+
+
+def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
+    """Points and normals (k, n, 3) on straightest ways from points (n, 3), at ways (k,) m.
+
+    ticks: rising, as many before 0 as after it, which is the middle.
+    """
+    middle = len(ticks) // 2
+    begun = shape.closest(starts)
+    points, normals = (np.empty((len(ticks), *starts.shape)) for _ in range(2))
+    points[middle], normals[middle] = begun.point, begun.normal
+    for sign in (1, -1):
+        found, heading = begun, sign * headings
+        here, normal = found.point, found.normal
+        for step in range(1, middle + 1):
+            to = middle + sign * step
+            way_m = abs(ticks[to] - ticks[to - sign])
+            parts = max(1, int(np.ceil(way_m / STRIDE_M)))
+            for _ in range(parts):
+                heading = heading - normal * (heading * normal).sum(1, keepdims=True)
+                heading = heading / np.maximum(np.linalg.norm(heading, axis=1), 1e-12)[:, None]
+                # Seen from the tangent plane a way s on a bend k is tan(k s) / k long.
+                bend = np.einsum("ni,nij,nj->n", heading, found.shape_operator, heading)
+                length = way_m / parts * (1.0 + (bend * way_m / parts) ** 2 / 3.0)
+                found = shape.closest(here + length[:, None] * heading, previous=here)
+                here, normal = found.point, found.normal
+            points[to], normals[to] = here, normal
+    return points, normals
+
+
+def _ground_of(scene: Scene) -> Ground:
+    """The scene's ground; the latest few are kept, since a path asks for it many times."""
+    key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
+    if key not in _GROUNDS:
+        while len(_GROUNDS) >= MOST_GROUNDS:
+            _GROUNDS.pop(next(iter(_GROUNDS)))
+        _GROUNDS[key] = Ground(scene)
+    return _GROUNDS[key]
 
 
 def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
