@@ -68,6 +68,8 @@ def geometries() -> dict[str, Mapping[str, Any]]:
             origin="benchmark",
         )
     )
+    organ = load_scene(SCENE_FILE.with_name("organ.yaml")).object.geometry
+    named["organ"] = dict(organ)
     if len(sys.argv) == 3:
         named[Path(sys.argv[1]).stem] = dict(read_mesh(Path(sys.argv[1]), float(sys.argv[2]), None))
     return named

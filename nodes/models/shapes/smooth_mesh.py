@@ -157,6 +157,10 @@ class SmoothMeshShape:
         """
         queries = checked(points)
         before = checked_previous(previous, queries)
+        if queries.ndim == 1 and before is not None:
+            going_on = self._going_on(queries, before)
+            if going_on is not None:
+                return going_on
         flat = queries.reshape(-1, 3)
         earlier = None if before is None else before.reshape(-1, 3)
         point, normal, operator = (np.empty((len(flat), *end)) for end in ((3,), (3,), (3, 3)))
@@ -188,14 +192,28 @@ class SmoothMeshShape:
         """See `Shape`."""
         return self.closest(points).height_m
 
+    def _going_on(self, query: Floats, before: Floats) -> Nearest | None:
+        """`closest` for one query (3,) whose descent from the point before ends well, as nearly all
+        do; else None."""
+        feet = self._descend_one(query, before)
+        if not feet.is_nearest[0]:
+            return None
+        point, normal, operator = feet.point[0], feet.normal[0], feet.shape_operator[0]
+        edge = EDGE * TIGHTEST / self.smoothing_m
+        on_edge = bool(
+            float(np.einsum("ij,ij", operator, operator)) > edge * edge
+            or abs(feet.steepness[0] - 1.0) > OFF_ONE
+        )
+        height = (query - point) @ normal
+        return Nearest(
+            point, normal, height, operator, np.array(on_edge), np.zeros((), dtype=np.bool_)
+        )
+
     def _feet(self, queries: Floats, before: Floats | None) -> tuple[Feet, Bools]:
         """The feet of queries (n, 3), going on from those found before, and which are undecided."""
         if before is None:
             return self._nearest_of_all(queries)
-        if len(queries) == 1:
-            feet = self._descend_one(queries[0], before[0])
-        else:
-            feet = self._descend(queries, before)
+        feet = self._descend(queries, before)
         undecided = np.zeros(len(queries), dtype=bool)
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
