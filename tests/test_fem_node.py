@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,8 @@ from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
 from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver import precompute
+from nodes.fem_solver import precompute, pushes
+from nodes.fem_solver.body import SceneBody
 from nodes.fem_solver.node import FemSolver, FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
 
@@ -46,6 +48,16 @@ def fingertip(
         np.array(velocity, dtype=np.float64),
         reason="ok" if valid else "no_mark",
     )
+
+
+class Named:
+    """A method under another name."""
+
+    def __init__(self, method: Any, name: str) -> None:
+        self._method, self.name = method, name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._method, name)
 
 
 class Bench:
@@ -259,3 +271,74 @@ async def test_the_same_messages_give_the_same_bytes(cache: str) -> None:
         answers = [await bench.push(fingertip(tuple(wiggle(i))), i) for i in range(20)]
         runs.append(b"".join(a.displacement_world_m.tobytes() for a in answers))
     assert runs[0] == runs[1]
+
+
+@pytest.fixture
+def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pushes, "DEPTHS_M", (0.0015, 0.003, 0.006))
+    monkeypatch.setattr(pushes, "SPACING_RATIO", 1.0)
+    monkeypatch.setattr(pushes, "STATIONS", (0.0,))
+    monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
+
+
+async def test_the_table_is_made_while_the_linear_method_answers(
+    few_pushes: None, tmp_path: Path
+) -> None:
+    bench = Bench(cache_dir=tmp_path, method="nonlinear_table", workers=1)
+    await bench.node.setup()
+    await bench.node.step("scene", scene(), header())
+    tip = fingertip((0.0, 0.0, -0.003))
+    first = await bench.push(tip)
+    assert first.method == "linear"
+    while first.method == "linear":
+        assert bench.node.errors == 0, bench.node.last_error
+        await asyncio.sleep(0.05)
+        first = await bench.push(tip)
+    assert first.method == "nonlinear_table"
+    assert first.in_range
+    assert "nonlinear_table" in bench.node.note
+    await bench.node.close()
+    # from now on it is there from the start, and for who leaves the choice to the node
+    again = Bench(cache_dir=tmp_path)
+    await again.node.setup()
+    await again.node.step("scene", scene(), header())
+    answer = await again.push(tip)
+    assert answer.method == "nonlinear_table"
+    assert answer.displacement_world_m.tobytes() == first.displacement_world_m.tobytes()
+    await again.node.close()
+    assert (bench.node.errors, again.node.errors) == (0, 0)
+
+
+async def test_another_scene_ends_the_making_of_a_table(few_pushes: None, tmp_path: Path) -> None:
+    bench = Bench(cache_dir=tmp_path, method="nonlinear_table", workers=1)
+    await bench.node.setup()
+    await bench.node.step("scene", scene(), header())
+    while "deep pushes" not in bench.node.note:  # noqa: ASYNC110  # notes come without an event
+        await asyncio.sleep(0.01)
+    await bench.node.step("scene", scene(support_angle_rad=1.2), header())
+    await bench.node.close()
+    assert bench.node.errors == 0, bench.node.last_error
+    assert not any("table" in path.name and path.suffix == ".npz" for path in tmp_path.iterdir())  # noqa: ASYNC240
+
+
+async def test_a_late_method_is_left_for_a_quicker_one_and_that_is_said(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = {"linear": 0.0}
+    clock = bench.node.clock
+    assert isinstance(clock, VirtualClock)
+    linear = bench.node._bodies["linear"]
+    bench.node._use([linear, replace(linear, method=Named(linear.method, "other"))])
+    respond = SceneBody.respond
+
+    def timed(body: SceneBody, *rest: Any) -> Any:
+        clock.move_to(clock.now_ns() + int(1e9 * slow.get(body.method.name, 0.0)))
+        return respond(body, *rest)
+
+    monkeypatch.setattr(SceneBody, "respond", timed)
+    tip = fingertip((0.0, 0.0, -0.003))
+    assert (await bench.push(tip)).method == "linear"
+    slow["linear"] = 0.02
+    methods = [(await bench.push(tip)).method for _ in range(10)]
+    assert methods == ["linear"] * 5 + ["other"] * 5
+    assert "linear was late" in bench.node.note

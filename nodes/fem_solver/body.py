@@ -14,6 +14,8 @@ from nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
 from nodes.fem_solver.mesh import mesh_spec, world_from_mesh
 from nodes.fem_solver.place import Entry, locate
 from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
+from nodes.fem_solver.precompute_table import TableSpec
+from nodes.fem_solver.table import Table, TableSoftBody
 from nodes.models import rigid
 from nodes.models.prediction import path_at
 from nodes.models.shapes import Shape, make_shape
@@ -24,6 +26,11 @@ Floats = NDArray[np.float64]
 def spec_of(scene: Scene, skin_spacing_m: float) -> SoftBodySpec:
     """What has to be precomputed for this scene's object; ValueError as `mesh_spec`."""
     return SoftBodySpec(mesh_spec(scene, skin_spacing_m), scene.object.material.poisson_ratio)
+
+
+def table_spec_of(scene: Scene, spec: SoftBodySpec) -> TableSpec:
+    """What the nonlinear table of this body depends on."""
+    return TableSpec(spec, scene.finger.radius_m)
 
 
 def front_of(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
@@ -37,7 +44,8 @@ def front_of(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
 class SceneBody:
     """The soft body standing in its scene.
 
-    front (3,): the surface point nearest to the user, mesh frame.
+    front (3,): the surface point nearest to the user, mesh frame.  linear_depth_m: to which the
+    linear method is good, and at which the stiffness is told.
     """
 
     method: SoftBodyMethod
@@ -46,6 +54,7 @@ class SceneBody:
     front: Floats
     world_from_mesh: Floats
     skin: Skin
+    linear_depth_m: float
 
     def respond(self, point_world: Floats, held: Entry | None) -> tuple[Response, Entry | None]:
         """Answer to a fingertip at `point_world` (3,), and where it is in the body, to be handed in
@@ -117,7 +126,22 @@ def scene_body(
         front=front_of(shape, spec, rest),
         world_from_mesh=pose,
         skin=skin,
+        linear_depth_m=linear_depth_m,
     )
+
+
+def with_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table) -> SceneBody:
+    """The same body, answered for by its nonlinear table."""
+    method = TableSoftBody(
+        model.response,
+        model.response.rest[model.bounds],
+        table,
+        young_modulus_pa=scene.object.material.young_modulus_pa,
+        finger_radius_m=scene.finger.radius_m,
+        push_depth_m=scene.working_range.push_depth_m,
+        linear_depth_m=body.linear_depth_m,
+    )
+    return replace(body, method=method)
 
 
 def faded(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:

@@ -211,8 +211,11 @@ class NeoHookeanBody:
         poisson_ratio: float,
         finger_radius_m: float,
         friction: Friction = "none",
+        tolerance: float = TOLERANCE,
+        smallest_share: float = SMALLEST_SHARE,
     ) -> None:
         """faces (f, 6): six-node triangles that a finger can touch, node indices, outward.
+        tolerance, smallest_share: as `TOLERANCE` and `SMALLEST_SHARE`.
 
         Errors as `NeoHookeanSolid`.
         """
@@ -223,6 +226,7 @@ class NeoHookeanBody:
             nodes, elements, faces, modulus_pa=young_modulus_pa, radius_m=finger_radius_m
         )
         self.fixed, self.friction = fixed, friction
+        self.tolerance, self.smallest_share = tolerance, smallest_share
         self._order = Dissection(nodes, elements, fixed)
 
     def follow(
@@ -255,7 +259,7 @@ class NeoHookeanBody:
                     )
                 except StuckError:
                     share *= 0.5
-                    stuck = share < SMALLEST_SHARE
+                    stuck = share < self.smallest_share
                     continue
                 iterations, done, at = iterations + count, done + step, target
                 share = min(1.0, 2.0 * share)
@@ -289,7 +293,7 @@ class NeoHookeanBody:
             pressed = self.obstacle.forces(nodes + displacement, centre, held)
             residual = np.where(self.fixed[:, None], 0.0, inner + pressed)
             scale = max(np.abs(inner).max(), np.abs(pressed).max())
-            if np.abs(residual).max() <= TOLERANCE * scale:
+            if np.abs(residual).max() <= self.tolerance * scale:
                 return displacement, iteration, factors
             factors = self._factors(displacement, centre, held)
             step = -factors.solve(residual.ravel()).reshape(-1, 3)

@@ -13,16 +13,29 @@ from messages.scene import NonNegative, Positive, Scene
 from messages.types import Fingertip, Skin, SoftBody
 from nodes.fem_solver import body, cache, precompute
 from nodes.fem_solver.contact import Response
+from nodes.fem_solver.making import Maker, MethodChoice
+from nodes.fem_solver.pace import Pace
 from nodes.fem_solver.place import Entry
 from nodes.node import Input, Node, NodeParameters, Output
 
 
 class FemSolverParameters(NodeParameters):
+    method: MethodChoice = Field(
+        default="auto",
+        description="auto: the nonlinear table if it is in the cache, else linear; nonlinear_table "
+        "makes it, in minutes, in the background, if it is not there",
+    )
     skin_spacing_m: Positive = Field(
         default=0.003, description="between skin nodes where fingers go; finer is dearer at set-up"
     )
     linear_depth_m: Positive = Field(default=0.006, description="deeper pushes are out of range")
     largest_depth_m: Positive = Field(default=0.010, description="the skin never goes deeper")
+    step_budget_s: Positive = Field(
+        default=0.004, description="answers later than this, five running, change the method"
+    )
+    workers: int = Field(
+        default=0, ge=0, description="processes that make a table; 0: one for every core"
+    )
     lead_s: NonNegative = Field(default=0.0, description="finger is predicted this far ahead")
     hold_s: NonNegative = Field(default=0.1, description="a lost finger keeps its dent this long")
     relax_s: Positive = Field(default=0.15, description="time constant of springing back after it")
@@ -42,8 +55,15 @@ class FemSolver(Node):
 
     async def setup(self) -> None:
         self._stop = threading.Event()
-        self._model: tuple[str, precompute.SoftBodyModel] | None = None
-        self._body: body.SceneBody | None = None
+        self._maker = Maker(
+            skin_spacing_m=self.parameters.skin_spacing_m,
+            linear_depth_m=self.parameters.linear_depth_m,
+            largest_depth_m=self.parameters.largest_depth_m,
+            cache_dir=self.parameters.cache_dir or cache.default_cache_dir(),
+            workers=self.parameters.workers,
+        )
+        self._making: asyncio.Task[None] | None = None
+        self._use([])
         self._forget()
         self.note = "waiting for a scene"
 
@@ -52,51 +72,74 @@ class FemSolver(Node):
         self._last_ns = 0
         self._entry: Entry | None = None
 
+    def _use(self, bodies: list[body.SceneBody]) -> None:
+        """Answer by these from now on, the best first; by none before a scene."""
+        self._bodies = {one.method.name: one for one in bodies}
+        if bodies:
+            self._pace = Pace(list(self._bodies), self.parameters.step_budget_s)
+            nodes = len(bodies[0].skin.vertices_world_m)
+            self.note = f"soft body ready, {self._pace.name}, {nodes} skin nodes"
+
     async def close(self) -> None:
         self._stop.set()
+        await self._end_making()
+
+    async def _end_making(self) -> None:
+        if self._making is not None:
+            self._stop.set()
+            await self._making
+            self._making = None
+            self._stop = threading.Event()
 
     async def on_scene(self, scene: Scene, header: Header) -> None:
-        self._body = None
+        self._use([])
         self._forget()
+        await self._end_making()
         try:
-            self._body = await asyncio.to_thread(self._build, scene)
+            bodies = await asyncio.to_thread(
+                self._maker.bodies, scene, self.parameters.method, self._progress
+            )
         except precompute.Interrupted:
             self.note = "precomputation interrupted"
             return
         except Exception as error:
             self.note = f"no soft body: {error}"
             raise
-        self.note = f"soft body ready, {len(self._body.skin.vertices_world_m)} skin nodes"
-        self.skin.publish(self._body.skin, source_ns=header.source_ns)
+        self._use(bodies)
+        self.skin.publish(bodies[0].skin, source_ns=header.source_ns)
+        if self.parameters.method == "nonlinear_table" and len(bodies) == 1:
+            self._making = asyncio.create_task(self._make_table(scene, bodies[0]))
 
-    def _build(self, scene: Scene) -> body.SceneBody:
-        """In a thread of its own: takes seconds when nothing is in the cache."""
-        spec = body.spec_of(scene, self.parameters.skin_spacing_m)
-        if self._model is None or self._model[0] != spec.key():
-            path = self.parameters.cache_dir or cache.default_cache_dir()
-            self._model = spec.key(), precompute.load_or_compute(spec, path, self._progress)
-        return body.scene_body(
-            scene,
-            spec,
-            self._model[1],
-            linear_depth_m=self.parameters.linear_depth_m,
-            largest_depth_m=self.parameters.largest_depth_m,
-        )
+    async def _make_table(self, scene: Scene, linear: body.SceneBody) -> None:
+        """While the linear method answers, make what answers better."""
+        try:
+            best = await asyncio.to_thread(self._maker.tabulated, scene, linear, self._progress)
+        except precompute.Interrupted:
+            self.note = "making of the nonlinear table interrupted; it goes on from there next time"
+        except Exception as error:
+            self.report_error("nonlinear_table", error)
+        else:
+            self._use([best, linear])
 
-    def _progress(self, done: int, total: int, need: precompute.Budget) -> None:
+    def _progress(self, done: int, total: int, need: precompute.Need) -> None:
         if self._stop.is_set():
             raise precompute.Interrupted
         self.note = f"precomputing the soft body: {100 * done // total} % ({need.text()})"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
-        if self._body is None:
+        if not self._bodies:
             return
+        current = self._bodies[self._pace.name]
         if fingertip.valid:
+            begun_ns = self.clock.now_ns()
             point = body.position_at(fingertip, self.parameters.lead_s)
-            response, self._entry = self._body.respond(point, self._entry)
+            response, self._entry = current.respond(point, self._entry)
             self._last, self._last_ns = response, header.source_ns
+            if self._pace.took((self.clock.now_ns() - begun_ns) * 1e-9):
+                late = f", {current.method.name} was late" if self._pace.dropped else ""
+                self.note = f"soft body by {self._pace.name}{late}"
         elif self._last is None:
-            response = self._body.at_rest()
+            response = current.at_rest()
         else:
             response = body.faded(
                 self._last,
@@ -104,4 +147,4 @@ class FemSolver(Node):
                 hold_s=self.parameters.hold_s,
                 relax_s=self.parameters.relax_s,
             )
-        self.soft_body.publish(self._body.message(response), source_ns=header.source_ns)
+        self.soft_body.publish(current.message(response), source_ns=header.source_ns)

@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,12 @@ MESH_STEPS, FACTOR_STEPS = 1, 4
 Progress = Callable[[int, int, "Budget"], None]
 """Called with (done, total) steps of the work and what it needs, first before it starts; may raise
 `Interrupted` to stop it."""
+
+
+class Need(Protocol):
+    """What some work needs, said before it starts."""
+
+    def text(self) -> str: ...
 
 
 class Interrupted(Exception):

@@ -7,7 +7,7 @@ mesh = build_mesh(spec)                     # in the frame of `world_from_mesh(s
 
 from __future__ import annotations
 
-from nodes.fem_solver.mesh.cylinder import cylinder_mesh
+from nodes.fem_solver.mesh.cylinder import Focus, cylinder_mesh
 from nodes.fem_solver.mesh.from_scene import (
     MeshBudget,
     MeshSpec,
@@ -30,6 +30,7 @@ __all__ = [
     "EDGES",
     "FACES",
     "SUBTRIANGLES",
+    "Focus",
     "MeshBudget",
     "MeshSpec",
     "SolidMesh",

@@ -10,6 +10,9 @@ middle nodes lie on the true cylinder (isoparametric), all other edges are strai
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +25,20 @@ BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
 """Elements grow by this much per length of depth below the side."""
 RAMP_RAD = 0.6
+FOCUS_GROWTH = 0.45
+"""About a focus, elements grow by this much per length of way from it, ..."""
+COARSEST_RATIO = 0.5
+"""... up to this share of the radius."""
+
+
+@dataclass(frozen=True, slots=True)
+class Focus:
+    """The one place of the side that is to be meshed finely: its station along the axis, its angle
+    from +z, and how far around it elements are as small as asked."""
+
+    x_m: float
+    angle_rad: float
+    near_m: float
 
 
 def cylinder_mesh(
@@ -31,11 +48,13 @@ def cylinder_mesh(
     support_angle_rad: float,
     touch_angle_rad: float,
     skin_spacing_m: float,
+    focus: Focus | None = None,
 ) -> SolidMesh:
     """The solid cylinder, its skin nodes `skin_spacing_m` apart within `touch_angle_rad` of +z.
 
     support_angle_rad: full angle of the fixed strip about -z; touch_angle_rad: half angle about +z
-    that fingers can load.  Farther back, elements grow to twice the size; inwards, likewise.
+    that fingers can load.  Farther back, elements grow to twice the size; inwards, likewise.  With
+    a focus, they grow away from that instead.
     Raises ValueError where no sound mesh results: spacing too coarse for the radius, support all
     around, touchable part reaching into the support.
     """
@@ -55,10 +74,11 @@ def cylinder_mesh(
             f"({radius_m:g} m) and length ({length_m:g} m)"
         )
     element_m = 2.0 * skin_spacing_m
-    points, triangles = _disc(radius_m, half_support, touch_angle_rad, element_m)
-    slices = max(2, round(length_m / element_m))
-    corners, tetrahedra = _extrude(points, triangles, length_m, slices)
-    layer = np.repeat(np.arange(slices + 1), len(points))
+    sizes = _Sizes(element_m, touch_angle_rad, radius_m, focus)
+    points, triangles = _disc(radius_m, half_support, sizes)
+    stations = _stations(length_m, sizes)
+    corners, tetrahedra = _extrude(points, triangles, stations)
+    layer = np.repeat(np.arange(len(stations)), len(points))
     return _with_midnodes(
         corners,
         tetrahedra,
@@ -70,54 +90,86 @@ def cylinder_mesh(
     )
 
 
-def _size(angle: Floats, touch_angle: float, element_m: float) -> Floats:
-    """Wanted edge length at an angle from +z (rad, either sign)."""
-    behind = np.clip((np.abs(angle) - touch_angle) / RAMP_RAD, 0.0, 1.0)
-    return element_m * (1.0 + (BACK_COARSENING - 1.0) * behind)
+@dataclass(frozen=True, slots=True)
+class _Sizes:
+    """Wanted edge lengths on the side, by the angle from +z (n,) and along the axis."""
+
+    element_m: float
+    touch_angle: float
+    radius_m: float
+    focus: Focus | None
+
+    def around(self, angle: Floats) -> Floats:
+        wrapped = (angle + np.pi) % (2 * np.pi) - np.pi
+        if self.focus is None:
+            behind = np.clip((np.abs(wrapped) - self.touch_angle) / RAMP_RAD, 0.0, 1.0)
+            result: Floats = self.element_m * (1.0 + (BACK_COARSENING - 1.0) * behind)
+            return result
+        apart = (wrapped - self.focus.angle_rad + np.pi) % (2 * np.pi) - np.pi
+        return self._away(self.radius_m * np.abs(apart), self.focus)
+
+    def along(self, x: Floats) -> Floats:
+        if self.focus is None:
+            return np.full(len(x), self.element_m)
+        return self._away(np.abs(x - self.focus.x_m), self.focus)
+
+    def _away(self, way_m: Floats, focus: Focus) -> Floats:
+        grown = self.element_m + FOCUS_GROWTH * np.maximum(way_m - focus.near_m, 0.0)
+        result: Floats = np.minimum(grown, max(COARSEST_RATIO * self.radius_m, self.element_m))
+        return result
 
 
-def _arc(start: float, stop: float, radius: float, size: tuple[float, float, float]) -> Floats:
-    """Angles from `start` (included) to `stop` (not), spaced as `size` asks.
+def _stations(length_m: float, sizes: _Sizes) -> Floats:
+    """Where the cross-sections stand along the axis, ends included, and one at the focus."""
+    ends = [-0.5 * length_m, 0.5 * length_m]
+    if sizes.focus is not None and abs(sizes.focus.x_m) < 0.5 * length_m - sizes.element_m:
+        ends.insert(1, sizes.focus.x_m)
+    stations = []
+    for start, stop in itertools.pairwise(ends):
+        fine = np.linspace(start, stop, 2001)
+        stations.append(_spaced(fine, 1.0 / sizes.along(fine), fewest=1))
+    return np.concatenate([*stations, ends[-1:]])
 
-    size: touchable half angle, element length on the side, depth of this ring below it.
-    """
-    touch_angle, element_m, depth = size
+
+def _arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
+    """Angles from `start` (included) to `stop` (not), spaced as sizes ask, on a ring of this radius
+    at this depth below the side."""
     fine = np.linspace(start, stop, 2001)
-    wrapped = (fine + np.pi) % (2 * np.pi) - np.pi
-    density = radius / (_size(wrapped, touch_angle, element_m) + DEPTH_GROWTH * depth)
+    return _spaced(fine, radius / (sizes.around(fine) + DEPTH_GROWTH * depth), fewest=2)
+
+
+def _spaced(fine: Floats, density: Floats, *, fewest: int) -> Floats:
+    """Places among `fine` with so many per length, from its first on, without its last."""
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
-    pieces = max(2, round(float(total[-1])))
-    angles: Floats = np.interp(np.arange(pieces) * total[-1] / pieces, total, fine)
-    return angles
+    pieces = max(fewest, round(float(total[-1])))
+    result: Floats = np.interp(np.arange(pieces) * total[-1] / pieces, total, fine)
+    return result
 
 
-def _disc(
-    radius_m: float, half_support: float, touch_angle: float, element_m: float
-) -> tuple[Floats, Ints]:
+def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
     """Points (y, z) of the cross-section and its triangles, counter-clockwise seen from +x.
 
-    Points on the rim come first, with one on each end of the support.
+    Points on the rim come first, with one on each end of the support, and one at the focus.
     """
     from scipy.spatial import Delaunay  # late, as all of scipy: the process must start quickly
 
     free = np.pi - half_support
-    size = (touch_angle, element_m, 0.0)
+    ends = [-free, free, 2 * np.pi - free]
+    if sizes.focus is not None:
+        ends.insert(1, sizes.focus.angle_rad)
     rim = np.concatenate(
-        [
-            _arc(-free, free, radius_m, size),
-            _arc(free, 2 * np.pi - free, radius_m, size),
-        ]
+        [_arc(start, stop, radius_m, 0.0, sizes) for start, stop in itertools.pairwise(ends)]
     )
     rings = [radius_m * np.column_stack([np.sin(rim), np.cos(rim)])]
-    depth, step = 0.0, element_m
+    depth, step = 0.0, sizes.element_m
     while True:
         depth += 0.85 * step
-        step = element_m + DEPTH_GROWTH * depth
+        step = sizes.element_m + DEPTH_GROWTH * depth
         inner = radius_m - depth
         if inner < 0.6 * step:
             break
         offset = 0.5 * step / inner if len(rings) % 2 else 0.0
-        angles = _arc(-np.pi + offset, np.pi + offset, inner, (touch_angle, element_m, depth))
+        angles = _arc(-np.pi + offset, np.pi + offset, inner, depth, sizes)
         if len(angles) < 4:
             break
         rings.append(inner * np.column_stack([np.sin(angles), np.cos(angles)]))
@@ -130,14 +182,13 @@ def _disc(
     return points, triangles
 
 
-def _extrude(points: Floats, triangles: Ints, length_m: float, slices: int) -> tuple[Floats, Ints]:
+def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
     """Corner nodes (k, 3) and tetrahedra (e, 4) of the extruded cross-section, slice by slice.
 
     The diagonals lean to the other side in every second slice, lest the whole solid lean.
     """
-    count = len(points)
-    x = np.linspace(-0.5 * length_m, 0.5 * length_m, slices + 1)
-    corners = np.column_stack([np.repeat(x, count), np.tile(points, (slices + 1, 1))])
+    count, slices = len(points), len(x) - 1
+    corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])
     low, middle, high = np.sort(triangles, axis=1).T
     tetrahedra = []
     for number in range(slices):

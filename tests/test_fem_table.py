@@ -1,0 +1,295 @@
+"""The nonlinear table: filled from few pushes, smooth, bounded, kept, made in other processes."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nodes.fem_solver import precompute_table, pushes
+from nodes.fem_solver.carried import Hull, turn
+from nodes.fem_solver.contact import CURVE_SHARES, Response, SkinResponse
+from nodes.fem_solver.mesh import build_mesh
+from nodes.fem_solver.place import Push
+from nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
+from nodes.fem_solver.precompute_table import (
+    TableSpec,
+    compute_table,
+    load_table,
+    local_processes,
+    parts_of,
+    save_table,
+    solve_all,
+    table_path,
+)
+from nodes.fem_solver.pushes import PushAnswer, Site, solve_push
+from nodes.fem_solver.table import Table, TableSoftBody, depth_modes
+from tests.soft_bodies import cylinder_spec
+
+Floats = NDArray[np.float64]
+
+RADIUS, LENGTH, FINGER = 0.02, 0.06, 0.007
+SPEC = TableSpec(cylinder_spec(RADIUS, LENGTH, touch_angle_rad=1.2, skin_spacing_m=0.005), FINGER)
+DEPTHS = (0.0015, 0.003, 0.005, 0.0075)
+MODULUS = 4000.0
+
+
+class Here(Executor):
+    """Does what is submitted at once, in this process."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+@pytest.fixture(scope="module", autouse=True)
+def coarse() -> Iterator[None]:
+    """Few sites, few depths, a coarse mesh: what is tested does not depend on them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pushes, "DEPTHS_M", DEPTHS)
+        patch.setattr(pushes, "SPACING_RATIO", 1.0)
+        patch.setattr(pushes, "STATIONS", (0.0, 0.6))
+        patch.setattr(pushes, "ANGLE_STEP_RAD", 0.5)
+        yield
+
+
+@pytest.fixture(scope="module")
+def model() -> SoftBodyModel:
+    return compute(SPEC.body, lambda done, total, need: None)
+
+
+@pytest.fixture(scope="module")
+def table(model: SoftBodyModel, tmp_path_factory: pytest.TempPathFactory) -> Table:
+    folder = tmp_path_factory.mktemp("table")
+    made = compute_table(SPEC, model, folder, Here(), lambda done, total, need: None)
+    assert [path.name for path in folder.iterdir()] == [table_path(SPEC, folder).name]
+    return made
+
+
+def soft_body(response: SkinResponse, bounds: Floats, table: Table) -> TableSoftBody:
+    return TableSoftBody(
+        response,
+        bounds,
+        table,
+        young_modulus_pa=MODULUS,
+        finger_radius_m=FINGER,
+        push_depth_m=0.02,
+        linear_depth_m=0.003,
+    )
+
+
+@pytest.fixture(scope="module")
+def body(model: SoftBodyModel, table: Table) -> TableSoftBody:
+    return soft_body(model.response, model.response.rest[model.bounds], table)
+
+
+def push(x: float, angle: float, depth: float) -> Push:
+    normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+    beyond = max(0.0, abs(x) - 0.5 * LENGTH)
+    return Push(RADIUS * normal + np.array([x, 0.0, 0.0]), normal, depth, beyond)
+
+
+def largest_move(a: Response, b: Response) -> float:
+    return float(np.linalg.norm(a.displacement - b.displacement, axis=1).max())
+
+
+def test_away_from_the_finger_it_is_what_newton_finds(
+    body: TableSoftBody, model: SoftBodyModel
+) -> None:
+    """At a place that no push was solved at."""
+    there = push(0.005, 0.2, 0.003)
+    mesh = build_mesh(SPEC.body.mesh)
+    site = Site(there.surface, there.normal)
+    job = pushes.job_of(SPEC.body.mesh, mesh, site, poisson_ratio=0.45, finger_radius_m=FINGER)
+    wanted = solve_push(job)
+    nodes, weights = Hull(wanted.rest, wanted.faces).weights(model.response.rest)
+    moved = np.einsum("qa,qai->qi", weights, wanted.moved[DEPTHS.index(0.003)][nodes])
+    answer = body.respond(there)
+    away = np.linalg.norm(model.response.rest - there.surface, axis=1) > 1.5 * FINGER
+    assert (
+        np.linalg.norm(answer.displacement - moved, axis=1)[away].max() < 0.6e-3
+    )  # elements of 10 mm
+    force = MODULUS * wanted.force_n[DEPTHS.index(0.003)] @ there.normal
+    assert answer.force_n @ there.normal == pytest.approx(force, rel=0.1)
+    assert answer.in_range
+
+
+@pytest.mark.parametrize("depth", [0.0005, 0.002, 0.005, 0.02])
+def test_a_slide_moves_no_skin_node_a_tenth_of_a_millimetre(
+    body: TableSoftBody, depth: float
+) -> None:
+    answers = [
+        body.respond(push(0.003 + 1.2e-5 * i, 0.1 + 1.6e-5 * i / RADIUS, depth)) for i in range(300)
+    ]
+    assert max(largest_move(a, b) for a, b in itertools.pairwise(answers)) < 0.1e-3
+    forces = np.array([np.linalg.norm(a.force_n) for a in answers])
+    assert np.abs(np.diff(forces)).max() < 0.01 * forces.mean()
+
+
+def test_a_push_grows_from_nothing_and_never_jumps(body: TableSoftBody) -> None:
+    answers = [body.respond(push(0.004, 0.1, d)) for d in np.linspace(-1e-4, 0.03, 800)]
+    assert max(largest_move(a, b) for a, b in itertools.pairwise(answers)) < 0.08e-3
+    forces = np.array([a.force_n @ push(0, 0.1, 0).normal for a in answers])
+    assert forces[0] == 0.0
+    assert (np.diff(forces) >= -1e-4 * forces.max()).all()
+
+
+def test_deeper_than_solved_is_flagged_bounded_and_never_inverted(
+    body: TableSoftBody, model: SoftBodyModel
+) -> None:
+    rest = model.response.rest
+
+    def normals(vertices: Floats) -> Floats:
+        a, b, c = vertices[model.triangles].transpose(1, 0, 2)
+        return np.cross(b - a, c - a)
+
+    for depth in (0.004, 0.0075, 0.03):
+        answer = body.respond(push(0.004, 0.1, depth))
+        assert answer.in_range == (depth <= DEPTHS[-1] - 0.0025)
+        assert np.linalg.norm(answer.displacement, axis=1).max() < 1.2 * DEPTHS[-1]
+        turned = np.einsum("ij,ij->i", normals(rest), normals(rest + answer.displacement))
+        assert turned.min() > 0.0
+
+
+def test_past_the_end_the_dent_fades_and_is_flagged(body: TableSoftBody) -> None:
+    answers = [body.respond(push(0.02 + 1e-4 * i, 0.1, 0.004)) for i in range(300)]
+    assert max(largest_move(a, b) for a, b in itertools.pairwise(answers)) < 0.25e-3
+    assert answers[0].in_range
+    assert not answers[110].in_range
+    assert not answers[-1].displacement.any()
+
+
+def test_the_curve_is_what_pushes_then_give(body: TableSoftBody) -> None:
+    there = push(0.004, 0.1, 0.003)
+    curve = body.force_curve(there.surface)
+    assert (np.diff(curve[:, 1]) >= 0.0).all()
+    assert curve[-1, 0] == pytest.approx(0.02)
+    for depth in (0.0015, 0.003, 0.006, 0.015):
+        answer = body.respond(push(0.004, 0.1, depth))
+        wanted = np.interp(depth, *curve.T)
+        assert answer.force_n @ there.normal == pytest.approx(wanted, rel=0.12)
+    secant = curve[len(CURVE_SHARES), 1] / 0.003
+    assert body.stiffness_n_per_m(there.surface) == pytest.approx(secant)
+
+
+def test_a_finger_in_the_air_moves_nothing(body: TableSoftBody) -> None:
+    answer = body.respond(push(0.0, 0.0, -0.01))
+    assert not answer.displacement.any()
+    assert not answer.force_n.any()
+    assert answer.stiffness_n_per_m > 0.0
+
+
+def test_the_body_answers_its_mirror_image_alike(body: TableSoftBody) -> None:
+    here, there = (body.respond(push(0.006, sign * 0.3, 0.004)) for sign in (1.0, -1.0))
+    assert there.force_n == pytest.approx(here.force_n * [1, -1, 1], rel=0.05, abs=1e-4)
+
+
+def test_pushes_cover_what_can_be_touched_but_for_reflections() -> None:
+    mesh = build_mesh(SPEC.body.mesh)
+    mirrors = pushes.mirrors_of(mesh)
+    assert len(mirrors) == 4
+    sites = pushes.sites_of(SPEC.body.mesh, mesh, mirrors, FINGER)
+    assert all(site.place[0] >= 0.0 and site.place[1] >= 0.0 for site in sites)
+    one_sided = pushes.sites_of(SPEC.body.mesh, mesh, mirrors[:1], FINGER)
+    assert len(one_sided) == (2 * 2 - 1) * (2 * len(sites) // 2 - 1)
+
+
+def test_a_point_is_found_on_the_hull() -> None:
+    mesh = build_mesh(SPEC.body.mesh)
+    answer = PushAnswer(mesh.nodes, mesh.touch[mesh.touch_faces], *[np.zeros(1)] * 3, 0)
+    points = mesh.nodes[mesh.touch]
+    nodes, weights = Hull(answer.rest, answer.faces).weights(points)
+    found = np.einsum("qa,qai->qi", weights, mesh.nodes[nodes])
+    assert found == pytest.approx(points, abs=1e-12)
+    assert weights.sum(axis=1) == pytest.approx(1.0)
+
+
+def test_the_least_turn_takes_one_direction_into_another() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        start, end = rng.normal(size=(2, 3))
+        start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
+        rotation = turn(start, end)
+        assert rotation @ start == pytest.approx(end)
+        assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
+
+
+def test_modes_leave_no_more_than_asked() -> None:
+    depths = np.linspace(0.0, 1.0, 9)
+    rng = np.random.default_rng(1)
+    samples = np.array(
+        [np.outer(depths, a) + np.outer(depths**2, b) for a, b in rng.normal(size=(5, 2, 30))]
+    ).astype(np.float32)
+    modes = depth_modes(samples, 1e-4)
+    assert modes.shape == (9, 2)
+    left = samples - np.einsum("ak,bk,pbn->pan", modes, modes, samples)
+    assert np.abs(left).max() < 1e-4
+
+
+def test_a_table_is_kept_whole_or_not_at_all(table: Table, tmp_path: Path) -> None:
+    assert load_table(SPEC, tmp_path) is None
+    save_table(table, SPEC, tmp_path)
+    kept = load_table(SPEC, tmp_path)
+    assert kept is not None
+    assert np.array_equal(kept.fields, table.fields)
+    path = table_path(SPEC, tmp_path)
+    path.write_bytes(path.read_bytes()[:-1000])
+    assert load_table(SPEC, tmp_path) is None
+
+
+def test_an_interrupted_table_goes_on_where_it_stopped(
+    model: SoftBodyModel, table: Table, tmp_path: Path
+) -> None:
+    def stop(done: int, total: int, need: object) -> None:
+        if done >= precompute_table.PUSH_STEPS * 2:
+            raise Interrupted
+
+    with pytest.raises(Interrupted):
+        compute_table(SPEC, model, tmp_path, Here(), stop)
+    assert load_table(SPEC, tmp_path) is None
+    kept = len(list(parts_of(SPEC, tmp_path).folder.iterdir()))
+    assert kept >= 2
+    seen: list[int] = []
+    compute_table(SPEC, model, tmp_path, Here(), lambda done, *_: seen.append(done))
+    assert seen[1] == precompute_table.PUSH_STEPS * kept
+    again = load_table(SPEC, tmp_path)
+    assert again is not None
+    assert np.allclose(again.fields, table.fields, atol=1e-9)
+
+
+def test_too_little_memory_is_said_before_it_is_taken(
+    model: SoftBodyModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Little:
+        available = 1000
+
+    monkeypatch.setattr("psutil.virtual_memory", Little)
+    with pytest.raises(MemoryError, match="skin_spacing_m"):
+        compute_table(SPEC, model, tmp_path, Here(), lambda *_: None)
+
+
+def test_pushes_are_solved_in_other_processes(tmp_path: Path) -> None:
+    mesh = build_mesh(SPEC.body.mesh)
+    site = pushes.sites_of(SPEC.body.mesh, mesh, pushes.mirrors_of(mesh), FINGER)[0]
+    job = pushes.job_of(SPEC.body.mesh, mesh, site, poisson_ratio=0.45, finger_radius_m=FINGER)
+    parts = precompute_table.Parts(tmp_path / "parts")
+    with local_processes(1) as executor:
+        (there,) = solve_all([job], executor, parts, lambda count: None)
+    here = solve_push(job)
+    assert np.array_equal(there.moved, here.moved)
+    assert there.reached == here.reached == len(DEPTHS)
+
+
+def test_a_push_that_is_asked_to_stop_does() -> None:
+    mesh = build_mesh(SPEC.body.mesh)
+    site = pushes.sites_of(SPEC.body.mesh, mesh, pushes.mirrors_of(mesh), FINGER)[0]
+    job = pushes.job_of(SPEC.body.mesh, mesh, site, poisson_ratio=0.45, finger_radius_m=FINGER)
+    with pytest.raises(pushes.StoppedError):
+        solve_push(job, lambda: True)
