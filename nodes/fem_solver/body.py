@@ -44,8 +44,8 @@ def front_of(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
 class SceneBody:
     """The soft body standing in its scene.
 
-    front (3,): the surface point nearest to the user, mesh frame.  linear_depth_m: to which the
-    linear method is good, and at which the stiffness is told.
+    front (3,): the surface point nearest to the user, rest (s, 3): skin nodes, mesh frame.
+    linear_depth_m: to which the linear method is good, and at which the stiffness is told.
     """
 
     method: SoftBodyMethod
@@ -53,6 +53,7 @@ class SceneBody:
     shape: Shape
     front: Floats
     world_from_mesh: Floats
+    rest: Floats
     skin: Skin
     linear_depth_m: float
 
@@ -125,6 +126,7 @@ def scene_body(
         shape=shape,
         front=front_of(shape, spec, rest),
         world_from_mesh=pose,
+        rest=rest,
         skin=skin,
         linear_depth_m=linear_depth_m,
     )

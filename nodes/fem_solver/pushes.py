@@ -175,10 +175,16 @@ def _cylinder_sites(cylinder: Cylinder, touch_rad: float, mirrors: list[Floats])
 
 
 def job_of(
-    spec: MeshSpec, mesh: SolidMesh, site: Site, *, poisson_ratio: float, finger_radius_m: float
+    spec: MeshSpec,
+    mesh: SolidMesh,
+    site: Site,
+    *,
+    poisson_ratio: float,
+    finger_radius_m: float,
+    spacing_m: float | None = None,
 ) -> PushJob:
     """The job of a push: on a mesh that is fine just there where the shape has one, else on its
-    own."""
+    own.  spacing_m: of skin nodes there; None: as a table wants it."""
     geometry, support = spec.geometry, spec.support
     if isinstance(geometry, Cylinder) and isinstance(support, StripSupport):
         focus = Focus(
@@ -191,7 +197,7 @@ def job_of(
             length_m=geometry.length_m,
             support_angle_rad=support.angle_rad,
             touch_angle_rad=np.pi - 0.5 * support.angle_rad,
-            skin_spacing_m=min(SPACING_RATIO * finger_radius_m, spec.skin_spacing_m),
+            skin_spacing_m=spacing_m or min(SPACING_RATIO * finger_radius_m, spec.skin_spacing_m),
             focus=focus,
         )
     return PushJob(
