@@ -86,15 +86,14 @@ class Tally:
     pass_ns: list[int] = field(default_factory=list)
 
     def judge(self, name: str, share: Floats | float, allowed: Flags | bool = False) -> None:
-        """share: of a limit, 1 being all of it; where `allowed`, more is no violation."""
+        """share: of a limit, 1 being all of it; more is counted apart where it is `allowed`."""
         shares = np.atleast_1d(np.asarray(share, dtype=np.float64))
         if shares.size == 0:
             return
-        over = ~(shares <= WITHIN)
-        excused = over & np.broadcast_to(allowed, shares.shape)
-        self.excused += int(excused.sum())
-        self.violations[name] += int((over & ~excused).sum())
-        self.worst[name] = max(self.worst[name], float(np.where(excused, 0.0, shares).max()))
+        over, free = ~(shares <= WITHIN), np.broadcast_to(allowed, shares.shape)
+        self.excused += int((over & free).sum())
+        self.violations[name] += int((over & ~free).sum())
+        self.worst[name] = max(self.worst[name], float(np.where(free, 0.0, shares).max()))
 
 
 def flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
