@@ -511,3 +511,23 @@ async def test_an_object_turned_in_the_world_is_met_from_the_users_side() -> Non
     assert target.normal_world == pytest.approx([0.0, 0.0, 1.0], abs=1e-9)
     on_object = (inverse(world_from_object) @ np.append(target.contact_world_m, 1.0))[:3]
     assert np.hypot(on_object[1], on_object[2]) == pytest.approx(RADIUS)
+
+
+async def test_an_object_that_cannot_be_presented_is_said_and_nothing_is_sent() -> None:
+    desk = await table()
+    await desk.rest_at(in_world(on_cylinder(0.0, 0.02)), 3)
+    sent = len(desk.sent)
+    data = YAML(typ="safe").load(SCENE_FILE)
+    data["object"]["geometry"] = {"shape": "plane", "width_m": 0.1, "height_m": 0.1}
+    data["object"]["world_from_object"] = {
+        "position_m": [0.0, 0.0, 0.0],
+        "rpy_rad": [math.pi, 0.0, 0.0],
+    }
+    data["object"]["support"] = {"kind": "base", "height_m": 0.008}
+    data["object"].pop("support_angle_rad", None)
+    await desk.planner.step("scene", Scene.model_validate(data), desk.header())
+    assert desk.planner.errors == 1
+    assert "object.world_from_object" in desk.planner.last_error
+    desk.now_ns += FRAME_NS
+    await desk.planner.step("fingertip", fingertip(np.array([0.0, 0.0, 0.02])), desk.header())
+    assert len(desk.sent) == sent

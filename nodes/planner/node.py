@@ -44,6 +44,8 @@ class Planner(Node):
             self._calibration = load_sheet_calibration(path)
 
     def on_scene(self, scene: Scene, header: Header) -> None:
+        # An object that cannot be presented must not leave the last one's plan in force.
+        self._plan = self._yielding = None
         self._plan = Plan(scene, self.parameters.settings())
         law = law_for(scene.sheet, self._calibration)
         self._yielding = Yielding(scene, law, self.parameters.presents)
