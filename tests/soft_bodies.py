@@ -17,6 +17,7 @@ def cylinder_spec(
     skin_spacing_m: float,
     support_angle_rad: float = 0.5 * np.pi,
     poisson_ratio: float = 0.45,
+    sticking: bool = False,
 ) -> SoftBodySpec:
     """A cylinder that lies across, held at its back."""
     mesh = MeshSpec(
@@ -29,4 +30,4 @@ def cylinder_spec(
         turn_rad=0.0,
         slab_depth_m=0.0,
     )
-    return SoftBodySpec(mesh, poisson_ratio)
+    return SoftBodySpec(mesh, poisson_ratio, sticking)

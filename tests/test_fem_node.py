@@ -342,3 +342,20 @@ async def test_a_late_method_is_left_for_a_quicker_one_and_that_is_said(
     methods = [(await bench.push(tip)).method for _ in range(10)]
     assert methods == ["linear"] * 5 + ["other"] * 5
     assert "linear was late" in bench.node.note
+
+
+async def test_with_friction_the_finger_drags_the_skin_until_it_slips(cache: str) -> None:
+    rough = Bench(cache_dir=cache, friction_ratio=0.5)
+    await rough.node.setup()
+    await rough.node.step("scene", scene(), header())
+    await rough.push(fingertip((0.0, 0.0, -0.0001)))
+    ratios = []
+    for i in range(60):
+        answer = await rough.push(fingertip((2e-4 * i, 0.0, -0.004)))
+        ratios.append(-answer.force_world_n[0] / answer.force_world_n[2])
+    assert answer.method == "linear"
+    assert ratios[5] > ratios[1] > 0.02
+    assert max(ratios) == pytest.approx(0.5, abs=0.05)
+    assert min(ratios[-10:]) > 0.4
+    await rough.node.close()
+    assert rough.node.errors == 0, rough.node.last_error

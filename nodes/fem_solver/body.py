@@ -12,7 +12,7 @@ from messages.scene import Scene
 from messages.types import Fingertip, Skin, SoftBody
 from nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
 from nodes.fem_solver.mesh import mesh_spec, world_from_mesh
-from nodes.fem_solver.place import Entry, locate
+from nodes.fem_solver.place import Entry, locate, locate_stuck, slipped
 from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from nodes.fem_solver.precompute_table import TableSpec
 from nodes.fem_solver.table import Table, TableSoftBody
@@ -23,9 +23,10 @@ from nodes.models.shapes import Shape, make_shape
 Floats = NDArray[np.float64]
 
 
-def spec_of(scene: Scene, skin_spacing_m: float) -> SoftBodySpec:
+def spec_of(scene: Scene, skin_spacing_m: float, *, sticking: bool = False) -> SoftBodySpec:
     """What has to be precomputed for this scene's object; ValueError as `mesh_spec`."""
-    return SoftBodySpec(mesh_spec(scene, skin_spacing_m), scene.object.material.poisson_ratio)
+    mesh = mesh_spec(scene, skin_spacing_m)
+    return SoftBodySpec(mesh, scene.object.material.poisson_ratio, sticking)
 
 
 def table_spec_of(scene: Scene, spec: SoftBodySpec) -> TableSpec:
@@ -46,6 +47,7 @@ class SceneBody:
 
     front (3,): the surface point nearest to the user, rest (s, 3): skin nodes, mesh frame.
     linear_depth_m: to which the linear method is good, and at which the stiffness is told.
+    friction_ratio: of what the finger can pull along the skin to what it presses; 0: it slides.
     """
 
     method: SoftBodyMethod
@@ -56,14 +58,28 @@ class SceneBody:
     rest: Floats
     skin: Skin
     linear_depth_m: float
+    friction_ratio: float
 
     def respond(self, point_world: Floats, held: Entry | None) -> tuple[Response, Entry | None]:
         """Answer to a fingertip at `point_world` (3,), and where it is in the body, to be handed in
         as `held` the next time.  ValueError for a point that is not finite."""
-        push, entry = locate(
-            self.shape, rigid.apply(rigid.inverse(self.world_from_mesh), point_world), held
-        )
-        return self.method.respond(push), entry
+        point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
+        if self.friction_ratio == 0.0:
+            push, entry = locate(self.shape, point, held)
+            return self.method.respond(push), entry
+        push, entry = locate_stuck(self.shape, point, held)
+        response = self.method.respond(push)
+        if entry is None or push.drag_m is None:
+            return response, entry
+        pressing = float(response.force_n @ push.normal)
+        aside = float(np.linalg.norm(response.force_n - pressing * push.normal))
+        most = self.friction_ratio * max(pressing, 0.0)
+        if aside > most:
+            # the skin pulls back in proportion to the drag: so much of it is held
+            share = most / aside
+            entry = slipped(self.shape, entry, push.drag_m, share)
+            response = self.method.respond(replace(push, drag_m=share * push.drag_m))
+        return response, entry
 
     def at_rest(self) -> Response:
         """The untouched body; its stiffness is that of the place nearest to the user."""
@@ -99,6 +115,7 @@ def scene_body(
     *,
     linear_depth_m: float,
     largest_depth_m: float,
+    friction_ratio: float = 0.0,
 ) -> SceneBody:
     """The soft body of a scene from its precomputed model; ValueError as its parts."""
     pose = world_from_mesh(scene)
@@ -113,6 +130,7 @@ def scene_body(
         linear_depth_m=linear_depth_m,
         largest_depth_m=largest_depth_m,
         push_depth_m=scene.working_range.push_depth_m,
+        drag=model.drag,
     )
     pose_digest = hashlib.sha256(pose.tobytes()).hexdigest()[:8]
     skin = Skin(
@@ -129,6 +147,7 @@ def scene_body(
         rest=rest,
         skin=skin,
         linear_depth_m=linear_depth_m,
+        friction_ratio=friction_ratio,
     )
 
 

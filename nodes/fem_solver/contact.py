@@ -38,6 +38,8 @@ FACING = (0.2, 0.6)
 """Cosines between the skin's normal and the push at which none, and all of its reach counts."""
 PAD_RATIO = 1.1
 """Half width of the contact patch at the end of the linear range, in finger radii."""
+TIE_GIVE_RATIO = 0.004
+"""A tie gives by this share of the finger's radius under what presses its point."""
 FULL_STEPS = 8
 MAX_ITERATIONS = 40
 CURVE_SHARES = (0.05, 0.12, 0.22, 0.35, 0.5, 0.7, 1.0)
@@ -59,6 +61,20 @@ class SkinResponse:
     touch: Ints
     normals: Floats
     faces: Ints
+    compliance: Floats
+    table: Floats32
+
+
+@dataclass(frozen=True, slots=True)
+class DragResponse:
+    """What the same body answers to unit forces along its skin, for 1 Pa.
+
+    tangents (m, 2, 3): two directions along the skin at each touch node.  compliance (2m, 2m):
+    displacement along direction i under 1 N along direction j.  table (2m, 3 s) float32: of the
+    whole skin.
+    """
+
+    tangents: Floats
     compliance: Floats
     table: Floats32
 
@@ -105,7 +121,24 @@ class SoftBodyMethod(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """Inward forces (k,) in N on the touch nodes `nodes` (k,); their sum (3,) on the finger."""
+    """Inward forces (k,) in N on the touch nodes `nodes` (k,); their sum (3,) on the finger.
+
+    weights (q, k), normals (q, 3), pressed_n (q,): of the points in contact, their shape functions
+    at the nodes, normals, and the forces that press them.
+    """
+
+    nodes: Ints
+    forces: Floats
+    force_n: Floats
+    weights: Floats
+    normals: Floats
+    pressed_n: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Drag:
+    """Forces (k, 2) in N along the tangents of the touch nodes `nodes` (k,); their sum (3,) on the
+    finger."""
 
     nodes: Ints
     forces: Floats
@@ -214,13 +247,50 @@ class SphereContact:
         nodes, local = np.unique(self._response.faces[face], return_inverse=True)
         weights = np.zeros((len(reached), len(nodes)))
         weights[np.arange(len(reached))[:, None], local.reshape(-1, 6)] = self._shape[point]
-        forces = solve_bed(
-            weights,
-            self._compliance[np.ix_(nodes, nodes)],
-            self._bed[face],
-            below[reached],
+        compliance, bed = self._compliance[np.ix_(nodes, nodes)], self._bed[face]
+        forces = solve_bed(weights, compliance, bed, below[reached])
+        left = below[reached] - weights @ (compliance @ forces)
+        pressed = left > 0.0
+        return Contact(
+            nodes=nodes,
+            forces=forces,
+            force_n=forces @ self._response.normals[nodes],
+            weights=weights[pressed],
+            normals=self._normals[face[pressed], point[pressed]],
+            pressed_n=bed[pressed] * left[pressed],
         )
-        return Contact(nodes, forces, forces @ self._response.normals[nodes])
+
+
+class DragContact:
+    """How a finger that sticks to the skin drags it along.
+
+    Points in contact are tied to the finger, along the skin, by springs as strong as they are
+    pressed: so a point that comes into contact, or leaves it, does so without a jump.  What the
+    straight push moves along the skin is left free, and dragging does not change what presses.
+    """
+
+    def __init__(
+        self, response: DragResponse, *, young_modulus_pa: float, finger_radius_m: float
+    ) -> None:
+        self._response = response
+        self._compliance = response.compliance / young_modulus_pa
+        self._give = TIE_GIVE_RATIO * finger_radius_m
+
+    def solve(self, contact: Contact, drag: Floats) -> Drag:
+        """The drag by a finger that has moved along the skin by `drag` (3,), m, since it stuck."""
+        nodes, count = contact.nodes, len(contact.nodes)
+        rows = (2 * nodes[:, None] + np.arange(2)).ravel()
+        across = self._response.tangents[nodes]
+        along = np.eye(3) - contact.normals[:, :, None] * contact.normals[:, None, :]
+        # displacement along the skin at the points (3 q), by that of the nodes' directions (2 k)
+        moved = np.einsum("qk,kai,qij->qjka", contact.weights, across, along, optimize=True)
+        moved = moved.reshape(-1, 2 * count)
+        ties = np.repeat(contact.pressed_n / self._give, 3)
+        wanted = (along @ drag).ravel()
+        pulled = moved.T * ties
+        system = np.eye(2 * count) + pulled @ moved @ self._compliance[np.ix_(rows, rows)]
+        forces = np.linalg.solve(system, pulled @ wanted).reshape(-1, 2)
+        return Drag(nodes, forces, -np.einsum("ka,kai->i", forces, across))
 
 
 def solve_bed(weights: Floats, compliance: Floats, bed: Floats, below: Floats) -> Floats:
@@ -284,9 +354,11 @@ class LinearSoftBody:
         linear_depth_m: float,
         largest_depth_m: float,
         push_depth_m: float | None = None,
+        drag: DragResponse | None = None,
     ) -> None:
         """bounds (b, 3): skin nodes that cannot be touched; pushes next to them are out of range.
-        push_depth_m: how deep the force curve goes; None: to `largest_depth_m`.
+        push_depth_m: how deep the force curve goes; None: to `largest_depth_m`.  drag: for a finger
+        that sticks; None: pushes are answered as without friction.
 
         ValueError unless 0 < linear_depth_m < largest_depth_m.
         """
@@ -298,6 +370,12 @@ class LinearSoftBody:
         self.contact = SphereContact(
             response, shape, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
         )
+        self._drag = None if drag is None else drag.table
+        self._drag_contact = None
+        if drag is not None:
+            self._drag_contact = DragContact(
+                drag, young_modulus_pa=young_modulus_pa, finger_radius_m=finger_radius_m
+            )
         self._response = response
         self._modulus = young_modulus_pa
         self._linear, self._largest = linear_depth_m, largest_depth_m
@@ -326,9 +404,16 @@ class LinearSoftBody:
         if contact is None:
             clear = push.depth_m <= 0.0 or push.beyond_m > 0.0
             return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, clear)
+        total = self._sum(self._response.table, contact.nodes, contact.forces)
+        force = contact.force_n
+        if self._drag_contact is not None and self._drag is not None and push.drag_m is not None:
+            dragged = self._drag_contact.solve(contact, push.drag_m)
+            rows = (2 * dragged.nodes[:, None] + np.arange(2)).ravel()
+            total += self._sum(self._drag, rows, dragged.forces.ravel())
+            force = force + dragged.force_n
         return Response(
-            displacement=self._displacement(contact),
-            force_n=contact.force_n * (push.depth_m / depth if push.depth_m > depth else 1.0),
+            displacement=total.reshape(-1, 3),
+            force_n=force * (push.depth_m / depth if push.depth_m > depth else 1.0),
             stiffness_n_per_m=stiffness,
             force_curve=curve,
             push_depth_m=max(0.0, push.depth_m - push.beyond_m),
@@ -379,12 +464,13 @@ class LinearSoftBody:
         result: Floats = np.maximum.accumulate(np.interp(bent, solved, forces) * grown)
         return result
 
-    def _displacement(self, contact: Contact) -> Floats32:
-        forces = (contact.forces / self._modulus).astype(np.float32)
-        total = np.zeros(self._response.table.shape[1], dtype=np.float32)
+    def _sum(self, table: Floats32, rows: Ints, forces: Floats) -> Floats32:
+        """Displacement (3 s,) of the skin under forces (k,), N, of some rows (k,) of a table."""
+        scaled = (forces / self._modulus).astype(np.float32)
+        total = np.zeros(table.shape[1], dtype=np.float32)
         # nodes are numbered along the mesh: runs of neighbours are read in place, without a copy
-        breaks = np.flatnonzero(np.diff(contact.nodes) != 1) + 1
-        for start, stop in zip([0, *breaks], [*breaks, len(forces)], strict=True):
-            first = contact.nodes[start]
-            total += forces[start:stop] @ self._response.table[first : first + stop - start]
-        return total.reshape(-1, 3)
+        breaks = np.flatnonzero(np.diff(rows) != 1) + 1
+        for start, stop in zip([0, *breaks], [*breaks, len(scaled)], strict=True):
+            first = rows[start]
+            total += scaled[start:stop] @ table[first : first + stop - start]
+        return total

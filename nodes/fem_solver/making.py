@@ -24,6 +24,7 @@ class Maker:
     skin_spacing_m: float
     linear_depth_m: float
     largest_depth_m: float
+    friction_ratio: float
     cache_dir: Path
     workers: int
     _model: tuple[str, precompute.SoftBodyModel] | None = field(default=None, init=False)
@@ -33,7 +34,7 @@ class Maker:
     ) -> list[body.SceneBody]:
         """The soft body by each method that is at hand, the best first; errors as
         `load_or_compute` and `scene_body`."""
-        spec = body.spec_of(scene, self.skin_spacing_m)
+        spec = body.spec_of(scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0)
         if self._model is None or self._model[0] != spec.key():
             model = precompute.load_or_compute(spec, self.cache_dir, progress)
             self._model = spec.key(), model
@@ -43,8 +44,10 @@ class Maker:
             self._model[1],
             linear_depth_m=self.linear_depth_m,
             largest_depth_m=self.largest_depth_m,
+            friction_ratio=self.friction_ratio,
         )
-        if method == "linear":
+        # the table knows no drag
+        if method == "linear" or spec.sticking:
             return [linear]
         table = precompute_table.load_table(body.table_spec_of(scene, spec), self.cache_dir)
         if table is None:

@@ -30,6 +30,11 @@ class FemSolverParameters(NodeParameters):
     )
     linear_depth_m: Positive = Field(default=0.006, description="deeper pushes are out of range")
     largest_depth_m: Positive = Field(default=0.010, description="the skin never goes deeper")
+    friction_ratio: NonNegative = Field(
+        default=0.0,
+        description="the finger sticks until it pulls along the skin by more than this share of "
+        "what it presses, then slips; 0: it slides freely; above 0 the linear method answers",
+    )
     step_budget_s: Positive = Field(
         default=0.004, description="answers later than this, five running, change the method"
     )
@@ -59,6 +64,7 @@ class FemSolver(Node):
             skin_spacing_m=self.parameters.skin_spacing_m,
             linear_depth_m=self.parameters.linear_depth_m,
             largest_depth_m=self.parameters.largest_depth_m,
+            friction_ratio=self.parameters.friction_ratio,
             cache_dir=self.parameters.cache_dir or cache.default_cache_dir(),
             workers=self.parameters.workers,
         )
@@ -107,7 +113,8 @@ class FemSolver(Node):
             raise
         self._use(bodies)
         self.skin.publish(bodies[0].skin, source_ns=header.source_ns)
-        if self.parameters.method == "nonlinear_table" and len(bodies) == 1:
+        wanted = self.parameters.method == "nonlinear_table" and not self.parameters.friction_ratio
+        if wanted and len(bodies) == 1:
             self._making = asyncio.create_task(self._make_table(scene, bodies[0]))
 
     async def _make_table(self, scene: Scene, linear: body.SceneBody) -> None:

@@ -22,12 +22,14 @@ class Push:
 
     normal: outward, of the surface point that is pushed.  depth_m: of the fingertip below it, along
     the normal; negative outside.  beyond_m: how far the fingertip is past the end of the surface.
+    drag_m (3,): how far the fingertip went along the surface since it stuck there; None: it slides.
     """
 
     surface: Floats
     normal: Floats
     depth_m: float
     beyond_m: float = 0.0
+    drag_m: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +59,28 @@ def locate(shape: Shape, point: Floats, held: Entry | None) -> tuple[Push, Entry
             return _push(point, held.point, held.normal, False), held
     push = _push(point, found.point, found.normal, bool(found.on_edge))
     return push, Entry(found.point, found.normal)
+
+
+def locate_stuck(shape: Shape, point: Floats, held: Entry | None) -> tuple[Push, Entry | None]:
+    """The push of a fingertip at `point` (3,) that sticks to the surface where it first touched it.
+
+    held: that place, from the time before.  ValueError as `locate`.
+    """
+    push, entry = locate(shape, point, held)
+    if entry is None or held is None:
+        return push, entry
+    depth = float((held.point - point) @ held.normal)
+    if depth <= 0.0:
+        # it has left the place that it stuck to, and touches another
+        return push, entry
+    drag = point - held.point + depth * held.normal
+    return Push(held.point, held.normal, depth, push.beyond_m, drag), held
+
+
+def slipped(shape: Shape, held: Entry, drag: Floats, share: float) -> Entry:
+    """Where a finger sticks after it slid on until only `share` of its drag (3,) is left."""
+    found = shape.closest(held.point + (1.0 - share) * drag, previous=held.point)
+    return Entry(found.point, found.normal)
 
 
 def _push(point: Floats, foot: Floats, normal: Floats, on_edge: bool) -> Push:

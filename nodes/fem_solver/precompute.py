@@ -18,13 +18,17 @@ from numpy.typing import NDArray
 
 from messages.scene import Plane
 from nodes.fem_solver.cache import Parts, load_arrays, save_arrays, say_damaged
-from nodes.fem_solver.contact import SkinResponse
+from nodes.fem_solver.contact import DragResponse, SkinResponse
 from nodes.fem_solver.mesh import MeshSpec, SolidMesh, build_mesh, mesh_budget
 
 if TYPE_CHECKING:
-    from nodes.fem_solver.multifrontal import Dissection
+    from nodes.fem_solver.multifrontal import Dissection, Factors
 
-VERSION = 2
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+VERSION = 3
 """Counts up whenever the same specification gives other numbers."""
 CHUNK_LOADS = 128
 ELEMENT_BYTES = 30 * 30 * 8
@@ -48,25 +52,34 @@ class Interrupted(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SoftBodySpec:
-    """All that a precomputation depends on; equal where their keys are."""
+    """All that a precomputation depends on; equal where their keys are.
+
+    sticking: whether forces along the skin are answered too, for three times the memory.
+    """
 
     mesh: MeshSpec
     poisson_ratio: float
+    sticking: bool = False
+
+    @property
+    def loads_per_node(self) -> int:
+        return 3 if self.sticking else 1
 
     def key(self) -> str:
         """Digest of the specification and of the code's version."""
-        text = json.dumps([VERSION, self.mesh.key(), self.poisson_ratio])
+        text = json.dumps([VERSION, self.mesh.key(), self.poisson_ratio, self.sticking])
         return hashlib.sha256(text.encode()).hexdigest()[:24]
 
 
 @dataclass(frozen=True, slots=True)
 class SoftBodyModel:
     """The precomputed response, and the skin: triangles (t, 3), outward; which of its nodes are
-    bounds (s,), neither touchable nor past an end of what can be touched."""
+    bounds (s,), neither touchable nor past an end of what can be touched; drag, if asked for."""
 
     response: SkinResponse
     triangles: NDArray[np.int32]
     bounds: NDArray[np.bool_]
+    drag: DragResponse | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,13 +98,14 @@ class Budget:
         )
 
 
-def budget(mesh: SolidMesh, order: Dissection) -> Budget:
+def budget(mesh: SolidMesh, order: Dissection, loads_per_node: int = 1) -> Budget:
     """Memory that `compute` takes on this mesh: stiffness, factors, some loads, the result."""
     factors = sum(len(f.own) * (len(f.own) + len(f.border)) for f in order.fronts) * 8
     stiffness = len(mesh.elements) * ELEMENT_BYTES * 3
     chunk = 3 * len(mesh.nodes) * CHUNK_LOADS * 8 * 4
-    table = len(mesh.touch) * len(mesh.skin) * 3 * 4 + len(mesh.touch) ** 2 * 8
-    return Budget(len(mesh.skin), len(mesh.touch), factors + stiffness + chunk, table)
+    loads = len(mesh.touch) * loads_per_node
+    table = loads * (len(mesh.skin) * 3 * 4 + loads * 8)
+    return Budget(len(mesh.skin), loads, factors + stiffness + chunk, table)
 
 
 def foreseen(spec: SoftBodySpec) -> Budget:
@@ -105,6 +119,7 @@ def foreseen(spec: SoftBodySpec) -> Budget:
     loads, geometry = skin // 2, spec.mesh.geometry
     if isinstance(geometry, Plane):
         loads = int(geometry.width_m * geometry.height_m / spec.mesh.skin_spacing_m**2)
+    loads *= spec.loads_per_node
     return Budget(skin, loads, nodes.bytes + 16_000 * nodes.nodes, loads * (skin * 12 + loads * 8))
 
 
@@ -126,10 +141,9 @@ def compute(spec: SoftBodySpec, progress: Progress, parts: Parts | None = None) 
     mesh = build_mesh(spec.mesh)
     require_support(mesh.nodes, mesh.fixed)
     order = Dissection(mesh.nodes, mesh.elements, mesh.fixed)
-    need = budget(mesh, order)
+    need = budget(mesh, order, spec.loads_per_node)
     require_memory(need, spec)
-    loads = len(mesh.touch)
-    done, total = MESH_STEPS, loads + MESH_STEPS + FACTOR_STEPS
+    done, total = MESH_STEPS, need.loads + MESH_STEPS + FACTOR_STEPS
     progress(done, total, need)
     matrices = element_stiffness(
         mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=spec.poisson_ratio
@@ -138,27 +152,22 @@ def compute(spec: SoftBodySpec, progress: Progress, parts: Parts | None = None) 
     del matrices
     done += FACTOR_STEPS
     progress(done, total, need)
-    table = np.empty((loads, 3 * len(mesh.skin)), dtype=np.float32)
-    compliance = np.empty((loads, loads))
-    for start in range(0, loads, CHUNK_LOADS):
-        part = slice(start, min(start + CHUNK_LOADS, loads))
-        count, name = part.stop - start, f"loads-{start:06d}"
-        kept = parts.load(name) if parts else None
-        if kept is None:
-            right = np.zeros((3 * len(mesh.nodes), count))
-            normals = mesh.touch_normals[part]
-            for axis in range(3):
-                right[3 * mesh.touch[part] + axis, np.arange(count)] = -normals[:, axis]
-            moved = factors.solve(right).reshape(-1, 3, count)
-            kept = {
-                "table": moved[mesh.skin].reshape(-1, count).T.astype(np.float32),
-                "compliance": -np.einsum("mik,mi->km", moved[mesh.touch], mesh.touch_normals),
-            }
-            if parts:
-                parts.save(name, kept)
-        table[part], compliance[part] = kept["table"], kept["compliance"]
+
+    def advance(count: int) -> None:
+        nonlocal done
         done += count
         progress(done, total, need)
+
+    table, compliance = _unit_loads(
+        mesh, factors, -mesh.touch_normals[:, None], KeptParts("loads", parts), advance
+    )
+    drag = None
+    if spec.sticking:
+        tangents = tangents_of(mesh.touch_normals)
+        drag_table, drag_compliance = _unit_loads(
+            mesh, factors, tangents, KeptParts("drags", parts), advance
+        )
+        drag = DragResponse(tangents, drag_compliance, drag_table)
     touched = np.searchsorted(mesh.skin, mesh.touch)
     skin = mesh.nodes[mesh.skin]
     found = make_shape(dict(spec.mesh.geometry)).closest(skin)
@@ -171,10 +180,71 @@ def compute(spec: SoftBodySpec, progress: Progress, parts: Parts | None = None) 
         touch=touched,
         normals=mesh.touch_normals,
         faces=mesh.touch_faces,
-        compliance=0.5 * (compliance + compliance.T),
+        compliance=compliance,
         table=table,
     )
-    return SoftBodyModel(response, mesh.skin_triangles, bounds)
+    return SoftBodyModel(response, mesh.skin_triangles, bounds, drag)
+
+
+@dataclass(frozen=True, slots=True)
+class KeptParts:
+    """Parts under one name; None: nothing is kept."""
+
+    name: str
+    parts: Parts | None
+
+    def get(self, number: int, make: Callable[[], dict[str, Floats]]) -> dict[str, Floats]:
+        """A part kept before, or made and kept now."""
+        if self.parts is None:
+            return make()
+        name = f"{self.name}-{number:06d}"
+        kept = self.parts.load(name)
+        if kept is None:
+            kept = make()
+            self.parts.save(name, kept)
+        return kept
+
+
+def _unit_loads(
+    mesh: SolidMesh,
+    factors: Factors,
+    directions: Floats,
+    kept: KeptParts,
+    advance: Callable[[int], None],
+) -> tuple[Floats32, Floats]:
+    """Table (m p, 3 s) and compliance (m p, m p) for unit forces along p directions (m, p, 3) at
+    each of the m touch nodes."""
+    each = directions.shape[1]
+    loads = len(mesh.touch) * each
+    table = np.empty((loads, 3 * len(mesh.skin)), dtype=np.float32)
+    compliance = np.empty((loads, loads))
+    for start in range(0, loads, CHUNK_LOADS):
+        numbers = np.arange(start, min(start + CHUNK_LOADS, loads))
+        node, which, count = numbers // each, numbers % each, len(numbers)
+
+        def solved(node: Ints = node, which: Ints = which, count: int = count) -> dict[str, Floats]:
+            right = np.zeros((3 * len(mesh.nodes), count))
+            for axis in range(3):
+                right[3 * mesh.touch[node] + axis, np.arange(count)] = directions[node, which, axis]
+            moved = factors.solve(right).reshape(-1, 3, count)
+            along = np.einsum("mik,mpi->kmp", moved[mesh.touch], directions)
+            return {
+                "table": moved[mesh.skin].reshape(-1, count).T.astype(np.float32),
+                "compliance": along.reshape(count, loads),
+            }
+
+        part = kept.get(start, solved)
+        table[numbers], compliance[numbers] = part["table"], part["compliance"]
+        advance(count)
+    return table, 0.5 * (compliance + compliance.T)
+
+
+def tangents_of(normals: Floats) -> Floats:
+    """Two directions (m, 2, 3) at right angles to unit normals (m, 3) and to one another."""
+    least = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    first = np.cross(normals, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first)], axis=1)
 
 
 def require_memory(need: Budget, spec: SoftBodySpec) -> None:
@@ -206,9 +276,11 @@ def load(spec: SoftBodySpec, cache_dir: Path) -> SoftBodyModel | None:
     if content is None:
         return None
     try:
+        drag = {name[5:]: content.pop(name) for name in list(content) if name.startswith("drag_")}
         return SoftBodyModel(
             triangles=content.pop("triangles"),
             bounds=content.pop("bounds"),
+            drag=DragResponse(**drag) if spec.sticking else None,
             response=SkinResponse(**content),
         )
     except (KeyError, TypeError) as error:
@@ -220,7 +292,10 @@ def save(model: SoftBodyModel, spec: SoftBodySpec, cache_dir: Path) -> Path:
     """Keep a model; a reader sees the whole file or none.  OSError if it cannot be written."""
     path = cache_path(spec, cache_dir)
     response = {one.name: getattr(model.response, one.name) for one in fields(model.response)}
-    save_arrays(path, {"triangles": model.triangles, "bounds": model.bounds, **response})
+    content = {"triangles": model.triangles, "bounds": model.bounds, **response}
+    if model.drag is not None:
+        content |= {f"drag_{one.name}": getattr(model.drag, one.name) for one in fields(model.drag)}
+    save_arrays(path, content)
     return path
 
 

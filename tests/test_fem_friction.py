@@ -1,0 +1,137 @@
+"""A finger that sticks drags the skin along; pushed harder aside than it presses, it slips."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nodes.fem_solver.contact import LinearSoftBody
+from nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
+from nodes.fem_solver.mesh import build_mesh
+from nodes.fem_solver.place import Entry, Push, locate_stuck, slipped
+from nodes.fem_solver.precompute import SoftBodyModel, compute, load, save, tangents_of
+from nodes.models.shapes import CylinderShape
+from tests.soft_bodies import cylinder_spec
+
+Floats = NDArray[np.float64]
+
+RADIUS, LENGTH, FINGER, MODULUS = 0.02, 0.06, 0.007, 4000.0
+SPEC = cylinder_spec(RADIUS, LENGTH, touch_angle_rad=1.2, skin_spacing_m=0.005, sticking=True)
+SHAPE = CylinderShape(RADIUS, LENGTH)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def model() -> SoftBodyModel:
+    return compute(SPEC, lambda done, total, need: None)
+
+
+@pytest.fixture(scope="module")
+def body(model: SoftBodyModel) -> LinearSoftBody:
+    return LinearSoftBody(
+        model.response,
+        SHAPE,
+        model.response.rest[model.bounds],
+        young_modulus_pa=MODULUS,
+        finger_radius_m=FINGER,
+        linear_depth_m=0.006,
+        largest_depth_m=0.010,
+        drag=model.drag,
+    )
+
+
+def push(depth: float, drag: tuple[float, float, float] = (0.0, 0.0, 0.0), x: float = 0.0) -> Push:
+    return Push(RADIUS * UP + [x, 0.0, 0.0], UP, depth, 0.0, np.array(drag))
+
+
+def test_each_column_is_the_solution_under_its_load(model: SoftBodyModel) -> None:
+    mesh = build_mesh(SPEC.mesh)
+    assert model.drag is not None
+    matrix = stiffness_matrix(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
+    held = degrees_of_freedom(np.flatnonzero(mesh.fixed))
+    for node, which in ((0, 0), (len(mesh.touch) // 2, 1)):
+        loads = np.zeros(matrix.shape[0])
+        loads[degrees_of_freedom(mesh.touch[[node]])] = model.drag.tangents[node, which]
+        wanted = solve(matrix, held, np.zeros(len(held)), loads).reshape(-1, 3)
+        got = model.drag.table[2 * node + which].reshape(-1, 3)
+        assert np.abs(got - wanted[mesh.skin]).max() < 1e-6 * np.abs(wanted).max()
+        along = np.einsum("mi,mpi->mp", wanted[mesh.touch], model.drag.tangents).ravel()
+        assert model.drag.compliance[2 * node + which] == pytest.approx(along, rel=1e-7)
+
+
+def test_tangents_are_at_right_angles() -> None:
+    normals = np.random.default_rng(2).normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    frames = np.concatenate([normals[:, None], tangents_of(normals)], axis=1)
+    assert frames @ frames.transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(3), (50, 1, 1)))
+
+
+def test_a_sticking_finger_drags_the_skin_beneath_it(
+    body: LinearSoftBody, model: SoftBodyModel
+) -> None:
+    straight, aside = body.respond(push(0.004)), body.respond(push(0.004, (0.002, 0.0, 0.0)))
+    below = np.linalg.norm(model.response.rest - RADIUS * UP, axis=1) < 0.003
+    dragged = (aside.displacement - straight.displacement)[below, 0]
+    assert dragged.mean() == pytest.approx(0.002, rel=0.15)
+    # the skin pulls it back
+    assert aside.force_n[0] < -0.1 * straight.force_n[2]
+    assert aside.force_n[2] == pytest.approx(straight.force_n[2], rel=0.1)
+    assert np.abs(straight.force_n[:2]).max() < 0.05 * straight.force_n[2]
+
+
+def test_the_pull_is_in_proportion_to_the_drag(body: LinearSoftBody) -> None:
+    straight = body.respond(push(0.004)).force_n
+    once = body.respond(push(0.004, (0.001, 0.0005, 0.0))).force_n - straight
+    twice = body.respond(push(0.004, (0.002, 0.001, 0.0))).force_n - straight
+    assert twice == pytest.approx(2.0 * once, rel=1e-6)
+
+
+def test_sticking_is_smooth_in_depth_and_drag(body: LinearSoftBody) -> None:
+    """A tilted push: down and aside at once, from the touch on."""
+    way = np.linspace(0.0, 0.006, 400)
+    answers = [body.respond(push(d, (0.5 * d, 0.0, 0.0))) for d in way]
+    moves = [
+        np.linalg.norm(a.displacement - b.displacement, axis=1).max()
+        for a, b in itertools.pairwise(answers)
+    ]
+    assert max(moves) < 0.06e-3
+    pulls = np.array([answer.force_n[0] for answer in answers])
+    assert np.abs(np.diff(pulls)).max() < 0.02 * np.abs(pulls).max()
+
+
+def test_the_place_of_first_touch_stays_until_the_finger_lifts() -> None:
+    touch, held = locate_stuck(SHAPE, np.array([0.001, 0.0, RADIUS - 1e-4]), None)
+    assert touch.drag_m is None
+    there, held = locate_stuck(SHAPE, np.array([0.003, 0.001, RADIUS - 0.004]), held)
+    assert there.surface == pytest.approx([0.001, 0.0, RADIUS])
+    assert there.drag_m == pytest.approx([0.002, 0.001, 0.0])
+    assert there.depth_m == pytest.approx(0.004)
+    away, held = locate_stuck(SHAPE, np.array([0.003, 0.001, RADIUS + 0.01]), held)
+    assert held is None
+    assert away.depth_m < 0.0
+    anew, held = locate_stuck(SHAPE, np.array([0.005, 0.0, RADIUS - 0.001]), held)
+    assert anew.surface[0] == pytest.approx(0.005)
+
+
+def test_slipping_leaves_the_drag_that_friction_holds() -> None:
+    held = Entry(RADIUS * UP, UP)
+    after = slipped(SHAPE, held, np.array([0.004, 0.0, 0.0]), 0.25)
+    assert after.point == pytest.approx([0.003, 0.0, RADIUS])
+    around = slipped(SHAPE, held, np.array([0.0, 0.004, 0.0]), 0.25)
+    assert np.linalg.norm(around.point[1:]) == pytest.approx(RADIUS)
+
+
+def test_what_drags_is_kept_with_the_model(
+    model: SoftBodyModel, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("drag")
+    save(model, SPEC, folder)
+    kept = load(SPEC, folder)
+    assert kept is not None
+    assert kept.drag is not None
+    assert model.drag is not None
+    assert np.array_equal(kept.drag.table, model.drag.table)
+    assert np.array_equal(kept.drag.tangents, model.drag.tangents)
