@@ -53,12 +53,12 @@ FELT_N = 0.05
 """Forces below this are not compared, but as if they were this large: those of the first 2 mm into
 an object of 4 kPa, which the soft body itself knows to a tenth at best."""
 
-QUIET_N, ANSWERED_N = 0.5 * FELT_N, 1.5 * FELT_N
+QUIET_N, ANSWERED_N = 0.25 * FELT_N, FELT_N
 """Up to the first force, the object's or the sheet's, the sheet does not come towards the finger;
 from the second on as far as it takes."""
 
-QUIET_M, ANSWERED_M = 0.5e-3, 1.5e-3
-"""The same for depths: less than half a millimetre may be a fingertip that lies on the object."""
+QUIET_M, ANSWERED_M = 0.3e-3, 1.2e-3
+"""The same for depths: less than a third of a millimetre may be a fingertip that lies on the object."""
 
 GOOD_RATIO = 0.10
 """Error of the presented force, over the wanted, that is aimed for."""
