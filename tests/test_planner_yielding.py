@@ -81,7 +81,7 @@ async def test_what_is_published_as_retreat_is_where_the_sheet_comes_to_rest() -
     assert stands_behind_m(target) == pytest.approx(target.retreat_m, abs=1e-6)
 
 
-@pytest.mark.parametrize("depth_m", [0.0003, 0.0008])
+@pytest.mark.parametrize("depth_m", [0.0002, 0.0004])
 async def test_the_sheet_does_not_come_towards_a_finger_that_lies_on_a_stiff_object(
     depth_m: float,
 ) -> None:

@@ -53,13 +53,15 @@ class PushPath:
 
     depths_m (n,).  forces_n (n,): of the sheet on the finger, along its normal.  edge_forces_n
     (n,): on each clamp, along the line between them (mean of both).  positions (n, rows, columns,
-    3): in the frame of the flat sheet, origin at its centre.
+    3): in the frame of the flat sheet, origin at its centre.  rest_m (rows, columns, 2): of the
+    same nodes in the slack sheet, from its centre.
     """
 
     depths_m: Floats
     forces_n: Floats
     edge_forces_n: Floats
     positions: Floats
+    rest_m: Floats
 
 
 def push_path(
@@ -118,6 +120,7 @@ def push_path(
         forces_n=np.array([row[0] for row in rows]),
         edge_forces_n=np.array([row[1] for row in rows]),
         positions=np.array([row[2] for row in rows]).reshape(len(rows), *grid.shape, 3),
+        rest_m=(grid.rest - grid.centre).reshape(*grid.shape, 2),
     )
 
 
