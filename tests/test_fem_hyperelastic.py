@@ -101,7 +101,7 @@ def test_an_element_turned_inside_out_has_no_energy_and_no_forces() -> None:
         solid.forces(flipped)
     with pytest.raises(InvertedError, match="inside out"):
         solid.tangents(flipped)
-    with pytest.raises(MeshError, match="inverted at rest"):
+    with pytest.raises(MeshError, match="inverted or flat"):
         NeoHookeanSolid(
             solid.nodes * [1, 1, -1], solid.elements, young_modulus_pa=1.0, poisson_ratio=0.3
         )

@@ -22,6 +22,9 @@ Ints = NDArray[np.int64]
 CHUNK_ELEMENTS = 2048
 MAX_POISSON_RATIO = 0.4999
 """Nearer to 0.5 a displacement formulation loses all digits to the bulk modulus."""
+LEAST_VOLUME_RATIO = 1e-6
+"""An element's Jacobian is at least this much of its side's cube: flatter ones lose the answer to
+rounding."""
 
 
 class MeshError(ValueError):
@@ -72,25 +75,42 @@ def shape_gradients(points: Floats) -> Floats:
     return np.concatenate([corner, edge], axis=1)
 
 
-def element_stiffness(
-    nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
-) -> Floats:
-    """Stiffness matrices (e, 30, 30) in N/m.
+def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Floats]:
+    """Derivatives (e, q, 3, 3) of places by the unit tetrahedron's coordinates, and their
+    determinants (e, q), from gradients (q, 10, 3) of the shape functions.
 
-    MeshError where an element is inverted or flat, ValueError as `lame_constants`.
+    MeshError where an element is inverted or flat, or a node's place is no finite number.
     """
-    lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
-    points, weights = quadrature()
-    local = shape_gradients(points)
-    jacobian = np.einsum("qak,eai->eqik", local, nodes[elements])
-    determinant = np.linalg.det(jacobian)
-    size = np.ptp(nodes[elements[:, :4]], axis=1).max(axis=1)
-    bad = determinant.min(axis=1) <= 1e-6 * size**3
+    corners = nodes[elements]
+    lost = ~np.isfinite(corners).all(axis=(1, 2))
+    if lost.any():
+        raise MeshError(
+            f"nodes of {int(lost.sum())} of {len(elements)} elements are not finite, the first is "
+            f"element number {int(np.argmax(lost))}"
+        )
+    jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
+    determinant: Floats = np.linalg.det(jacobian)
+    size = np.ptp(corners[:, :4], axis=1).max(axis=1)
+    bad = determinant.min(axis=1) <= LEAST_VOLUME_RATIO * size**3
     if bad.any():
         raise MeshError(
             f"{int(bad.sum())} of {len(elements)} elements are inverted or flat, the first is "
             f"number {int(np.argmax(bad))} (smallest Jacobian {determinant.min():.3g} m^3)"
         )
+    return jacobian, determinant
+
+
+def element_stiffness(
+    nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
+) -> Floats:
+    """Stiffness matrices (e, 30, 30) in N/m.
+
+    MeshError as `jacobians`, ValueError as `lame_constants`.
+    """
+    lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
+    points, weights = quadrature()
+    local = shape_gradients(points)
+    jacobian, determinant = jacobians(nodes, elements, local)
     # gradients in space: J^-T applied to the local ones, one row per (node, axis)
     gradient = np.einsum("qak,eqki->eqai", local, np.linalg.inv(jacobian))
     flat = gradient.reshape(len(elements), len(points), 30)

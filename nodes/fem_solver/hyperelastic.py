@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.fem_solver.elasticity import (
-    MeshError,
+    jacobians,
     lame_constants,
     quadrature,
     scattered,
@@ -37,20 +37,13 @@ class NeoHookeanSolid:
     def __init__(
         self, nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
     ) -> None:
-        """nodes (n, 3), elements (e, 10).  MeshError where an element is inverted at rest,
-        ValueError as `lame_constants`."""
+        """nodes (n, 3), elements (e, 10).  MeshError as `jacobians`, ValueError as
+        `lame_constants`."""
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
         points, weights = quadrature()
         local = shape_gradients(points)
-        corners = nodes[elements].transpose(0, 2, 1)
-        jacobian = corners[:, None] @ local
-        determinant = np.linalg.det(jacobian)
-        if determinant.min() <= 0.0:
-            raise MeshError(
-                f"{int((determinant.min(axis=1) <= 0).sum())} of {len(elements)} elements are "
-                "inverted at rest"
-            )
+        jacobian, determinant = jacobians(nodes, elements, local)
         self._gradients: Floats = local @ np.linalg.inv(jacobian)
         self._volumes = determinant * weights
         flat = self._gradients.transpose(0, 2, 1, 3).reshape(len(elements), 10, -1)

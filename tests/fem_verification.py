@@ -1,0 +1,92 @@
+"""What the soft body was verified against: findings of the tests, and the table of them.
+
+    OPENBLAS_NUM_THREADS=1 python -m tests.fem_verification
+
+runs tests/test_fem_verify_*.py and prints a Markdown table, a row for each finding: docs/
+soft-body-verification.md holds it.  A test notes what it measures by `at_most`, `between` or
+`near`, which assert at once what they note, and names its source in the last paragraph of its
+docstring, after "Source:".
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+Record = Callable[[str, Any], None]
+"""Pytest's fixture `record_property`."""
+KEY = "verified"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    what: str
+    measured: str
+    tolerance: str
+
+
+def at_most(record: Record, what: str, measured: float, limit: float) -> None:
+    """Note an error; AssertionError unless it is within the limit."""
+    record(KEY, Finding(what, f"{measured:.2g}", f"at most {limit:g}"))
+    assert measured <= limit, f"{what}: {measured:.3g}, at most {limit:g}"
+
+
+def between(record: Record, what: str, measured: float, low: float, high: float) -> None:
+    """Note a value; AssertionError unless it lies in the band."""
+    record(KEY, Finding(what, f"{measured:.4g}", f"{low:g} to {high:g}"))
+    assert low <= measured <= high, f"{what}: {measured:.6g}, not in {low:g} to {high:g}"
+
+
+def near(record: Record, what: str, measured: float, wanted: float, relative: float) -> None:
+    """Note a value beside the one that it should have."""
+    record(KEY, Finding(what, f"{measured:.5g}", f"{wanted:.5g} ± {100 * relative:.2g} %"))
+    error = abs(measured / wanted - 1.0)
+    assert error <= relative, f"{what}: {measured:.6g}, wanted {wanted:.6g}, off by {error:.3g}"
+
+
+class _Table:
+    """Rows of the findings of a pytest run."""
+
+    def __init__(self) -> None:
+        self.rows: list[str] = []
+        self._sources: dict[str, str] = {}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        for item in items:
+            text = getattr(getattr(item, "function", None), "__doc__", None) or ""
+            source = text.partition("Source:")[2]
+            self._sources[item.nodeid] = " ".join(source.split()).rstrip(".")
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if report.when != "call":
+            return
+        name = report.nodeid.partition("::")[2].partition("[")[0]
+        file = Path(report.nodeid.partition("::")[0]).stem.removeprefix("test_fem_verify_")
+        for key, finding in report.user_properties:
+            if key == KEY:
+                cells = (
+                    finding.what,
+                    self._sources[report.nodeid],
+                    finding.measured,
+                    finding.tolerance,
+                    f"`{file}`: `{name}`",
+                )
+                self.rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells))
+
+
+def main() -> int:
+    table = _Table()
+    files = sorted(str(path) for path in Path(__file__).parent.glob("test_fem_verify_*.py"))
+    outcome = pytest.main(["-q", "-p", "no:cacheprovider", *files], plugins=[table])
+    print("\n| what | source | measured | tolerance | test |\n|---|---|---|---|---|")
+    print("\n".join(f"{row} |" for row in table.rows))
+    return int(outcome)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

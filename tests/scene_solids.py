@@ -1,0 +1,52 @@
+"""The mesh of every shape that a scene can have, coarse, for tests."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from ruamel.yaml import YAML
+
+from messages.scene import Scene
+from nodes.fem_solver.mesh import SolidMesh, mesh_of_scene
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SPACING_M = 0.006
+SHAPES = ("cylinder", "sphere", "ellipsoid", "rounded_box", "plane", "mesh")
+
+
+def geometry(shape: str) -> dict[str, Any]:
+    """An object of this shape, a hand's size or less."""
+    match shape:
+        case "cylinder":
+            return {"shape": shape, "radius_m": 0.0353553, "length_m": 0.06}
+        case "sphere":
+            return {"shape": shape, "radius_m": 0.03}
+        case "ellipsoid":
+            return {"shape": shape, "semi_axes_m": [0.045, 0.03, 0.02]}
+        case "rounded_box":
+            return {"shape": shape, "size_m": [0.08, 0.06, 0.04], "edge_radius_m": 0.008}
+        case "plane":
+            return {"shape": shape, "width_m": 0.04, "height_m": 0.03}
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    return {
+        "shape": "mesh",
+        "vertices_m": np.ascontiguousarray(ball.vertices * [0.035, 0.03, 0.025]),
+        "triangles": np.ascontiguousarray(ball.faces, dtype=np.int32),
+        "smoothing_m": 0.006,
+        "origin": "made",
+    }
+
+
+@cache
+def scene_solid(shape: str) -> SolidMesh:
+    """As the solver meshes it, with the support of the scene."""
+    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    body = content["object"]
+    body.pop("support_angle_rad", None)
+    body["geometry"] = geometry(shape)
+    body["support"] = {"kind": "strip", "angle_rad": 1.5}
+    return mesh_of_scene(Scene.model_validate(content), SPACING_M)
