@@ -14,7 +14,8 @@ from messages.scene import Scene
 from nodes.fem_solver.mesh import SolidMesh, mesh_of_scene
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SPACING_M = 0.006
+SPACINGS_M = {"plane": 0.012}
+"""Between skin nodes; 0.006 of other shapes."""
 SHAPES = ("cylinder", "sphere", "ellipsoid", "rounded_box", "plane", "mesh")
 
 
@@ -49,4 +50,4 @@ def scene_solid(shape: str) -> SolidMesh:
     body.pop("support_angle_rad", None)
     body["geometry"] = geometry(shape)
     body["support"] = {"kind": "strip", "angle_rad": 1.5}
-    return mesh_of_scene(Scene.model_validate(content), SPACING_M)
+    return mesh_of_scene(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006))

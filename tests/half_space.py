@@ -1,0 +1,45 @@
+"""A piece of a half-space, its elements small about the origin of its surface, for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.fem_solver.mesh.bisection import CELL, bisected, lattice
+from nodes.fem_solver.mesh.grading import longest_edges
+from nodes.fem_solver.mesh.solid import oriented, with_middles
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def half_space(
+    *, half_width: float, smallest: float, fine_radius: float, growth: float, whole: bool
+) -> tuple[Floats, Ints]:
+    """Nodes and elements of a block, `half_width` to each side and deep, its top at z = 0: edges
+    of `smallest` within `fine_radius` of the origin, then in proportion to the distance.
+
+    growth: longest edge over the distance from the origin.  whole: all four quarters about the z
+    axis, or the one with x, y >= 0 only.
+    """
+    vertices, tetrahedra = lattice((1, 1, 1))
+    inside = vertices[:, 2] <= 0
+    if not whole:
+        inside &= (vertices[:, :2] >= 0).all(axis=1)
+    kept = tetrahedra[inside[tetrahedra].all(axis=1)]
+    used, index = np.unique(kept, return_inverse=True)
+    scale = 1 << 6
+    vertices = vertices[used] * scale
+
+    def place(vertices: Ints) -> Floats:
+        return np.asarray(vertices * (half_width / (CELL * scale)))
+
+    def too_large(vertices: Ints, tetrahedra: Ints) -> NDArray[np.bool_]:
+        points = place(vertices)
+        away = np.linalg.norm(points, axis=1)[tetrahedra].min(axis=1)
+        wanted = np.where(away < fine_radius, smallest, np.maximum(smallest, growth * away))
+        return np.asarray(longest_edges(points, tetrahedra) > 1.5 * wanted)
+
+    vertices, tetrahedra = bisected(vertices, index.reshape(-1, 4), too_large)
+    corners = place(vertices)
+    return with_middles(corners, oriented(corners, tetrahedra))

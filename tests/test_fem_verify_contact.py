@@ -1,0 +1,182 @@
+"""Point loads and light pushes on a half-space: Boussinesq and Hertz."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nodes.fem_solver import newton
+from nodes.fem_solver.elasticity import solve, stiffness_matrix
+from nodes.fem_solver.mesh import boundary_faces
+from tests.fem_fields import dofs_of
+from tests.fem_verification import Record, at_most, between, near
+from tests.half_space import half_space
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+E = 4000.0
+
+
+def boussinesq(points: Floats, force: float, nu: float) -> Floats:
+    """Displacement (k, 3) of the half-space z <= 0 under a force down in the origin."""
+    r2 = points[:, 0] ** 2 + points[:, 1] ** 2
+    depth = -points[:, 2]
+    rho = np.sqrt(r2 + depth**2)
+    scale = force * (1 + nu) / (2 * np.pi * E)
+    aside = scale * (depth / rho**3 - (1 - 2 * nu) / (rho * (rho + depth)))
+    down = scale * (depth**2 / rho**3 + 2 * (1 - nu) / rho)
+    return np.column_stack([aside * points[:, 0], aside * points[:, 1], -down])
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.45, 0.499])
+def test_point_load_on_a_half_space(record_property: Record, nu: float) -> None:
+    """A quarter of a block, its outer faces moved as the half-space's are there: how deep the skin
+    sinks around the load, and how that falls with the distance.
+
+    Source: Boussinesq 1885; w = (1 - nu^2) F / (pi E r): Johnson, Contact Mechanics, 1985,
+    eqs. 3.18-3.22
+    """
+    width, force = 30.0, 1000.0
+    nodes, elements = half_space(
+        half_width=width, smallest=0.25, fine_radius=1.0, growth=0.5, whole=False
+    )
+    matrix = stiffness_matrix(nodes, elements, young_modulus_pa=E, poisson_ratio=nu)
+    outer = np.isclose(np.abs(nodes), width).any(axis=1)
+    away = np.linalg.norm(nodes, axis=1)
+    exact = boussinesq(np.where(away[:, None] > 0.0, nodes, 1.0), force, nu)
+    glide = np.flatnonzero((nodes[:, :2] == 0.0).ravel())
+    held = np.union1d(dofs_of(np.flatnonzero(outer)), 3 * (glide // 2) + glide % 2)
+    values = np.where(outer[:, None], exact, 0.0).ravel()
+    loads = np.zeros(nodes.size)
+    loads[3 * int(np.argmin(away)) + 2] = -0.25 * force
+    got = solve(matrix, held, values[held], loads).reshape(-1, 3)
+    seen = np.flatnonzero((nodes[:, 2] == 0.0) & (away > 1.5) & (away < 20.0))
+    assert len(seen) > 50
+    slope, height = np.polyfit(np.log(away[seen]), np.log(-got[seen, 2]), 1)
+    what = f"point load, ν = {nu:g}"
+    between(record_property, f"{what}, power of the distance", float(slope), -1.02, -0.98)
+    wanted = (1 - nu**2) * force / (np.pi * E)
+    error = float(np.abs(-got[seen, 2] * away[seen] / wanted - 1).max())
+    at_most(record_property, f"{what}, worst skin node, relative", error, 0.05)
+    inside = (away > 2.0) & ~outer
+    error = float(
+        (np.linalg.norm(got - exact, axis=1) / np.linalg.norm(exact, axis=1))[inside].max()
+    )
+    at_most(record_property, f"{what}, worst node inside, relative", error, 0.06)
+
+
+RADIUS, NU = 10.0, 0.3
+DEPTHS = (0.2, 0.4)
+SHIPPED = (newton.BED_RATIO, newton.ROUNDING_RATIO)
+HARD = (10 * newton.BED_RATIO, newton.ROUNDING_RATIO / 10)
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """What a light push measures: the force, the patch's radius by the pressure's second moment,
+    how deep the skin sinks below the finger, and by how much more than at the distance `away`."""
+
+    depth: float
+    force: float
+    patch: float
+    sunk: float
+    relative: float
+    away: float
+
+
+@cache
+def touches(bed: tuple[float, float]) -> list[Touch]:
+    """A sphere pressed lightly into a block by the full Newton, its contact's bed as hard as this:
+    the solver's ratios `BED_RATIO` and `ROUNDING_RATIO`."""
+    nodes, elements = half_space(
+        half_width=16.0, smallest=0.6, fine_radius=1.8, growth=0.7, whole=True
+    )
+    faces = boundary_faces(elements)
+    top = faces[(nodes[faces, 2] == 0.0).all(axis=1)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(newton, "BED_RATIO", bed[0])
+        patch.setattr(newton, "ROUNDING_RATIO", bed[1])
+        body = newton.NeoHookeanBody(
+            nodes,
+            elements,
+            (np.abs(nodes[:, :2]) > 15.9).any(axis=1) | (nodes[:, 2] < -15.9),
+            top[(np.linalg.norm(nodes[top], axis=2) < 4.0).all(axis=1)],
+            young_modulus_pa=E,
+            poisson_ratio=NU,
+            finger_radius_m=RADIUS,
+        )
+    surface = np.flatnonzero(nodes[:, 2] == 0.0)
+    r = np.linalg.norm(nodes[surface, :2], axis=1)
+    ring = (r > 4.0) & (r < 6.0)
+    found = []
+    centres = [np.array([0.0, 0.0, RADIUS - depth]) for depth in (0.0, *DEPTHS)]
+    for depth, state in zip(DEPTHS, list(body.follow(centres))[1:], strict=True):
+        assert state.reached
+        positions = nodes + state.displacement
+        push = body.obstacle.forces(positions, state.centre, newton.NOTHING_HELD)[surface, 2]
+        down = -state.displacement[surface, 2]
+        found.append(
+            Touch(
+                depth=depth,
+                force=float(state.force_n[2]),
+                patch=float(np.sqrt(2.5 * (push * r**2).sum() / push.sum())),
+                sunk=float(down[np.argmin(r)]),
+                relative=float(down[np.argmin(r)] - down[ring].mean()),
+                away=float(r[ring].mean()),
+            )
+        )
+    return found
+
+
+def sunk_at(r: float, patch: float, force: float) -> float:
+    """Hertz's surface outside the patch."""
+    pressure = 3 * force / (2 * np.pi * patch**2)
+    share = patch / r
+    bend = (2 * patch**2 - r**2) * np.arcsin(share) + r * patch * np.sqrt(1 - share**2)
+    return float((1 - NU**2) / E * pressure / (2 * patch) * bend)
+
+
+@pytest.mark.parametrize(("bed", "name", "off"), [(HARD, "hard", 0.03), (SHIPPED, "own", 0.1)])
+def test_light_pushes_follow_hertz(
+    record_property: Record, bed: tuple[float, float], name: str, off: float
+) -> None:
+    """From the force: the patch's radius, and how far the skin sinks; and the power 3/2.  Sinking
+    is taken against the skin some patches away, which the block's far ends do not shift.  With a
+    bed ten times as hard as the solver's own, Hertz is what is left; with its own, the patch is
+    wider by what the bed gives way.
+
+    Source: Hertz 1882; Johnson, Contact Mechanics, 1985, eqs. 3.42, 4.22-4.24
+    """
+    modulus = E / (1 - NU**2)
+    found = touches(bed)
+    for touch in found:
+        what = f"Hertz, depth {touch.depth / RADIUS:g} R, {name} bed"
+        patch = (0.75 * touch.force * RADIUS / modulus) ** (1 / 3)
+        near(
+            record_property, f"{what}, patch radius / R", touch.patch / RADIUS, patch / RADIUS, off
+        )
+        wanted = patch**2 / RADIUS - sunk_at(touch.away, patch, touch.force)
+        near(record_property, f"{what}, sinking / R", touch.relative / RADIUS, wanted / RADIUS, off)
+    sunk = [touch.relative + sunk_at(touch.away, touch.patch, touch.force) for touch in found]
+    power = np.log(found[1].force / found[0].force) / np.log(sunk[1] / sunk[0])
+    between(record_property, f"Hertz, power of force, {name} bed", float(power), 1.45, 1.55)
+
+
+def test_what_the_bed_costs_is_known(record_property: Record) -> None:
+    """The solver's bed lets the skin enter the finger by less than a hundredth of its radius.  Of a
+    light push that is a part that matters; the force at the same depth is lower by it.
+
+    Source: the bed's own law, nodes/fem_solver/newton.py, against the bed ten times as hard
+    """
+    for own, hard in zip(touches(SHIPPED), touches(HARD), strict=True):
+        what = f"own bed at depth {own.depth / RADIUS:g} R"
+        entered = (own.depth - own.sunk) / RADIUS
+        between(record_property, f"{what}, skin inside the finger / R", entered, 0.0, 0.01)
+        between(
+            record_property, f"{what}, force over hard bed's", own.force / hard.force, 0.75, 1.0
+        )

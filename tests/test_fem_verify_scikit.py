@@ -1,0 +1,103 @@
+"""The meshes of all shapes through scikit-fem as well: the same stiffness, the same solution."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import skfem
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+from nodes.fem_solver.elasticity import element_stiffness, quadrature, solve, stiffness_matrix
+from nodes.fem_solver.mesh import EDGES, boundary_faces
+from nodes.fem_solver.multifrontal import Dissection
+from tests.fem_fields import dofs_of, pressure_loads
+from tests.fem_verification import Record, at_most
+from tests.scene_solids import SHAPES, scene_solid
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+E, NU, PRESSURE = 4000.0, 0.45, 50.0
+
+
+@cache
+def their_basis(shape: str) -> tuple[Any, Ints]:
+    """scikit-fem's basis on the curved mesh, and our degree of freedom for each of its.
+
+    Same quadrature as ours, so that nothing but the assembly differs.
+    """
+    mesh = scene_solid(shape)
+    corners = np.unique(mesh.elements[:, :4])
+    straight = mesh.nodes.copy()
+    straight[mesh.elements[:, 4:]] = mesh.nodes[mesh.elements[:, EDGES]].mean(axis=2)
+    tetrahedra = np.searchsorted(corners, mesh.elements[:, :4])
+    theirs = skfem.MeshTet2.from_mesh(skfem.MeshTet(straight[corners].T, tetrahedra.T))
+    distance, ours = cKDTree(straight).query(theirs.doflocs.T)
+    assert distance.max() < 1e-12
+    theirs = skfem.MeshTet2(mesh.nodes[ours].T, theirs.t)
+    points, weights = quadrature()
+    basis = skfem.Basis(
+        theirs, skfem.ElementVector(skfem.ElementTetP2()), quadrature=(points.T, weights)
+    )
+    distance, node = cKDTree(mesh.nodes).query(basis.doflocs.T)
+    assert distance.max() < 1e-9
+    axis = np.empty(len(node), dtype=np.int64)
+    for names in (basis.nodal_dofs, basis.edge_dofs):
+        for number, dofs in enumerate(names):
+            axis[dofs] = number
+    return basis, 3 * node + axis
+
+
+@cache
+def their_matrix(shape: str) -> Any:
+    basis, _ = their_basis(shape)
+    return skfem.asm(linear_elasticity(*lame_parameters(E, NU)), basis)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_stiffness_equals_that_of_scikit_fem(record_property: Record, shape: str) -> None:
+    """Largest difference of any entry over the largest entry.
+
+    Source: scikit-fem (Gustafsson & McBain, J. Open Source Softw. 5, 2020), linear_elasticity on
+    curved ElementTetP2
+    """
+    mesh = scene_solid(shape)
+    _, order = their_basis(shape)
+    theirs = their_matrix(shape)
+    ours = stiffness_matrix(mesh.nodes, mesh.elements, young_modulus_pa=E, poisson_ratio=NU)
+    error = float(abs(ours[order][:, order] - theirs).max() / abs(theirs).max())
+    at_most(record_property, f"stiffness as scikit-fem's, mesh of the {shape}", error, 1e-10)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_solution_equals_that_of_scikit_fem(record_property: Record, shape: str) -> None:
+    """The body on its support, a pressure on the skin that fingers reach: both of the solver's
+    factors against scikit-fem's `solve`.
+
+    Source: scikit-fem, `condense` and `solve`
+    """
+    mesh = scene_solid(shape)
+    basis, order = their_basis(shape)
+    faces = boundary_faces(mesh.elements)
+    pressed = faces[np.isin(faces, mesh.touch).all(axis=1)]
+    loads = pressure_loads(mesh.nodes, pressed, PRESSURE)
+    held = np.flatnonzero(np.isin(order, dofs_of(np.flatnonzero(mesh.fixed))))
+    solver = skfem.solver_direct_scipy(permc_spec="MMD_AT_PLUS_A")
+    problem = skfem.condense(their_matrix(shape), loads[order], D=held)
+    theirs = skfem.solve(*problem, solver=solver)
+    largest = np.abs(theirs).max()
+    assert largest > 1e-5
+    ours = stiffness_matrix(mesh.nodes, mesh.elements, young_modulus_pa=E, poisson_ratio=NU)
+    fixed = dofs_of(np.flatnonzero(mesh.fixed))
+    by_sparse = solve(ours, fixed, np.zeros(len(fixed)), loads)
+    matrices = element_stiffness(mesh.nodes, mesh.elements, young_modulus_pa=E, poisson_ratio=NU)
+    by_fronts = Dissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices).solve(loads)
+    for name, mine in (("sparse", by_sparse), ("multifrontal", by_fronts)):
+        error = float(np.abs(mine[order] - theirs).max() / largest)
+        what = f"solution by {name} factor as scikit-fem's, mesh of the {shape}"
+        at_most(record_property, what, error, 1e-8)

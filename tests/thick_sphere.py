@@ -1,0 +1,53 @@
+"""An eighth of a thick sphere, meshed with the solver's own lattice, for tests."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.fem_solver.mesh import boundary_faces
+from nodes.fem_solver.mesh.bisection import CELL, lattice
+from nodes.fem_solver.mesh.curving import curved
+from nodes.fem_solver.mesh.solid import oriented, with_middles
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+INNER, OUTER = 1.0, 2.0
+
+
+def eighth(layers: int) -> tuple[Floats, Ints]:
+    """Nodes and elements between the spheres, x, y, z >= 0: this many cells of the lattice across
+    the wall and twice as many along each arc; edges on the spheres curved."""
+    cells = 2 * layers
+    vertices, tetrahedra = lattice((cells, cells, cells))
+    u = vertices / (CELL * cells)
+    out = np.abs(u).max(axis=1)
+    kept = tetrahedra[((u >= 0).all(axis=1) & (out >= 0.5))[tetrahedra].all(axis=1)]
+    used, index = np.unique(kept, return_inverse=True)
+    u, out = u[used], out[used]
+    way = np.tan(0.25 * np.pi * u / out[:, None])
+    radius = INNER + (OUTER - INNER) * (2.0 * out - 1.0)
+    corners = radius[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    corners[u == 0.0] = 0.0
+    near = 0.3 * (OUTER - INNER) / layers
+
+    def nearest(points: Floats) -> Floats:
+        radius = np.linalg.norm(points, axis=1)
+        wanted = np.where(radius < INNER, INNER, np.where(radius > OUTER - near, OUTER, radius))
+        return points * (wanted / radius)[:, None]
+
+    nodes, elements = with_middles(corners, oriented(corners, index.reshape(-1, 4)))
+    return curved(nodes, elements, nearest), elements
+
+
+def symmetry(nodes: Floats) -> Ints:
+    """Degrees of freedom across the planes of symmetry."""
+    return np.flatnonzero((nodes == 0.0).ravel())
+
+
+def faces_at(nodes: Floats, elements: Ints, radius: float) -> Ints:
+    """Six-node faces on a sphere, outward."""
+    faces = boundary_faces(elements)
+    there = np.isclose(np.linalg.norm(nodes, axis=1), radius, rtol=1e-9)
+    return faces[there[faces].all(axis=1)]
