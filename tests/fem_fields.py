@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 from scipy.special import roots_jacobi
 
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
@@ -23,6 +23,7 @@ Field = Callable[[Floats], Floats]
 """Points (k, 3) to vectors (k, 3), or to gradients (k, 3, 3) with the derivative last."""
 
 MOST_ITERATIONS = 40
+SYMMETRIC = {"SymmetricMode": True}
 SETTLED = 1e-9
 """Newton's last step over the displacement."""
 
@@ -198,7 +199,7 @@ def equilibrium(
             step[held] = share * values - moved[held]
             right = residual[free] + matrix[free][:, held] @ step[held]
             inner = matrix[free][:, free].tocsc()
-            step[free] = -spsolve(inner, right, permc_spec="MMD_AT_PLUS_A")
+            step[free] = -splu(inner, permc_spec="MMD_AT_PLUS_A", options=SYMMETRIC).solve(right)
             way = 1.0
             while not np.isfinite(solid.energy((moved + way * step).reshape(-1, 3))):
                 way *= 0.5

@@ -82,7 +82,7 @@ class _Table:
 def main() -> int:
     table = _Table()
     files = sorted(str(path) for path in Path(__file__).parent.glob("test_fem_verify_*.py"))
-    outcome = pytest.main(["-q", "-p", "no:cacheprovider", *files], plugins=[table])
+    outcome = pytest.main(["-q", "--durations=10", *files], plugins=[table])
     print("\n| what | source | measured | tolerance | test |\n|---|---|---|---|---|")
     print("\n".join(f"{row} |" for row in table.rows))
     return int(outcome)

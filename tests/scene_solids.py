@@ -14,7 +14,7 @@ from messages.scene import Scene
 from nodes.fem_solver.mesh import SolidMesh, mesh_of_scene
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SPACINGS_M = {"plane": 0.012}
+SPACINGS_M = {"plane": 0.0075}
 """Between skin nodes; 0.006 of other shapes."""
 SHAPES = ("cylinder", "sphere", "ellipsoid", "rounded_box", "plane", "mesh")
 

@@ -193,8 +193,8 @@ def cook_mixed_tip(nu: float) -> float:
     """The same by scikit-fem in the plane, with pressure of its own (Taylor & Hood's elements),
     which do not lock: shear modulus 3/8."""
     import skfem
-    from skfem.helpers import ddot, div, sym_grad
     from scipy.sparse import bmat
+    from skfem.helpers import ddot, div, sym_grad
 
     mesh = skfem.MeshTri.init_tensor(np.linspace(0, 1, 41), np.linspace(0, 1, 41))
     s, t = mesh.p

@@ -57,7 +57,7 @@ def test_point_load_on_a_half_space(record_property: Record, nu: float) -> None:
     got = solve(matrix, held, values[held], loads).reshape(-1, 3)
     seen = np.flatnonzero((nodes[:, 2] == 0.0) & (away > 1.5) & (away < 20.0))
     assert len(seen) > 50
-    slope, height = np.polyfit(np.log(away[seen]), np.log(-got[seen, 2]), 1)
+    slope, _ = np.polyfit(np.log(away[seen]), np.log(-got[seen, 2]), 1)
     what = f"point load, ν = {nu:g}"
     between(record_property, f"{what}, power of the distance", float(slope), -1.02, -0.98)
     wanted = (1 - nu**2) * force / (np.pi * E)
@@ -147,8 +147,8 @@ def test_light_pushes_follow_hertz(
 ) -> None:
     """From the force: the patch's radius, and how far the skin sinks; and the power 3/2.  Sinking
     is taken against the skin some patches away, which the block's far ends do not shift.  With a
-    bed ten times as hard as the solver's own, Hertz is what is left; with its own, the patch is
-    wider by what the bed gives way.
+    bed ten times as hard as the solver's own, Hertz is nearly what is left; with its own, the patch
+    is wider by what the bed gives way.
 
     Source: Hertz 1882; Johnson, Contact Mechanics, 1985, eqs. 3.42, 4.22-4.24
     """

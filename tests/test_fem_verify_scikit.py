@@ -82,7 +82,7 @@ def test_solution_equals_that_of_scikit_fem(record_property: Record, shape: str)
     Source: scikit-fem, `condense` and `solve`
     """
     mesh = scene_solid(shape)
-    basis, order = their_basis(shape)
+    _, order = their_basis(shape)
     faces = boundary_faces(mesh.elements)
     pressed = faces[np.isin(faces, mesh.touch).all(axis=1)]
     loads = pressure_loads(mesh.nodes, pressed, PRESSURE)

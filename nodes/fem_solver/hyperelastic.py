@@ -22,9 +22,15 @@ from nodes.fem_solver.elasticity import (
     scattered,
     shape_gradients,
 )
+from nodes.fem_solver.mesh import EDGES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+CORNERS = np.vstack([np.zeros(3), np.eye(3)])
+NODE_PLACES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
+"""The ten nodes (10, 3) on the unit tetrahedron."""
 
 
 class InvertedError(ArithmeticError):
@@ -115,8 +121,18 @@ class NeoHookeanSolid:
             blocks[:, :, axis, :, axis] += share * self._laplacian
 
     def smallest_volume_ratio(self, displacement: Floats) -> float:
-        """The least J at any quadrature point: 1 at rest, 0 and less where turned inside out."""
-        return float(self.deformation(displacement)[1].min())
+        """The least J at any quadrature point or node: 1 at rest, 0 and less where turned inside
+        out.
+
+        A quadratic element's corner can turn over while its quadrature points, and so its energy,
+        see nothing of it.
+        """
+        local = shape_gradients(NODE_PLACES)
+        rest, moved = (
+            np.linalg.det(places[self.elements].transpose(0, 2, 1)[:, None] @ local)
+            for places in (self.nodes, self.nodes + displacement)
+        )
+        return float(min(self.deformation(displacement)[1].min(), (moved / rest).min()))
 
     def _state(self, displacement: Floats) -> tuple[Floats, Floats, Floats]:
         gradient, volume_ratio = self.deformation(displacement)

@@ -21,10 +21,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.contact import triangle_points
+from nodes.fem_solver.contact import POINT_SPACING_RATIO, triangle_points
 from nodes.fem_solver.elasticity import degrees_of_freedom, scattered
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from nodes.fem_solver.mesh import FACES
+from nodes.fem_solver.mesh import FACES, SUBTRIANGLES, boundary_faces
 from nodes.fem_solver.multifrontal import Dissection, Factors, IndefiniteError
 
 Floats = NDArray[np.float64]
@@ -98,8 +98,11 @@ class SphereObstacle:
         """faces (f, 6): the six-node triangles that a finger can touch."""
         self.radius_m = radius_m
         self._count, self._faces = len(nodes), faces
-        self._shape, _ = triangle_points(POINTS_PER_EDGE)
         corners = nodes[faces[:, :3]]
+        # no finger, however small, falls between the points
+        longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+        divisions = int(np.ceil(longest / (POINT_SPACING_RATIO * radius_m)))
+        self._shape, _ = triangle_points(max(POINTS_PER_EDGE, divisions))
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas = 0.5 * np.linalg.norm(normals, axis=1)
         points = len(self._shape)
@@ -228,6 +231,7 @@ class NeoHookeanBody:
         self.fixed, self.friction = fixed, friction
         self.tolerance, self.smallest_share = tolerance, smallest_share
         self._order = Dissection(nodes, elements, fixed)
+        self._hull = boundary_faces(elements)[:, SUBTRIANGLES].reshape(-1, 3)
 
     def follow(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
@@ -236,12 +240,16 @@ class NeoHookeanBody:
 
         start: a displacement and the centre that it is in balance with, without friction; None:
         the first centre, which must not touch the body.  Where the body cannot follow any farther,
-        all answers from there on are the last that it could, with `reached` false.
+        all answers from there on are the last that it could, with `reached` false: so does a body
+        of which an element turned over, or into which the finger slipped through the skin.
+        ValueError for a centre that is not finite.
         """
         displacement, at = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
         held, stuck = NOTHING_HELD, False
         for centre in centres:
+            if not np.isfinite(centre).all():
+                raise ValueError(f"the finger's centre {centre} is not finite")
             iterations = 0
             if at is None:
                 at = centre
@@ -254,14 +262,14 @@ class NeoHookeanBody:
                 target = begin + (done + step) * way
                 try:
                     guess = self._predicted(displacement, at, target, held, factors)
-                    displacement, count, factors = self.settle(
-                        displacement, target, held, guess=guess
-                    )
+                    settled, count, factors = self.settle(displacement, target, held, guess=guess)
+                    self._require_sound(settled, target)
                 except StuckError:
                     share *= 0.5
                     stuck = share < self.smallest_share
                     continue
-                iterations, done, at = iterations + count, done + step, target
+                displacement, at = settled, target
+                iterations, done = iterations + count, done + step
                 share = min(1.0, 2.0 * share)
                 if self.friction == "stick":
                     held = self.obstacle.hold(self.solid.nodes + displacement, at, held)
@@ -310,6 +318,16 @@ class NeoHookeanBody:
             displacement, energy = trial, now
         raise StuckError(f"not settled after {MAX_ITERATIONS} iterations")
 
+    def _require_sound(self, displacement: Floats, centre: Floats) -> None:
+        """StuckError where an element is turned over, or the finger's centre is inside the body:
+        nothing keeps it from where no skin is, so that it has slipped through."""
+        ratio = self.solid.smallest_volume_ratio(displacement)
+        if ratio <= 0.0:
+            raise StuckError(f"an element is turned over (volume ratio {ratio:.3g})")
+        triangles = (self.solid.nodes + displacement)[self._hull] - centre
+        if winding_number(triangles) > 0.5:
+            raise StuckError("the finger is inside the body")
+
     def _energy(self, displacement: Floats, centre: Floats, held: _Held) -> float:
         elastic = self.solid.energy(displacement)
         if not np.isfinite(elastic):
@@ -349,6 +367,20 @@ class NeoHookeanBody:
             except IndefiniteError:
                 continue
         raise StuckError("the stiffness cannot be made definite")
+
+
+def winding_number(triangles: Floats) -> float:
+    """How often a closed surface of triangles (t, 3, 3), outward, goes around the origin: 1 where
+    that is inside.
+
+    The sum of solid angles over a full one (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30,
+    1983).
+    """
+    a, b, c = triangles.transpose(1, 0, 2)
+    x, y, z = np.linalg.norm(triangles, axis=2).T
+    spanned = (a * np.cross(b, c)).sum(axis=1)
+    total = x * y * z + (a * b).sum(1) * z + (b * c).sum(1) * x + (c * a).sum(1) * y
+    return float(np.arctan2(spanned, total).sum() / (2.0 * np.pi))
 
 
 def _parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:

@@ -1,0 +1,167 @@
+"""Where the full Newton comes to its end: what it says then, and that it never shows worse."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nodes.fem_solver.hyperelastic import NeoHookeanSolid
+from nodes.fem_solver.mesh import boundary_faces
+from nodes.fem_solver.mesh.quality import least_jacobians
+from nodes.fem_solver.newton import Friction, NeoHookeanBody, Solved, winding_number
+from tests.fem_verification import Record, at_most, between
+from tests.solids import box
+
+Floats = NDArray[np.float64]
+
+FINGER, SIDE, HEIGHT = 0.007, 0.03, 0.012
+
+
+def pad(
+    *, nu: float = 0.45, finger: float = FINGER, friction: Friction = "none", sides: bool = False
+) -> NeoHookeanBody:
+    """A block of 30 x 30 x 12 mm, glued to the ground, its top at z = 0; coarse, to fail early."""
+    nodes, elements = box((4, 4, 2), (SIDE, SIDE, HEIGHT))
+    nodes = nodes - [0.5 * SIDE, 0.5 * SIDE, HEIGHT]
+    faces = boundary_faces(elements)
+    ground = np.isclose(nodes[:, 2], -HEIGHT)
+    free = ~ground[faces].all(axis=1)
+    top = np.isclose(nodes[faces, 2], 0.0).all(axis=1)
+    return NeoHookeanBody(
+        nodes,
+        elements,
+        ground,
+        faces[free if sides else top],
+        young_modulus_pa=4000.0,
+        poisson_ratio=nu,
+        finger_radius_m=finger,
+        friction=friction,
+    )
+
+
+def pressed(body: NeoHookeanBody, *places: tuple[float, float, float]) -> list[Solved]:
+    return list(body.follow([np.array(place) for place in places]))
+
+
+def require_sound(body: NeoHookeanBody, states: list[Solved]) -> None:
+    """No answer is turned over or endless, all Newton's claims hold, and after the first that was
+    not reached none is."""
+    for state in states:
+        assert np.isfinite(state.displacement).all()
+        assert np.isfinite(state.force_n).all()
+        bound = least_jacobians(body.solid.nodes + state.displacement, body.solid.elements).min()
+        assert bound > 0.0
+        assert state.least_volume_ratio > 0.0
+    assert all(a.reached or not b.reached for a, b in itertools.pairwise(states))
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.45, 0.499])
+def test_a_push_too_deep_is_flagged_and_sound(record_property: Record, nu: float) -> None:
+    """Deeper and deeper until the mesh can no more: the last answer stays, flagged; no element is
+    turned over anywhere, not only at its quadrature points.
+
+    Source: Jacobians bounded by Bernstein coefficients, Johnen, Remacle & Geuzaine, J. Comput.
+    Phys. 233, 2013
+    """
+    body = pad(nu=nu)
+    places = [(0.001, 0.0007, FINGER - depth) for depth in (0.0, 0.004, 0.0115, 0.03)]
+    states = pressed(body, *places)
+    require_sound(body, states)
+    assert states[1].reached
+    assert not states[-1].reached
+    depth = FINGER - float(states[-1].centre[2])
+    what = f"12 mm block, coarse mesh, ν = {nu:g}, depth reached"
+    between(record_property, f"{what} / thickness", depth / HEIGHT, 0.5, 1.0)
+    forces = [float(state.force_n[2]) for state in states]
+    assert all(a <= b for a, b in itertools.pairwise(forces))
+
+
+def test_a_finger_faster_than_a_frame_does_not_slip_through() -> None:
+    """From above to beyond the bottom in one step: as if it had gone slowly, not a body at rest
+    with a finger inside."""
+    body = pad()
+    states = pressed(body, (0.001, 0.0007, FINGER), (0.001, 0.0007, FINGER - 0.03))
+    require_sound(body, states)
+    assert not states[-1].reached
+    assert states[-1].force_n[2] > 0.3
+    assert FINGER - states[-1].centre[2] > 0.006
+
+
+def test_a_finger_that_begins_inside_is_flagged() -> None:
+    """With no way in there is no answer."""
+    state = pressed(pad(), (0.001, 0.0007, -0.006))[0]
+    assert not state.reached
+    assert not state.displacement.any()
+
+
+def test_a_finger_smaller_than_the_elements_is_felt(record_property: Record) -> None:
+    """A tip of 1 mm on elements of 7.5 mm touches between their nodes; what no mesh as coarse can
+    follow is flagged."""
+    body = pad(finger=0.001)
+    states = pressed(body, (0.001, 0.0007, 0.001), (0.001, 0.0007, 0.0), (0.001, 0.0007, -0.006))
+    require_sound(body, states)
+    assert states[1].reached
+    assert states[1].force_n[2] > 0.0
+    _, depth, _, _ = body.obstacle.inside(
+        body.solid.nodes + states[1].displacement, states[1].centre
+    )
+    at_most(
+        record_property,
+        "tip of 1 mm, elements of 7.5 mm, skin inside / R",
+        depth.max() / 1e-3,
+        0.15,
+    )
+
+
+def test_a_finger_on_the_edge_slides_off_soundly() -> None:
+    """Half on the top, half beside it."""
+    body = pad(sides=True)
+    states = pressed(body, (0.015, 0.0007, 0.0071), (0.015, 0.0007, 0.003))
+    require_sound(body, states)
+    assert states[-1].reached
+    assert states[-1].force_n[0] > 0.0
+
+
+def test_a_sticking_finger_that_goes_too_far_is_flagged() -> None:
+    """Held skin is dragged until elements would turn over."""
+    body = pad(friction="stick")
+    states = pressed(
+        body, (-0.006, 0.0007, FINGER), (-0.006, 0.0007, 0.003), (0.014, 0.0007, 0.003)
+    )
+    require_sound(body, states)
+    assert states[1].reached
+    assert not states[-1].reached
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_finger_nowhere_is_an_error(value: float) -> None:
+    """Whether it is the first place or a later one."""
+    with pytest.raises(ValueError, match="not finite"):
+        pressed(pad(), (value, 0.0, 0.0))
+    with pytest.raises(ValueError, match="not finite"):
+        pressed(pad(), (0.0, 0.0, FINGER), (0.0, value, 0.0))
+
+
+def test_a_turned_corner_is_seen_though_quadrature_sees_nothing() -> None:
+    """The middle of an edge moved nearly to its end: the corner there is turned over, while all
+    quadrature points keep a positive volume, and the energy stays finite."""
+    nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
+    solid = NeoHookeanSolid(nodes, elements, young_modulus_pa=1.0, poisson_ratio=0.3)
+    moved = np.zeros_like(nodes)
+    first, second, middle = elements[0, [0, 1, 4]]
+    moved[middle] = 0.3 * (nodes[first] - nodes[second])
+    assert np.isfinite(solid.energy(moved))
+    assert solid.deformation(moved)[1].min() > 0.0
+    assert least_jacobians(nodes + moved, elements).min() < 0.0
+    assert solid.smallest_volume_ratio(moved) < 0.0
+
+
+@pytest.mark.parametrize(("place", "times"), [((0.4, 0.5, 0.6), 1.0), ((1.2, 0.5, 0.5), 0.0)])
+def test_winding_number_tells_inside(place: tuple[float, float, float], times: float) -> None:
+    """Once around from inside, not at all from outside."""
+    nodes, elements = box((2, 2, 2), (1.0, 1.0, 1.0))
+    hull = boundary_faces(elements)[:, :3]
+    assert winding_number(nodes[hull] - place) == pytest.approx(times, abs=1e-12)
