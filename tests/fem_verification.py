@@ -55,6 +55,7 @@ class _Table:
     def __init__(self) -> None:
         self.rows: list[str] = []
         self._sources: dict[str, str] = {}
+        self._last = ""
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         for item in items:
@@ -69,20 +70,17 @@ class _Table:
         file = Path(report.nodeid.partition("::")[0]).stem.removeprefix("test_fem_verify_")
         for key, finding in report.user_properties:
             if key == KEY:
-                cells = (
-                    finding.what,
-                    self._sources[report.nodeid],
-                    finding.measured,
-                    finding.tolerance,
-                    f"`{file}`: `{name}`",
-                )
+                test = f"`{file}`: `{name}`"
+                source = self._sources[report.nodeid] if test != self._last else "″"
+                self._last = test
+                cells = (finding.what, source, finding.measured, finding.tolerance, test)
                 self.rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells))
 
 
 def main() -> int:
     table = _Table()
     files = sorted(str(path) for path in Path(__file__).parent.glob("test_fem_verify_*.py"))
-    outcome = pytest.main(["-q", "--durations=10", *files], plugins=[table])
+    outcome = pytest.main(["-q", "--timeout=600", *files], plugins=[table])
     print("\n| what | source | measured | tolerance | test |\n|---|---|---|---|---|")
     print("\n".join(f"{row} |" for row in table.rows))
     return int(outcome)

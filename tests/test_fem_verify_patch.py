@@ -109,7 +109,7 @@ def test_tractions_of_a_uniform_stress(record_property: Record, shape: str) -> N
     held = dofs_of(mesh.skin[[0, len(mesh.skin) // 2, -1]])
     got = solve(matrix, held, exact[held], loads)
     error = float(np.abs(got - exact).max() / np.abs(exact).max())
-    at_most(record_property, f"traction patch, mesh of the {shape}", error, 1e-8)
+    at_most(record_property, f"traction patch, mesh of the {shape}", error, 1e-11)
 
 
 def test_pure_bending_is_exact(record_property: Record) -> None:
