@@ -58,7 +58,7 @@ QUIET_N, ANSWERED_N = 0.25 * FELT_N, FELT_N
 from the second on as far as it takes."""
 
 QUIET_M, ANSWERED_M = 0.3e-3, 1.2e-3
-"""The same for depths: less than a third of a millimetre may be a fingertip that lies on the object."""
+"""The same for depths: a third of a millimetre may be a fingertip that lies on the object."""
 
 GOOD_RATIO = 0.10
 """Error of the presented force, over the wanted, that is aimed for."""
