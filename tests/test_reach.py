@@ -281,8 +281,9 @@ def test_the_demo_scene_is_within_reach(demo: Layout) -> None:
     assert demo.broken_ways == ()
     result = layout_result(demo)
     assert result["share"] == 1.0
-    # Its edges are 0.12 m long each way: strokes round so small an object turn them too fast.
-    assert 0.02 < result["speed_everywhere_m_per_s"] < SCENE.working_range.speed_m_per_s
+    assert result["share_at_working_speed"] == 1.0
+    # Its edges are 0.12 m long each way: quick strokes round so small an object turn them too fast.
+    assert SCENE.working_range.speed_m_per_s < result["speed_everywhere_m_per_s"] < 0.06
     json.dumps(result, allow_nan=False)
 
 
