@@ -22,9 +22,11 @@ from messages.scene import Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
+from nodes.renderer import dent_cache
 from nodes.renderer.families import rolled_on
 from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.stage import Stage, sheet_between
+from nodes.renderer.sheet import sheet_between
+from nodes.renderer.stage import Stage
 from nodes.twin.eye import METRES_PER_PX, TrueCylinder, proper, push_sizes, seen, tilt_sizes
 from nodes.twin.membrane import Rubber, solve
 
@@ -33,6 +35,8 @@ Image = NDArray[np.uint8]
 
 ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
+TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
+"""Of a flat sheet; four triangles are then one plane."""
 
 
 class Bench:
@@ -40,7 +44,8 @@ class Bench:
 
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
-        self._stage = Stage(scene, headless_context(), spacing_m=0.0025)
+        dents = dent_cache.load_or_solve(scene, None)
+        self._stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
         self._proper = proper(TrueCylinder(scene).at_rest(), eye=self._eye, flat=True)
 
@@ -89,7 +94,7 @@ def main() -> None:
             tilt = -np.radians(degrees)
             turned = transform(rotation_from_vector([tilt, 0.0, 0.0]), np.zeros(3))
             pose = rolled_on(scene, tilt) if name == "rolls" else turned
-            for correction in CORRECTIONS[:2]:
+            for correction in TILT_CORRECTIONS:
                 errors = 1e3 * bench.tilt_errors(correction, pose)
                 cells = " | ".join(f"{value:.3f}" for value in (*errors, errors.mean()))
                 print(f"| {name} | {degrees:+d} | {correction} | {cells} |", flush=True)

@@ -17,6 +17,7 @@ from launch.commands import (
     experiment,
     launching,
     node,
+    prepare,
     topic,
 )
 from launch.commands.output import BAD_INPUT, FAILED, CommandError, words
@@ -29,6 +30,7 @@ app = typer.Typer(
     help="An encountered-type visual haptic display with a flexible sheet.",
 )
 app.command()(launching.launch)
+app.command()(prepare.prepare)
 app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(bag.app, name="bag")

@@ -29,7 +29,7 @@ from messages.base import Message
 from messages.scene import Finite, NonNegative, Part, Positive
 
 Side = Literal["left", "right"]
-Correction = Literal["none", "one_plane", "four_triangles"]
+Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 Shading = Literal["soft", "flat"]
 StereoMode = Literal["mono", "side_by_side", "top_bottom", "anaglyph"]
 

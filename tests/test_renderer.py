@@ -22,7 +22,8 @@ from nodes.renderer.correction import Plane, correct, flat_screen, pushed_screen
 from nodes.renderer.gl import Canvas, Look, NoOpenGLError, View, headless_context
 from nodes.renderer.node import Renderer, RendererParameters
 from nodes.renderer.output import pack
-from nodes.renderer.stage import Stage, sheet_between, transform_of
+from nodes.renderer.sheet import sheet_between
+from nodes.renderer.stage import Stage, transform_of
 from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
 from tests.fingertips import fingertip
 

@@ -12,6 +12,7 @@ from typing import Any
 from launch.experiments import ExperimentError, image, stroke
 from launch.experiments.driver import Driver
 from launch.plan import Plan, load_plan
+from launch.prepare import prepare_plan
 from launch.supervisor import RunningGraph
 from messages.scene import Scene
 from messages.types import Correction, FingerPath, Shading
@@ -81,6 +82,7 @@ def run_experiment(
 ) -> None:
     """Run a procedure on a launch file's graph and record it to `bag`."""
     plan = load_plan(launch_file, settings=settings, record=bag)
+    prepare_plan(plan, progress)
     asyncio.run(_interruptible(drive(plan, procedure, progress)))
 
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from messages.types import ArmState, Fingertip, SheetTarget
 from nodes.models.prediction import path_at
 from nodes.node import Input
-from nodes.renderer.stage import Sheet, Stage, sheet_between, transform_of
+from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.stage import Stage, transform_of
 
 Floats = NDArray[np.float64]
 

@@ -9,7 +9,6 @@ asks for the family brings along.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +19,8 @@ from nodes.methods import Case, Family, Trial
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
 from nodes.renderer.correction import correct, on_imaginary_screen
-from nodes.renderer.stage import (
-    Sheet,
-    projector_homography,
-    screen_for,
-    sheet_between,
-    transform_of,
-)
+from nodes.renderer.sheet import Sheet, screen_for, sheet_between
+from nodes.renderer.stage import projector_homography, transform_of
 from nodes.renderer.surface import cylinder_surface, normals_of
 
 Floats = NDArray[np.float64]
@@ -40,7 +34,8 @@ Judge = Callable[[Scene, Floats, Floats, Floats | None], SeenAt]
 """Makes a `SeenAt` for a scene whose sheet has its left and right edge at two poses (4, 4) and is
 pushed by a fingertip (3,), or by none."""
 
-METHODS: tuple[Correction, ...] = get_args(Correction)
+METHODS: tuple[Correction, ...] = ("none", "one_plane", "four_triangles")
+"""Those that move vertices; two passes move none."""
 TILTS_DEG = (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50)
 PUSHES_MM = (0, 10, 20, 30, 40, 50)
 STRETCH = 1.05

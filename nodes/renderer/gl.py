@@ -65,7 +65,7 @@ class Canvas:
         """samples: to a pixel, at its edges; as many as the driver has, if those are fewer."""
         self.width_px, self.height_px = width_px, height_px
         self.context = context
-        vertex, fragment = _shader("object.vert.glsl"), _shader("object.frag.glsl")
+        vertex, fragment = shader_text("object.vert.glsl"), shader_text("object.frag.glsl")
         self._program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
         samples = min(samples, self.context.max_samples)
         size = (width_px, height_px)
@@ -104,8 +104,13 @@ class Canvas:
 
     def draw(self, view: View, look: Look) -> None:
         """Draw and wait until it is drawn."""
-        self._frame.use()
-        self._frame.clear(0.0, 0.0, 0.0, 1.0)
+        self.paint(self._frame, view, look)
+        self.finish()
+
+    def paint(self, frame: moderngl.Framebuffer, view: View, look: Look) -> None:
+        """Draw the object, or the pattern, into a frame."""
+        frame.use()
+        frame.clear(0.0, 0.0, 0.0, 1.0)
         mesh = self._grid if look.pattern == "grid" else self._object
         if look.pattern != "black" and mesh is not None:
             # A projector behind the screen draws mirrored: then front faces wind the other way.
@@ -114,6 +119,14 @@ class Canvas:
             set_view(self._program, view)
             self._set_look(look)
             mesh.array(self._program).render(moderngl.TRIANGLES)
+
+    def begin(self) -> None:
+        """Draw into the projector's frame from now on, which is black."""
+        self._frame.use()
+        self._frame.clear(0.0, 0.0, 0.0, 1.0)
+
+    def finish(self) -> None:
+        """Resolve the frame's samples and wait until all is drawn."""
         self.context.copy_framebuffer(self._resolved, self._frame)
         self.context.finish()
 
@@ -128,7 +141,7 @@ class Canvas:
         if self._object is None:
             raise RuntimeError("set_mesh comes before shifted_points")
         program = self.context.program(
-            vertex_shader=_shader("object.vert.glsl"), varyings=("shifted",)
+            vertex_shader=shader_text("object.vert.glsl"), varyings=("shifted",)
         )
         set_view(program, view)
         self._frame.use()  # without a window nothing runs, not even this, before a frame is bound
@@ -224,7 +237,7 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
     return points, triangles.astype(np.int32)
 
 
-def _shader(name: str) -> str:
+def shader_text(name: str) -> str:
     return files("nodes.renderer").joinpath(name).read_text()
 
 

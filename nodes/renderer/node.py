@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from pydantic import Field
 
 from messages.base import Header
@@ -18,6 +20,7 @@ from messages.types import (
     StereoMode,
 )
 from nodes.node import Input, Node, NodeParameters, Output, periodic
+from nodes.renderer import dent_cache
 from nodes.renderer.belief import SheetBelief
 from nodes.renderer.gl import SAMPLES, headless_context
 from nodes.renderer.stage import Stage
@@ -38,7 +41,10 @@ class RendererParameters(NodeParameters):
         le=16,
         description="of a pixel; fewer draw faster without a GPU",
     )
-    correction: Correction = Field(default="four_triangles", description="until a display message")
+    correction: Correction = Field(default="two_pass", description="until a display message")
+    cache_dir: Path | None = Field(
+        default=None, description="of the sheet's dent shapes; null: the user's cache"
+    )
     stereo: StereoMode = Field(default="side_by_side", description="until a display message")
 
 
@@ -74,10 +80,11 @@ class Renderer(Node):
 
     def on_scene(self, scene: Scene, header: Header) -> None:
         if self._stage is not None:
-            self._stage.canvas.release()
+            self._stage.release()
         self._stage, self._belief = None, self._new_belief()
         spacing_m, samples = self.parameters.spacing_m, self.parameters.samples
-        self._stage = Stage(scene, self._context, spacing_m=spacing_m, samples=samples)
+        dents = dent_cache.load(scene, self.parameters.cache_dir)
+        self._stage = Stage(scene, self._context, spacing_m=spacing_m, samples=samples, dents=dents)
 
     def on_display(self, display: Display, header: Header) -> None:
         self._shown, self._since_pixels = display, 0
@@ -111,7 +118,7 @@ class Renderer(Node):
         sheet = self._belief.update(
             stage, self.arm_left, self.arm_right, self.sheet_target, self.fingertip
         )
-        self.note = self._belief.note
+        self.note = "; ".join(filter(None, (self._belief.note, stage.note)))
         self._since_pixels += 1
         with_pixels = 0 < shown.pixels_every <= self._since_pixels
         look = stage.look(shown, self.fingertip.message, self.sheet_target.message)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import product
 
 import moderngl
 import numpy as np
@@ -10,91 +10,37 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from messages.scene import Pose, Scene, cylinder_of
-from messages.types import Correction, Display, Fingertip, SheetTarget, Skin, SoftBody
-from nodes.models.rigid import apply, inverse, moved, transform, transform_from_rpy
+from messages.types import Display, Fingertip, SheetTarget, Skin, SoftBody
+from nodes.models.rigid import apply, inverse, transform, transform_from_rpy
 from nodes.models.shapes import CylinderShape
-from nodes.models.sheet import corners, sheet_from_edges
+from nodes.models.sheet import corners
+from nodes.models.sheet.dents import DentShapes
 from nodes.renderer.correction import (
-    Plane,
-    Screen,
     clip_from_screen,
-    flat_screen,
+    on_imaginary_screen,
     pixel_from_screen,
     plane_is_usable,
-    pushed_screen,
 )
 from nodes.renderer.gl import SAMPLES, Canvas, Look, View
 from nodes.renderer.output import Image, pack
+from nodes.renderer.projection import Projection, Window
+from nodes.renderer.sheet import Sheet, screen_for
+from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, pyramid_mesh
 from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
 
 Floats = NDArray[np.float64]
 
-LEAST_EDGE_DISTANCE_M = 0.05
-"""Flanges nearer to one another than this hold no sheet: the poses are not believed."""
+OVERSAMPLING = 1.5
+"""Pixels of the eye's picture to one of the projector's."""
 
+BULGE_M, WINDOW_MARGIN_M = 0.012, 0.004
+NO_DENTS = "no dent shapes at hand: a pushed sheet is taken for four triangles (flexsheet prepare)"
 
-@dataclass(frozen=True, slots=True)
-class Sheet:
-    """The sheet as it is believed to be when the light leaves.
-
-    world_from_sheet: (4, 4).  corners: (4, 3).  pushed_point: (3,) in the world, or None.
-    """
-
-    world_from_sheet: Floats
-    corners: Floats
-    pushed_point: Floats | None
-
-    @property
-    def plane(self) -> Plane:
-        return Plane(self.world_from_sheet[:3, 3], self.world_from_sheet[:3, 2])
-
-    @property
-    def foremost_point(self) -> Floats:
-        """The pushed point, or the sheet's centre when nothing pushes it."""
-        return self.plane.point if self.pushed_point is None else self.pushed_point
+GRID_WINDOW = Window(-0.151, -0.151, 0.302, 0.302)
 
 
 def transform_of(pose: Pose) -> Floats:
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
-
-
-def sheet_between(
-    world_from_left_edge: Floats,
-    world_from_right_edge: Floats,
-    *,
-    height_m: float,
-    twist_world: Floats,
-    ahead_s: float,
-    finger_tip: Floats | None,
-) -> Sheet | None:
-    """The sheet between two edges, moved on by `twist_world` (6,) for `ahead_s`.
-
-    finger_tip: (3,) at that instant, or None.  It pushes the sheet when it is below the plane and
-    over the sheet.  None when the edges are too near to one another to hold a sheet.
-    """
-    left, right = world_from_left_edge, world_from_right_edge
-    distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
-    if distance < LEAST_EDGE_DISTANCE_M:
-        return None
-    measured = sheet_from_edges(left, right)
-    later = moved(measured, twist_world, ahead_s)
-    later_from_measured = later @ inverse(measured)
-    pushed_point = None
-    if finger_tip is not None:
-        x, y, z = apply(inverse(later), finger_tip)
-        if z < 0.0 and abs(x) < 0.5 * distance and abs(y) < 0.5 * height_m:
-            pushed_point = finger_tip
-    corner_points = corners(later_from_measured @ left, later_from_measured @ right, height_m)
-    return Sheet(later, corner_points, pushed_point)
-
-
-def screen_for(method: Correction, sheet: Sheet) -> Screen | None:
-    """The screen that a correction method assumes; None for no correction."""
-    if method == "none":
-        return None
-    if method == "four_triangles" and sheet.pushed_point is not None:
-        return pushed_screen(sheet.pushed_point, sheet.corners, sheet.plane)
-    return flat_screen(sheet.plane)
 
 
 def projector_homography(scene: Scene) -> Floats:
@@ -120,8 +66,11 @@ class Stage:
         *,
         spacing_m: float,
         samples: int = SAMPLES,
+        dents: DentShapes | None = None,
     ) -> None:
-        """ValueError for a projector that no homography describes."""
+        """dents: of the scene's sheet, for the two-pass projection; without them a pushed sheet is
+        taken for four triangles.  ValueError for a projector that no homography describes.
+        """
         projector, cylinder = scene.projector, cylinder_of(scene)
         self.scene = scene
         self._world_from_projector = transform_of(projector.world_from_projector)
@@ -138,6 +87,16 @@ class Stage:
         )
         self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
         self.canvas.set_mesh(self._surface.rest_world_m, self._surface.triangles)
+        self.dents, self.note = dents, ""
+        self._box_world = _box_around(self._surface.rest_world_m)
+        window = self._window(scene.eyes.centre_world_m)
+        across_px = OVERSAMPLING * projector_homography(scene)[0, 0]
+        self._projection = Projection(
+            context,
+            round(abs(across_px) * window.width),
+            round(abs(across_px) * window.height),
+            samples=samples,
+        )
         self._follow: csr_array | None = None
         self._shaped_by: SoftBody | None = None
         self._is_shaped = False
@@ -209,14 +168,48 @@ class Stage:
         The second eye needs the frame of the first to be read or shown before, so in stereo each
         is read when pixels are wanted.
         """
-        screen = screen_for(display.correction, sheet)
-        eyes = self.eyes(display)
+        screen, eyes = screen_for(display.correction, sheet), self.eyes(display)
+        mesh = self.sheet_mesh(sheet) if display.correction == "two_pass" else None
         pictures = []
         for eye in eyes[:1] if display.stereo == "mono" else eyes:
             projector = self._world_from_projector[:3, 3]
-            self.canvas.draw(View(eye, projector, screen, self._clip_from_screen), look)
+            view = View(eye, projector, screen, self._clip_from_screen)
+            if mesh is None:
+                self.canvas.draw(view, look)
+            else:
+                window = GRID_WINDOW if look.pattern == "grid" else self._window(eye)
+                self._projection.draw(self.canvas, mesh, view, look, window)
             if read:
                 pictures.append(self.canvas.read())
         if not read:
             return None
         return pack(pictures[0], pictures[-1], display.stereo, swap_eyes=display.swap_eyes)
+
+    def sheet_mesh(self, sheet: Sheet) -> SheetMesh:
+        """The sheet as it is dented; as four triangles as long as no dent shapes are at hand.
+
+        `note` says where it is not quite so.
+        """
+        if self.dents is None:
+            self.note = NO_DENTS
+            return pyramid_mesh(sheet)
+        mesh = dented_mesh(sheet, self.dents)
+        self.note = mesh.note
+        return mesh
+
+    def _window(self, eye: Floats) -> Window:
+        """What of the imaginary screen the object can cover, as the eye sees it."""
+        crossings = on_imaginary_screen(self._box_world, eye)
+        low, high = crossings.min(axis=0) - WINDOW_MARGIN_M, crossings.max(axis=0) + WINDOW_MARGIN_M
+        return Window(float(low[0]), float(low[1]), *(float(side) for side in high - low))
+
+    def release(self) -> None:
+        """Free what is on the graphics card; the context stays."""
+        self.canvas.release()
+        self._projection.release()
+
+
+def _box_around(points: Floats) -> Floats:
+    """Corners (8, 3) of the box around points, with room for a skin that bulges."""
+    low, high = points.min(axis=0) - BULGE_M, points.max(axis=0) + BULGE_M
+    return np.array(list(product(*zip(low, high, strict=True))))

@@ -1,0 +1,128 @@
+"""Keeps the sheet's dent shapes from one run to the next: they take half a minute to solve."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from nodes.models.sheet.dents import DentRange, DentShapes, Push, solve_dents, solve_push
+from nodes.models.sheet.rubber import Rubber
+
+Floats = NDArray[np.float64]
+
+VERSION = 1
+"""Of the shapes' making; another one makes them anew."""
+
+STRETCH_SLACK = 0.01
+"""How far past the scene's stretches the arms may be."""
+
+WORKERS_NICE = 10
+"""A graph may be running meanwhile."""
+
+DEPTH_SHARE = 1.2
+"""Deepest dent over the scene's push depth."""
+
+Progress = Callable[[int, int], None]
+
+
+def default_cache_dir() -> Path:
+    """$XDG_CACHE_HOME/flexsheet, or ~/.cache/flexsheet."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "flexsheet"
+
+
+def wanted(scene: Scene) -> tuple[Rubber, DentRange]:
+    """The sheet and the pushes for which a scene needs shapes."""
+    sheet = scene.sheet
+    rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
+    within = DentRange(
+        least_stretch=max(1.005, sheet.min_stretch_ratio - STRETCH_SLACK),
+        largest_stretch=sheet.max_stretch_ratio + STRETCH_SLACK,
+        deepest_m=DEPTH_SHARE * scene.working_range.push_depth_m,
+    )
+    return rubber, within
+
+
+def file_of(scene: Scene, cache_dir: Path | None) -> Path:
+    """Where the scene's shapes are kept: the name tells what they are of.  None: the default.
+
+    A sheet's shapes do not depend on its thickness or modulus, so neither does the name.
+    """
+    rubber, within = wanted(scene)
+    told = {
+        "version": VERSION,
+        "width_m": rubber.width_m,
+        "height_m": rubber.height_m,
+        "finger_radius_m": scene.finger.radius_m,
+        **asdict(within),
+    }
+    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:24]
+    return (cache_dir or default_cache_dir()) / f"dents-{digest}.npz"
+
+
+def load(scene: Scene, cache_dir: Path | None) -> DentShapes | None:
+    """The scene's shapes, or None where they are not kept, or a file is broken."""
+    path, (rubber, within) = file_of(scene, cache_dir), wanted(scene)
+    try:
+        with path.open("rb") as file, np.load(file) as kept:
+            return DentShapes(
+                rubber,
+                scene.finger.radius_m,
+                within.deepest_m,
+                kept["stretches"],
+                kept["xs_m"],
+                kept["ys_m"],
+                kept["roots"],
+                kept["modes"],
+                kept["coefficients"],
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+
+
+def load_or_solve(
+    scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
+) -> DentShapes:
+    """The scene's shapes from the cache; else solved on all cores, and kept once they are whole."""
+    shapes = load(scene, cache_dir)
+    if shapes is not None:
+        return shapes
+    rubber, within = wanted(scene)
+
+    def solve_all(pushes: Sequence[Push]) -> Iterator[Floats]:
+        with ProcessPoolExecutor(
+            mp_context=get_context("spawn"), initializer=os.nice, initargs=(WORKERS_NICE,)
+        ) as workers:
+            for done, solved in enumerate(workers.map(solve_push, pushes), start=1):
+                progress(done, len(pushes))
+                yield solved
+
+    shapes = solve_dents(
+        rubber, within=within, finger_radius_m=scene.finger.radius_m, solve_all=solve_all
+    )
+    path = file_of(scene, cache_dir)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(f".{os.getpid()}.partial")
+    with partial.open("wb") as file:
+        np.savez_compressed(
+            file,
+            stretches=shapes.stretches,
+            xs_m=shapes.xs_m,
+            ys_m=shapes.ys_m,
+            roots=shapes.roots,
+            modes=shapes.modes.astype(np.float32),
+            coefficients=shapes.coefficients.astype(np.float32),
+        )
+    partial.replace(path)
+    return shapes

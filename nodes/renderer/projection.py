@@ -1,0 +1,123 @@
+"""Two-pass projection: what the eye should see, drawn first, is then lit onto the sheet's mesh.
+
+The first pass draws the object as the eye sees it, through a window in the imaginary screen.  The
+second draws the sheet as the projector sees it; each of its points takes the colour that the eye
+should see there.  Any shape of the sheet will do, depth is right, and there is no seam between
+triangles, for nothing is moved vertex by vertex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.renderer.correction import GRAZING_SINE, NEAR_M
+from nodes.renderer.gl import FAR_M, SAMPLES, Canvas, Look, View, shader_text
+from nodes.renderer.sheet_mesh import SheetMesh
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """A rectangle on the imaginary screen, metres."""
+
+    left: float
+    bottom: float
+    width: float
+    height: float
+
+    @property
+    def clip_from_screen(self) -> Floats:
+        """(3, 3): (x, y, 1) on the imaginary screen to OpenGL's clip, the window filling it."""
+        return np.array(
+            [
+                [2.0 / self.width, 0.0, -2.0 * self.left / self.width - 1.0],
+                [0.0, 2.0 / self.height, -2.0 * self.bottom / self.height - 1.0],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+
+
+class Projection:
+    """The frame of the first pass, and the sheet that the second one draws."""
+
+    def __init__(
+        self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
+    ) -> None:
+        """width_px, height_px: of the eye's picture; samples as in `Canvas`."""
+        self._context = context
+        samples = min(samples, context.max_samples)
+        size = (width_px, height_px)
+        self._frame = context.framebuffer(
+            context.renderbuffer(size, 4, samples=samples),
+            context.depth_renderbuffer(size, samples=samples),
+        )
+        self._picture = context.texture(size, 4)
+        self._picture.repeat_x = self._picture.repeat_y = False
+        self._resolved = context.framebuffer([self._picture])
+        self._program = context.program(
+            vertex_shader=shader_text("sheet.vert.glsl"),
+            fragment_shader=shader_text("sheet.frag.glsl"),
+        )
+        self._vertices: moderngl.Buffer | None = None
+        self._array: moderngl.VertexArray | None = None
+        self._triangles: NDArray[np.int32] | None = None
+
+    def draw(
+        self, canvas: Canvas, sheet: SheetMesh, view: View, look: Look, window: Window
+    ) -> None:
+        """Draw one eye's picture onto the sheet, into the canvas's frame; wait until it is done."""
+        seen = replace(view, screen=None, clip_from_screen=window.clip_from_screen)
+        canvas.paint(self._frame, seen, look)
+        self._context.copy_framebuffer(self._resolved, self._frame)
+        array = self._sheet_array(sheet)
+        program = self._program
+        program["eye"], program["projector"] = tuple(view.eye), tuple(view.projector)
+        program["clip_from_screen"] = tuple(view.clip_from_screen.T.ravel())
+        program["near_m"], program["far_m"] = NEAR_M, FAR_M
+        program["grazing_sine"] = GRAZING_SINE
+        program["window"] = (window.left, window.bottom, window.width, window.height)
+        self._picture.use()
+        canvas.begin()
+        # The projector stands behind the sheet and sees its back.
+        self._context.disable(moderngl.CULL_FACE)
+        array.render(moderngl.TRIANGLES)
+        self._context.enable(moderngl.CULL_FACE)
+        canvas.finish()
+
+    def _sheet_array(self, sheet: SheetMesh) -> moderngl.VertexArray:
+        """The sheet's vertices in a buffer, with its triangles; made anew when those change."""
+        vertices = np.ascontiguousarray(sheet.vertices, np.float32)
+        same = self._triangles is not None and np.array_equal(self._triangles, sheet.triangles)
+        if self._array is None or self._vertices is None or not same:
+            self._release_sheet()
+            self._vertices = self._context.buffer(vertices)
+            triangles = self._context.buffer(np.ascontiguousarray(sheet.triangles, np.int32))
+            content = [(self._vertices, "3f", "position")]
+            self._array = self._context.vertex_array(self._program, content, triangles)
+            self._triangles = sheet.triangles.copy()
+        else:
+            self._vertices.write(vertices)
+        return self._array
+
+    def _release_sheet(self) -> None:
+        if self._array is not None:
+            if self._array.index_buffer is not None:
+                self._array.index_buffer.release()
+            self._array.release()
+        if self._vertices is not None:
+            self._vertices.release()
+
+    def release(self) -> None:
+        """Free all; the context stays."""
+        self._release_sheet()
+        for frame in (self._frame, self._resolved):
+            for attachment in (*frame.color_attachments, frame.depth_attachment):
+                if attachment is not None:
+                    attachment.release()
+            frame.release()
+        self._program.release()

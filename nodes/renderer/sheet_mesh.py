@@ -1,0 +1,73 @@
+"""The sheet as a mesh to project onto: flat, four triangles, or dented as the membrane dents."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.models.rigid import apply, inverse
+from nodes.models.sheet.dents import DentShapes, triangles_of
+from nodes.renderer.correction import LEAST_PUSH_M
+from nodes.renderer.sheet import Sheet
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int32]
+
+PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
+"""Triangles between neighbouring corners and the pushed point."""
+
+
+@dataclass(frozen=True, slots=True)
+class SheetMesh:
+    """vertices: (n, 3) in the world.  triangles: (m, 3), counter-clockwise for the user.
+
+    note: why the shape is not quite the sheet's; empty where it is.
+    """
+
+    vertices: Floats
+    triangles: Indices
+    note: str = ""
+
+
+def flat_mesh(sheet: Sheet) -> SheetMesh:
+    """The sheet that nothing pushes: its corners, and its middle, so that a twist is halved."""
+    vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
+    return SheetMesh(vertices, PYRAMID)
+
+
+def pyramid_mesh(sheet: Sheet) -> SheetMesh:
+    """The paper's four triangles between the corners and the fingertip."""
+    if sheet.pushed_point is None:
+        return flat_mesh(sheet)
+    return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
+
+
+def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
+    """The sheet as it narrows by its stretch and dents by its fingertip.
+
+    Edges that are turned to one another turn the flat sheet evenly between them; the dent is added
+    to that as to a flat one.
+    """
+    stretch = sheet.edge_distance_m / dents.rubber.width_m
+    x, y, depth_m = 0.0, 0.0, 0.0
+    if sheet.pushed_point is not None:
+        x, y, z = apply(inverse(sheet.world_from_sheet), sheet.pushed_point).tolist()
+        depth_m = max(0.0, -z)
+    place = (x, y)
+    flat = dents.grid(stretch, place)
+    offsets = dents.offsets(stretch, place, depth_m if depth_m >= LEAST_PUSH_M else 0.0)
+    share = (flat[..., 0] / sheet.edge_distance_m + 0.5)[..., None]
+    up = (flat[..., 1] / dents.rubber.height_m + 0.5)[..., None]
+    left_bottom, right_bottom, right_top, left_top = sheet.corners
+    ruled = (1.0 - share) * ((1.0 - up) * left_bottom + up * left_top) + share * (
+        (1.0 - up) * right_bottom + up * right_top
+    )
+    vertices = ruled + offsets @ sheet.world_from_sheet[:3, :3].T
+    rows, columns = flat.shape[:2]
+    return SheetMesh(
+        vertices.reshape(-1, 3),
+        triangles_of(rows, columns),
+        dents.outside(stretch, place, depth_m),
+    )

@@ -1,0 +1,20 @@
+"""Dent shapes for tests: fewer nodes than the renderer's, over less, solved once."""
+
+from __future__ import annotations
+
+from functools import cache
+
+from nodes.models.sheet.dents import DentRange, DentShapes, solve_dents
+from nodes.models.sheet.rubber import Rubber
+
+RUBBER = Rubber(0.24, 0.24, 0.001, 1e6)
+RADIUS_M = 0.007
+LEAST_STRETCH, LARGEST_STRETCH, DEEPEST_M = 1.04, 1.06, 0.03
+
+
+@cache
+def few_dents() -> DentShapes:
+    within = DentRange(
+        LEAST_STRETCH, LARGEST_STRETCH, DEEPEST_M, stretch_nodes=2, place_nodes=2, depth_nodes=6
+    )
+    return solve_dents(RUBBER, within=within, finger_radius_m=RADIUS_M)

@@ -1,0 +1,208 @@
+"""Two passes: as the equations on a flat sheet, right on a dented one, nothing where it is none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import moderngl
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+
+from launch.plan import load_scene
+from messages.types import Correction, Display
+from nodes.models.rigid import apply, rotation_from_vector, transform
+from nodes.models.sheet import edge_poses
+from nodes.renderer import dent_cache
+from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.sheet_mesh import dented_mesh, flat_mesh, pyramid_mesh
+from nodes.renderer.stage import NO_DENTS, Stage
+from nodes.twin.eye import METRES_PER_PX, TrueCylinder, proper, push_sizes, seen
+from nodes.twin.membrane import DeformedSheet, Rubber, solve
+from tests.dent_shapes import few_dents
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+STRETCH = 1.05
+FLAT = Look(flat=True, pattern="object")
+
+
+@pytest.fixture(scope="module")
+def context() -> moderngl.Context:
+    return headless_context()
+
+
+@pytest.fixture(scope="module")
+def stage(context: moderngl.Context) -> Stage:
+    return Stage(SCENE, context, spacing_m=0.004, dents=few_dents())
+
+
+def sheet_at(pose: Floats, tip: Floats | None = None, *, twist_rad: float = 0.0) -> Sheet:
+    left, right = edge_poses(pose, STRETCH * SCENE.sheet.width_m)
+    turn = transform(rotation_from_vector([twist_rad, 0.0, 0.0]), np.zeros(3))
+    sheet = sheet_between(
+        left,
+        right @ turn,
+        height_m=SCENE.sheet.height_m,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=tip,
+    )
+    assert sheet is not None
+    return sheet
+
+
+def true_sheet(tip: Floats) -> DeformedSheet:
+    spec = SCENE.sheet
+    rubber = Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
+    edges = edge_poses(np.eye(4), STRETCH * spec.width_m)
+    return solve(rubber, *edges, finger_tip=tip, finger_radius_m=SCENE.finger.radius_m)
+
+
+def drawn(stage: Stage, correction: Correction, sheet: Sheet, look: Look = FLAT) -> Image:
+    shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
+    picture = stage.draw(shown, sheet, look, read=True)
+    assert picture is not None
+    return picture
+
+
+@pytest.mark.parametrize("tilt_deg", [-45.0, 0.0, 30.0])
+def test_on_a_flat_sheet_two_passes_are_the_equations(stage: Stage, tilt_deg: float) -> None:
+    pose = transform(rotation_from_vector([np.radians(tilt_deg), 0.0, 0.0]), np.zeros(3))
+    one_plane = drawn(stage, "one_plane", sheet_at(pose)).astype(float)
+    two_pass = drawn(stage, "two_pass", sheet_at(pose)).astype(float)
+    lit = (one_plane > 0).mean()
+    assert lit > 0.02
+    # Outlines are blurred by a pixel; nothing else may differ.
+    assert (np.abs(one_plane - two_pass) > 100).mean() < 0.01 * lit
+    assert np.abs(one_plane - two_pass).mean() < 0.05 * one_plane.mean()
+
+
+@pytest.mark.parametrize("depth_mm", [15, 29])
+def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: Stage, depth_mm: int) -> None:
+    tip = np.array([0.0, 0.0, -1e-3 * depth_mm])
+    eye = SCENE.eyes.centre_world_m
+    truth, sheet = true_sheet(tip), sheet_at(np.eye(4), tip)
+    wanted = np.array(
+        push_sizes(proper(TrueCylinder(SCENE).at_rest(), eye=eye, flat=True), METRES_PER_PX)
+    )
+
+    def errors_mm(correction: Correction) -> Floats:
+        picture = seen(drawn(stage, correction, sheet), truth, SCENE, eye=eye)
+        return np.asarray(1e3 * np.abs(np.array(push_sizes(picture, METRES_PER_PX)) - wanted))
+
+    assert errors_mm("two_pass").max() < 0.35
+    assert errors_mm("four_triangles").max() > 0.7
+
+
+# Between only two places in a quarter of the sheet there is little to interpolate from.
+@pytest.mark.parametrize(("place", "rms_m"), [((0.0, 0.0), 4e-4), ((0.03, -0.04), 1e-3)])
+def test_the_dented_mesh_is_the_twins_sheet(place: tuple[float, float], rms_m: float) -> None:
+    tip = np.array([*place, -0.02])
+    mesh = dented_mesh(sheet_at(np.eye(4), tip), few_dents())
+    assert mesh.note == ""
+    truth = true_sheet(tip)
+    points = truth.positions.reshape(-1, 3)
+    heights = LinearNDInterpolator(mesh.vertices[:, :2], mesh.vertices[:, 2])(points[:, :2])
+    off = (heights - points[:, 2])[np.isfinite(heights)]
+    assert len(off) > 0.9 * len(points)
+    assert np.sqrt(np.mean(off**2)) < rms_m
+    assert np.linalg.norm(mesh.vertices - tip, axis=1).min() < 5e-4
+
+
+def test_meshes_reach_to_the_corners_and_the_fingertip() -> None:
+    pose = transform(rotation_from_vector([0.4, 0.1, 0.0]), np.array([0.01, 0.02, -0.01]))
+    tip = apply(pose, np.array([0.02, 0.01, -0.015]))
+    for sheet in (sheet_at(pose, tip), sheet_at(pose, tip, twist_rad=0.15)):
+        for mesh in (pyramid_mesh(sheet), dented_mesh(sheet, few_dents())):
+            for corner in sheet.corners:
+                assert np.linalg.norm(mesh.vertices - corner, axis=1).min() < 1e-4
+            assert np.linalg.norm(mesh.vertices - tip, axis=1).min() < 1e-3
+    unpushed = sheet_at(pose)
+    assert pyramid_mesh(unpushed).vertices == pytest.approx(flat_mesh(unpushed).vertices)
+
+
+def test_a_push_out_of_range_is_drawn_and_said(stage: Stage) -> None:
+    picture = drawn(stage, "two_pass", sheet_at(np.eye(4), np.array([0.0, 0.0, -0.06])))
+    assert picture.max() == 255
+    assert "deeper than 30 mm" in stage.note
+    drawn(stage, "two_pass", sheet_at(np.eye(4)))
+    assert stage.note == ""
+
+
+def test_without_dent_shapes_four_triangles_are_taken_and_it_is_said(
+    context: moderngl.Context,
+) -> None:
+    bare = Stage(SCENE, context, spacing_m=0.006)
+    tip = np.array([0.0, 0.0, -0.02])
+    picture = drawn(bare, "two_pass", sheet_at(np.eye(4), tip))
+    assert picture.max() == 255
+    assert bare.note == NO_DENTS
+    bare.release()
+
+
+@pytest.mark.parametrize("tilt_deg", [88.5, 91.0])
+def test_a_sheet_edge_on_is_not_lit(stage: Stage, tilt_deg: float) -> None:
+    pose = transform(rotation_from_vector([0.0, np.radians(tilt_deg), 0.0]), np.zeros(3))
+    assert drawn(stage, "two_pass", sheet_at(pose)).max() == 0
+
+
+def test_the_grid_is_projected_too(stage: Stage) -> None:
+    grid = drawn(stage, "two_pass", sheet_at(np.eye(4)), Look(flat=False, pattern="grid"))
+    assert grid[300, 400].max() > 150
+    assert grid[290, 410].max() < 60
+
+
+def test_a_new_shape_of_another_grid_is_drawn_anew(stage: Stage) -> None:
+    tip = np.array([0.0, 0.0, -0.02])
+    dented = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
+    stage.dents = None
+    pyramid = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
+    stage.dents = few_dents()
+    again = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
+    assert (dented == again).all()
+    assert (dented != pyramid).any()
+
+
+def test_dent_shapes_are_kept_and_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solves = []
+
+    def solve_few(rubber: object, **given: object) -> object:
+        solves.append(rubber)
+        return few_dents()
+
+    monkeypatch.setattr(dent_cache, "solve_dents", solve_few)
+    assert dent_cache.load(SCENE, tmp_path) is None
+    dent_cache.load_or_solve(SCENE, tmp_path)
+    kept = dent_cache.load_or_solve(SCENE, tmp_path)
+    assert len(solves) == 1
+    at = (1.05, (0.01, 0.02), 0.01)
+    same = replace(few_dents(), deepest_m=kept.deepest_m)
+    assert kept.offsets(*at) == pytest.approx(same.offsets(*at), abs=1e-6)
+    assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
+    path = dent_cache.file_of(SCENE, tmp_path)
+    path.write_bytes(path.read_bytes()[:1000])
+    assert dent_cache.load(SCENE, tmp_path) is None
+    dent_cache.load_or_solve(SCENE, tmp_path)
+    assert len(solves) == 2
+
+
+def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(
+    tmp_path: Path,
+) -> None:
+    own = dent_cache.file_of(SCENE, tmp_path)
+    for part, change, differs in (
+        ("sheet", {"width_m": 0.26}, True),
+        ("sheet", {"max_stretch_ratio": 1.1}, True),
+        ("finger", {"radius_m": 0.008}, True),
+        ("sheet", {"young_modulus_pa": 2e6}, False),
+    ):
+        changed = getattr(SCENE, part).model_copy(update=change)
+        other = dent_cache.file_of(SCENE.model_copy(update={part: changed}), tmp_path)
+        assert (other != own) == differs
