@@ -1,6 +1,10 @@
 """How smooth and how quick the soft body is: slides a fingertip over meshes of several spacings.
 
-    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body [--table]
+
+With --table, the nonlinear table of the demo's mesh instead: how long it takes to make (minutes, if
+the cache does not hold it), how far it and the linear method are, at places that it was not made
+from, from Newton solutions on meshes made as the table's, and the same slides.
 
 The fingertip goes 6 mm in each of three directions at constant depth, 0.02 mm a step.  Prints for
 every mesh and depth the force (beside Hertz's), its ripple, the largest jump of any skin node in a
@@ -10,6 +14,7 @@ step, the stiffness, and the time of a step.  About a minute, 1.5 GiB.
 from __future__ import annotations
 
 import resource
+import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -21,12 +26,19 @@ from numpy.typing import NDArray
 
 from launch.plan import load_scene
 from messages.scene import Scene, cylinder_of
-from nodes.fem_solver import body, precompute
-from nodes.fem_solver.place import locate
+from nodes.fem_solver import body, precompute, pushes
+from nodes.fem_solver.cache import default_cache_dir
+from nodes.fem_solver.carried import Hull
+from nodes.fem_solver.making import Maker
+from nodes.fem_solver.mesh import SolidMesh, build_mesh
+from nodes.fem_solver.place import Push, locate
 
 Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+DEMO_SPACING_M = 0.0045
+JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
+"""Station along the axis (m) and angle: places that no table is made from."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
 HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
@@ -51,6 +63,71 @@ def places(heading_rad: float) -> Iterator[tuple[float, float]]:
     for i in range(STEPS):
         way = STEP_M * i
         yield FROM_M[0] + way * np.cos(heading_rad), FROM_M[1] + way * np.sin(heading_rad)
+
+
+def judge_table(scene: Scene, spacing_m: float) -> None:
+    """Make or load the table, compare it with full Newton, slide over it, print."""
+    maker = Maker(
+        skin_spacing_m=spacing_m,
+        linear_depth_m=0.006,
+        largest_depth_m=0.010,
+        friction_ratio=0.0,
+        cache_dir=default_cache_dir(),
+        workers=0,
+    )
+    start = time.perf_counter()
+    bodies = maker.bodies(scene, "auto", lambda *_: None)
+    if len(bodies) == 1:
+        bodies.insert(0, maker.tabulated(scene, bodies[0], say))
+    best, linear = bodies
+    print(f"ready after {time.perf_counter() - start:.1f} s, {len(best.rest)} skin nodes")
+    mesh, radius_m = build_mesh(best.spec.mesh), cylinder_of(scene).radius_m
+    for along, angle in JUDGED_AT:
+        normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+        site = pushes.Site(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
+        judge_push(scene, mesh, site, best, linear)
+    for depth_m in DEPTHS_M:
+        say_slides(scene, slide(best, radius_m, depth_m), depth_m)
+
+
+def say(done: int, total: int, need: precompute.Need) -> None:
+    """Progress, on one line."""
+    print(f"\r{100 * done // total:3d} % of {need.text()}", end="", file=sys.stderr, flush=True)
+
+
+def judge_push(
+    scene: Scene,
+    mesh: SolidMesh,
+    site: pushes.Site,
+    best: body.SceneBody,
+    linear: body.SceneBody,
+) -> None:
+    """Largest error off the finger and error of the force, depth by depth."""
+    job = pushes.job_of(
+        best.spec.mesh,
+        mesh,
+        site,
+        poisson_ratio=best.spec.poisson_ratio,
+        finger_radius_m=scene.finger.radius_m,
+    )
+    solved = pushes.solve_push(job)
+    nodes, weights = Hull(solved.rest, solved.faces).weights(best.rest)
+    away = np.linalg.norm(best.rest - site.place, axis=1) > 1.5 * scene.finger.radius_m
+    print(f"\nagainst Newton at {1e3 * site.place[0]:.0f} mm, normal {site.normal.round(2)}:")
+    for level in range(solved.reached):
+        depth_m = float(solved.depths_m[level])
+        wanted = np.einsum("qa,qai->qi", weights, solved.moved[level][nodes])
+        modulus = scene.object.material.young_modulus_pa
+        force_n = modulus * float(solved.force_n[level] @ site.normal)
+        texts = []
+        for one in (best, linear):
+            answer = one.method.respond(Push(site.place, site.normal, depth_m))
+            error = np.linalg.norm(answer.displacement - wanted, axis=1)
+            texts.append(
+                f"{one.method.name} {1e3 * error[away].max():.3f} mm,"
+                f" force {100 * (answer.force_n @ site.normal / force_n - 1):+.1f} %"
+            )
+        print(f"{1e3 * depth_m:5.1f} mm: {'; '.join(texts)}")
 
 
 def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
@@ -104,21 +181,27 @@ def measure(scene: Scene, spacing_m: float) -> None:
         flush=True,
     )
     for depth_m in DEPTHS_M:
-        slides = slide(built, cylinder_of(scene).radius_m, depth_m)
-        mean_n, stiffness = slides.force_n.mean(), slides.stiffness_n_per_m
-        median_s, p99_s = np.quantile(slides.step_s, [0.5, 0.99])
-        print(
-            f"{1e3 * depth_m:5.1f} mm: force {1e3 * mean_n:7.1f} mN"
-            f" (Hertz {1e3 * hertz_force_n(scene, depth_m):6.1f}),"
-            f" ripple +-{50 * np.ptp(slides.force_n) / mean_n:4.1f} %,"
-            f" jump {1e3 * slides.jump_m:.3f} mm, stiffness {stiffness.mean():.1f} N/m,"
-            f" step {1e6 * median_s:.0f} / {1e6 * p99_s:.0f} us",
-            flush=True,
-        )
+        say_slides(scene, slide(built, cylinder_of(scene).radius_m, depth_m), depth_m)
+
+
+def say_slides(scene: Scene, slides: Slides, depth_m: float) -> None:
+    mean_n, stiffness = slides.force_n.mean(), slides.stiffness_n_per_m
+    median_s, p99_s = np.quantile(slides.step_s, [0.5, 0.99])
+    print(
+        f"{1e3 * depth_m:5.1f} mm: force {1e3 * mean_n:7.1f} mN"
+        f" (Hertz {1e3 * hertz_force_n(scene, depth_m):6.1f}),"
+        f" ripple +-{50 * np.ptp(slides.force_n) / mean_n:4.1f} %,"
+        f" jump {1e3 * slides.jump_m:.3f} mm, stiffness {stiffness.mean():.1f} N/m,"
+        f" step {1e6 * median_s:.0f} / {1e6 * p99_s:.0f} us",
+        flush=True,
+    )
 
 
 def main() -> None:
     scene = load_scene(SCENE_FILE)
+    if "--table" in sys.argv[1:]:
+        judge_table(scene, DEMO_SPACING_M)
+        return
     for spacing_m in SPACINGS_M:
         measure(scene, spacing_m)
 

@@ -29,7 +29,7 @@ from nodes.fem_solver.precompute_table import (
     table_path,
 )
 from nodes.fem_solver.pushes import PushAnswer, Site, solve_push
-from nodes.fem_solver.table import Table, TableSoftBody, depth_modes
+from nodes.fem_solver.table import Cubics, Table, TableSoftBody
 from tests.soft_bodies import cylinder_spec
 
 Floats = NDArray[np.float64]
@@ -221,16 +221,21 @@ def test_the_least_turn_takes_one_direction_into_another() -> None:
         assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
 
 
-def test_modes_leave_no_more_than_asked() -> None:
-    depths = np.linspace(0.0, 1.0, 9)
-    rng = np.random.default_rng(1)
-    samples = np.array(
-        [np.outer(depths, a) + np.outer(depths**2, b) for a, b in rng.normal(size=(5, 2, 30))]
-    ).astype(np.float32)
-    modes = depth_modes(samples, 1e-4)
-    assert modes.shape == (9, 2)
-    left = samples - np.einsum("ak,bk,pbn->pan", modes, modes, samples)
-    assert np.abs(left).max() < 1e-4
+def test_cubics_go_through_their_points_and_reproduce_parabolas() -> None:
+    depths = np.array([0.0, 0.7, 1.5, 3.0, 5.0, 7.5])
+    cubics = Cubics(depths)
+
+    def through(values: Floats, at: float) -> float:
+        first, weights = cubics.at(at)
+        return float(weights @ values[first : first + 4])
+
+    any_values = np.random.default_rng(1).normal(size=6)
+    assert [through(any_values, float(d)) for d in depths] == pytest.approx(any_values)
+    fine = np.linspace(0.0, 7.5, 301)
+    parabola = 2.0 + depths - 0.3 * depths**2
+    assert [through(parabola, float(d)) for d in fine] == pytest.approx(2 + fine - 0.3 * fine**2)
+    slopes = np.diff([through(any_values, float(d)) for d in fine]) / np.diff(fine)
+    assert np.abs(np.diff(slopes)).max() < 0.1 * np.ptp(slopes)  # continuous
 
 
 def test_a_table_is_kept_whole_or_not_at_all(table: Table, tmp_path: Path) -> None:

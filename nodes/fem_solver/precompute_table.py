@@ -141,7 +141,7 @@ def compute_table(
     mesh = build_mesh(mesh_spec)
     mirrors = pushes.mirrors_of(mesh)
     sites = pushes.sites_of(mesh_spec, mesh, mirrors, spec.finger_radius_m)
-    table = table_bytes(len(response.touch), len(response.rest))
+    table = table_bytes(len(response.touch), len(response.rest), len(pushes.DEPTHS_M))
     need = TableBudget(len(sites), len(response.touch), 2 * table + workers * PUSH_BYTES)
     total = PUSH_STEPS * len(sites) + PLACE_STEPS * len(response.touch)
     progress(0, total, need)

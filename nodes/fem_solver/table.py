@@ -1,9 +1,11 @@
 """The precomputed nonlinear method: neo-Hookean pushes, tabulated over places and depths.
 
-A table holds, for a push at every node of the touchable skin, how all the skin moves and what force
-answers, at some depths.  Over depth it is reduced to a few modes (proper orthogonal decomposition),
-between nodes it is interpolated by the mesh's own shape functions, between depths by splines.  So
-the answer is continuous in the finger's place, and follows from that alone.
+A table holds, for a push at every node of the touchable skin, how all the skin moves and what
+force answers, at some depths.  Between nodes it is interpolated by the mesh's own shape functions,
+between depths by cubics with a continuous slope.  So the answer is continuous in the finger's
+place, and follows from that alone; it costs the reading of 24 rows: six nodes, four depths.  (Modes
+over depth, by proper orthogonal decomposition, were tried: as the contact spreads with depth, nine
+of thirteen were needed to keep a tenth of a millimetre, which is more to read.)
 
 What fills it: full Newton solutions at some tens of sites, carried to the nodes between them
 (`carried`); for the smallest depths, where these have nothing to add, the linear method's contact.
@@ -11,6 +13,7 @@ What fills it: full Newton solutions at some tens of sites, carried to the nodes
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -33,16 +36,10 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-LINEAR_DEPTHS_M = (0.0004, 0.0008)
+LINEAR_DEPTHS_M = (0.0007,)
 """Depths that are tabulated beside those that were solved."""
-BLEND_M = (0.0008, 0.0015)
+BLEND_M = (0.0007, 0.0015)
 """Up to the first depth the linear method's answer counts, from the second on the solutions'."""
-MODE_ERROR_M = 1e-5
-"""What the modes leave out at any place and depth that they are chosen from."""
-BASIS_SHARE = 24
-"""Modes are chosen from every so manieth place."""
-DEPTH_STEP_M = 2e-5
-"""Splines over depth are evaluated beforehand, at such steps."""
 END_SPAN_M = 0.0025
 """The range ends this far before what was solved; deeper pushes approach that."""
 FADE_RATIO = 2.0
@@ -55,20 +52,19 @@ Told = Callable[[int, int], None]
 class Table:
     """For pushes at the m touchable nodes, at L depths, 1 Pa:
 
-    depths_m (L,), from 0.  modes (L, k).  fields (m, k, 3 s) float32: skin displacement is modes
-    times fields.  force_n (m, L, 3).  reach_m (m,): the depth to which solutions were found there.
+    depths_m (L,), from 0.  fields (m, L - 1, 3 s) float32: skin displacement at all depths but 0.
+    force_n (m, L, 3).  reach_m (m,): the depth to which solutions were found there.
     """
 
     depths_m: Floats
-    modes: Floats
     fields: Floats32
     force_n: Floats
     reach_m: Floats
 
 
-def table_bytes(loads: int, skin_nodes: int) -> int:
-    """About what a table takes, with as many modes as usual."""
-    return loads * skin_nodes * 3 * 4 * 7
+def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
+    """What a table takes whose pushes were solved at so many depths."""
+    return loads * skin_nodes * 3 * 4 * (depths + len(LINEAR_DEPTHS_M))
 
 
 def fill(response: SkinResponse, linear: LinearSoftBody, carrier: Carrier, told: Told) -> Table:
@@ -80,21 +76,14 @@ def fill(response: SkinResponse, linear: LinearSoftBody, carrier: Carrier, told:
     places, normals = response.rest[response.touch], response.normals
     count = len(places)
 
-    def at(number: int) -> tuple[Floats32, Floats, float]:
-        site = Site(places[number], normals[number])
-        return _levels(site, response, linear, carrier, depths)
-
-    some = [at(number)[0] for number in range(0, count, BASIS_SHARE)]
-    modes = depth_modes(np.stack(some), MODE_ERROR_M)
-    del some
-    project = np.linalg.pinv(modes).astype(np.float32)
-    fields = np.empty((count, modes.shape[1], response.rest.size), dtype=np.float32)
+    fields = np.empty((count, len(depths) - 1, response.rest.size), dtype=np.float32)
     force, reach = np.empty((count, len(depths), 3)), np.empty(count)
     for number in range(count):
-        moved, force[number], reach[number] = at(number)
-        fields[number] = project @ moved
+        site = Site(places[number], normals[number])
+        moved, force[number], reach[number] = _levels(site, response, linear, carrier, depths)
+        fields[number] = moved[1:]
         told(number + 1, count)
-    return Table(depths, modes, fields, force, reach)
+    return Table(depths, fields, force, reach)
 
 
 def _levels(
@@ -118,17 +107,31 @@ def _levels(
     return moved, force, reach
 
 
-def depth_modes(samples: Floats32, error_m: float) -> Floats:
-    """Modes over depth (L, k), as few as leave no more than `error_m` of samples (p, L, n)."""
-    gram = np.einsum("pan,pbn->ab", samples, samples, optimize=True).astype(np.float64)
-    values, vectors = np.linalg.eigh(gram)
-    vectors = vectors[:, np.argsort(values)[::-1]]
-    for count in range(1, len(vectors) + 1):
-        modes = vectors[:, :count]
-        left = (np.eye(len(vectors)) - modes @ modes.T).astype(np.float32)
-        if max(float(np.abs(left @ one).max()) for one in samples) <= error_m:
-            break
-    return np.asarray(modes)
+class Cubics:
+    """Interpolation over rising depths by cubics with a continuous slope, that of the parabola
+    through a depth and its neighbours; each lies between two depths and knows one more beyond."""
+
+    def __init__(self, depths_m: Floats) -> None:
+        """depths_m (L,), four or more."""
+        count = len(depths_m)
+        self._depths = depths_m.tolist()
+        values = np.eye(count)
+        slopes = np.gradient(values, depths_m, axis=0, edge_order=2)
+        self._first = [min(max(level - 1, 0), count - 4) for level in range(count - 1)]
+        self._powers = []
+        for level, first in enumerate(self._first):
+            span = depths_m[level + 1] - depths_m[level]
+            start, end = values[level], values[level + 1]
+            leaving, coming = span * slopes[level], span * slopes[level + 1]
+            rise = end - start
+            rows = [start, leaving, 3 * rise - 2 * leaving - coming, leaving + coming - 2 * rise]
+            self._powers.append(np.array(rows)[:, first : first + 4])
+
+    def at(self, depth_m: float) -> tuple[int, Floats]:
+        """The first of the four depths that count at a depth within the range, their weights."""
+        level = min(max(bisect_right(self._depths, depth_m) - 1, 0), len(self._depths) - 2)
+        t = (depth_m - self._depths[level]) / (self._depths[level + 1] - self._depths[level])
+        return self._first[level], np.array([1.0, t, t * t, t * t * t]) @ self._powers[level]
 
 
 def nearest_on_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
@@ -159,7 +162,6 @@ class TableSoftBody:
         linear_depth_m: float,
     ) -> None:
         """bounds as `LinearSoftBody`; linear_depth_m: where the stiffness is told."""
-        from scipy.interpolate import CubicSpline
         from scipy.linalg.blas import sgemv
         from scipy.spatial import cKDTree
 
@@ -168,15 +170,13 @@ class TableSoftBody:
         self._radius = finger_radius_m
         self._fields = table.fields
         deepest = float(table.depths_m[-1])
-        fine = np.linspace(0.0, deepest, int(np.ceil(deepest / DEPTH_STEP_M)) + 1)
-        self._step = fine[1]
-        self._modes = CubicSpline(table.depths_m, table.modes)(fine).astype(np.float32)
-        self._splines = CubicSpline(table.depths_m, np.eye(len(table.depths_m)))(fine)
+        self._cubics = Cubics(table.depths_m)
         self._force = young_modulus_pa * table.force_n
         self._reach = np.maximum(table.reach_m, 2.0 * END_SPAN_M)
         self._faces = response.faces
         self._corners = response.rest[response.touch][response.faces]
         self._centres = self._corners.mean(axis=1)
+        self._centre_squares = np.square(self._centres).sum(axis=1)
         middles = 0.5 * (self._corners[:, :3] + self._corners[:, [1, 2, 0]])
         self._sag = float(np.linalg.norm(self._corners[:, 3:] - middles, axis=2).max())
         sides = self._corners[:, 1:3] - self._corners[:, :1]
@@ -194,7 +194,7 @@ class TableSoftBody:
     def respond(self, push: Push) -> Response:
         """The body's answer; any finite push has one."""
         nodes, weights, off = self.foot(push.surface)
-        curve = np.column_stack([self._depths, weights @ self._curves[nodes]])
+        curve = self._curve_at(nodes, weights)
         stiffness = float(curve[len(CURVE_SHARES), 1]) / self._linear
         if push.depth_m <= 0.0:
             return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, True)
@@ -202,17 +202,19 @@ class TableSoftBody:
         depth = saturated(push.depth_m, reach - END_SPAN_M, reach)
         past = min(max(off, push.beyond_m) / (FADE_RATIO * self._radius), 1.0)
         fade = 1.0 - past * past * (3.0 - 2.0 * past)
-        level = min(int(depth / self._step), len(self._modes) - 2)
-        share = depth / self._step - level
-        over = (1.0 - share) * self._splines[level] + share * self._splines[level + 1]
-        modes = (1.0 - share) * self._modes[level] + share * self._modes[level + 1]
+        first, over = self._cubics.at(depth)
+        # at depth 0 nothing moves: it has no row
+        skipped = 1 if first == 0 else 0
+        rows, shares = slice(first + skipped - 1, first + 3), over[skipped:].astype(np.float32)
         total = np.zeros(self._fields.shape[2], dtype=np.float32)
         for node, weight in zip(nodes.tolist(), (fade * weights).tolist(), strict=True):
             # adds up in place: what it takes is reading the table
-            self._add(weight, self._fields[node].T, modes, 1.0, total, overwrite_y=1)
+            self._add(weight, self._fields[node, rows].T, shares, 1.0, total, overwrite_y=1)
         return Response(
             displacement=total.reshape(-1, 3),
-            force_n=weights @ (over @ self._force[nodes]) * (fade * push.depth_m / depth),
+            force_n=weights
+            @ (over @ self._force[nodes, first : first + 4])
+            * (fade * push.depth_m / depth),
             stiffness_n_per_m=stiffness,
             force_curve=curve,
             push_depth_m=max(0.0, push.depth_m - push.beyond_m),
@@ -222,11 +224,13 @@ class TableSoftBody:
     def foot(self, surface: Floats) -> tuple[Ints, Floats, float]:
         """Touchable nodes (6,) around a surface point (3,) with their shape functions there, and
         how far (m) the point is off the touchable skin."""
-        squared = ((self._centres - surface) ** 2).sum(axis=1)
+        # squared distances, but for what is the same for all
+        squared = self._centre_squares - self._centres @ (2.0 * surface)
         tried = squared.argpartition(FACES_TRIED)[:FACES_TRIED]
         corners, inverse = self._corners[tried], self._inverse[tried]
         local = (inverse @ (surface - corners[:, 0])[:, :, None])[:, :, 0]
-        least = np.minimum(local.min(axis=1), 1.0 - local.sum(axis=1))
+        a, b = local[:, 0], local[:, 1]
+        least = np.minimum(np.minimum(a, b), 1.0 - a - b)
         best = int(least.argmax())
         if least[best] < 0.0:
             # off the skin, or over an edge that two flat faces leave between them
@@ -246,14 +250,21 @@ class TableSoftBody:
     def force_curve(self, surface: Floats) -> Floats:
         """Force over depth near `surface`, as `SoftBodyMethod`; past the range as `respond`."""
         nodes, weights, _ = self.foot(surface)
-        return np.column_stack([self._depths, weights @ self._curves[nodes]])
+        return self._curve_at(nodes, weights)
+
+    def _curve_at(self, nodes: Ints, weights: Floats) -> Floats:
+        result = np.empty((len(self._depths), 2))
+        result[:, 0], result[:, 1] = self._depths, weights @ self._curves[nodes]
+        return result
 
     def _curve(self, number: int, normal: Floats) -> Floats:
         """Force along the normal at the depths of the curve, never falling."""
         reach = float(self._reach[number])
         bent = np.array([saturated(float(d), reach - END_SPAN_M, reach) for d in self._depths])
-        along = self._splines @ (self._force[number] @ normal)
-        forces = np.interp(bent, self._step * np.arange(len(along)), along)
+        along = self._force[number] @ normal
+        forces = np.array(
+            [over @ along[first : first + 4] for first, over in map(self._cubics.at, bent)]
+        )
         grown = np.divide(self._depths, bent, out=np.ones_like(bent), where=bent > 0.0)
         result: Floats = np.maximum.accumulate(np.maximum(forces * grown, 0.0))
         return result
