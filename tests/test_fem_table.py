@@ -29,7 +29,7 @@ from nodes.fem_solver.precompute_table import (
     table_path,
 )
 from nodes.fem_solver.pushes import PushAnswer, Site, solve_push
-from nodes.fem_solver.table import Cubics, Table, TableSoftBody
+from nodes.fem_solver.table import Cubics, Table, TableSoftBody, sound_levels
 from tests.soft_bodies import cylinder_spec
 
 Floats = NDArray[np.float64]
@@ -236,6 +236,16 @@ def test_cubics_go_through_their_points_and_reproduce_parabolas() -> None:
     assert [through(parabola, float(d)) for d in fine] == pytest.approx(2 + fine - 0.3 * fine**2)
     slopes = np.diff([through(any_values, float(d)) for d in fine]) / np.diff(fine)
     assert np.abs(np.diff(slopes)).max() < 0.1 * np.ptp(slopes)  # continuous
+
+
+def test_levels_that_turn_triangles_over_are_left_out() -> None:
+    rest = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    triangles = np.array([[0, 1, 2]], dtype=np.int32)
+    moved = np.zeros((4, 3, 3), dtype=np.float32)
+    moved[1, 1] = [-0.5, 0.0, 0.0]
+    moved[2, 1] = [-1.5, 0.0, 0.0]
+    assert sound_levels(rest, moved, triangles) == 2
+    assert sound_levels(rest, moved[:2], triangles) == 2
 
 
 def test_a_table_is_kept_whole_or_not_at_all(table: Table, tmp_path: Path) -> None:

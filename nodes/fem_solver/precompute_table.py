@@ -29,7 +29,7 @@ from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from nodes.fem_solver.table import Table, fill, table_bytes
 from nodes.models.shapes import make_shape
 
-VERSION = 1
+VERSION = 2
 """Counts up whenever the same specification gives other numbers."""
 PUSH_STEPS, PLACE_STEPS = 200, 1
 """How much of the progress a push, and a place that is filled in, are."""
@@ -180,6 +180,7 @@ def compute_table(
     )
     filled = fill(
         response,
+        model.triangles,
         linear,
         carrier,
         lambda done, _: progress(PUSH_STEPS * len(sites) + done, total, need),

@@ -40,6 +40,8 @@ LINEAR_DEPTHS_M = (0.0007,)
 """Depths that are tabulated beside those that were solved."""
 BLEND_M = (0.0007, 0.0015)
 """Up to the first depth the linear method's answer counts, from the second on the solutions'."""
+LEAST_COSINE = -0.25
+"""No triangle of the skin is shown that is turned so that its normal falls below this."""
 END_SPAN_M = 0.0025
 """The range ends this far before what was solved; deeper pushes approach that."""
 FADE_RATIO = 2.0
@@ -67,8 +69,15 @@ def table_bytes(loads: int, skin_nodes: int, depths: int) -> int:
     return loads * skin_nodes * 3 * 4 * (depths + len(LINEAR_DEPTHS_M))
 
 
-def fill(response: SkinResponse, linear: LinearSoftBody, carrier: Carrier, told: Told) -> Table:
-    """The table of a body; linear: of the same response, 1 Pa, and linear at any depth.
+def fill(
+    response: SkinResponse,
+    triangles: NDArray[np.int32],
+    linear: LinearSoftBody,
+    carrier: Carrier,
+    told: Told,
+) -> Table:
+    """The table of a body; triangles (t, 3) of its skin; linear: of the same response, 1 Pa, and
+    linear at any depth.
 
     told: called with (done, total) places; may raise to stop.
     """
@@ -82,6 +91,8 @@ def fill(response: SkinResponse, linear: LinearSoftBody, carrier: Carrier, told:
         site = Site(places[number], normals[number])
         moved, force[number], reach[number] = _levels(site, response, linear, carrier, depths)
         fields[number] = moved[1:]
+        sound = sound_levels(response.rest, moved.reshape(len(depths), -1, 3), triangles)
+        reach[number] = min(reach[number], float(depths[sound - 1]))
         told(number + 1, count)
     return Table(depths, fields, force, reach)
 
@@ -132,6 +143,24 @@ class Cubics:
         level = min(max(bisect_right(self._depths, depth_m) - 1, 0), len(self._depths) - 2)
         t = (depth_m - self._depths[level]) / (self._depths[level + 1] - self._depths[level])
         return self._first[level], np.array([1.0, t, t * t, t * t * t]) @ self._powers[level]
+
+
+def sound_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int32]) -> int:
+    """How many of the first levels of a skin that moves (L, s, 3) turn none of its triangles
+    farther than `LEAST_COSINE` says; where a finger is carried past a rim, they may be."""
+
+    def normals(points: Floats) -> Floats:
+        a, b, c = points[triangles].transpose(1, 0, 2)
+        return np.cross(b - a, c - a)
+
+    before = normals(rest)
+    before /= np.linalg.norm(before, axis=1, keepdims=True)
+    for level, way in enumerate(moved):
+        after = normals(rest + way)
+        cosines = (before * after).sum(axis=1) / np.linalg.norm(after, axis=1)
+        if not cosines.min() > LEAST_COSINE:
+            return level
+    return len(moved)
 
 
 def nearest_on_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
