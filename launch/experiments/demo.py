@@ -25,9 +25,9 @@ METRES_PER_PX = 0.0007
 
 SECONDS = (10.0, 30.0)
 TILT_DEG = -40
-TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane")
+TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
 DEPTH_MM = 30
-PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles")
+PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass")
 
 
 @dataclass(frozen=True, slots=True)

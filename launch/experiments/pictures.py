@@ -31,6 +31,7 @@ CORRECTION_NAMES = {
     "none": "not corrected",
     "one_plane": "corrected for one plane",
     "four_triangles": "corrected for 4 triangles",
+    "two_pass": "projected onto the sheet's shape",
 }
 
 

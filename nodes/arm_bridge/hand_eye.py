@@ -60,6 +60,10 @@ STRAY, MEDIAN_CHI_SQUARE = 60.0, 5.348
 freedom, whose median scales it).  In 75 made-up sets of 15 places without a stray the largest was
 43: an arm's error is not quite the same everywhere."""
 
+ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
+LEAST_SCALE = 0.01
+"""Poses that agree to rounding have no spread to be measured by."""
+
 RETURNS = 5
 
 NO_ARM_M, NO_ARM_RAD = 0.01, 0.05
@@ -451,10 +455,19 @@ class _Model:
 
 
 def _sound(places: Sequence[_Linear], model: _Model) -> NDArray[np.bool_]:
-    """Which places (n,) are off by no more than chance allows, given how far most are off."""
+    """Which places (n,) are off by no more than chance allows, given how far most are off.
+
+    What is off by no more than rounding is sound, however exact the others are.
+    """
     seen = np.array([one.seen for one in places])
-    squares = np.einsum("nk,nkl,nl->n", seen, model.weights(places), seen)
-    return np.asarray(squares <= STRAY * np.median(squares) / MEDIAN_CHI_SQUARE)
+    at_least = _Model(
+        max(model.corner_px, ROUNDING_PX),
+        max(model.arm_rad, ROUNDING_RAD),
+        max(model.arm_m, ROUNDING_M),
+    )
+    squares = np.einsum("nk,nkl,nl->n", seen, at_least.weights(places), seen)
+    scale = max(float(np.median(squares)) / MEDIAN_CHI_SQUARE, LEAST_SCALE)
+    return np.asarray(squares <= STRAY * scale)
 
 
 def _fitted(

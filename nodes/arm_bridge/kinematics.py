@@ -300,7 +300,8 @@ def _shoulder_angle(out: float, height: float, q3: float) -> float:
 
 def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -> UnreachableError:
     """What to say of a pose of which no solution is within the joint ranges."""
-    x, y, z = base_from_flange[:3, 3] * 1e3
+    # Adding zero takes the sign from what is rounded to minus zero.
+    x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
     where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
     if not solutions:
         wrist = base_from_flange[:3, 3] - FLANGE_M * base_from_flange[:3, 2]

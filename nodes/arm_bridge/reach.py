@@ -326,7 +326,7 @@ class PathError(ValueError):
     def __init__(
         self, why: str, *, side: Side, limit: str, share: float, world_from_sheet: Floats
     ) -> None:
-        x, y, z = 1e3 * world_from_sheet[:3, 3]
+        x, y, z = np.round(1e3 * world_from_sheet[:3, 3]) + 0.0
         super().__init__(
             f"{side} arm, at {100 * share:.0f} % of the way, "
             f"sheet at ({x:.0f}, {y:.0f}, {z:.0f}) mm: {why}"
