@@ -25,8 +25,9 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# Threads of BLAS would only spin against the processes that tests start.
 test: setup lint
-	$(BIN)/pytest
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest
 
 # Longer than the tests: what docs/messaging.md, docs/image-correction.md and docs/results.md hold.
 bench: setup

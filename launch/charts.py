@@ -23,6 +23,7 @@ FAMILIES: dict[str, str] = {
     "soft-body": "nodes.fem_solver.families:SOFT_BODY",
     "correction": "launch.families:CORRECTION",
     "sheet-force": "launch.families:SHEET_FORCE",
+    "sheet-shape": "launch.families:SHEET_SHAPE",
     "mesh-normal": "nodes.planner.families:MESH_NORMAL",
     "rolling": "nodes.planner.families:ROLLING",
 }

@@ -7,11 +7,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from launch.experiments.stroke import stroke_path
-from launch.twin_sheet import twin_force
+from launch.twin_sheet import twin_force, twin_points
 from messages.scene import Scene
 from messages.types import FingerPath
 from nodes.planner.sheet_force import sheet_force_family
 from nodes.renderer.families import correction_family
+from nodes.renderer.shape_families import sheet_shape_family
 from nodes.triangulator.tracking_family import Motion, tracking_family
 from nodes.twin.eye import seen_at
 from nodes.twin.finger import FingerMotion
@@ -48,3 +49,4 @@ def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
 
 TRACKING = tracking_family(finger_motions)
 SHEET_FORCE = sheet_force_family(twin_force)
+SHEET_SHAPE = sheet_shape_family(twin_points)

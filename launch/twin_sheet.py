@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from messages.scene import SheetSpec
+from messages.scene import Scene, SheetSpec
 from nodes.models.rigid import transform
 from nodes.twin.membrane import CELLS, SLACK_TENSION, Rubber, solve
+
+Floats = NDArray[np.float64]
 
 JUST_TAUT_TENSION = 2e-6
 """What the twin's rubber keeps of tension where it is slack, in shear moduli.  A hundredth of what
@@ -48,3 +51,18 @@ def twin_force(
 ) -> float:
     """The first of `twin_push`."""
     return twin_push(sheet, stretch_ratio, depth_m, place_m, finger_radius_m)[0]
+
+
+def twin_points(
+    scene: Scene, world_from_left_edge: Floats, world_from_right_edge: Floats, finger_tip: Floats
+) -> Floats:
+    """Points (n, 3) of the twin's sheet in the world, between two edges and under a fingertip."""
+    sheet = scene.sheet
+    pushed = solve(
+        Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
+        world_from_left_edge,
+        world_from_right_edge,
+        finger_tip=finger_tip,
+        finger_radius_m=scene.finger.radius_m,
+    )
+    return pushed.positions.reshape(-1, 3)
