@@ -47,7 +47,7 @@ def sheet_shape_family(judge: Judge) -> Family:
     return Family(
         name="sheet-shape",
         unit="mm",
-        reference="rms height over the flat sheet against the twin's membrane",
+        reference="the twin's membrane, rms height",
         methods=METHODS,
         trials=partial(_trials, judge),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
