@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from launch.plan import load_scene
 from messages.scene import Scene, cylinder_of
+from nodes.cache import default_cache_dir
 from nodes.fem_solver import body, precompute, pushes
-from nodes.fem_solver.cache import default_cache_dir
 from nodes.fem_solver.carried import Hull
 from nodes.fem_solver.making import Maker
 from nodes.fem_solver.mesh import SolidMesh, build_mesh

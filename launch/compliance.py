@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene
-from nodes.fem_solver import body, cache, precompute
+from nodes import cache
+from nodes.fem_solver import body, precompute
 from nodes.models.sheet.laws import SheetLaw
 from nodes.planner.compliance import (
     GOOD_RATIO,

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from nodes.cache import Parts, default_cache_dir
 from nodes.fem_solver import precompute
-from nodes.fem_solver.cache import Parts, default_cache_dir
 from nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
 from nodes.fem_solver.mesh import build_mesh
 from nodes.fem_solver.multifrontal import Dissection

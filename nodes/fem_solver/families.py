@@ -18,9 +18,9 @@ import structlog
 from numpy.typing import NDArray
 
 from messages.scene import Scene
+from nodes.cache import default_cache_dir, load_arrays, save_arrays
 from nodes.fem_solver import pushes
 from nodes.fem_solver.body import SceneBody, scene_body, spec_of, table_spec_of, with_table
-from nodes.fem_solver.cache import default_cache_dir, load_arrays, save_arrays
 from nodes.fem_solver.carried import Hull
 from nodes.fem_solver.contact import Response
 from nodes.fem_solver.mesh import boundary_faces, build_mesh

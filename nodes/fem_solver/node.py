@@ -11,7 +11,8 @@ from pydantic import Field
 from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver import body, cache, precompute
+from nodes import cache
+from nodes.fem_solver import body, precompute
 from nodes.fem_solver.contact import Response
 from nodes.fem_solver.making import Maker, MethodChoice
 from nodes.fem_solver.pace import Pace

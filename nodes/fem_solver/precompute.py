@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Plane
-from nodes.fem_solver.cache import Parts, load_arrays, save_arrays, say_damaged
+from nodes.cache import Parts, load_arrays, save_arrays, say_damaged
 from nodes.fem_solver.contact import DragResponse, SkinResponse
 from nodes.fem_solver.mesh import MeshSpec, SolidMesh, build_mesh, mesh_budget
 

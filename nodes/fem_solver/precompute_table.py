@@ -20,8 +20,8 @@ from pathlib import Path
 
 import numpy as np
 
+from nodes.cache import Parts, load_arrays, save_arrays, say_damaged
 from nodes.fem_solver import pushes
-from nodes.fem_solver.cache import Parts, load_arrays, save_arrays, say_damaged
 from nodes.fem_solver.carried import Carrier, Hull, Solved
 from nodes.fem_solver.contact import LinearSoftBody
 from nodes.fem_solver.mesh import build_mesh

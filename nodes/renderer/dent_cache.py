@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
@@ -16,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene
+from nodes.cache import default_cache_dir, load_arrays, save_arrays
 from nodes.models.sheet.dents import DentRange, DentShapes, Push, solve_dents, solve_push
 from nodes.models.sheet.rubber import Rubber
 
@@ -27,6 +27,9 @@ VERSION = 1
 STRETCH_SLACK = 0.01
 """How far past the scene's stretches the arms may be."""
 
+KEPT = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
+"""Fields of `DentShapes` that are in the file, in their order."""
+
 WORKERS_NICE = 10
 """A graph may be running meanwhile."""
 
@@ -34,12 +37,6 @@ DEPTH_SHARE = 1.2
 """Deepest dent over the scene's push depth."""
 
 Progress = Callable[[int, int], None]
-
-
-def default_cache_dir() -> Path:
-    """$XDG_CACHE_HOME/flexsheet, or ~/.cache/flexsheet."""
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "flexsheet"
 
 
 def wanted(scene: Scene) -> tuple[Rubber, DentRange]:
@@ -72,23 +69,14 @@ def file_of(scene: Scene, cache_dir: Path | None) -> Path:
 
 
 def load(scene: Scene, cache_dir: Path | None) -> DentShapes | None:
-    """The scene's shapes, or None where they are not kept, or a file is broken."""
-    path, (rubber, within) = file_of(scene, cache_dir), wanted(scene)
-    try:
-        with path.open("rb") as file, np.load(file) as kept:
-            return DentShapes(
-                rubber,
-                scene.finger.radius_m,
-                within.deepest_m,
-                kept["stretches"],
-                kept["xs_m"],
-                kept["ys_m"],
-                kept["roots"],
-                kept["modes"],
-                kept["coefficients"],
-            )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+    """The scene's shapes, or None where they are not kept, or the file is damaged."""
+    kept = load_arrays(file_of(scene, cache_dir))
+    if kept is None or not kept.keys() >= set(KEPT):
         return None
+    rubber, within = wanted(scene)
+    return DentShapes(
+        rubber, scene.finger.radius_m, within.deepest_m, *(kept[name] for name in KEPT)
+    )
 
 
 def load_or_solve(
@@ -111,18 +99,5 @@ def load_or_solve(
     shapes = solve_dents(
         rubber, within=within, finger_radius_m=scene.finger.radius_m, solve_all=solve_all
     )
-    path = file_of(scene, cache_dir)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    with partial.open("wb") as file:
-        np.savez_compressed(
-            file,
-            stretches=shapes.stretches,
-            xs_m=shapes.xs_m,
-            ys_m=shapes.ys_m,
-            roots=shapes.roots,
-            modes=shapes.modes.astype(np.float32),
-            coefficients=shapes.coefficients.astype(np.float32),
-        )
-    partial.replace(path)
+    save_arrays(file_of(scene, cache_dir), {name: getattr(shapes, name) for name in KEPT})
     return shapes
