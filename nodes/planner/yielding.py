@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -67,29 +68,18 @@ class Yielding:
 
     def _fit(self, curve: ObjectCurve, *, touching: bool) -> None:
         scene = self._scene
-        deepest_m, radius_m = scene.working_range.push_depth_m, scene.finger.radius_m
-        half_m, error_m = scene.sheet.usable_half_height_m, scene.tolerances.sheet_position_m
+        fit = fit_compliance
         if touching and self._compliance is not None:
-            fitted = compliance_at(
-                curve,
-                self._law,
-                self._pull,
-                stretch_ratio=self._compliance.stretch_ratio,
-                deepest_m=deepest_m,
-                finger_radius_m=radius_m,
-                usable_half_height_m=half_m,
-                position_error_m=error_m,
-            )
-        else:
-            fitted = fit_compliance(
-                curve,
-                self._law,
-                self._pull,
-                deepest_m=deepest_m,
-                finger_radius_m=radius_m,
-                usable_half_height_m=half_m,
-                position_error_m=error_m,
-            )
+            fit = partial(compliance_at, stretch_ratio=self._compliance.stretch_ratio)
+        fitted = fit(
+            curve,
+            self._law,
+            self._pull,
+            deepest_m=scene.working_range.push_depth_m,
+            finger_radius_m=scene.finger.radius_m,
+            usable_half_height_m=scene.sheet.usable_half_height_m,
+            position_error_m=scene.tolerances.sheet_position_m,
+        )
         self._compliance = fitted
         self.stretch_ratio, self.note = fitted.stretch_ratio, fitted.note
 
