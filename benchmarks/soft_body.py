@@ -32,6 +32,7 @@ from nodes.fem_solver.carried import Hull
 from nodes.fem_solver.making import Maker
 from nodes.fem_solver.mesh import SolidMesh, build_mesh
 from nodes.fem_solver.place import Push, locate
+from nodes.fem_solver.table import TableSoftBody
 
 Floats = NDArray[np.float64]
 
@@ -81,6 +82,13 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
         bodies.insert(0, maker.tabulated(scene, bodies[0], say))
     best, linear = bodies
     print(f"ready after {time.perf_counter() - start:.1f} s, {len(best.rest)} skin nodes")
+    if isinstance(best.method, TableSoftBody):
+        least, tenth, half = 1e3 * np.quantile(best.method.reach_m, [0.0, 0.1, 0.5])
+        deep = int((best.method.reach_m >= 0.02 - 1e-9).sum())
+        print(
+            f"{len(best.method.reach_m)} places reach {least:.1f} mm at least, nine in ten "
+            f"{tenth:.1f} mm, half {half:.1f} mm; {deep} reach 20 mm"
+        )
     mesh, radius_m = build_mesh(best.spec.mesh), cylinder_of(scene).radius_m
     for along, angle in JUDGED_AT:
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])

@@ -201,7 +201,7 @@ class TableSoftBody:
         deepest = float(table.depths_m[-1])
         self._cubics = Cubics(table.depths_m)
         self._force = young_modulus_pa * table.force_n
-        self._reach = np.maximum(table.reach_m, 2.0 * END_SPAN_M)
+        self.reach_m = np.maximum(table.reach_m, 2.0 * END_SPAN_M)
         self._faces = response.faces
         self._corners = response.rest[response.touch][response.faces]
         self._centres = self._corners.mean(axis=1)
@@ -218,7 +218,7 @@ class TableSoftBody:
         room = np.full(len(response.touch), np.inf)
         if len(bounds):
             room, _ = cKDTree(bounds).query(response.rest[response.touch])
-        self._reach_and_room = np.column_stack([self._reach, np.minimum(room, 1.0)])
+        self._reach_and_room = np.column_stack([self.reach_m, np.minimum(room, 1.0)])
 
     def respond(self, push: Push) -> Response:
         """The body's answer; any finite push has one."""
@@ -288,7 +288,7 @@ class TableSoftBody:
 
     def _curve(self, number: int, normal: Floats) -> Floats:
         """Force along the normal at the depths of the curve, never falling."""
-        reach = float(self._reach[number])
+        reach = float(self.reach_m[number])
         bent = np.array([saturated(float(d), reach - END_SPAN_M, reach) for d in self._depths])
         along = self._force[number] @ normal
         forces = np.array(
