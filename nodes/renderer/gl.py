@@ -73,7 +73,10 @@ class Canvas:
             self.context.renderbuffer(size, 4, samples=samples),
             self.context.depth_renderbuffer(size, samples=samples),
         )
-        self._resolved = self.context.framebuffer(self.context.renderbuffer(size, 4))
+        picture = self.context.renderbuffer(size, 4)
+        self._resolved = self.context.framebuffer(picture)
+        # The same picture, to draw into without samples.  Resolving would copy a depth too.
+        self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         self._object: _Mesh | None = None
         self._grid = _Mesh(self.context, *_grid_mesh())
@@ -83,10 +86,11 @@ class Canvas:
         for mesh in (self._object, self._grid):
             if mesh is not None:
                 mesh.release()
-        for frame in (self._frame, self._resolved):
-            for attachment in (*frame.color_attachments, frame.depth_attachment):
-                if attachment is not None:
-                    attachment.release()
+        pictures = (*self._frame.color_attachments, *self._resolved.color_attachments)
+        for attachment in (*pictures, self._frame.depth_attachment, self._single.depth_attachment):
+            if attachment is not None:
+                attachment.release()
+        for frame in (self._frame, self._resolved, self._single):
             frame.release()
         self._program.release()
 
@@ -121,9 +125,9 @@ class Canvas:
             mesh.array(self._program).render(moderngl.TRIANGLES)
 
     def begin(self) -> None:
-        """Draw into the projector's frame from now on, which is black."""
-        self._frame.use()
-        self._frame.clear(0.0, 0.0, 0.0, 1.0)
+        """Draw without samples into the frame that is read, which is black, from now on."""
+        self._single.use()
+        self._single.clear(0.0, 0.0, 0.0, 1.0)
 
     def finish(self) -> None:
         """Resolve the frame's samples and wait until all is drawn."""

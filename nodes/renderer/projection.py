@@ -20,6 +20,9 @@ from nodes.renderer.sheet_mesh import SheetMesh
 
 Floats = NDArray[np.float64]
 
+CLIP_DISTANCE_0, CLIP_PLANES = 0x3000, 5
+"""OpenGL's name of the first plane, and how many `sheet.vert.glsl` has."""
+
 
 @dataclass(frozen=True, slots=True)
 class Window:
@@ -85,9 +88,13 @@ class Projection:
         canvas.begin()
         # The projector stands behind the sheet and sees its back.
         self._context.disable(moderngl.CULL_FACE)
+        for plane in range(CLIP_PLANES):
+            self._context.enable_direct(CLIP_DISTANCE_0 + plane)
         array.render(moderngl.TRIANGLES)
+        for plane in range(CLIP_PLANES):
+            self._context.disable_direct(CLIP_DISTANCE_0 + plane)
         self._context.enable(moderngl.CULL_FACE)
-        canvas.finish()
+        self._context.finish()
 
     def _sheet_array(self, sheet: SheetMesh) -> moderngl.VertexArray:
         """The sheet's vertices in a buffer, with its triangles; made anew when those change."""

@@ -6,6 +6,8 @@ uniform vec3 projector;
 uniform mat3 clip_from_screen;
 uniform float near_m;
 uniform float far_m;
+uniform vec3 eye;
+uniform vec4 window;  // of the picture on the imaginary screen: left, bottom, width, height
 
 in vec3 position;
 
@@ -20,4 +22,15 @@ void main() {
     vec3 clip = clip_from_screen * vec3(on_screen, w);
     float z = ((far_m + near_m) * clip.z - 2.0 * far_m * near_m) / (far_m - near_m);
     gl_Position = vec4(clip.xy, z, clip.z);
+
+    // Only what the eye sees through the window is lit: four planes through the eye, and its depth.
+    float before_eye = eye.z - position.z;
+    vec2 seen = eye.xy * before_eye + (position.xy - eye.xy) * eye.z;
+    vec2 low = seen - window.xy * before_eye;
+    vec2 high = (window.xy + window.zw) * before_eye - seen;
+    gl_ClipDistance[0] = low.x;
+    gl_ClipDistance[1] = low.y;
+    gl_ClipDistance[2] = high.x;
+    gl_ClipDistance[3] = high.y;
+    gl_ClipDistance[4] = before_eye - near_m;
 }
