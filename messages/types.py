@@ -182,7 +182,10 @@ class Display(Message):
     stereo: StereoMode
     swap_eyes: bool = False
     shading: Shading = "soft"
-    pattern: Literal["object", "grid", "black"] = "object"
+    pattern: Literal["object", "grid", "black", "places_x", "places_y"] = Field(
+        default="object",
+        description="places_x, places_y: the object, painted with where it should be seen",
+    )
     marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
     pixels_every: int = Field(
         default=0, ge=0, description="attach pixels to each nth frame; 0: none"

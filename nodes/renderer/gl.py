@@ -25,6 +25,7 @@ SAMPLES = 4
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 OBJECT_COLOUR = (0.95, 0.72, 0.60)
 GRID_PITCH_M = 0.02
+PLACES_AXES = {"places_x": 1, "places_y": 2}
 MARK_RADIUS_M = 0.003
 
 
@@ -158,6 +159,7 @@ class Canvas:
         program["flat_shading"] = look.flat
         program["grid"] = look.pattern == "grid"
         program["grid_pitch_m"] = GRID_PITCH_M
+        program["places_axis"] = PLACES_AXES.get(look.pattern, 0)
         program["light_direction"] = tuple(LIGHT)
         program["object_colour"] = OBJECT_COLOUR
         for name, point in (

@@ -3,16 +3,22 @@
 uniform bool flat_shading;
 uniform bool grid;
 uniform float grid_pitch_m;
+uniform int places_axis;  // 1 or 2: paint each point with the x or y at which the eye should see it
+uniform vec3 eye;
 uniform vec3 light_direction;
 uniform vec3 object_colour;
 uniform vec4 fingertip_mark;  // point of the object at rest, radius; radius 0: none
 uniform vec4 target_mark;
 
 in vec3 rest_point;
+in vec3 true_point;
 in vec3 surface_normal;
 in float valid;
 
 out vec4 colour;
+
+const float PLACES_PERIOD_M = 0.02;
+const float PLACES_RANGE_M = 0.24;
 
 void main() {
     if (valid < 0.9999) discard;  // a triangle with a vertex that could not be corrected
@@ -21,6 +27,15 @@ void main() {
         vec2 softness = fwidth(rest_point.xy);
         vec2 line = 1.0 - smoothstep(vec2(0.0005), vec2(0.0005) + softness, from_line);
         colour = vec4(vec3(max(line.x, line.y)), 1.0);
+        return;
+    }
+    if (places_axis > 0) {
+        // On the imaginary screen, coded: fine by a phase in red and green, coarse in blue.
+        vec2 seen = eye.xy + (true_point.xy - eye.xy) * (eye.z / (eye.z - true_point.z));
+        float place = places_axis == 1 ? seen.x : seen.y;
+        float phase = 6.283185307 * place / PLACES_PERIOD_M;
+        float coarse = clamp(place / PLACES_RANGE_M + 0.5, 0.0, 1.0);
+        colour = vec4(0.5 + 0.5 * cos(phase), 0.5 + 0.5 * sin(phase), 0.2 + 0.8 * coarse, 1.0);
         return;
     }
     if (flat_shading) {

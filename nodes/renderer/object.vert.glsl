@@ -18,6 +18,7 @@ in vec3 position;
 in vec3 normal;
 
 out vec3 rest_point;
+out vec3 true_point;  // A
 out vec3 surface_normal;
 out float valid;
 out vec4 shifted;  // A', and 1 where it is valid
@@ -62,6 +63,7 @@ void main() {
     shifted = shift(position);
     valid = shifted.w;
     rest_point = rest_position;
+    true_point = position;
     surface_normal = normal;
 
     // From A' through the eye's pinhole onto z = 0, homogeneous: w is the depth before the eye.
