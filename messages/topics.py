@@ -66,6 +66,7 @@ _ROWS = (
           many_writers=True),
     Topic("frame", types.Frame, _LATEST, (5, 130), True, "what the projector was given",
           max_bytes=64 << 20),
+    Topic("eye", types.Eye, _LATEST, None, True, "where the user's eyes are", many_writers=True),
     Topic("estop", types.EStop, _LATCHED, None, True, "stop, latched", many_writers=True),
     Topic("status", types.Status, _EVERY, (0.5, 3), True, "how each node is", many_writers=True),
     Topic("twin/finger_path", types.FingerPath, _LATCHED, None, True, "what the twin's finger does",

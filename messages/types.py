@@ -31,7 +31,7 @@ from messages.scene import Finite, NonNegative, Part, Positive
 Side = Literal["left", "right"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 Shading = Literal["soft", "flat"]
-StereoMode = Literal["mono", "side_by_side", "top_bottom", "anaglyph"]
+StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "anaglyph"]
 
 
 class StereoPair(Message):
@@ -172,7 +172,21 @@ class SoftBody(Message):
         description="of the object where the finger is, whether it touches or not: rows of depth "
         "(m) and force (N), both from 0 and never falling; empty: not known",
     )
+    lead_s: NonNegative = Field(
+        default=0.0, description="how long after the exposure the finger is that it answers to"
+    )
     displacement_world_m: Points3
+
+
+class Eye(Message):
+    """Where the user's eyes are, from whatever tracks his head; the scene's `eyes` without it."""
+
+    valid: bool = Field(description="false: not seen; the rest is the last that was")
+    centre_world_m: Vector3 = Field(description="midway between both eyes")
+    right_world: Vector3 = Field(
+        default_factory=lambda: np.array([1.0, 0.0, 0.0]),
+        description="from the left eye to the right one, of any length but zero",
+    )
 
 
 class Display(Message):
@@ -205,7 +219,24 @@ class Frame(Message):
     pushed_point_world_m: Vector3
     predicted_to_ns: int = Field(description="the instant that the picture was drawn for")
     draw_s: NonNegative
-    late_frames: int = Field(ge=0)
+    late_frames: int = Field(
+        ge=0, description="whose light was later than predicted by more than half a frame"
+    )
+    eye: Literal["both", "left", "right"] = Field(
+        default="both", description="whose picture it is: one eye's, where frames alternate"
+    )
+    drawn_ns: int = Field(default=0, description="when the graphics card was through with it")
+    swapped_ns: int = Field(default=0, description="when the window showed it; 0: no window did")
+    light_ns: int = Field(
+        default=0, description="the middle of its light, as measured; without a window: assumed"
+    )
+    shaped_for_ns: int = Field(
+        default=0, description="the instant whose finger dents the object; 0: it is at rest"
+    )
+    fingertip_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
+        default_factory=lambda: np.zeros((0, 3)),
+        description="where the finger was taken to be at `predicted_to_ns`; none: not known",
+    )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, one (mono or packed)"
     )

@@ -180,18 +180,8 @@ def test_homography_agrees_with_the_pinhole() -> None:
         fy_px=1900.0,
         cx_px=399.5,
         cy_px=799.5,
-        distortion=(0.0,) * 5,
         world_from_projector=world_from_projector,
     )
     x, y, w = homography @ [0.03, -0.02, 1.0]
     assert np.isclose(x / w, 399.5 - 2000.0 * 0.03)
     assert np.isclose(y / w, 799.5 + 1900.0 * (-0.25 + 0.02))
-    with pytest.raises(ValueError, match=r"projector\.lens\.distortion"):
-        pixel_from_screen(
-            fx_px=1.0,
-            fy_px=1.0,
-            cx_px=0.0,
-            cy_px=0.0,
-            distortion=(0.1, 0, 0, 0, 0),
-            world_from_projector=world_from_projector,
-        )

@@ -491,7 +491,7 @@ async def test_object_follows_its_own_skin_only(bench: Bench) -> None:
 
 async def test_a_new_scene_is_drawn_and_a_bad_one_is_reported(bench: Bench) -> None:
     await bench.step("scene", bench.scene)
-    lens = bench.scene.projector.lens.model_copy(update={"distortion": (0.1, 0, 0, 0, 0)})
+    lens = bench.scene.projector.lens.model_copy(update={"distortion": (-3.0, 0, 0, 0, 0)})
     projector = bench.scene.projector.model_copy(update={"lens": lens})
     header = Header(1, 0, 0, "virtual", "test", 1)
     bad = bench.scene.model_copy(update={"projector": projector})

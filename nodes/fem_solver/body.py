@@ -92,8 +92,8 @@ class SceneBody:
             in_range=True,
         )
 
-    def message(self, response: Response) -> SoftBody:
-        """The response as it goes on the wire."""
+    def message(self, response: Response, *, lead_s: float = 0.0) -> SoftBody:
+        """The response as it goes on the wire, to a finger `lead_s` after its exposure."""
         rotation = self.world_from_mesh[:3, :3]
         turned = response.displacement @ rotation.T.astype(np.float32)
         return SoftBody(
@@ -104,6 +104,7 @@ class SceneBody:
             force_world_n=rotation @ response.force_n,
             stiffness_n_per_m=response.stiffness_n_per_m,
             force_curve=response.force_curve,
+            lead_s=lead_s,
             displacement_world_m=np.ascontiguousarray(turned),
         )
 

@@ -155,4 +155,5 @@ class FemSolver(Node):
                 hold_s=self.parameters.hold_s,
                 relax_s=self.parameters.relax_s,
             )
-        self.soft_body.publish(current.message(response), source_ns=header.source_ns)
+        answer = current.message(response, lead_s=self.parameters.lead_s)
+        self.soft_body.publish(answer, source_ns=header.source_ns)

@@ -1,4 +1,4 @@
-"""Where the renderer believes the sheet to be when the light leaves."""
+"""Where the renderer believes the sheet and the fingertip to be when the light leaves."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ Floats = NDArray[np.float64]
 class SheetBelief:
     """The sheet from the measured flange poses; the last good one while those are no good.
 
-    Poses older than `stale_s` are not used.  `lead_s` is how far ahead the light leaves.  `note`
-    says why the last plane is held; empty otherwise.
+    Poses older than `stale_s` are not used.  `note` says why the last plane is held; empty
+    otherwise.
     """
 
-    def __init__(self, *, stale_s: float, lead_s: float) -> None:
-        self._stale_s, self._lead_s = stale_s, lead_s
+    def __init__(self, *, stale_s: float) -> None:
+        self._stale_s = stale_s
         self._sheet: Sheet | None = None
         self.note = ""
 
@@ -32,9 +32,15 @@ class SheetBelief:
         left: Input[ArmState],
         right: Input[ArmState],
         target: Input[SheetTarget],
-        finger: Input[Fingertip],
+        finger_tip: Floats | None,
+        *,
+        lead_s: float,
+        eye: Floats,
     ) -> Sheet:
-        """The sheet at `lead_s` from now; before any pose was measured, the one at rest."""
+        """The sheet at `lead_s` from now; before any pose was measured, the one at rest.
+
+        finger_tip: (3,) at that instant, or None.  eye: (3,) the point of view.
+        """
         sheet, age_s = None, max(left.age_s(), right.age_s())
         if left.message is not None and right.message is not None and age_s <= self._stale_s:
             arms = stage.scene.arms
@@ -46,10 +52,10 @@ class SheetBelief:
                 twist_world=target.message.twist_world
                 if moving and target.message is not None
                 else np.zeros(6),
-                ahead_s=age_s + self._lead_s,
-                finger_tip=self._finger_tip(finger),
+                ahead_s=age_s + lead_s,
+                finger_tip=finger_tip,
             )
-        if sheet is not None and stage.usable(sheet):
+        if sheet is not None and stage.usable(sheet, eye):
             self._sheet, self.note = sheet, ""
             return sheet
         why = f"arm poses {age_s:.2f} s old" if sheet is None else "sheet edge-on or turned away"
@@ -58,10 +64,11 @@ class SheetBelief:
             self._sheet = stage.sheet_at_rest()
         return self._sheet
 
-    def _finger_tip(self, finger: Input[Fingertip]) -> Floats | None:
-        """The fingertip when the light leaves, or None when it is not known."""
-        age_s = finger.age_s()
-        if finger.message is None or not finger.message.valid or age_s > self._stale_s:
-            return None
-        message, lead_s = finger.message, age_s + self._lead_s
-        return path_at(message.ahead_world_m, message.ahead_step_s, lead_s)[0]
+
+def finger_tip_at(finger: Input[Fingertip], lead_s: float, *, stale_s: float) -> Floats | None:
+    """The fingertip (3,) at `lead_s` from now, or None when it is not known."""
+    age_s = finger.age_s()
+    if finger.message is None or not finger.message.valid or age_s > stale_s:
+        return None
+    message = finger.message
+    return path_at(message.ahead_world_m, message.ahead_step_s, age_s + lead_s)[0]

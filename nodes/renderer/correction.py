@@ -207,18 +207,12 @@ def pixel_from_screen(
     fy_px: float,
     cx_px: float,
     cy_px: float,
-    distortion: tuple[float, ...],
     world_from_projector: Floats,
 ) -> Floats:
     """Homography (3, 3): (x, y, 1) on the imaginary screen, metres, to projector pixels.
 
-    ValueError for a projector with lens distortion, which no homography holds.
+    Of a pinhole; a lens bends the pixels afterwards (`lens.py`).
     """
-    if any(distortion):
-        raise ValueError(
-            f"projector.lens.distortion: {distortion}: the projector is modelled by a homography; "
-            "give zeros and let the projector's own warp remove the distortion"
-        )
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]
     homography: Floats = camera_matrix(fx_px, fy_px, cx_px, cy_px) @ columns

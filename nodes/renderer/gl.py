@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
@@ -16,6 +17,7 @@ from nodes.renderer.correction import (
     Screen,
     sector_normals,
 )
+from nodes.renderer.lens import ClipLens, set_lens
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -38,13 +40,14 @@ class View:
     """What one eye's picture is drawn with.
 
     eye, projector: (3,) world.  screen: None draws without correction.
-    clip_from_screen: (3, 3), see `correction.clip_from_screen`.
+    clip_from_screen: (3, 3), see `correction.clip_from_screen`.  lens: None bends nothing.
     """
 
     eye: Floats
     projector: Floats
     screen: Screen | None
     clip_from_screen: Floats
+    lens: ClipLens | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +78,7 @@ class Canvas:
             self.context.depth_renderbuffer(size, samples=samples),
         )
         picture = self.context.renderbuffer(size, 4)
-        self._resolved = self.context.framebuffer(picture)
+        self.resolved = self.context.framebuffer(picture)
         # The same picture, to draw into without samples.  Resolving would copy a depth too.
         self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
@@ -87,11 +90,11 @@ class Canvas:
         for mesh in (self._object, self._grid):
             if mesh is not None:
                 mesh.release()
-        pictures = (*self._frame.color_attachments, *self._resolved.color_attachments)
+        pictures = (*self._frame.color_attachments, *self.resolved.color_attachments)
         for attachment in (*pictures, self._frame.depth_attachment, self._single.depth_attachment):
             if attachment is not None:
                 attachment.release()
-        for frame in (self._frame, self._resolved, self._single):
+        for frame in (self._frame, self.resolved, self._single):
             frame.release()
         self._program.release()
 
@@ -132,12 +135,12 @@ class Canvas:
 
     def finish(self) -> None:
         """Resolve the frame's samples and wait until all is drawn."""
-        self.context.copy_framebuffer(self._resolved, self._frame)
+        self.context.copy_framebuffer(self.resolved, self._frame)
         self.context.finish()
 
     def read(self) -> Image:
         """The picture drawn last: (height, width, 3), top row first."""
-        data = self._resolved.read(components=3, alignment=1)
+        data = self.resolved.read(components=3, alignment=1)
         rows = np.frombuffer(data, np.uint8).reshape(self.height_px, self.width_px, 3)
         return np.ascontiguousarray(rows[::-1])
 
@@ -188,6 +191,7 @@ def set_view(program: moderngl.Program, view: View) -> None:
     for name, value in values.items():
         if name in program:
             program[name] = value
+    set_lens(program, view.lens)
 
 
 class _Mesh:
@@ -244,7 +248,9 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
 
 
 def shader_text(name: str) -> str:
-    return files("nodes.renderer").joinpath(name).read_text()
+    """The shader's text; a line `#include "name"` stands for that file's."""
+    text = files("nodes.renderer").joinpath(name).read_text()
+    return re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
 
 
 def headless_context() -> moderngl.Context:

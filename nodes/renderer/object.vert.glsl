@@ -13,6 +13,8 @@ uniform float grazing_sine;
 uniform float near_m;
 uniform float far_m;
 
+#include "lens.glsl"
+
 in vec3 rest_position;
 in vec3 position;
 in vec3 normal;
@@ -69,7 +71,7 @@ void main() {
     // From A' through the eye's pinhole onto z = 0, homogeneous: w is the depth before the eye.
     float w = eye.z - shifted.z;
     vec2 on_screen = eye.xy * w + (shifted.xy - eye.xy) * eye.z;
-    vec3 clip = clip_from_screen * vec3(on_screen, w);
+    vec3 clip = through_lens(clip_from_screen * vec3(on_screen, w));
     // At one pixel clip.z grows with the depth before the eye, so the depth test orders by it.
     float z = ((far_m + near_m) * clip.z - 2.0 * far_m * near_m) / (far_m - near_m);
     gl_Position = vec4(clip.xy, z, clip.z);

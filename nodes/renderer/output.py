@@ -1,13 +1,80 @@
-"""Packing of the two eyes' pictures into what the projector takes."""
+"""The two eyes: where they are, which of them a frame is for, and how the projector takes both."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import StereoMode
+from messages.scene import Eyes
+from messages.types import Eye, StereoMode
 
 Image = NDArray[np.uint8]
+Floats = NDArray[np.float64]
+WhichEye = Literal["both", "left", "right"]
+
+NEAREST_EYE_M = 0.05
+"""An eye nearer to the imaginary screen than this is not believed: nothing can be drawn for it."""
+
+
+def believed(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
+    """The eyes to draw for, the unit direction (3,) from left to right, and why not as tracked.
+
+    tracked: the newest `eye` message, or None when there is none or it is stale.
+    """
+    across = np.array([1.0, 0.0, 0.0])
+    if tracked is None:
+        return eyes, across, ""
+    if not tracked.valid:
+        return eyes, across, "the eyes are not seen: taken to be where the scene has them"
+    length = float(np.linalg.norm(tracked.right_world))
+    if length < 1e-6:
+        return eyes, across, "eye.right_world is zero: eyes taken to be where the scene has them"
+    across = np.asarray(tracked.right_world / length, dtype=np.float64)
+    reach = 0.5 * eyes.interocular_m * abs(float(across[2]))
+    if tracked.centre_world_m[2] - reach < NEAREST_EYE_M:
+        where = f"{tracked.centre_world_m[2] - reach:.3f} m"
+        return (
+            eyes,
+            np.array([1.0, 0.0, 0.0]),
+            f"an eye {where} before the screen: eyes taken to be where the scene has them",
+        )
+    return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
+
+
+def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
+    """(2, 3): left and right eye in the world; twice the point of view when mono.
+
+    across: (3,) unit direction from left to right; None: along x.
+    """
+    direction = np.array([1.0, 0.0, 0.0]) if across is None else across
+    half = 0.0 if mode == "mono" else 0.5 * eyes.interocular_m
+    return np.stack(
+        [eyes.centre_world_m - half * direction, eyes.centre_world_m + half * direction]
+    )
+
+
+def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
+    """Whose picture frame `number` is: in frame_sequential the left eye's are the odd ones.
+
+    shows_both: what shows the frame alternates by itself, and takes both pictures of each.
+    """
+    if mode != "frame_sequential" or shows_both:
+        return "both"
+    return "left" if number % 2 else "right"
+
+
+def drawn_for(pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool) -> Floats:
+    """(1 or 2, 3): the eyes of a pair (2, 3) that a frame draws, each a picture.
+
+    One that is for one eye only shows the other's picture where the eyes are swapped: the glasses
+    then open the other way round.  Pictures of both are swapped where they are packed.
+    """
+    if which != "both":
+        row = int((which == "right") != swap_eyes)
+        return pair[row : row + 1]
+    return pair[:1] if mode == "mono" else pair
 
 
 def pack(left: Image, right: Image, mode: StereoMode, *, swap_eyes: bool = False) -> Image:
@@ -15,13 +82,14 @@ def pack(left: Image, right: Image, mode: StereoMode, *, swap_eyes: bool = False
 
     mono: the left picture.  side_by_side, top_bottom: each squeezed to half the width or height by
     averaging neighbours, left first.  anaglyph: red of the left, green and blue of the right, each
-    from its grey.  swap_eyes exchanges the two first.  ValueError if the sizes differ or are odd.
+    from its grey.  frame_sequential: nothing is packed, the left one comes first.  swap_eyes
+    exchanges the two first.  ValueError if the sizes differ or are odd.
     """
     if left.shape != right.shape:
         raise ValueError(f"pictures of {left.shape} and {right.shape} cannot be packed")
     if swap_eyes:
         left, right = right, left
-    if mode == "mono":
+    if mode in ("mono", "frame_sequential"):
         return left
     if mode == "anaglyph":
         packed = np.empty_like(left)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from nodes.renderer.correction import GRAZING_SINE, NEAR_M
 from nodes.renderer.gl import FAR_M, SAMPLES, Canvas, Look, View, shader_text
+from nodes.renderer.lens import set_lens
 from nodes.renderer.sheet_mesh import SheetMesh
 
 Floats = NDArray[np.float64]
@@ -74,7 +75,7 @@ class Projection:
         self, canvas: Canvas, sheet: SheetMesh, view: View, look: Look, window: Window
     ) -> None:
         """Draw one eye's picture onto the sheet, into the canvas's frame; wait until it is done."""
-        seen = replace(view, screen=None, clip_from_screen=window.clip_from_screen)
+        seen = replace(view, screen=None, clip_from_screen=window.clip_from_screen, lens=None)
         canvas.paint(self._frame, seen, look)
         self._context.copy_framebuffer(self._resolved, self._frame)
         array = self._sheet_array(sheet)
@@ -82,6 +83,7 @@ class Projection:
         program["eye"], program["projector"] = tuple(view.eye), tuple(view.projector)
         program["clip_from_screen"] = tuple(view.clip_from_screen.T.ravel())
         program["near_m"], program["far_m"] = NEAR_M, FAR_M
+        set_lens(program, view.lens)
         program["grazing_sine"] = GRAZING_SINE
         program["window"] = (window.left, window.bottom, window.width, window.height)
         self._picture.use()

@@ -9,6 +9,8 @@ uniform float far_m;
 uniform vec3 eye;
 uniform vec4 window;  // of the picture on the imaginary screen: left, bottom, width, height
 
+#include "lens.glsl"
+
 in vec3 position;
 
 out vec3 point;
@@ -19,7 +21,7 @@ void main() {
     // distance from the projector's plane.
     float w = position.z - projector.z;
     vec2 on_screen = projector.xy * position.z - position.xy * projector.z;
-    vec3 clip = clip_from_screen * vec3(on_screen, w);
+    vec3 clip = through_lens(clip_from_screen * vec3(on_screen, w));
     float z = ((far_m + near_m) * clip.z - 2.0 * far_m * near_m) / (far_m - near_m);
     gl_Position = vec4(clip.xy, z, clip.z);
 

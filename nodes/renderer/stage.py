@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
 
 import moderngl
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from messages.scene import Pose, Scene, cylinder_of
-from messages.types import Display, Fingertip, SheetTarget, Skin, SoftBody
+from messages.types import Display, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import apply, inverse, transform, transform_from_rpy
 from nodes.models.shapes import CylinderShape
 from nodes.models.sheet import corners
@@ -22,7 +23,8 @@ from nodes.renderer.correction import (
     plane_is_usable,
 )
 from nodes.renderer.gl import SAMPLES, Canvas, Look, View
-from nodes.renderer.output import Image, pack
+from nodes.renderer.lens import clip_lens
+from nodes.renderer.output import Image, both_eyes, pack
 from nodes.renderer.projection import Projection, Window
 from nodes.renderer.sheet import Sheet, screen_for
 from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, pyramid_mesh
@@ -44,14 +46,13 @@ def transform_of(pose: Pose) -> Floats:
 
 
 def projector_homography(scene: Scene) -> Floats:
-    """(3, 3): the imaginary screen, metres, to projector pixels; ValueError if there is none."""
+    """(3, 3): the imaginary screen, metres, to projector pixels before the lens bends them."""
     lens = scene.projector.lens
     return pixel_from_screen(
         fx_px=lens.fx_px,
         fy_px=lens.fy_px,
         cx_px=lens.cx_px,
         cy_px=lens.cy_px,
-        distortion=lens.distortion,
         world_from_projector=transform_of(scene.projector.world_from_projector),
     )
 
@@ -69,15 +70,15 @@ class Stage:
         dents: DentShapes | None = None,
     ) -> None:
         """dents: of the scene's sheet, for the two-pass projection; without them a pushed sheet is
-        taken for four triangles.  ValueError for a projector that no homography describes.
+        taken for four triangles.  ValueError for a lens that folds the projector's picture.
         """
         projector, cylinder = scene.projector, cylinder_of(scene)
         self.scene = scene
         self._world_from_projector = transform_of(projector.world_from_projector)
         self._world_from_object = transform_of(scene.object.world_from_object)
-        self._clip_from_screen = clip_from_screen(
-            projector_homography(scene), projector.width_px, projector.height_px
-        )
+        size = projector.width_px, projector.height_px
+        self._clip_from_screen = clip_from_screen(projector_homography(scene), *size)
+        self._lens = clip_lens(projector.lens, *size)
         self._shape = CylinderShape(cylinder.radius_m, cylinder.length_m)
         self._surface = cylinder_surface(
             radius_m=cylinder.radius_m,
@@ -126,14 +127,17 @@ class Stage:
         self.canvas.set_shape(positions, normals_of(self._surface, positions))
         self._shaped_by, self._is_shaped = body, True
 
-    def look(self, shown: Display, finger: Fingertip | None, target: SheetTarget | None) -> Look:
-        """How to paint what is shown: marks where the finger is and where the sheet is tangent."""
+    def look(self, shown: Display, finger_tip: Floats | None, target: SheetTarget | None) -> Look:
+        """How to paint what is shown: marks where the finger is and where the sheet is tangent.
+
+        finger_tip: (3,) when the light leaves, or None when it is not known.
+        """
         marks = shown.marks and shown.pattern == "object" and shown.shading == "soft"
         return Look(
             flat=shown.shading == "flat",
             pattern=shown.pattern,
-            fingertip_mark=self.surface_point(finger.position_world_m)
-            if marks and finger is not None and finger.valid
+            fingertip_mark=self.surface_point(finger_tip)
+            if marks and finger_tip is not None
             else None,
             target_mark=target.contact_world_m if marks and target is not None else None,
         )
@@ -150,39 +154,51 @@ class Stage:
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return Sheet(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
 
-    def usable(self, sheet: Sheet) -> bool:
-        """Whether the eyes see the sheet's front and the projector lights its back."""
-        centre = self.scene.eyes.centre_world_m
-        return plane_is_usable(sheet.plane, centre, self._world_from_projector[:3, 3])
+    def usable(self, sheet: Sheet, centre: Floats | None = None) -> bool:
+        """Whether the eyes, about `centre` (3,) or the scene's, see the sheet's front and the
+        projector lights its back."""
+        eye = self.scene.eyes.centre_world_m if centre is None else centre
+        return plane_is_usable(sheet.plane, eye, self._world_from_projector[:3, 3])
 
     def eyes(self, display: Display) -> Floats:
-        """(2, 3): left and right eye in the world; twice the point of view when mono."""
-        half = 0.0 if display.stereo == "mono" else 0.5 * self.scene.eyes.interocular_m
-        offset = np.array([half, 0.0, 0.0])
-        centre = self.scene.eyes.centre_world_m
-        return np.stack([centre - offset, centre + offset])
+        """(2, 3): the scene's left and right eye; twice the point of view when mono."""
+        return both_eyes(self.scene.eyes, display.stereo)
 
-    def draw(self, display: Display, sheet: Sheet, look: Look, *, read: bool) -> Image | None:
+    def draw(
+        self,
+        display: Display,
+        sheet: Sheet,
+        look: Look,
+        *,
+        read: bool,
+        eyes: Floats | None = None,
+        drawn: Callable[[int], None] = lambda number: None,
+    ) -> Image | None:
         """Draw what the projector shall show; the picture (height, width, 3) if `read`.
 
-        The second eye needs the frame of the first to be read or shown before, so in stereo each
-        is read when pixels are wanted.
+        eyes: (1 or 2, 3), one picture each; None: the scene's, one when mono.  `drawn(number)` is
+        called when an eye's picture is in `canvas.resolved`, which the next one takes.
         """
-        screen, eyes = screen_for(display.correction, sheet), self.eyes(display)
+        if eyes is None:
+            eyes = self.eyes(display)[: 1 if display.stereo == "mono" else 2]
+        screen = screen_for(display.correction, sheet)
         mesh = self.sheet_mesh(sheet) if display.correction == "two_pass" else None
         pictures = []
-        for eye in eyes[:1] if display.stereo == "mono" else eyes:
+        for number, eye in enumerate(eyes):
             projector = self._world_from_projector[:3, 3]
-            view = View(eye, projector, screen, self._clip_from_screen)
+            view = View(eye, projector, screen, self._clip_from_screen, self._lens)
             if mesh is None:
                 self.canvas.draw(view, look)
             else:
                 window = GRID_WINDOW if look.pattern == "grid" else self._window(eye)
                 self._projection.draw(self.canvas, mesh, view, look, window)
+            drawn(number)
             if read:
                 pictures.append(self.canvas.read())
         if not read:
             return None
+        if len(pictures) == 1:
+            return pictures[0]
         return pack(pictures[0], pictures[-1], display.stereo, swap_eyes=display.swap_eyes)
 
     def sheet_mesh(self, sheet: Sheet) -> SheetMesh:

@@ -1,0 +1,74 @@
+"""The projector's lens distortion, as the shaders apply it to what a pinhole would project."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import moderngl
+import numpy as np
+
+from messages.scene import Lens
+
+REACH_MARGIN = 1.1
+"""The lens must be told apart this far beyond the picture's corners, as a ratio of slopes."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClipLens:
+    """focal_centre: (fx, fy, cx, cy) in OpenGL's clip coordinates.  distortion: k1 k2 p1 p2 k3.
+
+    reach: the greatest squared slope of a ray that is bent as the model says; farther ones are bent
+    as if they were there, since the polynomial folds them back into the picture somewhere.
+    """
+
+    focal_centre: tuple[float, float, float, float]
+    distortion: tuple[float, ...]
+    reach: float
+
+
+def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
+    """The lens for the shader `lens.glsl`; None for one without distortion.
+
+    ValueError for a distortion that folds within the picture: no such lens exists.
+    """
+    if not any(lens.distortion):
+        return None
+    k1, k2, _, _, k3 = lens.distortion
+    corners = [
+        ((x - lens.cx_px) / lens.fx_px, (y - lens.cy_px) / lens.fy_px)
+        for x in (-0.5, width_px - 0.5)
+        for y in (-0.5, height_px - 0.5)
+    ]
+    # Radii r at which the radial polynomial r (1 + k1 r^2 + ...) stops growing.
+    turns = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    real = turns[(np.abs(turns.imag) < 1e-9) & (turns.real > 0.0)].real
+    fold = float(np.sqrt(real.min())) if len(real) else np.inf
+    largest = fold * (1.0 + k1 * fold**2 + k2 * fold**4 + k3 * fold**6) if len(real) else np.inf
+    needed = REACH_MARGIN * max(float(np.hypot(*corner)) for corner in corners)
+    if largest < needed:
+        raise ValueError(
+            f"projector.lens.distortion: {lens.distortion} folds the picture over: nothing is "
+            f"bent farther out than {largest:.3f}, its corners are at {needed:.3f}; "
+            "calibrate anew with pixels all over the picture"
+        )
+    reach = min(fold, 4.0 * needed)
+    return ClipLens(
+        (
+            2.0 * lens.fx_px / width_px,
+            -2.0 * lens.fy_px / height_px,
+            (2.0 * lens.cx_px + 1.0) / width_px - 1.0,
+            1.0 - (2.0 * lens.cy_px + 1.0) / height_px,
+        ),
+        lens.distortion,
+        reach**2,
+    )
+
+
+def set_lens(program: moderngl.Program, lens: ClipLens | None) -> None:
+    """Hand the lens to a vertex shader that includes `lens.glsl`."""
+    if "lens_reach" not in program:
+        return
+    program["lens_reach"] = 0.0 if lens is None else lens.reach
+    if lens is not None:
+        program["lens"] = lens.focal_centre
+        program["lens_distortion"] = lens.distortion

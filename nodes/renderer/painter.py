@@ -1,0 +1,151 @@
+"""One frame from the newest messages: what is believed, drawn, and said about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from messages.clock import Clock
+from messages.types import (
+    ArmState,
+    Display,
+    Eye,
+    Fingertip,
+    Frame,
+    SheetTarget,
+    Skin,
+    SoftBody,
+)
+from nodes.node import Input
+from nodes.renderer.belief import SheetBelief, finger_tip_at
+from nodes.renderer.lead import Lead
+from nodes.renderer.output import believed, both_eyes, drawn_for, which_eye
+from nodes.renderer.stage import Stage
+from nodes.renderer.window import Screen
+
+
+@dataclass(frozen=True, slots=True)
+class Ports:
+    """What a frame is drawn from."""
+
+    skin: Input[Skin]
+    soft_body: Input[SoftBody]
+    fingertip: Input[Fingertip]
+    sheet_target: Input[SheetTarget]
+    arm_left: Input[ArmState]
+    arm_right: Input[ArmState]
+    eye: Input[Eye]
+
+
+class Painter:
+    """Draws a scene's frames on a screen; counts them, and those whose light was late."""
+
+    def __init__(
+        self,
+        stage: Stage,
+        screen: Screen,
+        ports: Ports,
+        lead: Lead,
+        clock: Clock,
+        *,
+        stale_s: float,
+    ) -> None:
+        self.stage = stage
+        self.note = ""
+        self.late = self.superseded = 0
+        self._screen, self._ports, self._lead, self._clock = screen, ports, lead, clock
+        self._stale_s = stale_s
+        self._belief = SheetBelief(stale_s=stale_s)
+        self._number = 0
+
+    def paint(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
+        """Draw a frame and hand it to the screen; also the exposure (ns) that it goes back to.
+
+        What the frame says of its light is as if no window showed it; see `was_shown`.
+        """
+        ports, stage = self._ports, self.stage
+        predicted_to_ns = self._lead.light_ns(begun_ns)
+        lead_s = (predicted_to_ns - self._clock.now_ns()) * 1e-9
+        source_ns = self._shape(begun_ns)
+        tracked = ports.eye.message if ports.eye.age_s() <= self._stale_s else None
+        eyes, across, eye_note = believed(stage.scene.eyes, tracked)
+        finger_tip = finger_tip_at(ports.fingertip, lead_s, stale_s=self._stale_s)
+        sheet = self._belief.update(
+            stage,
+            ports.arm_left,
+            ports.arm_right,
+            ports.sheet_target,
+            finger_tip,
+            lead_s=lead_s,
+            eye=eyes.centre_world_m,
+        )
+        self._number += 1
+        pair = both_eyes(eyes, shown.stereo, across)
+        which = which_eye(shown.stereo, self._number, shows_both=self._screen.shows_both)
+        picture = stage.draw(
+            shown,
+            sheet,
+            stage.look(shown, finger_tip, ports.sheet_target.message),
+            read=with_pixels,
+            eyes=drawn_for(pair, shown.stereo, which, swap_eyes=shown.swap_eyes),
+            drawn=lambda number: self._screen.take(number, stage.canvas.resolved),
+        )
+        drawn_ns = self._clock.now_ns()
+        light_ns = 0
+        if not self._screen.is_seen:
+            light_ns = self._lead.drawn(begun_ns, drawn_ns)
+            self.late += self._lead.is_late(light_ns, predicted_to_ns)
+        self.note = "; ".join(filter(None, (self._belief.note, stage.note, eye_note)))
+        frame = Frame(
+            number=self._number,
+            correction=shown.correction,
+            stereo=shown.stereo,
+            label=shown.label,
+            eye=which,
+            eyes_world_m=pair,
+            world_from_sheet=sheet.world_from_sheet,
+            pushed_point_world_m=sheet.foremost_point,
+            predicted_to_ns=predicted_to_ns,
+            draw_s=(drawn_ns - begun_ns) * 1e-9,
+            drawn_ns=drawn_ns,
+            light_ns=light_ns,
+            late_frames=self.late,
+            shaped_for_ns=self._shaped_for_ns(),
+            fingertip_world_m=np.zeros((0, 3)) if finger_tip is None else finger_tip[None],
+            pixels=() if picture is None else (picture,),
+        )
+        return frame, source_ns
+
+    def was_shown(self, frame: Frame, swapped_ns: int) -> Frame:
+        """The frame with what the window measured; `swapped_ns` 0: a newer one took its place."""
+        if not swapped_ns:
+            self.superseded += 1
+            return frame
+        begun_ns = frame.drawn_ns - round(frame.draw_s * 1e9)
+        light_ns = self._lead.shown(begun_ns, frame.drawn_ns, swapped_ns)
+        self.late += self._lead.is_late(light_ns, frame.predicted_to_ns)
+        return frame.model_copy(
+            update={"swapped_ns": swapped_ns, "light_ns": light_ns, "late_frames": self.late}
+        )
+
+    def _shape(self, now_ns: int) -> int:
+        """Deform the drawn object as the newest soft body says, however old that is.
+
+        Returns the exposure (ns) that the picture goes back to.
+        """
+        ports, stage = self._ports, self.stage
+        skin, body = ports.skin.message, ports.soft_body.message
+        if skin is not None and stage.mesh_id != skin.mesh_id:
+            stage.follow(skin)
+        stage.shape(body if body is not None and body.mesh_id == stage.mesh_id else None)
+        fresh = ports.soft_body.age_s() <= self._stale_s
+        header = ports.soft_body.header if fresh else ports.fingertip.header
+        recent = fresh or ports.fingertip.age_s() <= self._stale_s
+        return header.source_ns if recent and header is not None else now_ns
+
+    def _shaped_for_ns(self) -> int:
+        body, header = self._ports.soft_body.message, self._ports.soft_body.header
+        if body is None or header is None or body.mesh_id != self.stage.mesh_id:
+            return 0
+        return header.source_ns + round(body.lead_s * 1e9)

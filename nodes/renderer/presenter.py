@@ -1,0 +1,212 @@
+"""Shows the newest picture in a window, from a thread of its own that waits for the refresh.
+
+A swap that waits for the projector holds up this thread and no other: the event loop goes on
+drawing into textures that both contexts share.  Three pairs of them go round: one is shown, one is
+ready, one is drawn into.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import glfw
+import moderngl
+import numpy as np
+
+from messages.types import StereoMode
+from nodes.renderer.gl import shader_text
+from nodes.renderer.monitors import WindowError, glfw_errors
+
+SLOTS = 3
+IDLE_S = 0.1
+_NO_WINDOW: Any = None
+MODES: dict[StereoMode, int] = {
+    "mono": 0,
+    "frame_sequential": 0,
+    "side_by_side": 1,
+    "top_bottom": 2,
+    "anaglyph": 3,
+}
+GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
+
+Shown = Callable[[Any, int], None]
+"""Called in the presenter's thread with a picture's tag and when it was swapped to the front, ns;
+0 for a picture that a newer one took the place of."""
+
+
+@dataclass(slots=True)
+class Slot:
+    """Two textures, left and right, and what they hold."""
+
+    textures: tuple[moderngl.Texture, moderngl.Texture]
+    frames: tuple[moderngl.Framebuffer, moderngl.Framebuffer]
+    tag: Any = None
+    mode: StereoMode = "mono"
+    swap_eyes: bool = False
+
+
+def make_slot(context: moderngl.Context, size: tuple[int, int]) -> Slot:
+    textures = context.texture(size, 4), context.texture(size, 4)
+    left, right = textures
+    return Slot(textures, (context.framebuffer([left]), context.framebuffer([right])))
+
+
+class Presenter:
+    """Owns a window's context in a thread; pictures are handed over by `put`."""
+
+    def __init__(
+        self,
+        window: Any,
+        slots: list[Slot],
+        *,
+        swap_interval: int,
+        quad_buffered: bool,
+        now_ns: Callable[[], int],
+        shown: Shown,
+    ) -> None:
+        self._window, self._slots = window, slots
+        self._swap_interval, self._quad_buffered = swap_interval, quad_buffered
+        self._now_ns, self._shown = now_ns, shown
+        self._changed = threading.Condition()
+        self._ready: Slot | None = None
+        self._held: Slot | None = None
+        self._stop = self._again = False
+        self._right_is_next = False
+        self.framebuffer_px = glfw.get_framebuffer_size(window)
+        self.problem: Exception | None = None
+        self._thread = threading.Thread(target=self._run, name="presenter", daemon=True)
+        self._thread.start()
+
+    def free_slot(self) -> Slot:
+        """One to draw into: neither shown nor ready to be."""
+        with self._changed:
+            return next(
+                slot for slot in self._slots if slot is not self._ready and slot is not self._held
+            )
+
+    def put(self, slot: Slot) -> None:
+        """Show this from the next refresh on; it must be drawn, and waits for nothing."""
+        with self._changed:
+            superseded, self._ready = self._ready, slot
+            self._changed.notify()
+        if superseded is not None:
+            self._shown(superseded.tag, 0)
+
+    def redraw(self, framebuffer_px: tuple[int, int]) -> None:
+        """Show the same once more: the window was resized or uncovered."""
+        with self._changed:
+            self.framebuffer_px, self._again = framebuffer_px, True
+            self._changed.notify()
+
+    def stop(self) -> None:
+        """End the thread; its context is free then."""
+        with self._changed:
+            self._stop = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        try:
+            with glfw_errors():
+                glfw.make_context_current(self._window)
+                glfw.swap_interval(self._swap_interval)
+                pane = _Pane(self._slots)
+                while (slot := self._next()) is not None:
+                    self._present(pane, *slot)
+        except (WindowError, moderngl.Error) as error:
+            self.problem = error
+        finally:
+            glfw.make_context_current(_NO_WINDOW)
+
+    def _next(self) -> tuple[Slot, bool] | None:
+        """The slot to show now, and whether it is a new one; None at the end."""
+        with self._changed:
+            while not self._stop:
+                if self._ready is not None:
+                    self._held, self._ready, self._again = self._ready, None, False
+                    return self._held, True
+                if self._held is not None and (self._again or self._alternates(self._held)):
+                    self._again = False
+                    return self._held, False
+                self._changed.wait(IDLE_S)
+        return None
+
+    def _alternates(self, slot: Slot) -> bool:
+        return slot.mode == "frame_sequential" and not self._quad_buffered
+
+    def _present(self, pane: _Pane, slot: Slot, is_new: bool) -> None:
+        left, right = slot.textures[:: -1 if slot.swap_eyes else 1]
+        if slot.mode == "frame_sequential" and self._quad_buffered:
+            for buffer, texture in ((GL_BACK_LEFT, left), (GL_BACK_RIGHT, right)):
+                pane.choose_buffer(buffer)
+                pane.draw(self.framebuffer_px, 0, texture, texture)
+        else:
+            if self._alternates(slot):
+                left = right if self._right_is_next else left
+                self._right_is_next = not self._right_is_next
+            pane.draw(self.framebuffer_px, MODES[slot.mode], left, right)
+        glfw.swap_buffers(self._window)
+        pane.wait_until_done()
+        swapped_ns = self._now_ns()
+        if pane.is_lost():
+            raise WindowError("the graphics card was reset")
+        if is_new:
+            self._shown(slot.tag, swapped_ns)
+
+
+class _Pane:
+    """The window's own drawing: one triangle over it all, that takes the slots' textures.
+
+    GL functions that wait are called through ctypes, which lets the other threads run.
+    """
+
+    def __init__(self, slots: list[Slot]) -> None:
+        self._context = moderngl.create_context(require=330)
+        self._program = self._context.program(
+            vertex_shader=shader_text("pack.vert.glsl"),
+            fragment_shader=shader_text("pack.frag.glsl"),
+        )
+        self._program["left"], self._program["right"] = 0, 1
+        self._array = self._context.vertex_array(self._program, [])
+        self._size = slots[0].textures[0].size
+        self._textures = {
+            texture.glo: self._context.external_texture(texture.glo, self._size, 4, 0, "f1")
+            for slot in slots
+            for texture in slot.textures
+        }
+        self.wait_until_done = _function("glFinish", None)
+        self.choose_buffer = _function("glDrawBuffer", None, ctypes.c_uint)
+        self._reset_status = _function("glGetGraphicsResetStatus", ctypes.c_uint)
+
+    def draw(
+        self,
+        framebuffer_px: tuple[int, int],
+        mode: int,
+        left: moderngl.Texture,
+        right: moderngl.Texture,
+    ) -> None:
+        """Pixel for pixel, in the middle of a window of another size."""
+        origin = (np.array(framebuffer_px) - self._size) // 2
+        screen = self._context.screen
+        screen.viewport = (0, 0, *framebuffer_px)
+        screen.use()
+        self._program["mode"] = mode
+        self._program["origin"] = tuple(int(value) for value in origin)
+        self._textures[left.glo].use(0)
+        self._textures[right.glo].use(1)
+        self._array.render(moderngl.TRIANGLES, vertices=3)
+
+    def is_lost(self) -> bool:
+        return self._reset_status is not None and self._reset_status() != 0
+
+
+def _function(name: str, result: Any, *arguments: Any) -> Any:
+    """A function of OpenGL of the current context; None if the driver has none of that name."""
+    address = glfw.get_proc_address(name)
+    if not address:
+        return None
+    return ctypes.cast(address, ctypes.CFUNCTYPE(result, *arguments))

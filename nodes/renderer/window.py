@@ -1,0 +1,213 @@
+"""What the renderer draws on: nothing that is seen, or a window on the projector's monitor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import glfw
+import moderngl
+
+from messages.types import Display
+from nodes.renderer.gl import headless_context
+from nodes.renderer.monitors import (
+    chosen_monitor,
+    hidden_window,
+    open_window,
+    refresh_period_s,
+    start_glfw,
+)
+from nodes.renderer.parameters import RendererParameters
+from nodes.renderer.presenter import SLOTS, Presenter, Shown, Slot, make_slot
+
+CLOSED = "the window was closed: what is drawn is seen by nobody; restart the node to open it"
+
+
+class Screen(Protocol):
+    """Takes eyes' pictures; `context` is the one to draw in, current in the caller's thread."""
+
+    context: moderngl.Context
+    is_seen: bool
+    """Whether pictures are shown, and `shown` tells when."""
+    shows_both: bool
+    """Whether it alternates the eyes of frame_sequential by itself."""
+    period_s: float
+    """Of the refresh that swaps wait for; 0: none."""
+    note: str
+
+    def open(self, size: tuple[int, int]) -> None: ...
+    def take(self, number: int, picture: moderngl.Framebuffer) -> None: ...
+    def show(self, tag: Any, display: Display) -> None: ...
+    def poll(self) -> bool: ...
+    def close(self) -> None: ...
+
+
+class Offscreen:
+    """Nothing is shown: frames are drawn for whoever reads them."""
+
+    is_seen = shows_both = False
+    period_s = 0.0
+    note = ""
+
+    def __init__(self) -> None:
+        self.context = headless_context()
+
+    def open(self, size: tuple[int, int]) -> None:
+        """Nothing to open."""
+
+    def take(self, number: int, picture: moderngl.Framebuffer) -> None:
+        """Nothing to keep."""
+
+    def show(self, tag: Any, display: Display) -> None:
+        """Nobody to show it to."""
+
+    def poll(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        self.context.release()
+
+
+def open_screen(parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown) -> Screen:
+    """The screen that the parameters ask for; WindowError or NoOpenGLError if there is none."""
+    if parameters.output == "headless":
+        return Offscreen()
+    return ProjectorWindow(
+        monitor=parameters.monitor,
+        swap_interval=parameters.swap_interval,
+        now_ns=now_ns,
+        shown=shown,
+    )
+
+
+class ProjectorWindow:
+    """A window, full-screen on the projector's monitor, that swaps in a thread of its own.
+
+    Called on the main thread only, which the window system asks for.
+    """
+
+    def __init__(
+        self,
+        *,
+        monitor: str | int | None,
+        swap_interval: int,
+        now_ns: Callable[[], int],
+        shown: Shown,
+    ) -> None:
+        """monitor: its name or number; None: an ordinary window, to try things out.
+
+        swap_interval: refreshes to a swap; 0 does not wait, and tears.  WindowError without a
+        display or such a monitor.
+        """
+        start_glfw()
+        self._monitor = None if monitor is None else chosen_monitor(monitor)
+        self._swap_interval, self._now_ns, self._shown = swap_interval, now_ns, shown
+        self._hidden = hidden_window()
+        glfw.make_context_current(self._hidden)
+        self.context = moderngl.create_context(require=330)
+        self.note = ""
+        self.is_seen, self.shows_both, self.period_s = False, True, 0.0
+        self.quad_buffered = False
+        self._window: Any = None
+        self._presenter: Presenter | None = None
+        self._slots: list[Slot] = []
+        self._filling: Slot | None = None
+
+    def open(self, size: tuple[int, int]) -> None:
+        """Open the window for pictures of that size, in the place of one of another size."""
+        if self._presenter is not None and self._slots[0].textures[0].size == size:
+            return
+        self._shut()
+        self._window, self.quad_buffered = open_window(
+            size, self._monitor, self._hidden, stereo=True
+        )
+        at = self._monitor if self._monitor is not None else glfw.get_primary_monitor()
+        self.period_s = self._swap_interval * refresh_period_s(at) if at else 0.0
+        glfw.make_context_current(self._hidden)
+        self._slots = [make_slot(self.context, size) for _ in range(SLOTS)]
+        self.context.finish()
+        self._presenter = Presenter(
+            self._window,
+            self._slots,
+            swap_interval=self._swap_interval,
+            quad_buffered=self.quad_buffered,
+            now_ns=self._now_ns,
+            shown=self._shown,
+        )
+        glfw.set_framebuffer_size_callback(self._window, self._resized)
+        glfw.set_window_refresh_callback(self._window, self._uncovered)
+        self.is_seen, self.note = True, ""
+        self._note_size(size, self._presenter.framebuffer_px)
+
+    def take(self, number: int, picture: moderngl.Framebuffer) -> None:
+        """Keep an eye's picture, 0 the first, for the next `show`."""
+        if self._presenter is None:
+            return
+        if self._filling is None:
+            self._filling = self._presenter.free_slot()
+        self.context.copy_framebuffer(self._filling.frames[number], picture)
+
+    def show(self, tag: Any, display: Display) -> None:
+        """Have the pictures taken shown at the next refresh; `shown(tag, when)` tells of it."""
+        slot, self._filling = self._filling, None
+        if self._presenter is None or slot is None:
+            return
+        slot.tag, slot.mode, slot.swap_eyes = tag, display.stereo, display.swap_eyes
+        if display.stereo == "mono":
+            slot.swap_eyes = False
+        self.context.finish()
+        self._presenter.put(slot)
+
+    def poll(self) -> bool:
+        """See to the window's events; False once its context is lost and all must be made anew.
+
+        A closed window is gone for good; `note` says so.  WindowError tells why it was lost.
+        """
+        glfw.poll_events()
+        if self._presenter is not None and self._presenter.problem is not None:
+            self.note = f"the window was lost ({self._presenter.problem}): opening it anew"
+            return False
+        if self._window is not None and glfw.window_should_close(self._window):
+            self._shut()
+            self.note = CLOSED
+        return True
+
+    def _resized(self, window: Any, width: int, height: int) -> None:
+        if self._presenter is not None:
+            self._note_size(self._slots[0].textures[0].size, (width, height))
+            self._presenter.redraw((width, height))
+
+    def _uncovered(self, window: Any) -> None:
+        if self._presenter is not None:
+            self._presenter.redraw(glfw.get_framebuffer_size(window))
+
+    def _note_size(self, size: tuple[int, int], framebuffer_px: tuple[int, int]) -> None:
+        fits = tuple(framebuffer_px) == tuple(size)
+        width, height = framebuffer_px
+        self.note = (
+            ""
+            if fits
+            else f"window of {width}x{height} for pictures of {size[0]}x{size[1]}: shown unscaled, "
+            "in the middle"
+        )
+
+    def _shut(self) -> None:
+        """Close the window; drawing can go on."""
+        if self._presenter is not None:
+            self._presenter.stop()
+            self._presenter = None
+        self._filling, self.is_seen = None, False
+        glfw.make_context_current(self._hidden)
+        for slot in self._slots:
+            for part in (*slot.frames, *slot.textures):
+                part.release()
+        self._slots = []
+        if self._window is not None:
+            glfw.destroy_window(self._window)
+            self._window = None
+
+    def close(self) -> None:
+        """Close the window and free all that was drawn with."""
+        self._shut()
+        self.context.release()
+        glfw.destroy_window(self._hidden)
