@@ -215,7 +215,7 @@ def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
     assert recorder.parameters["bag"] == str(tmp_path / "a.mcap")
     assert recorder.parameters["compress"] is False
     assert {port.topic for port in recorder.inputs} == {
-        "twin/finger", "estop", "status", "display", "twin/finger_path",
+        "twin/finger", "estop", "status", "display", "twin/finger_path", "eye",
     }  # fmt: skip
 
 

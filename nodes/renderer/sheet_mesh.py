@@ -44,6 +44,22 @@ def pyramid_mesh(sheet: Sheet) -> SheetMesh:
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
+def finer(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
+    """The same surface in smaller triangles, so that a lens can bend what was straight."""
+    vertices, triangles = mesh.vertices, mesh.triangles
+    for _ in range(halvings):
+        edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        unique, of_edge = np.unique(edges, axis=0, return_inverse=True)
+        a, b, c = triangles.T
+        ab, bc, ca = (of_edge.reshape(-1, 3) + len(vertices)).T
+        vertices = np.vstack([vertices, vertices[unique].mean(axis=1)])
+        triangles = np.vstack(
+            [np.column_stack(corner) for corner in ((a, ab, ca), (b, bc, ab), (c, ca, bc))]
+            + [np.column_stack([ab, bc, ca])]
+        )
+    return SheetMesh(vertices, triangles.astype(np.int32), mesh.note)
+
+
 def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
     """The sheet as it narrows by its stretch and dents by its fingertip.
 

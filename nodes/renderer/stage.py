@@ -27,7 +27,7 @@ from nodes.renderer.lens import clip_lens
 from nodes.renderer.output import Image, both_eyes, pack
 from nodes.renderer.projection import Projection, Window
 from nodes.renderer.sheet import Sheet, screen_for
-from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, pyramid_mesh
+from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, finer, pyramid_mesh
 from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
 
 Floats = NDArray[np.float64]
@@ -208,7 +208,8 @@ class Stage:
         """
         if self.dents is None:
             self.note = NO_DENTS
-            return pyramid_mesh(sheet)
+            mesh = pyramid_mesh(sheet)
+            return mesh if self._lens is None else finer(mesh)
         mesh = dented_mesh(sheet, self.dents)
         self.note = mesh.note
         return mesh
