@@ -27,8 +27,9 @@ from nodes.renderer.families import rolled_on
 from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.sheet import sheet_between
 from nodes.renderer.stage import Stage
-from nodes.twin.eye import METRES_PER_PX, TrueCylinder, proper, push_sizes, seen, tilt_sizes
+from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen, tilt_sizes
 from nodes.twin.membrane import Rubber, solve
+from nodes.twin.true_object import TrueBody
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -47,7 +48,7 @@ class Bench:
         dents = dent_cache.load_or_solve(scene, None)
         self._stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
-        self._proper = proper(TrueCylinder(scene).at_rest(), eye=self._eye, flat=True)
+        self._proper = proper(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
 
     def tilt_errors(self, correction: Correction, world_from_sheet: Floats) -> Floats:
         """|height|, |upside width|, |downside width| (m) against the proper picture."""

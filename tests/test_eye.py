@@ -21,7 +21,6 @@ from nodes.twin.eye import (
     METRES_PER_PX,
     NotMeasurableError,
     Rays,
-    TrueCylinder,
     TrueProjector,
     first_hits,
     proper,
@@ -31,6 +30,7 @@ from nodes.twin.eye import (
 )
 from nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from nodes.twin.membrane import DeformedSheet
+from nodes.twin.true_object import TrueBody
 
 ROOT = Path(__file__).parents[1]
 EYE = np.array([0.0, 0.0, 0.4])
@@ -141,23 +141,14 @@ def test_flat_sheet_on_the_imaginary_screen_shows_the_picture_mirrored_back(
 
 
 def test_proper_picture_has_the_cylinders_own_size(scene: Scene) -> None:
-    picture = proper(TrueCylinder(scene).at_rest(), eye=EYE, flat=True)
+    picture = proper(TrueBody(scene).at_rest(), eye=EYE, flat=True)
     radius, length = scene.object.geometry.radius_m, scene.object.geometry.length_m
     height, width = push_sizes(picture, METRES_PER_PX)
     assert np.isclose(height, 0.8 * np.tan(np.arcsin(radius / (0.4 + radius))), atol=3e-5)
     assert np.isclose(width, length, atol=6e-5)
-    soft = proper(TrueCylinder(scene).at_rest(), eye=EYE, flat=False)
+    soft = proper(TrueBody(scene).at_rest(), eye=EYE, flat=False)
     assert len(np.unique(soft[..., 0])) > 20
     assert ((soft.max(axis=2) > 0) == (picture[..., 0] > 0)).mean() > 0.998
-
-
-def test_displaced_cylinder_follows_its_skin(scene: Scene) -> None:
-    cylinder = TrueCylinder(scene)
-    skin = cylinder.at_rest().vertices[::3]
-    moved = cylinder.displaced(skin, np.tile([0.0, 0.005, -0.01], (len(skin), 1)))
-    assert np.allclose(moved.vertices - cylinder.at_rest().vertices, [0.0, 0.005, -0.01])
-    with pytest.raises(ValueError, match="lie on the cylinder"):
-        cylinder.displaced(np.zeros((4, 3)), np.zeros((4, 3)))
 
 
 def blob(height: float, upper: float, lower: float, size: int = 300) -> np.ndarray:

@@ -203,9 +203,7 @@ def test_surface_is_closed_round_and_outward() -> None:
     assert np.isclose(volume, np.pi * 0.03**2 * 0.1, rtol=1e-3)
     assert (np.sum(cross * corners.mean(axis=1), axis=1) > 0).all()
     normals = normals_of(surface, surface.rest_world_m)
-    side = slice(0, surface.rings * surface.around)
-    outward = surface.rest_world_m[side] * [0, 1, 1] / 0.03
-    assert np.allclose(normals[side], outward, atol=1e-6)
+    assert np.allclose(normals, surface.normals_world, atol=0.02)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
 
 
@@ -222,6 +220,25 @@ def test_surface_follows_a_linear_displacement_of_a_coarse_skin() -> None:
     assert np.allclose(moved, fine.rest_world_m @ gradient, atol=2e-4 * np.abs(gradient).sum())
     with pytest.raises(ValueError, match="no triangles"):
         follow_matrix(fine.rest_world_m, coarse.rest_world_m, coarse.triangles[:0])
+    lost = (
+        coarse.rest_world_m * np.where(np.arange(len(coarse.rest_world_m)) == 7, np.nan, 1)[:, None]
+    )
+    with pytest.raises(ValueError, match="not finite"):
+        follow_matrix(fine.rest_world_m, lost, coarse.triangles)
+    # Triangles without area are passed over.
+    flat = np.concatenate([coarse.triangles, [[3, 3, 4], [5, 5, 5]]]).astype(np.int32)
+    again = follow_matrix(fine.rest_world_m, coarse.rest_world_m, flat)
+    assert abs(again - follow).max() < 1e-6
+
+
+def test_a_skin_finer_in_front_is_followed_by_its_nearest_triangles() -> None:
+    """Beside many small triangles a large one is the nearest, though its middle is far."""
+    corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    small = np.concatenate([[-0.02, -0.01, 0.0] + 0.02 * (corners - [k, 0, 0]) for k in range(40)])
+    vertices = np.concatenate([corners, small])
+    triangles = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+    point = np.array([[0.01, 0.3, 0.0], [0.001, 0.01, 0.0]])
+    assert np.allclose(follow_matrix(point, vertices, triangles) @ vertices, point, atol=1e-6)
 
 
 def test_sheet_between_edges_moves_with_its_twist() -> None:

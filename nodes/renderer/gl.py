@@ -98,17 +98,26 @@ class Canvas:
             frame.release()
         self._program.release()
 
-    def set_mesh(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
-        """The object's vertices at rest (vertices, 3), world, and its outward triangles."""
+    def set_mesh(
+        self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
+    ) -> None:
+        """The object's vertices at rest (vertices, 3), world, with the unit normals there, and its
+        outward triangles."""
         if self._object is not None:
             self._object.release()
-        self._object = _Mesh(self.context, rest, triangles)
+        self._object = _Mesh(self.context, rest, triangles, normals)
 
     def set_shape(self, positions: Floats, normals: Floats) -> None:
         """Where the vertices are now, and the unit normals there, both (vertices, 3)."""
         if self._object is None:
             raise RuntimeError("set_mesh comes before set_shape")
-        self._object.move(positions, normals)
+        self._object.move(_interleaved(positions, normals))
+
+    def set_moved(self, moved: NDArray[np.float32]) -> None:
+        """As `set_shape`, side by side (vertices, 6); the normals need not be of unit length."""
+        if self._object is None:
+            raise RuntimeError("set_mesh comes before set_moved")
+        self._object.move(moved)
 
     def draw(self, view: View, look: Look) -> None:
         """Draw and wait until it is drawn."""
@@ -198,25 +207,35 @@ class _Mesh:
     """Vertex buffers of one mesh: what is fixed, and what moves each frame."""
 
     def __init__(
-        self, context: moderngl.Context, rest: Floats, triangles: NDArray[np.int32]
+        self,
+        context: moderngl.Context,
+        rest: Floats,
+        triangles: NDArray[np.int32],
+        normals: Floats | None = None,
     ) -> None:
         self.count = len(rest)
         self._context = context
-        self._rest = context.buffer(np.ascontiguousarray(rest, np.float32))
-        normals = np.tile([0.0, 0.0, 1.0], (self.count, 1))
-        self._moving = context.buffer(_interleaved(rest, normals))
+        if normals is None:
+            normals = np.tile([0.0, 0.0, 1.0], (self.count, 1))
+        begun = _interleaved(rest, normals)
+        self._rest, self._moving = context.buffer(begun), context.buffer(begun, dynamic=True)
         self._triangles = context.buffer(np.ascontiguousarray(triangles, np.int32))
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
-    def move(self, positions: Floats, normals: Floats) -> None:
-        self._moving.write(_interleaved(positions, normals))
+    def move(self, moved: NDArray[np.float32]) -> None:
+        """Positions and normals (vertices, 6); ValueError for another number of vertices."""
+        if moved.shape != (self.count, 6):
+            raise ValueError(f"positions and normals {moved.shape} for {self.count} vertices")
+        # Fresh memory for each frame: the driver need not wait until the last one is drawn.
+        self._moving.orphan()
+        self._moving.write(moved)
 
     def array(self, program: moderngl.Program, *, indexed: bool = True) -> moderngl.VertexArray:
         key = (program.glo, indexed)
         if key not in self._arrays:
             content: list[tuple[object, ...]] = [(self._moving, "3f 3f", "position", "normal")]
             if "rest_position" in program:
-                content.append((self._rest, "3f", "rest_position"))
+                content.append((self._rest, "3f 3f", "rest_position", "rest_normal"))
             self._arrays[key] = self._context.vertex_array(
                 program, content, self._triangles if indexed else None, skip_errors=True
             )

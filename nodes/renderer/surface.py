@@ -1,133 +1,306 @@
-"""The drawn surface: a fine mesh of the scene's cylinder that follows the solver's skin.
+"""The drawn surface: a fine mesh of the scene's object that follows the solver's skin.
 
-The correction is exact at vertices only, and the silhouette is as round as its facets, so the
-drawn mesh is finer than the solver's and lies on the true shape; between the skin's vertices the
-displacement is interpolated.
+The equations correct at vertices only, and a silhouette is as round as its facets, so the drawn
+mesh is finer than the solver's and lies on the true shape; between the skin's vertices the
+displacement, and how the normal turns, are interpolated.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Sphere
 from nodes.models.rigid import apply
+from nodes.models.shapes import MeshError, Shape
+from nodes.models.shapes.triangles import degenerate, nearest_in_triangles, refined
 
 Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
 Indices = NDArray[np.int32]
+Real = TypeVar("Real", np.float32, np.float64)
+Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
+
+FEWEST_AROUND = 128
+"""Vertices around a cylinder, sphere or ellipsoid: its outline must not show corners."""
+CANDIDATES = 16
+"""Sample points of a skin, next to a drawn vertex, whose triangles may hold the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """Vertices at rest: `rings` x `around` on the side, then the two caps (ring and centre each).
+    """The object at rest, world frame.
 
-    rest_world_m: (vertices, 3).  triangles: (triangles, 3), outward.
+    rest_world_m, normals_world: (vertices, 3); along a sharp edge vertices are doubled.
+    triangles: (triangles, 3), outward.
     """
 
     rest_world_m: Floats
+    normals_world: Floats
     triangles: Indices
-    rings: int
-    around: int
+
+    @staticmethod
+    def placed(
+        points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
+    ) -> Surface:
+        """A surface given in the object's frame."""
+        return Surface(
+            apply(world_from_object, points),
+            normals @ world_from_object[:3, :3].T,
+            triangles.astype(np.int32),
+        )
+
+
+def surface_of(
+    geometry: Geometry, shape: Shape, *, world_from_object: Floats, spacing_m: float
+) -> Surface:
+    """The surface of a scene's geometry, whose shape is `shape`; vertices about `spacing_m` apart.
+
+    Of a plane only the touchable rectangle is drawn, of a mesh the smooth surface that it stands
+    for.  ValueError for a spacing that would take too many triangles.
+    """
+    match geometry:
+        case Cylinder(radius_m=radius, length_m=length):
+            return cylinder_surface(
+                radius_m=radius,
+                length_m=length,
+                world_from_object=world_from_object,
+                spacing_m=spacing_m,
+            )
+        case Plane(width_m=width, height_m=height):
+            points, triangles = _grid(_cells(width, spacing_m), _cells(height, spacing_m))
+            points = np.column_stack([points * [width, height], np.zeros(len(points))])
+            normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+        case Mesh(vertices_m=vertices, triangles=coarse):
+            try:
+                used, index = np.unique(coarse, return_inverse=True)
+                points, triangles = refined(vertices[used], index.reshape(-1, 3), spacing_m)
+            except MeshError as error:
+                raise ValueError(f"spacing_m: {spacing_m}: {error}; or take a larger one") from None
+            found = shape.closest(points)
+            points, normals = found.point, found.normal
+        case _:
+            points, triangles = _blown_cuboid(geometry, shape, spacing_m)
+            normals = shape.closest(points).normal
+    return Surface.placed(points, normals, triangles, world_from_object)
 
 
 def cylinder_surface(
     *, radius_m: float, length_m: float, world_from_object: Floats, spacing_m: float
 ) -> Surface:
-    """A closed cylinder about the object's x axis with vertices at most `spacing_m` apart."""
+    """A closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
+
+    Its side comes first, ring by ring; then each end cap, with a rim of its own and a centre.
+    """
     rings = int(np.ceil(length_m / spacing_m)) + 1
-    around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), 128)
+    around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), FEWEST_AROUND)
     x = np.linspace(-0.5 * length_m, 0.5 * length_m, rings)
     angle = 2.0 * np.pi * np.arange(around) / around
-    circle = radius_m * np.column_stack([np.sin(angle), np.cos(angle)])
-    side = np.empty((rings, around, 3))
-    side[..., 0] = x[:, None]
-    side[..., 1:] = circle
+    outward = np.column_stack([np.zeros(around), np.sin(angle), np.cos(angle)])
+    side = radius_m * outward + x[:, None, None] * np.array([1.0, 0.0, 0.0])
     centres = np.array([[x[0], 0.0, 0.0], [x[-1], 0.0, 0.0]])
-    vertices = np.concatenate(
-        [side.reshape(-1, 3), side[0], centres[:1], side[-1], centres[1:]], axis=0
-    )
+    points = np.concatenate([side.reshape(-1, 3), side[0], centres[:1], side[-1], centres[1:]])
+    ends = np.repeat([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]], around + 1, axis=0)
+    normals = np.concatenate([np.tile(outward, (rings, 1)), ends])
 
     j = np.arange(around)
     after = (j + 1) % around
     corner = (np.arange(rings - 1)[:, None] * around + j).ravel()
     beside = (np.arange(rings - 1)[:, None] * around + after).ravel()
-    side_triangles = np.concatenate(
+    first = rings * around
+    last = first + around + 1
+    triangles = np.concatenate(
         [
             np.column_stack([corner, corner + around, beside + around]),
             np.column_stack([corner, beside + around, beside]),
-        ]
-    )
-    first = rings * around
-    last = first + around + 1
-    caps = np.concatenate(
-        [
             np.column_stack([np.full(around, first + around), first + j, first + after]),
             np.column_stack([np.full(around, last + around), last + after, last + j]),
         ]
     )
-    triangles = np.concatenate([side_triangles, caps]).astype(np.int32)
-    return Surface(apply(world_from_object, vertices), triangles, rings, around)
+    return Surface.placed(points, normals, triangles, world_from_object)
+
+
+def _cells(length_m: float, spacing_m: float) -> int:
+    return max(1, int(np.ceil(length_m / spacing_m)))
+
+
+def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
+    """Points (n, 2) of a grid over -0.5..0.5, and its triangles, counter-clockwise."""
+    u, v = np.meshgrid(
+        np.linspace(-0.5, 0.5, columns + 1), np.linspace(-0.5, 0.5, rows + 1), indexing="xy"
+    )
+    here = (np.arange(rows)[:, None] * (columns + 1) + np.arange(columns)).ravel()
+    above = here + columns + 1
+    triangles = np.concatenate(
+        [
+            np.column_stack([here, here + 1, above + 1]),
+            np.column_stack([here, above + 1, above]),
+        ]
+    )
+    return np.column_stack([u.ravel(), v.ravel()]), triangles
+
+
+def _blown_cuboid(
+    geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape, spacing_m: float
+) -> tuple[Floats, NDArray[np.int64]]:
+    """A cuboid's surface grid drawn onto a rounder solid: points (n, 3), triangles (t, 3).
+
+    Onto a box by the nearest points; onto an ellipsoid by the map of a cube to the sphere that
+    nearly keeps areas, (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and in turn).
+    """
+    if isinstance(geometry, RoundedBox):
+        half = 0.5 * np.array(geometry.size_m)
+        cells = [_cells(length, spacing_m) for length in geometry.size_m]
+    else:
+        axes = geometry.semi_axes_m if isinstance(geometry, Ellipsoid) else (geometry.radius_m,) * 3
+        half = np.array(axes)
+        quarter = max(_cells(0.5 * np.pi * float(half.max()), spacing_m), FEWEST_AROUND // 4)
+        cells = [quarter] * 3
+    points, triangles, count = [], [], 0
+    for axis in range(3):
+        second, third = (axis + 1) % 3, (axis + 2) % 3
+        flat, faces = _grid(cells[second], cells[third])
+        for side in (1.0, -1.0):
+            w = np.empty((len(flat), 3))
+            w[:, axis], w[:, second], w[:, third] = side, 2.0 * flat[:, 0], 2.0 * flat[:, 1]
+            points.append(w)
+            triangles.append((faces if side > 0 else faces[:, ::-1]) + count)
+            count += len(w)
+    w, joined = np.unique(np.concatenate(points).round(12), axis=0, return_inverse=True)
+    if isinstance(geometry, RoundedBox):
+        onto = shape.closest(half * w).point
+    else:
+        square = w**2
+        beside, beyond = np.roll(square, -1, axis=1), np.roll(square, -2, axis=1)
+        onto = half * w * np.sqrt(1.0 - 0.5 * (beside + beyond) + beside * beyond / 3.0)
+    return onto, joined.ravel()[np.concatenate(triangles)]
 
 
 def normals_of(surface: Surface, positions: Floats) -> Floats:
-    """Smooth unit normals (vertices, 3) of the deformed surface (vertices, 3)."""
-    rings, around = surface.rings, surface.around
-    side = positions[: rings * around].reshape(rings, around, 3)
-    along = np.empty_like(side)
-    along[1:-1] = side[2:] - side[:-2]
-    along[0], along[-1] = side[1] - side[0], side[-1] - side[-2]
-    about = np.roll(side, -1, axis=1) - np.roll(side, 1, axis=1)
-    # np.cross is several times slower than its own six products.
-    normals = np.empty_like(positions)
-    flat = normals[: rings * around].reshape(rings, around, 3)
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        flat[..., i] = along[..., j] * about[..., k] - along[..., k] * about[..., j]
-    axis = side.mean(axis=1)
-    normals[rings * around : rings * around + around + 1] = axis[0] - axis[1]
-    normals[rings * around + around + 1 :] = axis[-1] - axis[-2]
-    lengths = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-    normals /= np.maximum(lengths, 1e-12)[:, None]
-    return normals
+    """Smooth unit normals (vertices, 3) of the surface moved to `positions` (vertices, 3)."""
+    return _Normals(surface.triangles, len(positions))(positions)
+
+
+class _Normals:
+    """Unit normals at the vertices of moving triangles: their triangles' mean, by area."""
+
+    def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
+        columns = np.repeat(np.arange(len(triangles)), 3)
+        ones = np.ones(3 * len(triangles), np.float32)
+        self._of_vertices = csr_array(
+            (ones, (triangles.ravel(), columns)), shape=(vertices, len(triangles))
+        )
+        self._corners = [np.ascontiguousarray(triangles[:, i]) for i in range(3)]
+
+    def __call__(self, positions: NDArray[Real]) -> NDArray[Real]:
+        a = positions[self._corners[0]]
+        b, c = positions[self._corners[1]] - a, positions[self._corners[2]] - a
+        area = np.empty_like(a)
+        # np.cross is several times slower than its own six products.
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            np.subtract(b[:, j] * c[:, k], b[:, k] * c[:, j], out=area[:, i])
+        total: NDArray[Real] = self._of_vertices @ area
+        total /= np.maximum(np.sqrt(np.einsum("ij,ij->i", total, total)), 1e-20)[:, None]
+        return total
+
+
+class Follower:
+    """A drawn surface that moves as a skin does.
+
+    A drawn vertex moves as the nearest point of the skin; its normal, exact at rest, turns as the
+    skin's own smooth normals there turn on the mean.
+    """
+
+    def __init__(self, surface: Surface, skin_vertices: Floats, skin_triangles: Indices) -> None:
+        """skin_vertices: (s, 3) at rest, world; skin_triangles: (t, 3), outward.
+
+        ValueError for a skin without triangles, or with places that are not finite.
+        """
+        self.vertices = len(skin_vertices)
+        self._weights = follow_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
+        self._skin = skin_vertices.astype(np.float32)
+        self._normals = _Normals(skin_triangles, len(skin_vertices))
+        self._rest_normals = self._normals(self._skin)
+        self._rest = np.concatenate(
+            [surface.rest_world_m, surface.normals_world], axis=1, dtype=np.float32
+        )
+        self._moves = np.empty((self.vertices, 6), np.float32)
+
+    def moved(self, displacement: Singles | None) -> Singles:
+        """Positions and normals, not of unit length, side by side (vertices, 6).
+
+        displacement: (s, 3) of the skin; None for the rest.  ValueError for one of another skin, or
+        that is not finite.
+        """
+        if displacement is None:
+            return self._rest
+        if displacement.shape != self._skin.shape:
+            raise ValueError(f"displacement of {len(displacement)} vertices fits no skin")
+        moves = self._moves
+        moves[:, :3] = displacement
+        # A sum is NaN or infinite as soon as one of its terms is.
+        if not np.isfinite(moves[:, :3].sum()):
+            raise ValueError("displacement of the skin holds NaN or infinity")
+        np.subtract(self._normals(self._skin + displacement), self._rest_normals, out=moves[:, 3:])
+        result: Singles = self._weights @ moves
+        result += self._rest
+        return result
 
 
 def follow_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
-    """(points, skin vertices): interpolates what the skin's vertices carry at the points.
+    """(points, skin vertices), float32: interpolates what the skin's vertices carry at the points.
 
-    Each point takes the barycentric weights of the nearest point of the nearest skin triangles.
-    ValueError for a skin without triangles.
+    Each point takes the barycentric weights of the nearest point of the skin; triangles without
+    area are passed over.  ValueError for a skin that has no others, or with NaN.
     """
+    if not np.isfinite(skin_vertices).all():
+        raise ValueError("the skin has vertices that are not finite")
+    skin_triangles = skin_triangles[~degenerate(skin_vertices, skin_triangles.astype(np.int64))]
     if len(skin_triangles) == 0:
-        raise ValueError("the skin has no triangles")
+        raise ValueError("the skin has no triangles with an area")
     corners = skin_vertices[skin_triangles]
-    candidates = min(12, len(skin_triangles))
-    _, near = cKDTree(corners.mean(axis=1)).query(points, k=candidates)
-    near = near.reshape(len(points), candidates)
-    weights = _barycentric(points[:, None, :], corners[near])
-    foot = np.einsum("pck,pckx->pcx", weights, corners[near])
-    best = np.argmin(np.linalg.norm(foot - points[:, None, :], axis=2), axis=1)
-    rows = np.arange(len(points))
+    samples, owners = _samples(corners)
+    candidates = min(CANDIDATES, len(samples))
+    _, near = cKDTree(samples).query(points, k=candidates)
+    near = owners[near.reshape(len(points), candidates)]
+    weights = np.empty((len(points), candidates, 3))
+    away = np.empty((len(points), candidates))
+    for i in range(candidates):
+        weights[:, i] = nearest_in_triangles(points, corners[near[:, i]])
+        foot = np.einsum("pc,pcx->px", weights[:, i], corners[near[:, i]])
+        away[:, i] = np.linalg.norm(foot - points, axis=1)
+    rows, best = np.arange(len(points)), np.argmin(away, axis=1)
     columns = skin_triangles[near[rows, best]]
     return csr_array(
-        (weights[rows, best].ravel(), (np.repeat(rows, 3), columns.ravel())),
+        (
+            weights[rows, best].ravel().astype(np.float32),
+            columns.ravel().astype(np.int32),
+            np.arange(0, 3 * len(points) + 1, 3, dtype=np.int32),
+        ),
         shape=(len(points), len(skin_vertices)),
     )
 
 
-def _barycentric(points: Floats, corners: Floats) -> Floats:
-    """Weights (..., 3), clamped to the triangle `corners` (..., 3, 3), of the foot of `points`."""
-    a, b, c = corners[..., 0, :], corners[..., 1, :], corners[..., 2, :]
-    u, v, p = b - a, c - a, points - a
-    uu, uv, vv = (np.sum(s * t, axis=-1) for s, t in ((u, u), (u, v), (v, v)))
-    pu, pv = np.sum(p * u, axis=-1), np.sum(p * v, axis=-1)
-    determinant = np.maximum(uu * vv - uv * uv, 1e-30)
-    weight_b = (vv * pu - uv * pv) / determinant
-    weight_c = (uu * pv - uv * pu) / determinant
-    weights: Floats = np.clip(
-        np.stack([1.0 - weight_b - weight_c, weight_b, weight_c], axis=-1), 0.0, 1.0
-    )
-    weights /= weights.sum(axis=-1, keepdims=True)
-    return weights
+def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
+    """Points (n, 3) spread over triangles (t, 3, 3), and whose they are (n,).
+
+    Large triangles get more, so that of a skin finer in front the nearest samples tell the nearest
+    triangle everywhere.
+    """
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
+    parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)
+    points, owners = [], []
+    for count in np.unique(parts):
+        i, j = (v.ravel() for v in np.meshgrid(*(np.arange(count),) * 2, indexing="ij"))
+        i, j = i[i + j < count], j[i + j < count]
+        at = np.column_stack([i, j, count - 1 - i - j]) + 1.0 / 3.0
+        mine = np.nonzero(parts == count)[0]
+        points.append(np.einsum("wc,tcx->twx", at / count, corners[mine]).reshape(-1, 3))
+        owners.append(np.repeat(mine, len(at)))
+    return np.concatenate(points), np.concatenate(owners)

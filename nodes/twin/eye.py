@@ -17,12 +17,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-from scipy.spatial import Delaunay
 
-from messages.scene import Projector, Scene, cylinder_of
+from messages.scene import Projector, Scene
 from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.twin.membrane import DeformedSheet, Rubber, solve
+from nodes.twin.true_object import TrueBody, TrueObject
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -266,113 +265,6 @@ def _put(whole: Image, box: Box, samples_of: NDArray[np.float32], samples: int) 
     whole[top:bottom, left:right] = np.rint(blocks.mean(axis=(1, 3)))
 
 
-@dataclass(frozen=True, slots=True)
-class TrueObject:
-    """The object as it is: vertices (vertices, 3) world, outward triangles, unit normals."""
-
-    vertices: Floats
-    triangles: Indices
-    normals: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class _Unrolled:
-    """A skin's side laid flat: which of its vertices, and the triangles between them."""
-
-    key: bytes
-    vertices: Indices
-    triangulation: Delaunay
-
-
-class TrueCylinder:
-    """The scene's cylinder, at rest or moved as a skin is, on a mesh of its own."""
-
-    def __init__(self, scene: Scene, *, around: int = 180, along: int = 48) -> None:
-        cylinder, pose = cylinder_of(scene), scene.object.world_from_object
-        self._around, self._along = around, along
-        self._unrolled: _Unrolled | None = None
-        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
-        self._length, self._radius = cylinder.length_m, cylinder.radius_m
-        angle = 2.0 * np.pi * np.arange(around) / around
-        station = np.linspace(-0.5, 0.5, along + 1) * cylinder.length_m
-        self._station, self._angle = (
-            values.ravel() for values in np.meshgrid(station, angle, indexing="ij")
-        )
-        side = np.column_stack(
-            [self._station, self._radius * np.sin(self._angle), self._radius * np.cos(self._angle)]
-        )
-        self._rest = apply(self._world_from_object, side)
-        i, j = (v.ravel() for v in np.meshgrid(np.arange(along), np.arange(around), indexing="ij"))
-        here, beside = i * around + j, i * around + (j + 1) % around
-        self._triangles = np.concatenate(
-            [
-                np.column_stack([here, here + around, beside + around]),
-                np.column_stack([here, beside + around, beside]),
-            ]
-        )
-
-    def at_rest(self) -> TrueObject:
-        return self._object(self._rest)
-
-    def displaced(self, skin_vertices: Floats, displacement: Floats) -> TrueObject:
-        """Moved by a skin's displacement (skin vertices, 3), linear between its vertices.
-
-        Skin vertices off the cylinder's side (inside its end caps) are left out.  ValueError if too
-        few lie on it.
-        """
-        unrolled = self._unrolled_skin(skin_vertices)
-        values = displacement[unrolled.vertices]
-        at = np.column_stack([self._station, self._angle * self._radius])
-        moved = LinearNDInterpolator(unrolled.triangulation, values)(at)
-        outside = np.isnan(moved).any(axis=1)
-        if outside.any():
-            moved[outside] = NearestNDInterpolator(unrolled.triangulation.points, values)(
-                at[outside]
-            )
-        return self._object(self._rest + moved)
-
-    def _unrolled_skin(self, skin_vertices: Floats) -> _Unrolled:
-        """The skin's side as a plane, with a margin beyond the seam; kept while the skin is one."""
-        key = skin_vertices.tobytes()
-        if self._unrolled is None or self._unrolled.key != key:
-            local = apply(inverse(self._world_from_object), skin_vertices)
-            radius = np.hypot(local[:, 1], local[:, 2])
-            side = np.nonzero(np.abs(radius - self._radius) < 0.02 * self._radius)[0]
-            if len(side) < 8:
-                raise ValueError(f"{len(side)} of {len(local)} skin vertices lie on the cylinder")
-            angle = np.arctan2(local[side, 1], local[side, 2]) % (2.0 * np.pi)
-            angles = np.concatenate([angle - 2.0 * np.pi, angle, angle + 2.0 * np.pi])
-            vertices = np.tile(side, 3)
-            near = (angles > -1.0) & (angles < 2.0 * np.pi + 1.0)
-            angles, vertices = angles[near], vertices[near]
-            places = np.column_stack([local[vertices, 0], angles * self._radius])
-            self._unrolled = _Unrolled(key, vertices, Delaunay(places))
-        return self._unrolled
-
-    def _object(self, vertices: Floats) -> TrueObject:
-        """Close the ends by a fan about each rim's mean, and find the normals."""
-        around, rim = self._around, np.arange(self._around)
-        last = self._along * around
-        count = len(vertices)
-        centres = np.stack([vertices[:around].mean(axis=0), vertices[last:].mean(axis=0)])
-        after = (rim + 1) % around
-        caps = [
-            np.column_stack([np.full(around, count), rim, after]),
-            np.column_stack([np.full(around, count + 1), last + after, last + rim]),
-        ]
-        grid = vertices.reshape(self._along + 1, around, 3)
-        about = np.roll(grid, -1, axis=1) - np.roll(grid, 1, axis=1)
-        normals = np.cross(np.gradient(grid, axis=0), about).reshape(-1, 3)
-        axis = centres[1] - centres[0]
-        normals = np.concatenate([normals, [-axis, axis]])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        return TrueObject(
-            np.concatenate([vertices, centres]),
-            np.concatenate([self._triangles, *caps]),
-            normals,
-        )
-
-
 def proper(
     true_object: TrueObject,
     *,
@@ -566,7 +458,7 @@ class Situation:
     """The truth in which a frame was shown.
 
     world_from_flange_...: (4, 4).  finger_tip: (3,) or None.  skin_vertices, displacement:
-    (skin vertices, 3) or both None for the object at rest.
+    (skin vertices, 3) and skin_triangles: (skin triangles, 3), or all None for the object at rest.
     """
 
     scene: Scene
@@ -574,6 +466,7 @@ class Situation:
     world_from_flange_right: Floats
     finger_tip: Floats | None
     skin_vertices: NDArray[np.float32] | None
+    skin_triangles: NDArray[np.int32] | None
     displacement: NDArray[np.float32] | None
     flat: bool
     metres_per_px: float
@@ -603,7 +496,7 @@ class Camera:
 
     def __init__(self) -> None:
         self._scene: Scene | None = None
-        self._cylinder: TrueCylinder | None = None
+        self._body: TrueBody | None = None
         self._proper: tuple[tuple[bytes, ...], Image] | None = None
 
     def take(self, projected: Image, situation: Situation, *, eye: Floats) -> tuple[Image, Image]:
@@ -624,19 +517,23 @@ class Camera:
         )
 
     def _proper_picture(self, situation: Situation, eye: Floats) -> Image:
-        if self._cylinder is None or self._scene is not situation.scene:
-            self._scene, self._cylinder = situation.scene, TrueCylinder(situation.scene)
+        if self._body is None or self._scene is not situation.scene:
+            self._scene, self._body = situation.scene, TrueBody(situation.scene)
             self._proper = None
-        skin, displacement = situation.skin_vertices, situation.displacement
-        if skin is None or displacement is None or not displacement.any():
-            skin = displacement = np.empty((0, 3), np.float32)
+        skin, triangles = situation.skin_vertices, situation.skin_triangles
+        displacement = situation.displacement
+        moved = displacement is not None and bool(displacement.any())
         settings = np.array([*eye, situation.flat, situation.metres_per_px])
-        key = (settings.tobytes(), skin.tobytes(), displacement.tobytes())
+        key: tuple[bytes, ...] = (settings.tobytes(),)
+        if skin is not None and displacement is not None and moved:
+            key += (skin.tobytes(), displacement.tobytes())
         if self._proper is None or self._proper[0] != key:
             true_object = (
-                self._cylinder.displaced(skin.astype(np.float64), displacement.astype(np.float64))
-                if len(skin)
-                else self._cylinder.at_rest()
+                self._body.displaced(
+                    skin.astype(np.float64), triangles, displacement.astype(np.float64)
+                )
+                if moved and skin is not None and triangles is not None and displacement is not None
+                else self._body.at_rest()
             )
             picture = proper(
                 true_object, eye=eye, flat=situation.flat, metres_per_px=situation.metres_per_px

@@ -97,6 +97,7 @@ class TwinEyeNode(Node):
             world_from_flange_right=arms.world_from_flange_right,
             finger_tip=None if finger is None else finger.position_world_m,
             skin_vertices=skin.vertices_world_m if matching and skin is not None else None,
+            skin_triangles=skin.triangles if matching and skin is not None else None,
             displacement=body.displacement_world_m if matching and body is not None else None,
             flat=display is not None and display.shading == "flat",
             metres_per_px=self.parameters.metres_per_px,

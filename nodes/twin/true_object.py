@@ -1,0 +1,228 @@
+"""The object as it truly is, at rest or moved as its skin is, on a mesh of the twin's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
+from nodes.models.rigid import apply, transform_from_rpy
+from nodes.models.shapes import Shape, make_shape
+from nodes.models.shapes.triangles import degenerate, nearest_in_triangles
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+AROUND, ALONG = 160, 40
+"""Vertices about the x axis, and rows of them along it."""
+PLANE_CELLS = 64
+LONGEST_EDGE_M = 0.004
+"""Of a mesh object's triangles, once they are cut up."""
+NEAREST_VERTICES = 3
+"""Of a skin: the triangles about so many of them are looked at for the nearest point."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrueObject:
+    """The object as it is: vertices (vertices, 3) world, outward triangles, unit normals.
+
+    Along a sharp edge vertices are doubled.
+    """
+
+    vertices: Floats
+    triangles: Indices
+    normals: Floats
+
+
+class TrueBody:
+    """The scene's object, of any shape; of a plane the touchable rectangle."""
+
+    def __init__(self, scene: Scene) -> None:
+        geometry, pose = scene.object.geometry, scene.object.world_from_object
+        world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        shape = make_shape(dict(geometry))
+        match geometry:
+            case Cylinder(radius_m=radius, length_m=length):
+                rest, triangles = _tube(radius, length)
+            case Plane(width_m=width, height_m=height):
+                rest, triangles = _rectangle(width, height)
+            case Mesh(vertices_m=vertices, triangles=coarse):
+                rest, triangles = _cut_up(vertices, coarse.astype(np.intp))
+                rest = shape.closest(rest).point
+            case _:
+                rest, triangles = _star(_reach(geometry, shape))
+        self._rest, self._triangles = apply(world_from_object, rest), triangles
+        owners = np.repeat(np.arange(len(triangles)), 3)
+        self._of_vertices = csr_array(
+            (np.ones(len(owners)), (triangles.ravel(), owners)), shape=(len(rest), len(triangles))
+        )
+        self._skin: tuple[bytes, Indices, Floats] | None = None
+
+    def at_rest(self) -> TrueObject:
+        return self._object(self._rest)
+
+    def displaced(
+        self, skin_vertices: Floats, skin_triangles: NDArray[np.integer], displacement: Floats
+    ) -> TrueObject:
+        """Each point moved as the nearest point of a skin (skin vertices, 3) at rest.
+
+        displacement: (skin vertices, 3), linear within skin_triangles (triangles, 3).  ValueError
+        if it is of another skin, or the skin has no triangles.
+        """
+        if displacement.shape != skin_vertices.shape:
+            raise ValueError(
+                f"displacement of {len(displacement)} vertices, skin of {len(skin_vertices)}"
+            )
+        corners, weights = self._on_skin(skin_vertices, skin_triangles)
+        return self._object(self._rest + np.einsum("vc,vcx->vx", weights, displacement[corners]))
+
+    def _on_skin(
+        self, skin_vertices: Floats, skin_triangles: NDArray[np.integer]
+    ) -> tuple[Indices, Floats]:
+        """The skin's vertices (vertices, 3) about each own one, and their weights; kept while the
+        skin is the same."""
+        key = skin_vertices.tobytes() + skin_triangles.tobytes()
+        if self._skin is None or self._skin[0] != key:
+            self._skin = key, *_feet(self._rest, skin_vertices, skin_triangles.astype(np.intp))
+        return self._skin[1], self._skin[2]
+
+    def _object(self, vertices: Floats) -> TrueObject:
+        corners = vertices[self._triangles]
+        area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normals = self._of_vertices @ area
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        return TrueObject(vertices, self._triangles, normals)
+
+
+def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
+    """Corners (points, 3) of the triangles that are nearest to points, and the weights there.
+
+    ValueError where no triangle has an area.
+    """
+    triangles = triangles[~degenerate(vertices, triangles)]
+    if not len(triangles):
+        raise ValueError("the skin has no triangles with an area")
+    # Triangles by corner: those of one vertex stand together.
+    order = np.argsort(triangles.ravel(), kind="stable")
+    corner = triangles.ravel()[order]
+    begin = np.searchsorted(corner, np.arange(len(vertices) + 1))
+    used = np.unique(triangles)
+    _, near = cKDTree(vertices[used]).query(points, k=min(NEAREST_VERTICES, len(used)))
+    best = np.full(len(points), np.inf)
+    chosen, weights = np.zeros(len(points), np.intp), np.zeros((len(points), 3))
+    for vertex in used[near.reshape(len(points), -1)].T:
+        degree = begin[vertex + 1] - begin[vertex]
+        for slot in range(int(degree.max())):
+            rows = np.nonzero(degree > slot)[0]
+            triangle = order[begin[vertex[rows]] + slot] // 3
+            corners = vertices[triangles[triangle]]
+            here = nearest_in_triangles(points[rows], corners)
+            away = np.linalg.norm(np.einsum("nc,ncx->nx", here, corners) - points[rows], axis=1)
+            nearer = away < best[rows]
+            rows = rows[nearer]
+            best[rows], chosen[rows], weights[rows] = away[nearer], triangle[nearer], here[nearer]
+    return triangles[chosen], weights
+
+
+def _strip(rows: int, around: int) -> Indices:
+    """Triangles between closed rows of vertices, outward where the rows turn about +x with the
+    sine along y and the cosine along z."""
+    i, j = (v.ravel() for v in np.meshgrid(np.arange(rows - 1), np.arange(around), indexing="ij"))
+    here, beside = i * around + j, i * around + (j + 1) % around
+    return np.concatenate(
+        [
+            np.column_stack([here, here + around, beside + around]),
+            np.column_stack([here, beside + around, beside]),
+        ]
+    )
+
+
+def _fan(rim: Indices, centre: int) -> Indices:
+    """Triangles from a centre to a closed rim."""
+    return np.column_stack([np.full(len(rim), centre), rim, np.roll(rim, -1)])
+
+
+def _turned() -> Floats:
+    """Unit vectors (AROUND, 3) about the x axis."""
+    angle = 2.0 * np.pi * np.arange(AROUND) / AROUND
+    return np.column_stack([np.zeros(AROUND), np.sin(angle), np.cos(angle)])
+
+
+def _tube(radius_m: float, length_m: float) -> tuple[Floats, Indices]:
+    """Side and end caps of a cylinder along x; the caps have rims of their own."""
+    side = np.repeat(radius_m * _turned()[None], ALONG + 1, axis=0)
+    side[..., 0] = length_m * np.linspace(-0.5, 0.5, ALONG + 1)[:, None]
+    count = AROUND * (ALONG + 1)
+    first, last = count + np.arange(AROUND), count + AROUND + np.arange(AROUND)
+    centres = np.array([[-0.5, 0.0, 0.0], [0.5, 0.0, 0.0]]) * length_m
+    vertices = np.concatenate([side.reshape(-1, 3), side[0], side[-1], centres])
+    caps = [_fan(first, len(vertices) - 2), _fan(last[::-1], len(vertices) - 1)]
+    return vertices, np.concatenate([_strip(ALONG + 1, AROUND), *caps])
+
+
+def _rectangle(width_m: float, height_m: float) -> tuple[Floats, Indices]:
+    """A rectangle about the origin that faces +z."""
+    x = np.linspace(-0.5, 0.5, PLANE_CELLS + 1)
+    y, x = (v.ravel() for v in np.meshgrid(height_m * x, width_m * x, indexing="ij"))
+    cell = np.arange(PLANE_CELLS)
+    here = (cell[:, None] * (PLANE_CELLS + 1) + cell).ravel()
+    above = here + PLANE_CELLS + 1
+    triangles = [[here, here + 1, above], [here + 1, above + 1, above]]
+    return (
+        np.column_stack([x, y, np.zeros_like(x)]),
+        np.concatenate([np.column_stack(each) for each in triangles]),
+    )
+
+
+def _directions() -> Floats:
+    """Unit vectors (directions, 3): rows about the x axis from -x to +x, the two poles last."""
+    polar = np.pi * np.arange(1, 2 * ALONG) / (2 * ALONG)
+    rows = np.sin(polar)[:, None, None] * _turned()
+    rows[..., 0] = -np.cos(polar)[:, None]
+    return np.concatenate([rows.reshape(-1, 3), [[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
+
+
+def _star(vertices: Floats) -> tuple[Floats, Indices]:
+    """A closed surface through one point along each of `_directions`."""
+    rows, count = 2 * ALONG - 1, len(vertices)
+    first, last = np.arange(AROUND), (rows - 1) * AROUND + np.arange(AROUND)
+    caps = [_fan(first, count - 2), _fan(last[::-1], count - 1)]
+    return vertices, np.concatenate([_strip(rows, AROUND), *caps])
+
+
+def _reach(geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape) -> Floats:
+    """Where rays from the centre along `_directions` leave a convex solid, (directions, 3)."""
+    away = _directions()
+    match geometry:
+        case Sphere(radius_m=radius):
+            return radius * away
+        case Ellipsoid(semi_axes_m=axes):
+            return np.asarray(away / np.linalg.norm(away / np.array(axes), axis=1)[:, None])
+    # From outside, steps of the distance never pass the surface of a convex solid.
+    reach = np.full(len(away), float(np.linalg.norm(geometry.size_m)))
+    for _ in range(100):
+        step = shape.signed_distance(reach[:, None] * away)
+        reach -= step
+        if step.max() < 1e-9:
+            break
+    return reach[:, None] * away
+
+
+def _cut_up(vertices: Floats, triangles: Indices) -> tuple[Floats, Indices]:
+    """All triangles in four, again and again, until no edge is longer than `LONGEST_EDGE_M`."""
+    while True:
+        corners = vertices[triangles]
+        longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+        if longest <= LONGEST_EDGE_M:
+            return vertices, triangles
+        ends = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
+        edges, which = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)
+        ab, bc, ca = which.ravel().reshape(3, -1) + len(vertices)
+        vertices = np.concatenate([vertices, vertices[edges].mean(axis=1)])
+        a, b, c = triangles.T
+        parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        triangles = np.concatenate([np.column_stack(part) for part in parts])
