@@ -32,6 +32,8 @@ from tests.test_arm_loop import (
 )
 from tests.test_arm_loop import until as until_within
 
+pytestmark = pytest.mark.alone
+
 until = partial(until_within, within_s=25.0)
 LONGEST_M = 0.24 * 1.09
 TIMEOUT_S, LATE_S = 0.25, 0.4

@@ -29,6 +29,8 @@ from nodes.twin.arms import STATE_MOVING, STATE_STOPPED
 from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from tests.fingertips import fingertip
 
+pytestmark = pytest.mark.alone
+
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 

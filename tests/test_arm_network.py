@@ -25,6 +25,8 @@ from nodes.runner import NodeConfig, PortConfig
 from tests.network import Computers
 from tests.test_arm_loop import until as until_within
 
+pytestmark = pytest.mark.alone
+
 until = partial(until_within, within_s=40.0)
 PATIENT = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
 PATIENT_TWIN = {"watchdog_s": 0.8}

@@ -34,6 +34,8 @@ from nodes.camera.pictures import DeviceError, Pictures, Region, Regions
 from nodes.camera.sources import OpenCvSource
 from nodes.camera.stamps import LAPSES, SLACK, Pairing, StampJudge
 
+pytestmark = pytest.mark.alone
+
 MS = 1_000_000
 PERIOD_NS = round(1e9 / 60)
 PAIR = {"kind": "opencv", "left": 0, "right": 2}

@@ -29,7 +29,7 @@ from messages.bag import BagReader
 from messages.topics import TOPICS
 from messages.types import ArmState, Frame, Status, TwinFinger
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.alone, pytest.mark.timeout(300)]
 
 STROKE_S = 4.0
 KILLED = "triangulator"

@@ -27,6 +27,8 @@ from launch.plan import Plan, load_plan
 from launch.supervisor import NodeFailedError, RunningGraph
 from messages.bag import BagReader
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).resolve().parent.parent
 FLEXSHEET = [sys.executable, str(ROOT / "flexsheet.py")]
 DEADLINE_S = 30.0

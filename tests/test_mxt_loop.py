@@ -20,6 +20,8 @@ from tests.test_arm_loop import (
     until,
 )
 
+pytestmark = pytest.mark.alone
+
 
 @pytest.mark.parametrize("driver", ["mxt", "mxt_pose"])
 async def test_a_stroke_is_presented_over_the_real_time_control(driver: str) -> None:

@@ -28,6 +28,8 @@ from messages.wire import encode
 from nodes.recorder.files import free_path
 from nodes.recorder.node import Recorder, RecorderParameters
 
+pytestmark = pytest.mark.alone
+
 ROOT = Path(__file__).resolve().parent.parent
 DEADLINE_S = 30.0
 
