@@ -23,6 +23,9 @@ from nodes.renderer.monitors import WindowError, glfw_errors
 
 SLOTS = 3
 IDLE_S = 0.1
+REDRAWN = 4
+"""Swaps after a resize: a driver's buffers may take their new size two swaps later."""
+
 _NO_WINDOW: Any = None
 MODES: dict[StereoMode, int] = {
     "mono": 0,
@@ -74,7 +77,7 @@ class Presenter:
         self._changed = threading.Condition()
         self._ready: Slot | None = None
         self._held: Slot | None = None
-        self._stop = self._again = False
+        self._stop, self._again = False, 0
         self._right_is_next = False
         self.framebuffer_px = glfw.get_framebuffer_size(window)
         self.problem: Exception | None = None
@@ -99,7 +102,7 @@ class Presenter:
     def redraw(self, framebuffer_px: tuple[int, int]) -> None:
         """Show the same once more: the window was resized or uncovered."""
         with self._changed:
-            self.framebuffer_px, self._again = framebuffer_px, True
+            self.framebuffer_px, self._again = framebuffer_px, REDRAWN
             self._changed.notify()
 
     def stop(self) -> None:
@@ -127,10 +130,10 @@ class Presenter:
         with self._changed:
             while not self._stop:
                 if self._ready is not None:
-                    self._held, self._ready, self._again = self._ready, None, False
+                    self._held, self._ready = self._ready, None
                     return self._held, True
                 if self._held is not None and (self._again or self._alternates(self._held)):
-                    self._again = False
+                    self._again = max(0, self._again - 1)
                     return self._held, False
                 self._changed.wait(IDLE_S)
         return None

@@ -1,0 +1,241 @@
+"""Two eyes: parallax in every mode, where the eyes are, the projector's lens, and the foretelling
+of the light."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+
+import cv2
+import moderngl
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from messages.scene import Lens, Pose
+from messages.types import Correction, Display, Eye, Frame, StereoMode
+from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.lead import Lead
+from nodes.renderer.lens import clip_lens
+from nodes.renderer.sheet_mesh import finer, flat_mesh
+from nodes.renderer.stage import Stage
+from tests.test_renderer import MS, Bench, load_scene
+
+Image = NDArray[np.uint8]
+
+FRONT_M = -0.06
+"""Depth of the object's front below the imaginary screen; the eyes are 0.4 m above it."""
+
+
+@pytest.fixture
+async def bench() -> AsyncIterator[Bench]:
+    bench = Bench()
+    radius = 0.0353553
+    pose = Pose(position_m=np.array([0.0, 0.0, FRONT_M - radius]), rpy_rad=np.zeros(3))
+    deeper = bench.scene.object.model_copy(update={"world_from_object": pose})
+    bench.scene = bench.scene.model_copy(update={"object": deeper})
+    await bench.node.setup()
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4))
+    yield bench
+    await bench.node.close()
+
+
+async def frame_of(bench: Bench, mode: StereoMode, *, swap_eyes: bool = False) -> Frame:
+    display = Display(
+        correction="two_pass", stereo=mode, swap_eyes=swap_eyes, shading="flat", pixels_every=1
+    )
+    await bench.step("display", display)
+    bench.forward(40)
+    await bench.arms(np.eye(4))
+    await bench.finger(0.0, 0.0, 0.2)
+    return bench.sent[-1][0]
+
+
+def middle_m(picture: NDArray[np.uint8], *, columns: float = 1.0) -> float:
+    """World x of the middle of what is bright in the middle rows; 2 px/mm, mirrored."""
+    rows = picture.shape[0] // 2 + np.arange(-5, 5)
+    bright = np.nonzero(picture[rows].astype(int).sum(axis=0) > 5 * 255)[0]
+    return -((bright.min() + bright.max() + 1) / 2.0 * columns - 0.5 - 399.5) / 2000.0
+
+
+def eyes_pictures(mode: StereoMode, frames: list[Frame]) -> tuple[float, float]:
+    """World x of the object's front as the left and the right eye's picture has it."""
+    picture = frames[0].pixels[0]
+    height, width = picture.shape[:2]
+    if mode == "side_by_side":
+        left, right = picture[:, : width // 2, 0], picture[:, width // 2 :, 0]
+        return middle_m(left, columns=2.0), middle_m(right, columns=2.0)
+    if mode == "top_bottom":
+        return middle_m(picture[: height // 2, :, 0]), middle_m(picture[height // 2 :, :, 0])
+    if mode == "anaglyph":
+        return middle_m(picture[..., 0]), middle_m(picture[..., 1])
+    by_eye = {frame.eye: frame.pixels[0][..., 0] for frame in frames}
+    return middle_m(by_eye["left"]), middle_m(by_eye["right"])
+
+
+@pytest.mark.parametrize("mode", ["side_by_side", "top_bottom", "anaglyph", "frame_sequential"])
+async def test_what_lies_behind_the_screen_has_uncrossed_parallax(
+    bench: Bench, mode: StereoMode
+) -> None:
+    """The right eye sees it to the right of where the left one does, by b d / (d + e)."""
+    wanted = 0.064 * -FRONT_M / (0.4 - FRONT_M)
+    for swap_eyes, sign in ((False, 1.0), (True, -1.0)):
+        frames = [await frame_of(bench, mode, swap_eyes=swap_eyes) for _ in range(2)]
+        left, right = eyes_pictures(mode, frames)
+        assert np.isclose(right - left, sign * wanted, atol=0.0006)
+        assert np.allclose(frames[0].eyes_world_m, [[-0.032, 0, 0.4], [0.032, 0, 0.4]])
+
+
+async def test_frame_sequential_names_the_eye_of_each_frame(bench: Bench) -> None:
+    frames = [await frame_of(bench, "frame_sequential") for _ in range(4)]
+    assert [frame.eye for frame in frames] in (
+        ["left", "right", "left", "right"],
+        ["right", "left", "right", "left"],
+    )
+    assert (await frame_of(bench, "mono")).eye == "both"
+
+
+async def test_the_picture_follows_a_tracked_eye_and_goes_back_when_it_is_stale(
+    bench: Bench,
+) -> None:
+    assert np.isclose(middle_m((await frame_of(bench, "mono")).pixels[0][..., 0]), 0, atol=3e-4)
+    eye = Eye(valid=True, centre_world_m=np.array([0.05, 0.0, 0.5]))
+    bench.forward(20)
+    await bench.step("eye", eye)
+    frame = await frame_of(bench, "mono")
+    wanted = 0.05 * -FRONT_M / (0.5 - FRONT_M)
+    assert np.allclose(frame.eyes_world_m, [[0.05, 0, 0.5]] * 2)
+    assert np.isclose(middle_m(frame.pixels[0][..., 0]), wanted, atol=0.0006)
+    bench.forward(200)
+    frame = await frame_of(bench, "mono")
+    assert np.allclose(frame.eyes_world_m, [[0, 0, 0.4]] * 2)
+
+
+async def test_tilted_heads_have_tilted_eyes(bench: Bench) -> None:
+    eye = Eye(
+        valid=True, centre_world_m=np.array([0.0, 0.0, 0.4]), right_world=np.array([0.0, 2.0, 0.0])
+    )
+    bench.forward(20)
+    await bench.step("eye", eye)
+    frame = await frame_of(bench, "side_by_side")
+    assert np.allclose(frame.eyes_world_m, [[0, -0.032, 0.4], [0, 0.032, 0.4]])
+
+
+@pytest.mark.parametrize(
+    ("eye", "why"),
+    [
+        ({"valid": False, "centre_world_m": np.zeros(3)}, "not seen"),
+        ({"valid": True, "centre_world_m": np.array([0, 0, 0.04])}, "0.040 m before the screen"),
+        ({"valid": True, "centre_world_m": np.array([0, 0, -1.0])}, "before the screen"),
+        (
+            {"valid": True, "centre_world_m": np.array([0, 0, 0.4]), "right_world": np.zeros(3)},
+            "right_world is zero",
+        ),
+    ],
+)
+async def test_an_eye_that_cannot_be_is_not_followed(
+    bench: Bench, eye: dict[str, object], why: str
+) -> None:
+    bench.forward(20)
+    await bench.step("eye", Eye.model_validate(eye))
+    frame = await frame_of(bench, "mono")
+    assert np.allclose(frame.eyes_world_m, [[0, 0, 0.4]] * 2)
+    assert why in bench.node.note
+
+
+LENS = Lens(
+    fx_px=2000.0,
+    fy_px=2000.0,
+    cx_px=399.5,
+    cy_px=799.5,
+    distortion=(-0.12, 0.15, 0.002, -0.003, 0.0),
+)
+
+
+@pytest.fixture(scope="module")
+def context() -> moderngl.Context:
+    return headless_context()
+
+
+@pytest.mark.parametrize("correction", ["none", "one_plane", "two_pass"])
+def test_the_lens_bends_the_picture_as_opencv_says(
+    context: moderngl.Context, correction: Correction
+) -> None:
+    scene = load_scene()
+    bent_projector = scene.projector.model_copy(update={"lens": LENS})
+    bent_scene = scene.model_copy(update={"projector": bent_projector})
+    shown = Display(correction=correction, stereo="mono", shading="flat", pattern="grid")
+    pictures = []
+    for each in (scene, bent_scene):
+        stage = Stage(each, context, spacing_m=0.004)
+        look = Look(flat=False, pattern="grid")
+        picture = stage.draw(shown, stage.sheet_at_rest(), look, read=True)
+        assert picture is not None
+        pictures.append(picture[..., 0])
+        stage.release()
+    straight, bent = pictures
+    matrix = np.array([[2000.0, 0, 399.5], [0, 2000.0, 799.5], [0, 0, 1]])
+    pixels = np.stack(np.meshgrid(np.arange(800.0), np.arange(600.0)), axis=-1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 50, 1e-9)
+    ideal = cv2.undistortImagePoints(
+        pixels, matrix, np.array(LENS.distortion), arg1=criteria
+    ).reshape(600, 800, 2)
+    x, y = (ideal[..., axis].astype(np.float32) for axis in (0, 1))
+    wanted = cv2.remap(straight, x, y, cv2.INTER_LINEAR)
+    # The lens moves lines by many pixels; both pictures of the grid then agree to blurred edges.
+    off = np.abs(cv2.blur(wanted, (3, 3)).astype(int) - cv2.blur(bent, (3, 3)))[20:-20, 20:-20]
+    unbent = np.abs(cv2.blur(straight, (3, 3)).astype(int) - cv2.blur(bent, (3, 3)))
+    assert np.quantile(off, 0.995) < 60
+    assert off.mean() < 0.2 * unbent.mean()
+
+
+def test_a_lens_that_folds_the_picture_is_refused() -> None:
+    assert clip_lens(load_scene().projector.lens, 800, 600) is None
+    assert clip_lens(LENS, 800, 600) is not None
+    folded = LENS.model_copy(update={"distortion": (-3.0, 0.0, 0.0, 0.0, 0.0)})
+    with pytest.raises(ValueError, match=r"projector\.lens\.distortion.*folds"):
+        clip_lens(folded, 800, 600)
+
+
+def test_a_finer_mesh_is_the_same_surface(context: moderngl.Context) -> None:
+    stage = Stage(load_scene(), context, spacing_m=0.01)
+    mesh = flat_mesh(stage.sheet_at_rest())
+    fine = finer(mesh, halvings=3)
+
+    def area(vertices: NDArray[np.float64], triangles: NDArray[np.int32]) -> float:
+        a, b, c = vertices[triangles].transpose(1, 0, 2)
+        return float(0.5 * np.cross(b - a, c - a)[:, 2].sum())
+
+    assert len(fine.triangles) == 64 * len(mesh.triangles)
+    assert np.isclose(area(fine.vertices, fine.triangles), area(mesh.vertices, mesh.triangles))
+    stage.release()
+
+
+def test_light_is_foretold_from_how_long_drawing_took() -> None:
+    lead = Lead(first_s=0.016, light_s=0.008)
+    assert lead.light_ns(1000 * MS) == 1016 * MS
+    for number, draw_ms in enumerate((5, 5, 40, 5, 5)):
+        begun = (1000 + 100 * number) * MS
+        assert lead.drawn(begun, begun + draw_ms * MS) == begun + (draw_ms + 8) * MS
+    assert lead.light_ns(2000 * MS) == 2013 * MS  # the slow one is outvoted
+    assert not lead.is_late(2020 * MS, 2013 * MS)
+    assert lead.is_late(2022 * MS, 2013 * MS)
+
+
+@given(st.floats(0.2e-3, 30e-3), st.floats(0.0, 1.0), st.sampled_from([1 / 60, 1 / 120, 1 / 48]))
+def test_light_is_foretold_to_the_refresh_that_the_picture_makes(
+    draw_s: float, phase: float, period_s: float
+) -> None:
+    """Against a projector that swaps at multiples of its period after a picture is drawn."""
+    lead = Lead(first_s=0.016, light_s=0.5 * period_s, period_s=period_s)
+    period, draw = round(period_s * 1e9), round(draw_s * 1e9)
+    begun = round(phase * period)
+    for _ in range(3):
+        predicted = lead.light_ns(begun)
+        swapped = -(-(begun + draw) // period) * period
+        light = lead.shown(begun, begun + draw, swapped)
+        begun = swapped + round((0.3 + phase) * period)
+    # Off by a whole refresh only where drawing ends within the margin before one.
+    assert abs(predicted - light) < 1000 or 0 <= predicted - light - period < 1000
