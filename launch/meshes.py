@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from launch.documents import BadInputError, Document, Key, did_you_mean, validate
+from launch.textures import put_image
 from messages.scene import Mesh, Positive, Scene
 from nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape
 from nodes.models.shapes.smooth_mesh import usual_smoothing_m
@@ -73,6 +74,7 @@ def scene_of(document: Document) -> Scene:
             problem = document.problem((*GEOMETRY, "file"), f'"{asked.file}": {error}')
             raise BadInputError([problem]) from error
         document.values["object"]["geometry"] = dict(mesh)
+    put_image(document)
     return validate(Scene, document)
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from messages.arrays import Transform, Triangles, Vector3, Vertices
+from messages.arrays import ColorImage, Transform, Triangles, Vector3, Vertices
 from messages.base import Message
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -161,6 +161,36 @@ Support = Annotated[
 ]
 
 
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Appearance(Part):
+    """How the object is painted; a texture moves with the skin and so shows how that is strained.
+
+    `texture: image` needs an image; a scene file names its file instead, as `image_file`, see
+    `launch/textures.py`.
+    """
+
+    colour: tuple[Share, Share, Share] = Field(
+        default=(0.95, 0.72, 0.60), description="red, green, blue in full light"
+    )
+    texture: Literal["none", "speckle", "grid", "image"] = "none"
+    texture_pitch_m: Positive = Field(
+        default=0.008, description="between the grid's lines, or the speckle's spots, about"
+    )
+    image: ColorImage | None = Field(
+        default=None,
+        description="top row first; laid over the object from its front, the object frame's +z, "
+        "fitted to its width and height",
+    )
+
+    @model_validator(mode="after")
+    def _has_image(self) -> Self:
+        if self.texture == "image" and (self.image is None or not self.image.size):
+            raise ValueError("texture: image has no image; give image_file, or another texture")
+        return self
+
+
 class VirtualObject(Part):
     """The soft object that is seen and touched.
 
@@ -171,6 +201,7 @@ class VirtualObject(Part):
     material: Material
     world_from_object: Pose
     support: Support = Field(description="the part of the skin that does not move")
+    appearance: Appearance = Appearance()
 
     @model_validator(mode="before")
     @classmethod

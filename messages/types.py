@@ -196,9 +196,10 @@ class Display(Message):
     stereo: StereoMode
     swap_eyes: bool = False
     shading: Shading = "soft"
-    pattern: Literal["object", "grid", "black", "places_x", "places_y"] = Field(
+    pattern: Literal["object", "grid", "checker", "white", "black", "places_x", "places_y"] = Field(
         default="object",
-        description="places_x, places_y: the object, painted with where it should be seen",
+        description="grid, checker, white: 300 mm square on the imaginary screen, every 20 mm a "
+        "line or a change; places_x, places_y: the object, painted with where it should be seen",
     )
     marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
     pixels_every: int = Field(

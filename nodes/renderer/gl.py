@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Any
 
@@ -25,8 +25,10 @@ Image = NDArray[np.uint8]
 FAR_M = 5.0
 SAMPLES = 4
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
-OBJECT_COLOUR = (0.95, 0.72, 0.60)
 GRID_PITCH_M = 0.02
+SCREEN_PATTERNS = {"grid": 1, "checker": 2, "white": 3}
+"""Those that lie on the imaginary screen, and their numbers in the shader."""
+TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
 PLACES_AXES = {"places_x": 1, "places_y": 2}
 MARK_RADIUS_M = 0.003
 
@@ -60,6 +62,23 @@ class Look:
     target_mark: Floats | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Paint:
+    """The object's own colour and texture.
+
+    colour: red, green, blue, 0 to 1.  pitch_m: of the procedural textures.  image: (height, width,
+    3), top row first, or None.  image_from_world: (4, 4), takes points of the object at rest to
+    0..1 across the image from its left and bottom.
+    """
+
+    colour: tuple[float, float, float] = (0.95, 0.72, 0.60)
+    texture: str = "none"
+    pitch_m: float = 0.008
+    image: Image | None = None
+    image_from_world: Floats = field(default_factory=lambda: np.eye(4))
+    object_from_world: Floats = field(default_factory=lambda: np.eye(4))
+
+
 class Canvas:
     """A context with the shaders, the meshes and the frame of one projector."""
 
@@ -83,6 +102,8 @@ class Canvas:
         self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         self._object: _Mesh | None = None
+        self._image: moderngl.Texture | None = None
+        self.set_paint(Paint())
         self._grid = _Mesh(self.context, *_grid_mesh())
 
     def release(self) -> None:
@@ -96,7 +117,28 @@ class Canvas:
                 attachment.release()
         for frame in (self._frame, self.resolved, self._single):
             frame.release()
+        if self._image is not None:
+            self._image.release()
         self._program.release()
+
+    def set_paint(self, paint: Paint) -> None:
+        """The object's colour and texture from now on."""
+        if self._image is not None:
+            self._image.release()
+            self._image = None
+        if paint.image is not None:
+            height, width = paint.image.shape[:2]
+            rows = np.ascontiguousarray(paint.image[::-1])
+            self._image = self.context.texture((width, height), 3, rows, alignment=1)
+            self._image.build_mipmaps()
+            self._image.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
+            self._image.repeat_x = self._image.repeat_y = False
+        program = self._program
+        program["object_colour"] = paint.colour
+        program["texture_kind"] = TEXTURES[paint.texture]
+        program["texture_pitch_m"] = paint.pitch_m
+        program["image_from_world"] = tuple(paint.image_from_world.T.ravel())
+        program["object_from_world"] = tuple(paint.object_from_world.T.ravel())
 
     def set_mesh(
         self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
@@ -128,13 +170,15 @@ class Canvas:
         """Draw the object, or the pattern, into a frame."""
         frame.use()
         frame.clear(0.0, 0.0, 0.0, 1.0)
-        mesh = self._grid if look.pattern == "grid" else self._object
+        mesh = self._grid if look.pattern in SCREEN_PATTERNS else self._object
         if look.pattern != "black" and mesh is not None:
             # A projector behind the screen draws mirrored: then front faces wind the other way.
             mirrored = np.linalg.det(view.clip_from_screen) < 0
             self.context.front_face = "cw" if mirrored else "ccw"
             set_view(self._program, view)
             self._set_look(look)
+            if self._image is not None:
+                self._image.use()
             mesh.array(self._program).render(moderngl.TRIANGLES)
 
     def begin(self) -> None:
@@ -169,11 +213,10 @@ class Canvas:
     def _set_look(self, look: Look) -> None:
         program = self._program
         program["flat_shading"] = look.flat
-        program["grid"] = look.pattern == "grid"
+        program["screen_pattern"] = SCREEN_PATTERNS.get(look.pattern, 0)
         program["grid_pitch_m"] = GRID_PITCH_M
         program["places_axis"] = PLACES_AXES.get(look.pattern, 0)
         program["light_direction"] = tuple(LIGHT)
-        program["object_colour"] = OBJECT_COLOUR
         for name, point in (
             ("fingertip_mark", look.fingertip_mark),
             ("target_mark", look.target_mark),

@@ -1,18 +1,27 @@
 #version 330
 
+// Patterns on the imaginary screen, the object coded with where it should be seen, or the object as
+// a soft thing looks; docs/renderer.md has the formulas.
+
 uniform bool flat_shading;
-uniform bool grid;
+uniform int screen_pattern;  // 0: the object, 1: grid, 2: checker, 3: white
 uniform float grid_pitch_m;
 uniform int places_axis;  // 1 or 2: paint each point with the x or y at which the eye should see it
 uniform vec3 eye;
 uniform vec3 light_direction;
 uniform vec3 object_colour;
+uniform int texture_kind;  // 0: none, 1: speckle, 2: grid, 3: image
+uniform float texture_pitch_m;
+uniform mat4 object_from_world;
+uniform mat4 image_from_world;
+uniform sampler2D image;
 uniform vec4 fingertip_mark;  // point of the object at rest, radius; radius 0: none
 uniform vec4 target_mark;
 
 in vec3 rest_point;
 in vec3 true_point;
 in vec3 surface_normal;
+in float sunk_m;
 in float valid;
 
 out vec4 colour;
@@ -20,13 +29,91 @@ out vec4 colour;
 const float PLACES_PERIOD_M = 0.02;
 const float PLACES_RANGE_M = 0.24;
 
+const float WRAP = 0.35;  // light reaches round the edge of the lit side: cosine down to -0.35
+const float AMBIENT = 0.25;
+const vec3 GLOW = vec3(0.16, 0.03, 0.02);  // red light from within, where the surface turns away
+const float HALF_DARK_M = 0.025;  // sunk so far in, half of the light is kept out
+const vec3 DARKENING = vec3(0.8, 1.0, 1.05);  // what is left there is redder
+const mat3 ASLANT = mat3(0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6);  // to no usual face
+const float SHEEN = 0.10;
+const float SHEEN_EXPONENT = 20.0;
+
+// Lines a pitch apart, at zero and its multiples, their edges as soft as a pixel is wide.
+vec2 lines(vec2 place, float pitch, float half_width) {
+    vec2 from_line = abs(fract(place / pitch + 0.5) - 0.5) * pitch;
+    vec2 softness = fwidth(place);
+    return 1.0 - smoothstep(vec2(half_width), vec2(half_width) + softness, from_line);
+}
+
+vec3 on_screen(vec2 place) {
+    if (screen_pattern == 1) {
+        vec2 line = lines(place, grid_pitch_m, 0.0005);
+        return vec3(max(line.x, line.y));
+    }
+    if (screen_pattern == 2) {
+        // A triangle wave, steep: +1 on even squares, -1 on odd ones, soft over a pixel.
+        vec2 wave = 1.0 - 2.0 * abs(2.0 * fract(place / (2.0 * grid_pitch_m) + 0.25) - 1.0);
+        vec2 steep = 0.5 * grid_pitch_m / max(fwidth(place), vec2(1e-9));
+        vec2 side = clamp(wave * steep, -1.0, 1.0);
+        return vec3(0.5 + 0.5 * side.x * side.y);
+    }
+    return vec3(1.0);
+}
+
+// One number from 0 to 1 for each cell of a lattice, without order.
+float scattered(ivec3 cell, uint which) {
+    uint h = uint(cell.x) * 0x8da6b343u + uint(cell.y) * 0xd8163841u + uint(cell.z) * 0xcb1ab31fu;
+    h = (h ^ (h >> 15) ^ (which * 0x9e3779b9u)) * 0x2c1b3c6du;
+    h = (h ^ (h >> 12)) * 0x297a2d39u;
+    return float((h ^ (h >> 15)) & 0xffffu) / 65535.0;
+}
+
+vec3 albedo() {
+    if (texture_kind == 0) return object_colour;
+    if (texture_kind == 3)
+        return texture(image, (image_from_world * vec4(rest_point, 1.0)).xy).rgb;
+    vec3 place = (object_from_world * vec4(rest_point, 1.0)).xyz;
+    if (texture_kind == 2) {
+        vec2 line = lines(place.xy, texture_pitch_m, 0.0004);
+        return mix(object_colour, 0.45 * object_colour, max(line.x, line.y));
+    }
+    // A ball somewhere in each cell of half a pitch; where the surface cuts one, there is a spot.
+    vec3 in_cells = ASLANT * place / (0.5 * texture_pitch_m);
+    ivec3 cell = ivec3(floor(in_cells));
+    float radius = 0.25 + 0.2 * scattered(cell, 4u);
+    vec3 middle = vec3(scattered(cell, 1u), scattered(cell, 2u), scattered(cell, 3u));
+    middle = radius + middle * (1.0 - 2.0 * radius);
+    float away = distance(in_cells - vec3(cell), middle);
+    float softness = length(fwidth(place)) / (0.5 * texture_pitch_m);
+    float spot = 1.0 - smoothstep(radius - softness, radius + softness, away);
+    return mix(object_colour, 0.5 * object_colour, spot * clamp(0.3 / softness, 0.0, 1.0));
+}
+
+vec3 soft() {
+    vec3 normal = surface_normal / max(length(surface_normal), 1e-6);
+    vec3 to_eye = normalize(eye - true_point);
+    float facing = dot(normal, light_direction);
+    float wrapped = max((facing + WRAP) / (1.0 + WRAP), 0.0);
+    float turning = wrapped * max(1.0 - wrapped, 0.0) * 4.0;
+    vec3 dark = pow(vec3(1.0 / (1.0 + max(sunk_m, 0.0) / HALF_DARK_M)), DARKENING);
+    float sheen = pow(max(dot(normal, normalize(light_direction + to_eye)), 0.0), SHEEN_EXPONENT);
+    vec3 light = vec3(AMBIENT + (1.0 - AMBIENT) * wrapped) + GLOW * turning;
+    return albedo() * light * dark + SHEEN * sheen * dark;
+}
+
+// How much of a ring between two radii covers this point, its edges as soft as a pixel is wide.
+float ring(vec4 mark, float inner) {
+    float away = distance(rest_point, mark.xyz) / max(mark.w, 1e-6);
+    float softness = max(0.5 * fwidth(away), 1e-6);
+    float covered = smoothstep(inner - softness, inner + softness, away)
+        * (1.0 - smoothstep(1.0 - softness, 1.0 + softness, away));
+    return mark.w > 0.0 ? covered : 0.0;
+}
+
 void main() {
     if (valid < 0.9999) discard;  // a triangle with a vertex that could not be corrected
-    if (grid) {
-        vec2 from_line = abs(fract(rest_point.xy / grid_pitch_m + 0.5) - 0.5) * grid_pitch_m;
-        vec2 softness = fwidth(rest_point.xy);
-        vec2 line = 1.0 - smoothstep(vec2(0.0005), vec2(0.0005) + softness, from_line);
-        colour = vec4(vec3(max(line.x, line.y)), 1.0);
+    if (screen_pattern > 0) {
+        colour = vec4(on_screen(rest_point.xy), 1.0);
         return;
     }
     if (places_axis > 0) {
@@ -38,15 +125,8 @@ void main() {
         colour = vec4(0.5 + 0.5 * cos(phase), 0.5 + 0.5 * sin(phase), 0.2 + 0.8 * coarse, 1.0);
         return;
     }
-    if (flat_shading) {
-        colour = vec4(1.0);
-    } else {
-        float facing = dot(normalize(surface_normal), light_direction);
-        colour = vec4(object_colour * (0.25 + 0.75 * max(facing, 0.0)), 1.0);
-    }
-    float from_target = distance(rest_point, target_mark.xyz) / max(target_mark.w, 1e-6);
-    float from_finger = distance(rest_point, fingertip_mark.xyz) / max(fingertip_mark.w, 1e-6);
-    if (target_mark.w > 0.0 && from_target < 1.0 && from_target > 0.6)
-        colour = vec4(0.1, 0.35, 0.9, 1.0);
-    if (fingertip_mark.w > 0.0 && from_finger < 1.0) colour = vec4(0.85, 0.1, 0.1, 1.0);
+    vec3 painted = flat_shading ? vec3(1.0) : soft();
+    painted = mix(painted, vec3(0.1, 0.35, 0.9), ring(target_mark, 0.6));
+    painted = mix(painted, vec3(0.85, 0.1, 0.1), ring(fingertip_mark, -1.0));
+    colour = vec4(painted, 1.0);
 }

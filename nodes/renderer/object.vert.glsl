@@ -16,12 +16,14 @@ uniform float far_m;
 #include "lens.glsl"
 
 in vec3 rest_position;
+in vec3 rest_normal;
 in vec3 position;
 in vec3 normal;
 
 out vec3 rest_point;
 out vec3 true_point;  // A
 out vec3 surface_normal;
+out float sunk_m;  // how far it is pushed in
 out float valid;
 out vec4 shifted;  // A', and 1 where it is valid
 
@@ -67,6 +69,7 @@ void main() {
     rest_point = rest_position;
     true_point = position;
     surface_normal = normal;
+    sunk_m = dot(rest_position - position, rest_normal);
 
     // From A' through the eye's pinhole onto z = 0, homogeneous: w is the depth before the eye.
     float w = eye.z - shifted.z;

@@ -22,7 +22,7 @@ from nodes.renderer.correction import (
     pixel_from_screen,
     plane_is_usable,
 )
-from nodes.renderer.gl import SAMPLES, Canvas, Look, View
+from nodes.renderer.gl import SAMPLES, SCREEN_PATTERNS, Canvas, Look, Paint, View
 from nodes.renderer.lens import clip_lens
 from nodes.renderer.output import Image, both_eyes, pack
 from nodes.renderer.projection import Projection, Window
@@ -91,6 +91,7 @@ class Stage:
         self.canvas.set_mesh(
             self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
         )
+        self.canvas.set_paint(self._paint())
         self.dents, self.note = dents, ""
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
@@ -104,6 +105,25 @@ class Stage:
         self._follower: Follower | None = None
         self._shaped_by: SoftBody | None = None
         self.mesh_id: str | None = None
+
+    def _paint(self) -> Paint:
+        """The scene's appearance; an image is fitted to the object's front."""
+        appearance, object_from_world = (
+            self.scene.object.appearance,
+            inverse(self._world_from_object),
+        )
+        front = apply(object_from_world, self._surface.rest_world_m)[:, :2]
+        low, extent = front.min(axis=0), np.ptp(front, axis=0)
+        image_from_object = np.diag([*(1.0 / extent), 1.0, 1.0])
+        image_from_object[:2, 3] = -low / extent
+        return Paint(
+            colour=appearance.colour,
+            texture=appearance.texture,
+            pitch_m=appearance.texture_pitch_m,
+            image=appearance.image,
+            image_from_world=image_from_object @ object_from_world,
+            object_from_world=object_from_world,
+        )
 
     def follow(self, skin: Skin) -> None:
         """From now on the drawn surface follows displacements of this skin."""
@@ -192,7 +212,7 @@ class Stage:
             if mesh is None:
                 self.canvas.draw(view, look)
             else:
-                window = GRID_WINDOW if look.pattern == "grid" else self._window(eye)
+                window = GRID_WINDOW if look.pattern in SCREEN_PATTERNS else self._window(eye)
                 self._projection.draw(self.canvas, mesh, view, look, window)
             drawn(number)
             if read:

@@ -41,8 +41,9 @@ SHADOW_TOLERANCE = 0.002
 """Relative depth behind the lit surface from which a point lies in its shadow."""
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
-OBJECT_COLOUR = np.array([0.95, 0.72, 0.60])
-AMBIENT = 0.25
+AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
+GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0, 1.05]), 0.025
+"""What a soft object looks like in this light; docs/renderer.md says what they are."""
 
 
 class NotMeasurableError(ValueError):
@@ -301,12 +302,28 @@ def proper(
         index = hits.triangle[hit]
         ones = np.column_stack([np.ones(len(row)), column, row])
         weights = np.einsum("nij,nj->ni", hits.weights[index], ones)
-        normals = np.einsum("ni,nij->nj", weights, true_object.normals[front[index]])
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-        brightness = AMBIENT + (1.0 - AMBIENT) * np.maximum(normals @ LIGHT, 0.0)
-        picture[hit] = 255.0 * brightness[:, None] * OBJECT_COLOUR
+        weights /= weights.sum(axis=1, keepdims=True)
+        corners = front[index]
+        picture[hit] = 255.0 * _soft(
+            true_object.colour,
+            normals=np.einsum("ni,nij->nj", weights, true_object.normals[corners]),
+            to_eye=eye - np.einsum("ni,nij->nj", weights, vertices[corners]),
+            sunk_m=np.einsum("ni,ni->n", weights, true_object.sunk_m[corners]),
+        ).clip(0.0, 1.0)
     _put(whole, box, picture, samples)
     return whole
+
+
+def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) -> Floats:
+    """Colours (n, 3) of a soft object without a texture, where it has those normals (n, 3)."""
+    normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + LIGHT
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    wrapped = np.maximum((normals @ LIGHT + WRAP) / (1.0 + WRAP), 0.0)[:, None]
+    dark = (1.0 / (1.0 + np.maximum(sunk_m, 0.0) / HALF_DARK_M))[:, None] ** DARKENING
+    sheen = np.maximum(np.einsum("ni,ni->n", normals, half), 0.0)[:, None] ** SHEEN_EXPONENT
+    light = AMBIENT + (1.0 - AMBIENT) * wrapped + GLOW * 4.0 * wrapped * (1.0 - wrapped)
+    return np.asarray((colour * light + SHEEN * sheen) * dark)
 
 
 class _Silhouette:

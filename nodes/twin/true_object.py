@@ -30,12 +30,15 @@ NEAREST_VERTICES = 3
 class TrueObject:
     """The object as it is: vertices (vertices, 3) world, outward triangles, unit normals.
 
-    Along a sharp edge vertices are doubled.
+    Along a sharp edge vertices are doubled.  sunk_m: (vertices,) how far each is pushed in.
+    colour: (3,) red, green, blue in full light, 0 to 1.
     """
 
     vertices: Floats
     triangles: Indices
     normals: Floats
+    sunk_m: Floats
+    colour: Floats
 
 
 class TrueBody:
@@ -60,6 +63,8 @@ class TrueBody:
         self._of_vertices = csr_array(
             (np.ones(len(owners)), (triangles.ravel(), owners)), shape=(len(rest), len(triangles))
         )
+        self._rest_normals = self._normals(self._rest)
+        self._colour = np.array(scene.object.appearance.colour)
         self._skin: tuple[bytes, Indices, Floats] | None = None
 
     def at_rest(self) -> TrueObject:
@@ -91,11 +96,16 @@ class TrueBody:
         return self._skin[1], self._skin[2]
 
     def _object(self, vertices: Floats) -> TrueObject:
+        sunk_m = np.einsum("vx,vx->v", self._rest - vertices, self._rest_normals)
+        normals = self._normals(vertices)
+        return TrueObject(vertices, self._triangles, normals, sunk_m, self._colour)
+
+    def _normals(self, vertices: Floats) -> Floats:
         corners = vertices[self._triangles]
         area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normals = self._of_vertices @ area
+        normals: Floats = self._of_vertices @ area
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
-        return TrueObject(vertices, self._triangles, normals)
+        return normals
 
 
 def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:

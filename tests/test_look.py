@@ -1,0 +1,232 @@
+"""What the object looks like: shading, textures, marks and patterns, and no seams in them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import moderngl
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from launch.documents import BadInputError
+from launch.plan import load_scene
+from messages.scene import Appearance, Scene
+from messages.types import Correction, Display, Skin, SoftBody
+from nodes.models.rigid import rotation_from_vector, transform
+from nodes.models.sheet import edge_poses
+from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.stage import Stage
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+CYLINDER = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
+SCENE = load_scene(CYLINDER)
+SOFT = Look(flat=False, pattern="object")
+MIDDLE = (299, 399)
+"""Row and column that light the world's origin; two pixels to a millimetre, x to the left."""
+
+
+@pytest.fixture(scope="module")
+def context() -> moderngl.Context:
+    return headless_context()
+
+
+@pytest.fixture(scope="module")
+def plain(context: moderngl.Context) -> Stage:
+    return Stage(SCENE, context, spacing_m=0.004)
+
+
+def painted(**appearance: object) -> Scene:
+    changed = SCENE.object.model_copy(update={"appearance": Appearance.model_validate(appearance)})
+    return SCENE.model_copy(update={"object": changed})
+
+
+def drawn(
+    stage: Stage,
+    look: Look = SOFT,
+    *,
+    correction: Correction = "none",
+    sheet: Sheet | None = None,
+) -> Image:
+    shown = Display(correction=correction, stereo="mono")
+    picture = stage.draw(shown, sheet or stage.sheet_at_rest(), look, read=True)
+    assert picture is not None
+    return picture
+
+
+def sheet_at(pose: Floats, tip: Floats | None = None) -> Sheet:
+    sheet = sheet_between(
+        *edge_poses(pose, 0.25),
+        height_m=SCENE.sheet.height_m,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=tip,
+    )
+    assert sheet is not None
+    return sheet
+
+
+def follow(stage: Stage, displacement: Floats | None) -> None:
+    """Deform the stage by a displacement (vertices, 3) of its own surface."""
+    surface = stage._surface
+    if displacement is None:
+        stage.shape(None)
+        return
+    vertices = surface.rest_world_m.astype(np.float32)
+    stage.follow(Skin(mesh_id="own", vertices_world_m=vertices, triangles=surface.triangles))
+    stage.shape(
+        SoftBody(
+            mesh_id="own",
+            method="linear",
+            in_range=True,
+            push_depth_m=0.0,
+            force_world_n=np.zeros(3),
+            stiffness_n_per_m=0.0,
+            displacement_world_m=displacement.astype(np.float32),
+        )
+    )
+
+
+def dent(stage: Stage, depth_m: float) -> Floats:
+    points = stage._surface.rest_world_m
+    depth = depth_m * np.exp(-((np.linalg.norm(points, axis=1) / 0.015) ** 2))
+    return depth[:, None] * np.array([0.0, 0.0, -1.0])
+
+
+def test_the_dent_is_darker_and_its_walls_face_the_light_or_not(plain: Stage) -> None:
+    follow(plain, None)
+    before = drawn(plain).astype(int)
+    follow(plain, dent(plain, 0.015))
+    after = drawn(plain).astype(int)
+    follow(plain, None)
+    row, column = MIDDLE
+    assert after[row, column, 0] < 0.8 * before[row, column, 0]
+    assert np.abs(after[:, :200] - before[:, :200]).max() == 0
+    # The light comes from above: the dent's upper wall turns away from it, the lower one to it.
+    upper, lower = after[row - 22, column, 0], after[row + 22, column, 0]
+    assert lower - upper > 20
+
+
+def test_shadows_are_redder_than_light(plain: Stage) -> None:
+    picture = drawn(plain).astype(float)[60:540, 399]
+    lit = picture[picture[:, 0] > 20]
+    share = lit[:, 0] / lit.sum(axis=1)
+    dim, bright = lit[:, 0].argmin(), lit[:, 0].argmax()
+    assert share[dim] > share[bright] + 0.01
+    assert lit[:, 0].min() > 40  # never quite dark
+
+
+def test_an_image_is_laid_over_the_front(context: moderngl.Context) -> None:
+    image = np.zeros((4, 8, 3), np.uint8)
+    image[:2, :4], image[:2, 4:] = (255, 0, 0), (0, 255, 0)
+    image[2:, :4], image[2:, 4:] = (0, 0, 255), (255, 255, 0)
+    stage = Stage(painted(texture="image", image=image), context, spacing_m=0.004)
+    picture = drawn(stage).astype(int)
+    stage.release()
+    row, column = MIDDLE
+    # As the projector shows it: left is right, seen through the sheet.
+    assert picture[row - 20, column + 60].argmax() == 0
+    assert picture[row - 20, column - 60].argmax() == 1
+    assert picture[row + 20, column + 60].argmax() == 2
+    assert picture[row + 20, column - 60, :2].min() > 2 * picture[row + 20, column - 60, 2]
+
+
+@pytest.mark.parametrize("texture", ["speckle", "grid"])
+def test_a_texture_moves_with_the_skin(context: moderngl.Context, texture: str) -> None:
+    stage = Stage(painted(texture=texture), context, spacing_m=0.004)
+    row, column = MIDDLE
+    patch = np.s_[row - 30 : row + 30, column - 60 : column + 60]
+    before = drawn(stage)[patch]
+    assert before[..., 0].std() > 15
+    # 4 mm to the right in the world is 8 pixels to the left.
+    follow(stage, np.tile([0.004, 0.0, 0.0], (len(stage._surface.rest_world_m), 1)))
+    after = drawn(stage)[patch].astype(int)
+    stage.release()
+    assert np.abs(after[:, :-8] - before[:, 8:]).mean() < 2.0
+    assert np.abs(after - before).mean() > 10.0
+
+
+def test_checker_and_white(plain: Stage) -> None:
+    row, column = MIDDLE
+    checker = drawn(plain, Look(False, "checker"))
+    signs = [int(checker[row + 20 * j, column + 20 * i, 0]) for j in (-1, 1) for i in (-1, 1)]
+    assert sorted(signs) == [0, 0, 255, 255]
+    assert signs[0] == signs[3]
+    assert checker[row + 20, column + 60, 0] == signs[2]
+    assert drawn(plain, Look(False, "white"))[row, column].tolist() == [255] * 3
+
+
+POSES = [
+    pytest.param(transform(rotation_from_vector([0.0, 0.0, 0.0]), np.zeros(3)), id="upright"),
+    pytest.param(transform(rotation_from_vector([0.5, -0.3, 0.1]), np.zeros(3)), id="tilted"),
+]
+
+
+@pytest.mark.parametrize("pose", POSES)
+@pytest.mark.parametrize("correction", ["one_plane", "four_triangles", "two_pass"])
+def test_an_even_patch_has_no_seam(plain: Stage, correction: Correction, pose: Floats) -> None:
+    """No dark line where triangles meet, of the sheet or of what is drawn."""
+    tip = (pose @ [0.02, -0.03, -0.03, 1.0])[:3]
+    picture = drawn(plain, Look(False, "white"), correction=correction, sheet=sheet_at(pose, tip))
+    lit = picture.min(axis=2)
+    outlines, _ = cv2.findContours(
+        (lit > 128).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    filled = cv2.drawContours(np.zeros_like(lit), outlines, -1, 1, cv2.FILLED)
+    inside = cv2.erode(filled, np.ones((7, 7), np.uint8), borderValue=0) > 0
+    assert inside.mean() > 0.3
+    assert lit[inside].min() == 255
+
+
+@pytest.mark.parametrize("correction", ["none", "four_triangles", "two_pass"])
+def test_edges_are_soft(plain: Stage, correction: Correction) -> None:
+    """Outlines have steps between black and white: they are sampled more than once a pixel."""
+    picture = drawn(plain, Look(True, "object"), correction=correction)[..., 0]
+    between = (picture > 16) & (picture < 240)
+    assert between.sum() > 200
+    assert len(np.unique(picture[between])) >= 3
+
+
+def scene_with(tmp_path: Path, appearance: str) -> Path:
+    text = CYLINDER.read_text().replace(
+        "  support_angle_rad", f"  appearance: {{{appearance}}}\n  support_angle_rad", 1
+    )
+    path = tmp_path / "scene.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
+    picture = np.zeros((5, 7, 3), np.uint8)
+    picture[0, 0] = (1, 2, 3)
+    cv2.imwrite(str(tmp_path / "skin.png"), picture[..., ::-1])
+    scene = load_scene(scene_with(tmp_path, "texture: image, image_file: skin.png"))
+    assert np.array_equal(scene.object.appearance.image, picture)
+
+
+@pytest.mark.parametrize(
+    ("appearance", "told"),
+    [
+        ("texture: image, image_file: gone.png", 'image_file.*"gone.png".*No such file'),
+        ("texture: image, image_file: skin.tif", r"read from \.png"),
+        ("texture: image, image_file: bad.png", "damaged"),
+        ("texture: image, image_file: huge.png", "2050x1 pixels, at most 2048"),
+        ("texture: grid, image_file: bad.png", "texture: image only"),
+        ("texture: image, image_file: 7", "no file's name"),
+        ("texture: image", "has no image"),
+    ],
+)
+def test_a_file_that_is_no_texture_is_told(tmp_path: Path, appearance: str, told: str) -> None:
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    cv2.imwrite(str(tmp_path / "huge.png"), np.zeros((1, 2050, 3), np.uint8))
+    with pytest.raises(BadInputError, match=f"(?s){told}"):
+        load_scene(scene_with(tmp_path, appearance))
+
+
+def test_appearance_is_checked() -> None:
+    with pytest.raises(ValidationError, match="less than or equal to 1"):
+        Appearance(colour=(2.0, 0.0, 0.0))
