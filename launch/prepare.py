@@ -7,6 +7,7 @@ from pathlib import Path
 
 from launch.plan import Plan
 from messages.scene import Scene
+from nodes.cache import default_cache_dir
 from nodes.models.sheet.membrane import NoEquilibriumError
 from nodes.renderer import dent_cache
 
@@ -45,3 +46,37 @@ def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress
     except NoEquilibriumError as error:
         progress(f"no dent shapes for this sheet: {error}")
     return dent_cache.file_of(scene, folder)
+
+
+def prepare_soft_body(
+    scene: Scene,
+    skin_spacing_m: float,
+    cache_dir: Path | None,
+    scheduler: str | None,
+    progress: Progress,
+) -> Path:
+    """The file with the nonlinear table of a scene's soft body, made if it is not there.
+
+    scheduler: as the fem_solver node's parameter.  LabError where that is of no use, ValueError for
+    a body that cannot be meshed, MemoryError where there is too little for it.
+    """
+    from nodes.fem_solver import body, precompute_table
+    from nodes.fem_solver.making import Maker
+    from nodes.fem_solver.precompute import Need
+
+    folder = cache_dir or default_cache_dir()
+    told = 0.0
+
+    def made(done: int, total: int, need: Need) -> None:
+        nonlocal told
+        if done == 0:
+            told = 0.0
+        if done / total >= told:
+            progress(f"making the soft body: {100 * done // total} % ({need.text()})")
+            told += TOLD_SHARE
+
+    maker = Maker(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
+    bodies = maker.bodies(scene, "auto", made)
+    if len(bodies) == 1:
+        maker.tabulated(scene, bodies[0], made)
+    return precompute_table.table_path(body.table_spec_of(scene, bodies[0].spec), folder)

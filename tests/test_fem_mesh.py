@@ -20,6 +20,7 @@ from launch.meshes import read_mesh
 from messages.scene import Mesh, Scene
 from nodes.fem_solver.elasticity import (
     degrees_of_freedom,
+    jacobians,
     quadrature,
     require_support,
     shape_gradients,
@@ -27,11 +28,13 @@ from nodes.fem_solver.elasticity import (
     stiffness_matrix,
 )
 from nodes.fem_solver.mesh import (
+    Focus,
     MeshSpec,
     SolidMesh,
     UnfitMeshError,
     boundary_faces,
     build_mesh,
+    cylinder_mesh,
     mesh_budget,
     mesh_of_scene,
     mesh_spec,
@@ -273,6 +276,34 @@ def test_symmetric_shapes_have_symmetric_meshes(name: str, axis: int) -> None:
     assert (solid.fixed[other] == solid.fixed).all()
     elements = {tuple(row) for row in np.sort(solid.elements, axis=1)}
     assert elements == {tuple(row) for row in np.sort(other[solid.elements], axis=1)}
+
+
+@pytest.mark.parametrize("angle_rad", [0.1, 1.2])
+def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> None:
+    """Or a finger that is pressed there is pushed aside: nodes and edges are mirrored."""
+    radius_m, near_m = CYLINDER["radius_m"], 0.011
+    mesh = cylinder_mesh(
+        radius_m=radius_m,
+        length_m=CYLINDER["length_m"],
+        support_angle_rad=1.5,
+        touch_angle_rad=2.0,
+        skin_spacing_m=0.003,
+        focus=Focus(0.004, angle_rad, near_m),
+    )
+    across = np.array([0.0, np.cos(angle_rad), -np.sin(angle_rad)])
+    out = np.array([0.0, np.sin(angle_rad), np.cos(angle_rad)])
+    local = np.column_stack([mesh.nodes[:, 0] - 0.004, mesh.nodes @ across, mesh.nodes @ out])
+    near = np.linalg.norm(local - [0.0, 0.0, radius_m], axis=1) < near_m
+    assert near.sum() > 80
+    # a middle of an edge stands for the edge
+    for signs in ([-1.0, 1.0, 1.0], [1.0, -1.0, 1.0]):
+        away, _ = cKDTree(local).query(local[near] * signs)
+        assert away.max() < 1e-9
+    whole = np.pi * radius_m**2 * CYLINDER["length_m"]
+    points, weights = quadrature()
+    _, determinants = jacobians(mesh.nodes, mesh.elements, shape_gradients(points))
+    assert (determinants * weights).sum() == pytest.approx(whole, rel=1e-3)
+    assert least_jacobians(mesh.nodes, mesh.elements).min() > LEAST_JACOBIAN
 
 
 @pytest.mark.parametrize("name", SHAPES)

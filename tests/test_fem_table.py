@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from nodes.fem_solver import precompute_table, pushes
 from nodes.fem_solver.carried import Hull, turn
 from nodes.fem_solver.contact import CURVE_SHARES, Response, SkinResponse
-from nodes.fem_solver.mesh import build_mesh
+from nodes.fem_solver.mesh import build_mesh, cylinder
 from nodes.fem_solver.place import Push
 from nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
 from nodes.fem_solver.precompute_table import (
@@ -57,6 +57,7 @@ def coarse() -> Iterator[None]:
         patch.setattr(pushes, "SPACING_RATIO", 1.0)
         patch.setattr(pushes, "STATIONS", (0.0, 0.6))
         patch.setattr(pushes, "ANGLE_STEP_RAD", 0.5)
+        patch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
         yield
 
 

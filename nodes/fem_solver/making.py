@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -17,16 +20,18 @@ MethodChoice = Literal["auto", "linear", "nonlinear_table"]
 class Maker:
     """How soft bodies are made; keeps the last model, which scenes may have in common.
 
-    workers: processes that make a table, 0: one for every core.  Everything here takes seconds to
-    minutes when the cache does not hold it.
+    workers: processes that make a table, 0: one for every core; scheduler: address of a lab's,
+    whose workers make it instead.  Everything here takes seconds to minutes when the cache does
+    not hold it.
     """
 
     skin_spacing_m: float
-    linear_depth_m: float
-    largest_depth_m: float
-    friction_ratio: float
     cache_dir: Path
-    workers: int
+    linear_depth_m: float = 0.006
+    largest_depth_m: float = 0.010
+    friction_ratio: float = 0.0
+    workers: int = 0
+    scheduler: str | None = None
     _model: tuple[str, precompute.SoftBodyModel] | None = field(default=None, init=False)
 
     def bodies(
@@ -58,10 +63,9 @@ class Maker:
         self, scene: Scene, linear: body.SceneBody, progress: precompute_table.Progress
     ) -> body.SceneBody:
         """The body of `bodies` by its nonlinear table, which is computed and kept; errors as
-        `compute_table`."""
+        `compute_table` and `lab_workers`."""
         assert self._model is not None
-        workers = self.workers or os.cpu_count() or 1
-        with precompute_table.local_processes(workers) as executor:
+        with self._executor() as (executor, workers):
             table = precompute_table.compute_table(
                 body.table_spec_of(scene, linear.spec),
                 self._model[1],
@@ -71,3 +75,16 @@ class Maker:
                 workers=workers,
             )
         return body.with_table(linear, scene, self._model[1], table)
+
+    @contextmanager
+    def _executor(self) -> Iterator[tuple[Executor, int]]:
+        """Who solves the pushes, and how many of them do so on this machine."""
+        if self.scheduler is not None:
+            from nodes.fem_solver.lab import lab_workers  # late: it is slow to import
+
+            with lab_workers(self.scheduler) as executor:
+                yield executor, 0
+            return
+        workers = self.workers or os.cpu_count() or 1
+        with precompute_table.local_processes(workers) as executor:
+            yield executor, workers

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from dataclasses import fields
 from pathlib import Path
 
 from pydantic import Field
@@ -42,6 +43,10 @@ class FemSolverParameters(NodeParameters):
     workers: int = Field(
         default=0, ge=0, description="processes that make a table; 0: one for every core"
     )
+    scheduler: str | None = Field(
+        default=None,
+        description="a dask.distributed one, as tcp://host:8786, whose workers make the table",
+    )
     lead_s: NonNegative = Field(default=0.0, description="finger is predicted this far ahead")
     hold_s: NonNegative = Field(default=0.1, description="a lost finger keeps its dent this long")
     relax_s: Positive = Field(default=0.15, description="time constant of springing back after it")
@@ -61,13 +66,10 @@ class FemSolver(Node):
 
     async def setup(self) -> None:
         self._stop = threading.Event()
+        makers = {field.name for field in fields(Maker) if field.init} - {"cache_dir"}
         self._maker = Maker(
-            skin_spacing_m=self.parameters.skin_spacing_m,
-            linear_depth_m=self.parameters.linear_depth_m,
-            largest_depth_m=self.parameters.largest_depth_m,
-            friction_ratio=self.parameters.friction_ratio,
             cache_dir=self.parameters.cache_dir or cache.default_cache_dir(),
-            workers=self.parameters.workers,
+            **self.parameters.model_dump(include=makers),
         )
         self._making: asyncio.Task[None] | None = None
         self._use([])

@@ -1,8 +1,8 @@
 """The nonlinear table of a scene's body: its pushes spread over processes, kept on disk.
 
 Pushes are independent of one another and take most of the time.  They are handed to an executor of
-`concurrent.futures`: processes of this machine, or any other that offers the same (as
-`dask.distributed.Client.get_executor()` does).  Each is kept as soon as it is there.
+`concurrent.futures`: processes of this machine, or a lab's workers (`lab`).  Each is kept as soon
+as it is there.
 """
 
 from __future__ import annotations
@@ -12,8 +12,16 @@ import json
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, fields
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -21,15 +29,16 @@ from pathlib import Path
 import numpy as np
 
 from nodes.cache import Parts, load_arrays, save_arrays, say_damaged
-from nodes.fem_solver import pushes
+from nodes.fem_solver import precompute, pushes
 from nodes.fem_solver.carried import Carrier, Hull, Solved
 from nodes.fem_solver.contact import LinearSoftBody
 from nodes.fem_solver.mesh import build_mesh
+from nodes.fem_solver.mesh.from_scene import VERSION as mesh_version
 from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from nodes.fem_solver.table import Table, fill, table_bytes
 from nodes.models.shapes import make_shape
 
-VERSION = 2
+VERSION = 3
 """Counts up whenever the same specification gives other numbers."""
 PUSH_STEPS, PLACE_STEPS = 200, 1
 """How much of the progress a push, and a place that is filled in, are."""
@@ -83,17 +92,26 @@ def local_processes(count: int) -> Iterator[Executor]:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-_stop: list[Event] = []
-"""In a worker process of `local_processes`: set when it shall end."""
+asked_to_stop: ContextVar[Callable[[], bool]] = ContextVar("asked_to_stop", default=lambda: False)
+"""In a worker: whether what it is at shall end."""
 
 
 def _begin(stop: Event) -> None:
     os.nice(NICER)
-    _stop.append(stop)
+    asked_to_stop.set(stop.is_set)
 
 
 def _solve(job: pushes.PushJob) -> pushes.PushAnswer:
-    return pushes.solve_push(job, lambda: any(stop.is_set() for stop in _stop))
+    return pushes.solve_push(job, asked_to_stop.get())
+
+
+class LostWorkersError(RuntimeError):
+    """Whoever was to solve pushes is gone; what they had solved is kept."""
+
+
+def code_version() -> str:
+    """Of all that decides what a push's answer is."""
+    return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
 def table_path(spec: TableSpec, cache_dir: Path) -> Path:
@@ -132,10 +150,11 @@ def compute_table(
     *,
     workers: int = 1,
 ) -> Table:
-    """Solve the pushes, fill the table, keep it.  model: of the same body.
+    """Solve the pushes, fill the table, keep it.  model: of the same body; workers: how many of the
+    executor's are on this machine.
 
     MemoryError, before anything is solved, if this machine, with so many workers on it, has too
-    little; OSError as `save_table`.
+    little; OSError as `save_table`; others as `solve_all`.
     """
     mesh_spec, response = spec.body.mesh, model.response
     mesh = build_mesh(mesh_spec)
@@ -194,7 +213,10 @@ def solve_all(
     jobs: list[pushes.PushJob], executor: Executor, parts: Parts, told: Callable[[int], None]
 ) -> list[pushes.PushAnswer]:
     """The jobs' answers, those kept before taken from parts; told is called with how many are
-    there, and may raise to stop: jobs that have not begun are then given up."""
+    there, and may raise to stop: jobs that have not begun are then given up.
+
+    LostWorkersError if the executor gives jobs up; errors of the jobs.
+    """
     answers: dict[int, pushes.PushAnswer] = {}
     for number in range(len(jobs)):
         kept = parts.load(f"push-{number:04d}")
@@ -211,7 +233,14 @@ def solve_all(
         while waiting:
             done, _ = wait(waiting, timeout=PULSE_S, return_when=FIRST_COMPLETED)
             for future in done:
-                number, answer = waiting.pop(future), future.result()
+                number = waiting.pop(future)
+                try:
+                    answer = future.result()
+                except CancelledError as error:
+                    raise LostWorkersError(
+                        "the workers that solve the pushes are gone; what they solved is kept, "
+                        "start them again and the table goes on from there"
+                    ) from error
                 content = {
                     one.name: np.asarray(getattr(answer, one.name)) for one in fields(answer)
                 }

@@ -22,9 +22,9 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
-SPACING_RATIO = 0.43
-"""Of the mesh at the push, in finger radii: 3 mm for the usual finger."""
-NEAR_RATIO = 1.7
+SPACING_RATIO = 0.35
+"""Of the mesh at the push, in finger radii: 2.5 mm for the usual finger."""
+NEAR_RATIO = 1.5
 """It is so fine within this many finger radii."""
 STATIONS = (0.0, 0.4, 0.7, 0.9)
 """Pushes on a cylinder, over half its length from the middle."""

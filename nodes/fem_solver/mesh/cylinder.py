@@ -11,6 +11,7 @@ middle nodes lie on the true cylinder (isoparametric), all other edges are strai
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,10 +26,11 @@ BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
 """Elements grow by this much per length of depth below the side."""
 RAMP_RAD = 0.6
-FOCUS_GROWTH = 0.45
+FOCUS_GROWTH = 0.35
 """About a focus, elements grow by this much per length of way from it, ..."""
-COARSEST_RATIO = 0.5
+COARSEST_RATIO = 0.35
 """... up to this share of the radius."""
+SPIRAL, FLAT_RATIO = 1e-3, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,10 @@ def cylinder_mesh(
         )
     element_m = 2.0 * skin_spacing_m
     sizes = _Sizes(element_m, touch_angle_rad, radius_m, focus)
-    points, triangles = _disc(radius_m, half_support, sizes)
+    if focus is None:
+        points, triangles = _disc(radius_m, half_support, sizes)
+    else:
+        points, triangles = _focused_disc(radius_m, half_support, sizes, focus)
     stations = _stations(length_m, sizes)
     corners, tetrahedra = _extrude(points, triangles, stations)
     layer = np.repeat(np.arange(len(stations)), len(points))
@@ -120,15 +125,19 @@ class _Sizes:
 
 
 def _stations(length_m: float, sizes: _Sizes) -> Floats:
-    """Where the cross-sections stand along the axis, ends included, and one at the focus."""
-    ends = [-0.5 * length_m, 0.5 * length_m]
-    if sizes.focus is not None and abs(sizes.focus.x_m) < 0.5 * length_m - sizes.element_m:
-        ends.insert(1, sizes.focus.x_m)
+    """Where the cross-sections stand along the axis, ends included; one at the focus, with the same
+    steps to both sides as far as elements are small."""
+    half = 0.5 * length_m
+    stops = [-half, half]
+    if sizes.focus is not None:
+        near, x = sizes.focus.near_m, sizes.focus.x_m
+        inner = [x - near, x, x + near]
+        stops[1:1] = [stop for stop in inner if abs(stop) < half - sizes.element_m]
     stations = []
-    for start, stop in itertools.pairwise(ends):
+    for start, stop in itertools.pairwise(stops):
         fine = np.linspace(start, stop, 2001)
         stations.append(_spaced(fine, 1.0 / sizes.along(fine), fewest=1))
-    return np.concatenate([*stations, ends[-1:]])
+    return np.concatenate([*stations, stops[-1:]])
 
 
 def _arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
@@ -146,40 +155,93 @@ def _spaced(fine: Floats, density: Floats, *, fewest: int) -> Floats:
     return result
 
 
-def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
-    """Points (y, z) of the cross-section and its triangles, counter-clockwise seen from +x.
-
-    Points on the rim come first, with one on each end of the support, and one at the focus.
-    """
-    from scipy.spatial import Delaunay  # late, as all of scipy: the process must start quickly
-
-    free = np.pi - half_support
-    ends = [-free, free, 2 * np.pi - free]
-    if sizes.focus is not None:
-        ends.insert(1, sizes.focus.angle_rad)
-    rim = np.concatenate(
-        [_arc(start, stop, radius_m, 0.0, sizes) for start, stop in itertools.pairwise(ends)]
-    )
-    rings = [radius_m * np.column_stack([np.sin(rim), np.cos(rim)])]
+def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
+    """Radius and depth of the rings of points below the rim, inwards."""
     depth, step = 0.0, sizes.element_m
     while True:
         depth += 0.85 * step
         step = sizes.element_m + DEPTH_GROWTH * depth
         inner = radius_m - depth
         if inner < 0.6 * step:
-            break
+            return
+        yield inner, depth
+
+
+def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
+    """Points (y, z) of the cross-section and its triangles, counter-clockwise seen from +x.
+
+    One point of the rim is on each end of the support.
+    """
+    free = np.pi - half_support
+    ends = [-free, free, 2 * np.pi - free]
+    rim = np.concatenate(
+        [_arc(start, stop, radius_m, 0.0, sizes) for start, stop in itertools.pairwise(ends)]
+    )
+    rings = [_circle(radius_m, rim)]
+    for inner, depth in _rings(radius_m, sizes):
+        step = sizes.element_m + DEPTH_GROWTH * depth
         offset = 0.5 * step / inner if len(rings) % 2 else 0.0
         angles = _arc(-np.pi + offset, np.pi + offset, inner, depth, sizes)
         if len(angles) < 4:
             break
-        rings.append(inner * np.column_stack([np.sin(angles), np.cos(angles)]))
-    rings.append(np.zeros((1, 2)))
-    points = np.concatenate(rings)
-    triangles = Delaunay(points).simplices.astype(np.int64)
+        rings.append(_circle(inner, angles))
+    points = np.concatenate([*rings, np.zeros((1, 2))])
+    return points, _triangles(points, points)
+
+
+def _focused_disc(
+    radius_m: float, half_support: float, sizes: _Sizes, focus: Focus
+) -> tuple[Floats, Ints]:
+    """As `_disc`; the halves beside the diameter through the focus are mirror images, but for where
+    the support's ends are.
+
+    A mesh that leans pushes a sphere that is pressed into it aside, by some percent of the force;
+    without friction the whole body then gives way to that side.
+    """
+    near = focus.near_m / radius_m
+    inner = [(r, _arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
+    radii = np.array([radius_m, *(r for r, _ in inner)])
+    axis = np.concatenate([radii, -radii, [0.0]])
+    points = [np.column_stack([0.0 * axis, axis])]
+    triangles, count = [], len(axis)
+    for side in (1.0, -1.0):
+        ends = side * (np.pi + half_support * np.array([-1.0, 1.0]) - focus.angle_rad)
+        ends = np.sort(ends % (2.0 * np.pi))
+        stops = [0.0, near, *ends[(near < ends) & (ends < np.pi)], np.pi]
+        rim = [_arc(a, b, radius_m, 0.0, sizes) for a, b in itertools.pairwise(stops)]
+        rings = [(radius_m, np.concatenate(rim)), *inner]
+        off = np.concatenate([_circle(r * (1.0 + SPIRAL * p[1:]), p[1:]) for r, p in rings])
+        # on a spiral, no four points are on a circle: both halves are triangulated alike
+        flat = np.column_stack([0.0 * axis, axis * np.where(axis < 0.0, 1.0 + SPIRAL * np.pi, 1.0)])
+        number = np.append(np.arange(len(axis)), count + np.arange(len(off)))
+        true = np.concatenate([_circle(np.full(len(p) - 1, r), p[1:]) for r, p in rings])
+        found = number[_triangles(np.concatenate([points[0], true]), np.concatenate([flat, off]))]
+        triangles.append(found if side > 0.0 else found[:, [0, 2, 1]])
+        points.append(true * [side, 1.0])
+        count += len(off)
+    y, z = np.concatenate(points).T
+    sine, cosine = np.sin(focus.angle_rad), np.cos(focus.angle_rad)
+    return np.column_stack([y * cosine + z * sine, z * cosine - y * sine]), np.concatenate(
+        triangles
+    )
+
+
+def _circle(radius: float | Floats, angles: Floats) -> Floats:
+    """Points (n, 2) at angles (n,) from +z."""
+    return np.column_stack([radius * np.sin(angles), radius * np.cos(angles)])
+
+
+def _triangles(points: Floats, where: Floats) -> Ints:
+    """Triangles (t, 3) of points (n, 2), counter-clockwise: Delaunay's, were they at `where`."""
+    from scipy.spatial import Delaunay  # late, as all of scipy: the process must start quickly
+
+    triangles = Delaunay(where).simplices.astype(np.int64)
     edges = points[triangles[:, 1:]] - points[triangles[:, :1]]
     area = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
     triangles[area < 0] = triangles[area < 0][:, [0, 2, 1]]
-    return points, triangles
+    size = np.square(edges).sum(axis=(1, 2))
+    sound: Ints = triangles[np.abs(area) > FLAT_RATIO * size]
+    return sound
 
 
 def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:

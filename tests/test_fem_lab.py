@@ -1,0 +1,163 @@
+"""A table's pushes on the workers of a lab's scheduler: real processes, on loopback."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from nodes.cache import Parts
+from nodes.fem_solver.lab import LabError, lab_workers
+from nodes.fem_solver.mesh import boundary_faces
+from nodes.fem_solver.precompute_table import LostWorkersError, solve_all
+from nodes.fem_solver.pushes import PushJob, Site, solve_push
+from tests.solids import box
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+class Lab:
+    """A scheduler of `distributed`, and workers that are started one by one."""
+
+    def __init__(self) -> None:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+        self._processes: list[subprocess.Popen[str]] = []
+        host, port = "127.0.0.1", self.address.rsplit(":", 1)[1]
+        self.scheduler = self._start(
+            "scheduler", "--host", host, "--port", port, say="Scheduler at"
+        )
+
+    def add_worker(self) -> subprocess.Popen[str]:
+        return self._start(
+            "worker", self.address, "--nthreads", "1", "--no-nanny", say="Registered to"
+        )
+
+    def _start(self, command: str, *options: str, say: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", f"distributed.cli.dask_{command}", *options, "--no-dashboard"],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self._processes.append(process)
+        assert process.stderr is not None
+        lines = process.stderr
+        for line in lines:
+            if say in line:
+                break
+        else:
+            raise AssertionError(f"the {command} ended with {process.wait()}")
+        threading.Thread(target=lines.read, daemon=True).start()
+        return process
+
+    def close(self) -> None:
+        for process in self._processes:
+            process.kill()
+            process.wait()
+            assert process.stderr is not None
+            process.stderr.close()
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    one = Lab()
+    yield one
+    one.close()
+
+
+def job(depth_m: float = 0.0005) -> PushJob:
+    """A block of 30 x 30 x 20 mm, glued to the ground, pushed in the middle of its top."""
+    nodes, elements = box((4, 4, 2), (0.03, 0.03, 0.02))
+    faces = boundary_faces(elements)
+    return PushJob(
+        nodes=nodes,
+        elements=elements,
+        fixed=np.isclose(nodes[:, 2], 0.0),
+        faces=faces[np.isclose(nodes[faces, 2], 0.02).all(axis=1)],
+        site=Site(np.array([0.015, 0.015, 0.02]), np.array([0.0, 0.0, 1.0])),
+        poisson_ratio=0.45,
+        finger_radius_m=0.007,
+        depths_m=(depth_m, 2.0 * depth_m),
+    )
+
+
+def cpu_s(process: subprocess.Popen[str]) -> float:
+    """Time that a process has been at work."""
+    return float(sum(psutil.Process(process.pid).cpu_times()[:2]))
+
+
+def test_a_scheduler_without_workers_is_an_error_that_says_what_to_do(lab: Lab) -> None:
+    with (
+        pytest.raises(LabError, match=r"dask worker tcp://127\.0\.0\.1"),
+        lab_workers(lab.address, connect_s=0.3),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1", "post://127.0.0.1:8786"])
+def test_no_scheduler_is_an_error_that_says_what_to_do(address: str) -> None:
+    with pytest.raises(LabError, match=r"no scheduler answers.*null"), lab_workers(address):
+        pass
+
+
+def test_what_a_lost_worker_was_at_is_done_by_others_and_a_lost_scheduler_is_said(
+    lab: Lab, tmp_path: Path
+) -> None:
+    first = lab.add_worker()
+    parts = Parts(tmp_path / "parts")
+    jobs = [job(), job(0.001)]
+    with lab_workers(lab.address, connect_s=2.0) as executor:
+        # it is given the first push, and never ends it
+        psutil.Process(first.pid).suspend()
+        told: list[int] = []
+
+        def lose(count: int) -> None:
+            told.append(count)
+            if len(told) == 2:
+                first.send_signal(signal.SIGKILL)
+                lab.add_worker()
+
+        answers = solve_all(jobs, executor, parts, lose)
+        for answer, one in zip(answers, jobs, strict=True):
+            here = solve_push(one)
+            assert np.allclose(answer.moved, here.moved, atol=1e-9)
+            assert answer.reached == here.reached == 2
+
+        def leave(count: int) -> None:
+            if count == 2:
+                lab.scheduler.kill()
+
+        with pytest.raises(LostWorkersError, match="goes on from there"):
+            solve_all([*jobs, job(0.002)], executor, parts, leave)
+
+
+def test_a_push_that_is_given_up_ends_in_the_lab(lab: Lab, tmp_path: Path) -> None:
+    worker = lab.add_worker()
+
+    class GivenUpError(Exception):
+        pass
+
+    def give_up(count: int) -> None:
+        # it is at work once it takes time
+        if cpu_s(worker) > begun + 0.3:
+            raise GivenUpError
+
+    long = [replace(job(), depths_m=(1e-4,) * 400)] * 3
+    begun = cpu_s(worker)
+    with lab_workers(lab.address) as executor, pytest.raises(GivenUpError):
+        solve_all(long, executor, Parts(tmp_path / "parts"), give_up)
+    with lab_workers(lab.address) as executor:
+        assert executor.submit(pow, 2, 3).result(timeout=20) == 8
