@@ -15,6 +15,7 @@ from launch.commands import (
     doctor,
     doctor_compliance,
     experiment,
+    keys,
     launching,
     node,
     prepare,
@@ -34,6 +35,7 @@ app.command()(prepare.prepare)
 app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(bag.app, name="bag")
+app.add_typer(keys.app, name="keys")
 calibrate_arms.register(calibrate.app)
 calibrate_sheet.register(calibrate.app)
 app.add_typer(calibrate.app, name="calibrate")
@@ -65,12 +67,15 @@ def _exit_code(error: Exception) -> int | None:
     from launch.supervisor import NodeFailedError
     from messages.bag import BagError
     from messages.bus import BusError
+    from messages.security import SecurityError
 
     if isinstance(error, CommandError):
         return error.code
     if isinstance(error, BadInputError):
         return BAD_INPUT
-    failures = BusError | RunDirectoryError | BagError | ExperimentError | NodeFailedError
+    failures = (
+        BusError | SecurityError | RunDirectoryError | BagError | ExperimentError | NodeFailedError
+    )
     if isinstance(error, failures):
         return FAILED
     return None

@@ -29,6 +29,7 @@ from launch.documents import (
     validate,
 )
 from launch.meshes import scene_of
+from messages.bus import Source
 from messages.calibration import (
     CalibrationFileError,
     CalibrationMismatchError,
@@ -36,6 +37,7 @@ from messages.calibration import (
     refuse_other_camera,
 )
 from messages.scene import Scene
+from messages.security import is_key
 from messages.sheet_calibration import (
     SheetCalibrationError,
     load_sheet_calibration,
@@ -71,6 +73,10 @@ class HostSpec(Strict):
     """One computer."""
 
     address: str = Field(description="IP address that its nodes listen on")
+    key: str | None = Field(default=None, description="its public key: flexsheet keys show")
+    may_reset_estop: bool | None = Field(
+        default=None, description="whether its nodes may; null: on the main host alone"
+    )
 
 
 class RestartSpec(Strict):
@@ -134,6 +140,11 @@ class Writer(Strict):
             return self.ipc
         return self.tcp
 
+    def source_for(self, host: str) -> Source:
+        """Where a subscriber on `host` connects to, and whose words alone it takes there."""
+        far = host != self.host and self.tcp is not None
+        return Source(self.endpoint_for(host), self.name, self.host if far else None)
+
 
 class PlannedPort(Strict):
     """A port, its topic, and the endpoints: bound for an output, connected to for an input."""
@@ -168,6 +179,8 @@ class Plan(Strict):
     hosts: dict[str, str] = Field(description="address by name")
     nodes: dict[str, PlannedNode]
     writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
+    keys: dict[str, str] = Field(default={}, description="public key by host; no part of the hash")
+    estop_resetters: tuple[str, ...] = Field(default=(MAIN,), description="hosts that may")
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
@@ -177,6 +190,18 @@ class Plan(Strict):
     def endpoints_to_read(self, topic: str, host: str = MAIN) -> tuple[str, ...]:
         """Where a subscriber of `topic` on `host` connects to."""
         return tuple(writer.endpoint_for(host) for writer in self.writers.get(topic, ()))
+
+    def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
+        """The same, with who may write there."""
+        return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
+
+    def may_reset_estop(self) -> tuple[str, ...]:
+        """Writers of e-stops whose hosts may reset one."""
+        return tuple(
+            writer.name
+            for writer in self.writers.get("estop", ())
+            if writer.host in self.estop_resetters
+        )
 
     def nodes_on(self, host: str | None) -> list[PlannedNode]:
         """The nodes of one host, or of all."""
@@ -234,7 +259,7 @@ def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None =
         _apply_setting(document, setting)
     spec = validate(LaunchFile, document)
     problems: list[Problem] = []
-    _check_hosts(spec, document, problems)
+    check_hosts(spec.hosts, document, problems)
     scene_document, scene = _load_scene(spec, document, problems)
     members = _members(spec, document, problems)
     for member in members:
@@ -243,6 +268,7 @@ def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None =
     _resolve_further_inputs(members, writers, document, problems)
     _check_inputs(members, writers, document, problems)
     _check_calibrations(members, scene, document, problems)
+    _check_wires(members, spec, document, problems)
     if problems:
         raise BadInputError(problems)
 
@@ -252,8 +278,14 @@ def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None =
         member.name: _planned(member, endpoints, document, resolve_paths=True) for member in members
     }
     scene_values = None if scene is None else scene.model_dump(mode="json")
+    resetters = tuple(
+        name
+        for name, host in spec.hosts.items()
+        if (name == MAIN if host.may_reset_estop is None else host.may_reset_estop)
+    )
     portable = {
         "hosts": addresses,
+        "estop_resetters": resetters,
         "scene": scene_values,
         "nodes": [
             _planned(member, endpoints, document, resolve_paths=False).model_dump(mode="json")
@@ -269,8 +301,24 @@ def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None =
         hosts=addresses,
         nodes=nodes,
         writers=endpoints,
+        keys={name: host.key for name, host in spec.hosts.items() if host.key is not None},
+        estop_resetters=resetters,
         hash=hashlib.sha256(json.dumps(portable, sort_keys=True).encode()).hexdigest()[:16],
     )
+
+
+def load_keys(path: Path) -> dict[str, str]:
+    """The public key of each host in a launch file, which may have changed since it was started.
+
+    Raises BadInputError.
+    """
+    document = read_document(path)
+    spec = validate(LaunchFile, document)
+    problems: list[Problem] = []
+    check_hosts(spec.hosts, document, problems)
+    if problems:
+        raise BadInputError(problems)
+    return {name: host.key for name, host in spec.hosts.items() if host.key is not None}
 
 
 def load_scene(path: Path) -> Scene:
@@ -324,15 +372,17 @@ def _apply_record(document: Document, bag: Path) -> None:
     document.set(("record", "bag"), str(bag), origin)
 
 
-def _check_hosts(spec: LaunchFile, document: Document, problems: list[Problem]) -> None:
-    if MAIN not in spec.hosts:
+def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
+    """Addresses and keys: each a good one, each of one host."""
+    if MAIN not in hosts:
         problems.append(
             document.problem(
                 ("hosts",), f'no host is named "{MAIN}"', "the launcher and the tools need it"
             )
         )
+    _check_keys(hosts, document, problems)
     seen: dict[str, str] = {}
-    for name, host in spec.hosts.items():
+    for name, host in hosts.items():
         key: Key = ("hosts", name, "address")
         try:
             address = ipaddress.ip_address(host.address)
@@ -354,6 +404,56 @@ def _check_hosts(spec: LaunchFile, document: Document, problems: list[Problem]) 
                     key, f'"{host.address}" is the address of host "{other}" too', "make them one"
                 )
             )
+
+
+def _check_keys(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
+    seen: dict[str, str] = {}
+    for name, host in hosts.items():
+        where: Key = ("hosts", name, "key")
+        if host.key is None:
+            if any(other.key is not None for other in hosts.values()):
+                problems.append(
+                    document.problem(
+                        ("hosts", name),
+                        "has no key, others have",
+                        f"make one there (flexsheet keys new {name}), then: "
+                        f"flexsheet keys install FILE {name} KEY",
+                    )
+                )
+        elif not is_key(host.key):
+            problems.append(
+                document.problem(
+                    where,
+                    f'"{host.key}" is no public key',
+                    f"40 characters, as this prints: flexsheet keys show {name}",
+                )
+            )
+        elif seen.setdefault(host.key, name) != name:
+            problems.append(
+                document.problem(
+                    where, f'is the key of host "{seen[host.key]}" too', "each host has its own"
+                )
+            )
+
+
+def _check_wires(
+    members: list[_Member], spec: LaunchFile, document: Document, problems: list[Problem]
+) -> None:
+    """A device's own protocol knows no keys: it stays on the wire of the host it belongs to."""
+    for member in members:
+        address = getattr(member.parameters, "host", None)
+        if member.type is None or not member.type.opens_devices or not isinstance(address, str):
+            continue
+        for name, host in spec.hosts.items():
+            if host.address == address and name != member.spec.host and not is_loopback(address):
+                problems.append(
+                    document.problem(
+                        (*member.key, "parameters", "host"),
+                        f'{address} is host "{name}": what it says would cross the network '
+                        "without keys",
+                        f"run {member.name} there (host: {name})",
+                    )
+                )
 
 
 def _load_scene(

@@ -14,29 +14,33 @@ from __future__ import annotations
 import asyncio
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from launch.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from launch.documents import BadInputError, Problem, read_document
+from launch.keys import KeyWatch, make_rings, ring_file
 from launch.plan import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort, is_loopback
 from launch.runs import RUN_VARIABLE, Run, create_run, is_free, sweep
 from messages.base import Header
-from messages.bus import Publisher
+from messages.bus import Publisher, Source
 from messages.clock import SystemClock
+from messages.security import KeyRing, SecurityError
 from messages.topics import topic_named
 from nodes.runner import NodeConfig, PortConfig
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 ENTRY = Path(__file__).resolve().parent.parent / "flexsheet.py"
 STOP_GRACE_S = 3.0
+KEYS_PERIOD_S = 1.0
 LOG_READ_BYTES = 65_536
 
 Report = Callable[[str, str], None]
@@ -171,6 +175,8 @@ class RunningGraph:
         self._keepers: dict[str, asyncio.Task[None]] = {}
         self._ready = {node.name: asyncio.Event() for node in self.nodes}
         self._publishers: list[Publisher] = []
+        self._rings: dict[str, KeyRing] = {}
+        self._keys_watch: asyncio.Task[None] | None = None
         self._lifeline: tuple[int, int] | None = None
         self._stopping = False
 
@@ -259,10 +265,11 @@ class RunningGraph:
     async def stop(self) -> None:
         """End all nodes (SIGINT, SIGTERM, SIGKILL) and remove sockets; may be called twice."""
         self._stopping = True
-        for keeper in self._keepers.values():
-            keeper.cancel()
+        watches = [] if self._keys_watch is None else [self._keys_watch]
+        for task in (*self._keepers.values(), *watches):
+            task.cancel()
         try:
-            await asyncio.gather(*self._keepers.values(), return_exceptions=True)
+            await asyncio.gather(*self._keepers.values(), *watches, return_exceptions=True)
             await self._end_children()
         finally:
             for child in self._children.values():
@@ -297,6 +304,9 @@ class RunningGraph:
         if swept:
             self._report(LAUNCHER, f"ended {len(swept)} processes of launchers that are gone")
         _check_ports(self.plan, self._host)
+        if self.plan.keys:
+            self._rings = make_rings(self.plan, self.run, self._host)
+            self._keys_watch = asyncio.create_task(self._watch_keys(), name="keys")
         self._write_run_files()
         self._lifeline = os.pipe()
         if self._host in (None, MAIN):
@@ -310,7 +320,12 @@ class RunningGraph:
         writer = self.plan.writer("scene", LAUNCHER)
         if scene is None or writer is None:
             return
-        publisher = Publisher(topic_named("scene"), local_endpoints(self.run, writer.endpoints))
+        publisher = Publisher(
+            topic_named("scene"),
+            local_endpoints(self.run, writer.endpoints),
+            keys=self._rings.get(MAIN),
+            on_refused=partial(self._report, LAUNCHER),
+        )
         self._publishers.append(publisher)
         clock = SystemClock()
         now_ns = clock.now_ns()
@@ -322,9 +337,30 @@ class RunningGraph:
                 publish_ns=now_ns,
                 clock_id=clock.id,
                 writer=LAUNCHER,
-                epoch=random.SystemRandom().getrandbits(32),
+                epoch=now_ns,
+                plan=self.plan.hash,
             ),
         )
+
+    async def _watch_keys(self) -> None:
+        """Pass on what changes about the keys in the launch file or in our own files of them."""
+        watch = KeyWatch(self.plan, self.run, self._rings)
+        said = ""
+        while True:
+            await asyncio.sleep(KEYS_PERIOD_S)
+            try:
+                changes = watch.look()
+            except (BadInputError, SecurityError, OSError) as error:
+                if str(error) != said:
+                    said = str(error)
+                    self._report(LAUNCHER, f"keys stay as they were: {said}")
+                continue
+            for host, change in changes.items():
+                said = ""
+                self._report(LAUNCHER, f"keys of {host} are read anew")
+                if host == MAIN:
+                    for publisher in self._publishers:
+                        publisher.renew_keys(change)
 
     async def _keep(self, node: PlannedNode) -> None:
         """Run the node again and again, as its policy says; NodeFailedError when for good."""
@@ -433,10 +469,27 @@ async def _end(children: list[Child]) -> None:
 def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
     """What a node's process is told, with the run's directory filled in."""
 
-    def ports(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
+    def outputs(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
             PortConfig(
                 port=port.port, topic=port.topic, endpoints=local_endpoints(run, port.endpoints)
+            )
+            for port in planned
+        )
+
+    def inputs(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
+        return tuple(
+            PortConfig(
+                port=port.port,
+                topic=port.topic,
+                endpoints=local_sources(
+                    run,
+                    [
+                        source
+                        for source in plan.sources_to_read(port.topic, node.host)
+                        if source.endpoint in port.endpoints
+                    ],
+                ),
             )
             for port in planned
         )
@@ -445,16 +498,26 @@ def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
         name=node.name,
         type=node.type,
         parameters=_fill_run(node.parameters, run),
-        inputs=ports(node.inputs),
-        outputs=ports(node.outputs),
+        inputs=inputs(node.inputs),
+        outputs=outputs(node.outputs),
         plan_hash=plan.hash,
         run_dir=str(run.directory),
+        keys_file=ring_file(run, node.host) if plan.keys else None,
+        estop_resetters=plan.may_reset_estop(),
     )
 
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
     """Endpoints of a plan with the run's directory filled in."""
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
+
+
+def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
+    """Sources of a plan with the run's directory filled in."""
+    return tuple(
+        replace(one, endpoint=one.endpoint.replace(RUN_DIRECTORY, str(run.directory)))
+        for one in sources
+    )
 
 
 def describe_exit(code: int) -> str | None:
@@ -509,13 +572,14 @@ def _refuse_open_network(plan: Plan, host: str | None) -> None:
             [Problem("--host", (), f'unknown host "{host}"', f"there are: {', '.join(plan.hosts)}")]
         )
     for name, address in plan.hosts.items():
-        if not is_loopback(address):
+        if not is_loopback(address) and not plan.keys:
             raise BadInputError(
                 [
                     read_document(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
                         f"{address} is beyond loopback and there are no keys",
-                        "nothing listens there without keys; --dry-run shows the plan",
+                        f"make one on each host (flexsheet keys new {name}) and put all of them "
+                        f"here: flexsheet keys install {plan.launch_file} {name} KEY",
                     )
                 ]
             )

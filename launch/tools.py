@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Iterable
 
-from launch.documents import BadInputError, Problem
-from launch.plan import TOOLS, Plan
+from launch import documents
+from launch.documents import BadInputError
+from launch.keys import ring_file
+from launch.plan import MAIN, TOOLS, Plan
 from launch.runs import Run
-from launch.supervisor import local_endpoints
+from launch.supervisor import local_endpoints, local_sources
 from messages.base import Header, Message
-from messages.bus import Publisher
+from messages.bus import Handler, Problem, Publisher, Subscriber
 from messages.clock import SystemClock
+from messages.security import KeyRing
 from messages.topics import topic_named
+from messages.types import Status
+from nodes.node import PortCounts
 
 READER_RECONNECT_S = 1.0
 """Readers look for a writer that was not there at most every half second."""
@@ -23,6 +27,34 @@ def topics_for_tools(plan: Plan) -> list[str]:
     return [topic for topic in plan.writers if plan.writer(topic, TOOLS) is not None]
 
 
+def keys_of(plan: Plan, run: Run) -> KeyRing | None:
+    """The keys of the main host, where tools are; None where the plan has none."""
+    return KeyRing(ring_file(run, MAIN)) if plan.keys else None
+
+
+def subscriber_to(
+    topic: str,
+    plan: Plan,
+    run: Run,
+    on_message: Handler,
+    *,
+    on_problem: Problem,
+    unopened: bool = False,
+) -> Subscriber:
+    """A subscriber, not yet started, to all writers of a topic in a running graph."""
+    wanted = topic_named(topic)
+    return Subscriber(
+        wanted,
+        local_sources(run, plan.sources_to_read(topic)),
+        on_message,
+        PortCounts(),
+        on_problem=on_problem,
+        unopened=unopened,
+        keys=keys_of(plan, run),
+        plan=None if wanted.message is Status else plan.hash,
+    )
+
+
 class ToolsWriter:
     """Publishers for some topics of a running graph; needs a running loop.
 
@@ -31,7 +63,8 @@ class ToolsWriter:
 
     def __init__(self, plan: Plan, run: Run, topics: Iterable[str]) -> None:
         self._clock = SystemClock()
-        self._epoch = random.SystemRandom().getrandbits(32)
+        self._epoch, self._plan = self._clock.now_ns(), plan.hash
+        keys = keys_of(plan, run)
         self._sequences: dict[str, int] = {}
         self._publishers: dict[str, Publisher] = {}
         try:
@@ -42,7 +75,7 @@ class ToolsWriter:
                     what = f"is written by {owners}" if owners else "is not part of the graph"
                     raise BadInputError(
                         [
-                            Problem(
+                            documents.Problem(
                                 plan.launch_file,
                                 ("from_tools",),
                                 f'topic "{name}" {what}',
@@ -52,7 +85,7 @@ class ToolsWriter:
                         ]
                     )
                 endpoints = local_endpoints(run, writer.endpoints)
-                self._publishers[name] = Publisher(topic_named(name), endpoints)
+                self._publishers[name] = Publisher(topic_named(name), endpoints, keys=keys)
         except BaseException:
             self.close()
             raise
@@ -70,6 +103,7 @@ class ToolsWriter:
                 clock_id=self._clock.id,
                 writer=TOOLS,
                 epoch=self._epoch,
+                plan=self._plan,
             ),
         )
 

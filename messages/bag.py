@@ -3,7 +3,7 @@
 What MCAP leaves to the application is decided here:
 
 - Profile "flexsheet"; one schema per message type (JSON Schema); one channel per topic, encoding
-  "flexsheet/1", with the type's fingerprint in the channel's metadata.
+  "flexsheet/2", with the type's fingerprint in the channel's metadata.
 - `log_time` is when the recorder received the message, `publish_time` is the header's source
   stamp; both in ns of a monotonic clock, not since 1970.
 - A message's data are its frames: uint32 number of frames, four zero bytes, a uint64 length per

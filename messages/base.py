@@ -32,7 +32,9 @@ class Header:
     publish_ns: when the message was handed to the socket, same clock.
     clock_id: names the clock of the two stamps; stamps of different clocks must not be subtracted.
     writer: the node that published.
-    epoch: drawn anew at each start of a writer, so that a restart is not taken for a loss.
+    epoch: when the writer was started, ns on the same clock: a restart is no loss, and what was
+        said before it is not taken again.
+    plan: hash of the writer's plan; empty in bags from before there was one in the header.
     """
 
     sequence: int
@@ -41,6 +43,7 @@ class Header:
     clock_id: str
     writer: str
     epoch: int
+    plan: str = ""
 
 
 @cache

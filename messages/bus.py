@@ -1,9 +1,13 @@
 """Publishers and subscribers: one ZeroMQ socket each, driven by the asyncio loop.
 
 A publisher binds, subscribers connect, in any order; either side may be restarted.  A subscriber
-reads its plain (not asyncio) socket in a callback of the loop and calls the handler right there:
+reads its plain (not asyncio) sockets in a callback of the loop and calls the handler right there:
 of the designs in `benchmarks/messaging.py` this has the least latency, and there is no pending
 `recv` that could be cancelled with a message in it.
+
+A subscriber has one socket per host that it hears, so that it knows from where each message comes:
+a host is believed only what its own writers say.  Beyond loopback nothing is bound or connected
+without keys (`messages.security`).
 
 ZeroMQ's file descriptor is edge-triggered: it tells that something changed, not that something is
 there, and any call on the socket may swallow the news.  So each callback reads until nothing is
@@ -14,21 +18,27 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import ipaddress
 import logging
 import os
 import socket
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import zmq
 
 from messages.base import Header, Message
+from messages.security import Gatekeeper, KeyChange, KeyRing
 from messages.topics import Delivery, Topic
 from messages.wire import Envelope, WireError, encode, read_envelope
 
 Handler = Callable[[Any, Header], None]
 Problem = Callable[[str], None]
+Objection = Callable[[Any, Header], str | None]
+"""Says why a message must not be taken although all its fields are right; None: it may."""
 
 QUEUE_SECONDS = 0.5
 QUEUE_LENGTH = 1000
@@ -40,6 +50,9 @@ IPC_PATH_BYTES = 107
 BIND_PATIENCE_S = 1.0
 IPC_CLOSING_S = 0.02
 REFUSABLE_BYTES = 256 << 20
+SUBSCRIPTION_BYTES = 1 << 16
+HANDSHAKE_MS = 5000
+CLOCKS_REMEMBERED = 16
 
 _log = logging.getLogger("flexsheet.bus")
 
@@ -70,30 +83,74 @@ def queue_length(topic: Topic) -> int:
     return max(QUEUE_LENGTH_MIN, wanted)
 
 
-class Publisher:
-    """Sends the messages of one topic to whoever is connected; needs a running loop if latched.
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Where a subscriber connects to, and who may speak there; None: anybody.
 
-    bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" takes a free port).
+    host: whose key must answer at a tcp endpoint, where there are keys.
     """
 
-    def __init__(self, topic: Topic, bind: Sequence[str]) -> None:
+    endpoint: str
+    writer: str | None = None
+    host: str | None = None
+
+
+class Publisher:
+    """Sends the messages of one topic to whoever is connected; needs a running loop if latched or
+    if there are keys.
+
+    bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" takes a free port).
+    keys: only hosts of this ring may connect by tcp; without it tcp is bound on loopback alone.
+    on_refused: told of connections that were refused.
+    """
+
+    def __init__(
+        self,
+        topic: Topic,
+        bind: Sequence[str],
+        *,
+        keys: KeyRing | None = None,
+        on_refused: Problem = _log.warning,
+    ) -> None:
         self.topic = topic
         self.endpoints: list[str] = []
         self._last: list[Any] | None = None
         self._latched = topic.delivery is Delivery.LATCHED
+        self._keys = keys if any(one.startswith("tcp:") for one in bind) else None
+        self._domain: bytes | None = None
+        if self._keys is not None:
+            self._domain = Gatekeeper.admit(self._keys, on_refused)
+        try:
+            self._open(bind)
+        except BaseException:
+            self._dismiss()
+            raise
+
+    def _open(self, bind: Sequence[str]) -> None:
         self._loop = asyncio.get_running_loop() if self._latched else None
-        self._socket = _open_socket(zmq.XPUB if self._latched else zmq.PUB, topic)
+        self._socket = _open_socket(zmq.XPUB if self._latched else zmq.PUB, self.topic)
+        endpoints = []
         try:
             if self._latched:
                 self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
-            for endpoint in bind:
-                self.endpoints.append(_bind(self._socket, topic, endpoint))
+            # What is bound before keys are set is open to this host, which ipc alone reaches.
+            for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
+                if endpoint.startswith("tcp:") and self._keys is not None and self._domain:
+                    self._keys.serve(self._socket, self._domain)
+                endpoints.append(_bind(self._socket, self.topic, endpoint, keys=self._keys))
         except BaseException:
             self._socket.close(linger=0)
             raise
+        self.endpoints = endpoints
         if self._loop is not None:
             self._loop.add_reader(self._socket.fileno(), self._serve_late_subscribers)
             self._loop.call_soon(self._serve_late_subscribers)
+
+    def renew_keys(self, change: KeyChange) -> None:
+        """Open anew where a key is ours no more, or somebody's who may be connected."""
+        if self._keys is not None and not self._socket.closed and (change.own or change.hosts):
+            self._close_socket(unbind=True)
+            self._open(self.endpoints)
 
     def send(self, message: Message, header: Header) -> None:
         """Hand the message to the socket; never blocks.
@@ -131,57 +188,256 @@ class Publisher:
         """Give the endpoints free; what was sent is still delivered for half a second."""
         if self._socket.closed:
             return
+        self._close_socket(unbind=False)
+        self._dismiss()
+
+    def _close_socket(self, *, unbind: bool) -> None:
         if self._loop is not None and not self._loop.is_closed():
             self._loop.remove_reader(self._socket.fileno())
+        if unbind:
+            for endpoint in self.endpoints:
+                self._socket.unbind(endpoint)
         self._socket.close(linger=LINGER_MS)
+
+    def _dismiss(self) -> None:
+        if self._domain is not None:
+            Gatekeeper.dismiss(self._domain)
+            self._domain = None
 
 
 class Subscriber:
     """Receives one topic and calls `on_message(message, header)` on the loop's thread.
 
-    connect: the endpoints of all writers; a writer may come later or come again.
+    connect: the endpoints of all writers; a writer may come later or come again.  A `Source` says
+        besides who may write there, and a host by whose key it is known.
     counts: gets what was superseded or overflown, lost on the way, or refused.
     on_problem: told in a sentence of losses (at the 1st, 2nd, 4th, 8th, ...; not on `latest`
         topics, where losing is meant), of the first refusal for each cause, and of an exception in
         `on_message`, which ends nothing.
     unopened: call `on_message(frames, header)` with every message that came, whatever the topic's
         delivery; its fields are not looked at.
+    keys: ours and those of the hosts; without it tcp leads to loopback alone.
+    plan: only messages of this plan are taken; None: of any.
+    objection: asked about each message before it is handed over.
     """
 
     def __init__(
         self,
         topic: Topic,
-        connect: Sequence[str],
+        connect: Sequence[str | Source],
         on_message: Handler,
         counts: Counts,
         *,
         on_problem: Problem = _log.error,
         unopened: bool = False,
+        keys: KeyRing | None = None,
+        plan: str | None = None,
+        objection: Objection | None = None,
     ) -> None:
-        self.topic, self._endpoints, self._unopened = topic, tuple(connect), unopened
-        self._on_message, self._on_problem, self._counts = on_message, on_problem, counts
-        self._newest_only = topic.delivery is Delivery.LATEST and not unopened
-        self._seen: dict[str, tuple[int, int]] = {}
+        self.topic, self.counts, self.on_problem = topic, counts, on_problem
+        self._on_message, self._objection, self._plan = on_message, objection, plan
+        self._latched = topic.delivery is Delivery.LATCHED
+        newest_only = topic.delivery is Delivery.LATEST and not unopened
+        self._seen: dict[str, _Writer] = {}
         self._reported_causes: set[str] = set()
         self._report_gaps_from = 1
-        self._socket: zmq.Socket[bytes] | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._started = False
+        by_host: dict[str | None, list[Source]] = {}
+        for one in connect:
+            source = one if isinstance(one, Source) else Source(one)
+            by_host.setdefault(source.host, []).append(source)
+        self._lines = [
+            _Line(self, host, sources, keys, newest_only=newest_only, unopened=unopened)
+            for host, sources in (by_host or {None: []}).items()
+        ]
 
     def start(self) -> None:
         """Connect and begin to deliver; needs a running loop."""
-        if self._socket is not None:
+        if self._started:
             raise BusError(f'topic "{self.topic.name}": this subscriber has been started already')
+        try:
+            for line in self._lines:
+                line.open()
+        except BaseException:
+            self.close()
+            raise
+        self._started = True
+
+    def close(self) -> None:
+        """Stop at once; may be called from the handler."""
+        for line in self._lines:
+            line.close()
+
+    def renew_keys(self, change: KeyChange) -> None:
+        """Connect anew to hosts whose key has changed, and to all when our own has."""
+        for line in self._lines:
+            if line.secured and not line.closed and (change.own or line.host in change.hosts):
+                line.close()
+                line.open()
+
+    def accept(self, frames: list[Any], writers: frozenset[str] | None) -> Envelope | None:
+        """The envelope, its sequence number accounted for; None if refused or seen before.
+
+        writers: who may speak where it came from; None: anybody.
+        """
+        try:
+            envelope = read_envelope(frames, self.topic)
+            header = envelope.header
+            if writers is not None and header.writer not in writers:
+                raise WireError(
+                    "writer",
+                    f"{header.writer!r:.60} does not write it from there; "
+                    f"{', '.join(sorted(writers))} may",
+                )
+            if self._plan is not None and header.plan != self._plan:
+                raise WireError(
+                    "plan",
+                    f"{header.writer} belongs to plan {header.plan!r:.40}, here it is "
+                    f"{self._plan}; start all hosts with the same launch file, scene and settings",
+                )
+            known = self._seen.get(header.writer)
+            if known is None:
+                self._seen[header.writer] = _Writer(header)
+                return envelope
+            lost = known.follow(header)
+        except WireError as error:
+            self.reject(error)
+            return None
+        if lost > 0:
+            self._count_gap(lost, header.writer)
+        elif lost < 0:
+            if not (self._latched and lost == -1):
+                self.reject(
+                    WireError("replayed", f"message {header.sequence} of {header.writer} again")
+                )
+            return None
+        return envelope
+
+    def deliver(self, envelope: Envelope) -> None:
+        """Validate and hand over."""
+        header = envelope.header
+        try:
+            message = envelope.open()
+            why = None if self._objection is None else self._objection(message, header)
+            if why is not None:
+                raise WireError("forbidden", why)
+        except WireError as error:
+            self.reject(error)
+            return
+        self.call(message, header)
+
+    def call(self, message: Any, header: Header) -> None:
+        """Call the handler; what it raises ends nothing."""
+        try:
+            self._on_message(message, header)
+        except Exception as error:
+            _log.exception("handler of topic %s failed", self.topic.name)
+            self.on_problem(
+                f'topic "{self.topic.name}": handler failed: {type(error).__name__}: {error}'
+            )
+
+    def reject(self, error: WireError) -> None:
+        """Count a message that is not taken; its cause is told once."""
+        self.counts.rejected += 1
+        if error.cause not in self._reported_causes:
+            self._reported_causes.add(error.cause)
+            self.on_problem(f'topic "{self.topic.name}": message refused: {error}')
+
+    def _count_gap(self, lost: int, writer: str) -> None:
+        self.counts.gaps += lost
+        newest_only = self.topic.delivery is Delivery.LATEST
+        if not newest_only and self.counts.gaps >= self._report_gaps_from:
+            self._report_gaps_from = 2 * self.counts.gaps
+            self.on_problem(
+                f'topic "{self.topic.name}": {lost} messages of {writer} lost, '
+                f"{self.counts.gaps} in all; a reader or the network is too slow"
+            )
+
+
+class _Writer:
+    """How far a writer has come; what lies before is not taken again.
+
+    A restart on the same clock is known by its later epoch, one after a reboot by a new clock,
+    which then never is the former one again.
+    """
+
+    __slots__ = ("clock_id", "epoch", "past_clocks", "sequence")
+
+    def __init__(self, header: Header) -> None:
+        self.clock_id, self.epoch, self.sequence = header.clock_id, header.epoch, header.sequence
+        self.past_clocks: deque[str] = deque(maxlen=CLOCKS_REMEMBERED)
+
+    def follow(self, header: Header) -> int:
+        """Messages lost before this one; below 0: it is not new, -1 for the newest again.
+
+        Raises WireError for a message from before the writer's newest start.
+        """
+        if header.clock_id != self.clock_id:
+            if header.clock_id in self.past_clocks:
+                raise WireError(
+                    "replayed", f"a message of {header.writer} from before its host's last start"
+                )
+            self.past_clocks.append(self.clock_id)
+            self.clock_id = header.clock_id
+        elif header.epoch == self.epoch:
+            lost = header.sequence - self.sequence - 1
+            if lost >= 0:
+                self.sequence = header.sequence
+            return lost
+        elif header.epoch < self.epoch:
+            raise WireError("replayed", f"a message of {header.writer} from before its last start")
+        self.epoch, self.sequence = header.epoch, header.sequence
+        return 0
+
+
+class _Line:
+    """One socket of a subscriber: what one host says on its topic."""
+
+    def __init__(
+        self,
+        subscriber: Subscriber,
+        host: str | None,
+        sources: list[Source],
+        keys: KeyRing | None,
+        *,
+        newest_only: bool,
+        unopened: bool,
+    ) -> None:
+        self._subscriber, self.host, self._sources, self._keys = subscriber, host, sources, keys
+        self._newest_only, self._unopened = newest_only, unopened
+        known = [one.writer for one in sources if one.writer is not None]
+        self._writers = frozenset(known) if len(known) == len(sources) > 0 else None
+        self._socket: zmq.Socket[bytes] | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None
+
+    @property
+    def closed(self) -> bool:
+        return self._socket is None or self._socket.closed
+
+    @property
+    def secured(self) -> bool:
+        """Whether keys are asked for."""
+        return self._keys is not None and self.host is not None
+
+    def open(self) -> None:
+        """Connect and begin to read."""
+        topic = self._subscriber.topic
         self._loop = asyncio.get_running_loop()
-        self._socket = _open_socket(zmq.SUB, self.topic)
+        self._socket = _open_socket(zmq.SUB, topic)
         try:
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
-            for endpoint in self._endpoints:
-                _check_endpoint(self.topic, endpoint)
+            for source in self._sources:
+                _check_endpoint(topic, source.endpoint)
+                if self._keys is not None and self.host is not None:
+                    self._keys.seek(self._socket, self.host)
+                else:
+                    _refuse_beyond_loopback(topic, source.endpoint)
                 try:
-                    self._socket.connect(endpoint)
+                    self._socket.connect(source.endpoint)
                 except zmq.ZMQError as error:
                     raise BusError(
-                        f'topic "{self.topic.name}": cannot connect to {endpoint}: {error.strerror}'
+                        f'topic "{topic.name}": cannot connect to {source.endpoint}: '
+                        f"{error.strerror}"
                     ) from error
         except BaseException:
             self._socket.close(linger=0)
@@ -192,7 +448,6 @@ class Subscriber:
         self._loop.call_soon(self._read)
 
     def close(self) -> None:
-        """Stop at once; may be called from the handler."""
         if self._socket is not None and not self._socket.closed:
             if self._loop is not None and not self._loop.is_closed():
                 self._loop.remove_reader(self._socket.fileno())
@@ -223,10 +478,12 @@ class Subscriber:
             if frames is None:
                 drained = True
                 break
-            envelope = self._accept(frames)
+            envelope = self._subscriber.accept(frames, self._writers)
             if envelope is not None:
                 # Taken out first, so that the order is that of arrival.
-                self._counts.dropped += newest.pop(envelope.header.writer, None) is not None
+                self._subscriber.counts.dropped += (
+                    newest.pop(envelope.header.writer, None) is not None
+                )
                 newest[envelope.header.writer] = envelope
         for envelope in newest.values():
             self._deliver(envelope)
@@ -237,12 +494,16 @@ class Subscriber:
             frames = self._receive()
             if frames is None:
                 return True
-            envelope = self._accept(frames)
+            envelope = self._subscriber.accept(frames, self._writers)
             if envelope is not None and self._unopened:
-                self._call(frames, envelope.header)
+                self._subscriber.call(frames, envelope.header)
             elif envelope is not None:
                 self._deliver(envelope)
         return False
+
+    def _deliver(self, envelope: Envelope) -> None:
+        if self._socket is not None and not self._socket.closed:
+            self._subscriber.deliver(envelope)
 
     def _has_more(self) -> bool:
         if self._socket is None or self._socket.closed:
@@ -264,57 +525,6 @@ class Subscriber:
             frames.append(frame)
         return frames
 
-    def _accept(self, frames: list[Any]) -> Envelope | None:
-        """The envelope, its sequence number accounted for; None if refused or seen before."""
-        try:
-            envelope = read_envelope(frames, self.topic)
-        except WireError as error:
-            self._reject(error)
-            return None
-        header = envelope.header
-        epoch, last = self._seen.get(header.writer, (None, 0))
-        if epoch == header.epoch:
-            if header.sequence <= last:
-                return None
-            if header.sequence > last + 1:
-                self._count_gap(header.sequence - last - 1, header.writer)
-        self._seen[header.writer] = (header.epoch, header.sequence)
-        return envelope
-
-    def _deliver(self, envelope: Envelope) -> None:
-        if self._socket is None or self._socket.closed:
-            return
-        try:
-            message = envelope.open()
-        except WireError as error:
-            self._reject(error)
-            return
-        self._call(message, envelope.header)
-
-    def _call(self, message: Any, header: Header) -> None:
-        try:
-            self._on_message(message, header)
-        except Exception as error:
-            _log.exception("handler of topic %s failed", self.topic.name)
-            self._on_problem(
-                f'topic "{self.topic.name}": handler failed: {type(error).__name__}: {error}'
-            )
-
-    def _reject(self, error: WireError) -> None:
-        self._counts.rejected += 1
-        if error.cause not in self._reported_causes:
-            self._reported_causes.add(error.cause)
-            self._on_problem(f'topic "{self.topic.name}": message refused: {error}')
-
-    def _count_gap(self, lost: int, writer: str) -> None:
-        self._counts.gaps += lost
-        if not self._newest_only and self._counts.gaps >= self._report_gaps_from:
-            self._report_gaps_from = 2 * self._counts.gaps
-            self._on_problem(
-                f'topic "{self.topic.name}": {lost} messages of {writer} lost, '
-                f"{self._counts.gaps} in all; a reader or the network is too slow"
-            )
-
 
 def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
     opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
@@ -323,13 +533,18 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.SNDHWM: length,
         zmq.RCVHWM: length,
         zmq.LINGER: LINGER_MS,
-        # A larger frame makes ZeroMQ give the endpoint up, for good and without a word.  So what is
-        # merely too large is let in, to be refused and counted; this limit saves the memory.
-        zmq.MAXMSGSIZE: topic.max_bytes + REFUSABLE_BYTES,
         zmq.RECONNECT_IVL: 20,
         zmq.RECONNECT_IVL_MAX: 500,
+        # Whoever connects and says nothing is not kept.
+        zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     }
-    if kind != zmq.SUB:
+    if kind == zmq.SUB:
+        # A larger frame makes ZeroMQ give the endpoint up, for good and without a word.  So what is
+        # merely too large is let in, to be refused and counted; this limit saves the memory.
+        options[zmq.MAXMSGSIZE] = topic.max_bytes + REFUSABLE_BYTES
+    else:
+        # A publisher is sent subscriptions and handshakes: a stranger shall not fill the memory.
+        options[zmq.MAXMSGSIZE] = SUBSCRIPTION_BYTES
         # Publishers ask, and tell subscribers to expect it.  A subscriber must not ask by itself:
         # libzmq 4.3.5 aborts the process when its heartbeat comes due after a publisher has gone
         # whose messages still fill the queue.
@@ -343,9 +558,11 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
     return opened
 
 
-def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str) -> str:
+def _bind(opened: zmq.Socket[bytes], topic: Topic, endpoint: str, *, keys: KeyRing | None) -> str:
     """Bind and return the endpoint with its port filled in."""
     _check_endpoint(topic, endpoint)
+    if keys is None:
+        _refuse_beyond_loopback(topic, endpoint)
     patience_ends = time.monotonic() + BIND_PATIENCE_S
     while True:
         try:
@@ -384,6 +601,23 @@ def _check_endpoint(topic: Topic, endpoint: str) -> None:
     if transport not in ("tcp", "ipc"):
         raise BusError(
             f'topic "{topic.name}": {endpoint} is neither ipc:///path nor tcp://host:port'
+        )
+
+
+def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
+    """Nothing speaks beyond this machine without keys."""
+    transport, _, place = endpoint.partition("://")
+    if transport != "tcp":
+        return
+    address = place.rpartition(":")[0].strip("[]")
+    try:
+        inside = ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        inside = False
+    if not inside:
+        raise BusError(
+            f'topic "{topic.name}": {endpoint} is beyond loopback and there are no keys; '
+            "make them: flexsheet keys new"
         )
 
 

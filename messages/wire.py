@@ -1,11 +1,11 @@
 """How a message looks on a socket and in a bag: a header frame, then large arrays as raw frames.
 
-The header frame is one msgpack array of ten elements:
+The header frame is one msgpack array of eleven elements:
 
-    protocol     "flexsheet/1"
+    protocol     "flexsheet/2"
     type         name of the message's class
     fingerprint  8 bytes of its JSON Schema's hash, see `messages.base.schema_fingerprint`
-    sequence, source_ns, publish_ns, clock_id, writer, epoch      see `messages.base.Header`
+    sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
     fields       a map; parts are maps, tuples are arrays, numpy arrays are extension types:
                  type 1  dtype and shape, then the elements (an array of at most 1 KiB)
                  type 2  dtype and shape only; the elements are the next frame
@@ -17,7 +17,8 @@ aligned.  Elements are little-endian and in C order.
 Large arrays are neither copied by `encode` nor by `decode`: a sender must leave an array alone once
 it is in a message, and a receiver gets read-only views on the memory that came from the socket.
 Small ones are cheaper to copy than to send apart (`benchmarks/messaging.py` measures both).
-Equal messages with equal headers have equal bytes.
+Equal messages with equal headers have equal bytes.  "flexsheet/1", which old bags hold, is the same
+without `plan`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from messages.topics import Topic
 Buffer: TypeAlias = bytes | memoryview
 M = TypeVar("M", bound=Message)
 
-PROTOCOL = "flexsheet/1"
+PROTOCOL = "flexsheet/2"
+ELEMENTS = {PROTOCOL: 11, "flexsheet/1": 10}
 DTYPES = tuple(
     np.dtype(name)
     for name in ("|b1", "|u1", "|i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f4", "<f8")
@@ -57,7 +59,8 @@ _extension = tuple.__new__
 class WireError(ValueError):
     """Bytes that are not the message that was expected, or a message that has no bytes.
 
-    `cause` is a word for counting: "malformed", "type", "fingerprint", "frames", "size" or "field".
+    `cause` is a word for counting: "malformed", "type", "fingerprint", "frames", "size" or "field";
+    a subscriber refuses more: "writer", "plan", "replayed" or "forbidden".
     """
 
     def __init__(self, cause: str, text: str) -> None:
@@ -117,6 +120,7 @@ def encode(
                 header.clock_id,
                 header.writer,
                 header.epoch,
+                header.plan,
                 message.__dict__,
             ),
             default=pack,
@@ -156,15 +160,15 @@ def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Env
     else:
         codec = codec_of(expected)
     unpacked = _unpack(frames)
-    if type(unpacked) is not tuple or len(unpacked) != 10:
-        raise WireError("malformed", "not a message of flexsheet: no header of ten elements")
-    protocol, name, fingerprint, sequence, source, publish, clock_id, writer, epoch, fields = (
-        unpacked
-    )
-    if protocol != PROTOCOL:
+    if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
+        raise WireError("malformed", "not a message of flexsheet: no header of eleven elements")
+    protocol, name, fingerprint, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
+    if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
         raise WireError(
             "malformed", f"speaks {_shown(protocol)}, wanted {PROTOCOL}: not a flexsheet node?"
         )
+    plan = unpacked[9] if len(unpacked) == 11 else ""
+    fields = unpacked[-1]
     if name != codec.name:
         raise WireError("type", f"carries {_shown(name)}, wanted {codec.name}")
     if fingerprint != codec.fingerprint:
@@ -176,12 +180,13 @@ def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Env
     for number in (sequence, source, publish, epoch):
         if type(number) is not int or not 0 <= number <= _MAX_INTEGER:
             raise WireError("malformed", f"a stamp or number in the header is {_shown(number)}")
-    for text in (clock_id, writer):
+    for text in (clock_id, writer, plan):
         if type(text) is not str or len(text) > NAME_LENGTH:
             raise WireError("malformed", f"a name in the header is {_shown(text)}")
     if type(fields) is not dict:
         raise WireError("malformed", f"the fields of {codec.name} are {_shown(fields)}")
-    return Envelope(codec, Header(sequence, source, publish, clock_id, writer, epoch), fields)
+    header = Header(sequence, source, publish, clock_id, writer, epoch, plan)
+    return Envelope(codec, header, fields)
 
 
 @overload

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import random
 import traceback
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
@@ -117,10 +116,13 @@ class Input(Generic[M]):
 class Output(Generic[M]):
     """A published topic: numbers and stamps each message."""
 
-    def __init__(self, topic: Topic, clock: Clock, send: Send, writer: str, epoch: int) -> None:
+    def __init__(
+        self, topic: Topic, clock: Clock, send: Send, *, writer: str, epoch: int, plan: str
+    ) -> None:
         self.topic = topic
         self.counts = PortCounts()
-        self._clock, self._send, self._writer, self._epoch = clock, send, writer, epoch
+        self._clock, self._send = clock, send
+        self._writer, self._epoch, self._plan = writer, epoch, plan
 
     def publish(self, message: M, *, source_ns: int | None = None) -> Header:
         """Send `message`; `source_ns` is the stamp of what it derives from (default: now)."""
@@ -132,6 +134,7 @@ class Output(Generic[M]):
             clock_id=self._clock.id,
             writer=self._writer,
             epoch=self._epoch,
+            plan=self._plan,
         )
         self.counts.count(header, now_ns)
         self._send(self.topic, message, header)
@@ -225,7 +228,7 @@ class Node:
     ) -> None:
         """`topics` connects ports to topics of other names: {"arm": "arm_left"}.
 
-        `epoch` tells one start of the node from another; drawn at random unless a replay gives it.
+        `epoch` tells one start of the node from another; when it starts, unless a replay gives it.
         """
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash
@@ -238,7 +241,7 @@ class Node:
         self.note = ""
         self.started_ns = clock.now_ns()
         if epoch is None:
-            epoch = random.SystemRandom().getrandbits(32)
+            epoch = self.started_ns
         for port in ports_of(type(self)).values():
             topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
@@ -250,7 +253,9 @@ class Node:
                 self.inputs[port.name] = Input(topic, clock)
                 setattr(self, port.name, self.inputs[port.name])
             else:
-                self.outputs[port.name] = Output(topic, clock, send, name, epoch)
+                self.outputs[port.name] = Output(
+                    topic, clock, send, writer=name, epoch=epoch, plan=plan_hash
+                )
                 setattr(self, port.name, self.outputs[port.name])
         self._mailboxes = {
             port: Mailbox(self, port)

@@ -11,6 +11,8 @@ import gc
 import os
 import signal
 import sys
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,29 +22,38 @@ import uvloop
 from pydantic import BaseModel, ConfigDict
 
 from messages.base import Header, Message
-from messages.bus import Publisher, Subscriber
+from messages.bus import Objection, Publisher, Source, Subscriber
 from messages.clock import SystemClock
+from messages.security import KeyRing, SecurityError
 from messages.topics import Delivery, Topic, topic_named
-from messages.types import Status
+from messages.types import EStop, Status
 from nodes import node_class
-from nodes.node import Node, Timer, parameters_of, timers_of
+from nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
 
 STATUS_PERIOD_S = 1.0
 CANCEL_AGAIN_S = 0.2
+KEYS_PERIOD_S = 1.0
 
 
 class PortConfig(BaseModel):
-    """One port of a node: the topic it is connected to and where (ZeroMQ endpoints)."""
+    """One port of a node: the topic it is connected to and where.
+
+    endpoints: ZeroMQ's; those of an input may say who writes there.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     port: str
     topic: str
-    endpoints: tuple[str, ...]
+    endpoints: tuple[str | Source, ...]
 
 
 class NodeConfig(BaseModel):
-    """All that one node's process needs to know."""
+    """All that one node's process needs to know.
+
+    keys_file: of a `KeyRing`, where there are keys.
+    estop_resetters: writers that may reset an e-stop; None: all.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -53,6 +64,8 @@ class NodeConfig(BaseModel):
     outputs: tuple[PortConfig, ...]
     plan_hash: str
     run_dir: str
+    keys_file: Path | None = None
+    estop_resetters: tuple[str, ...] | None = None
     ready_fd: int | None = None
 
 
@@ -61,14 +74,30 @@ class Links:
 
     def __init__(self, config: NodeConfig, log: Any) -> None:
         self._config, self._log = config, log
+        self.keys = None if config.keys_file is None else KeyRing(config.keys_file)
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: list[Subscriber] = []
+        self._keys_problem = ""
 
-    def open_outputs(self) -> None:
+    def open_outputs(self, node: Node) -> None:
         for output in self._config.outputs:
             if output.endpoints:
                 topic = topic_named(output.topic)
-                self._publishers[topic.name] = Publisher(topic, output.endpoints)
+                endpoints = [str(one) for one in output.endpoints]
+                refused = self._refusals(node.outputs[output.port].counts, topic)
+                self._publishers[topic.name] = Publisher(
+                    topic, endpoints, keys=self.keys, on_refused=refused
+                )
+
+    def _refusals(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
+        """Counts refused connections, and tells of the 1st, 2nd, 4th, 8th, ..."""
+
+        def refused(text: str) -> None:
+            counts.rejected += 1
+            if not counts.rejected & (counts.rejected - 1):
+                self._log.warning("output", topic=topic.name, problem=text, count=counts.rejected)
+
+        return refused
 
     def open_inputs(self, node: Node) -> None:
         def deliver_to(port: str) -> Any:
@@ -81,11 +110,52 @@ class Links:
                 config.endpoints,
                 deliver_to(config.port),
                 node_input.counts,
-                on_problem=lambda text: self._log.warning("input", problem=text),
+                on_problem=partial(self._tell, node),
                 unopened=node.takes_frames,
+                keys=self.keys,
+                # How others are must be seen most of all when they are not as they should be.
+                plan=None if node_input.topic.message is Status else self._config.plan_hash,
+                objection=self._objection(node_input.topic),
             )
             subscriber.start()
             self._subscribers.append(subscriber)
+
+    def _tell(self, node: Node, text: str) -> None:
+        node.last_error = text
+        self._log.warning("input", problem=text)
+
+    def _objection(self, topic: Topic) -> Objection | None:
+        allowed = self._config.estop_resetters
+        if topic.message is not EStop or allowed is None:
+            return None
+
+        def objection(estop: EStop, header: Header) -> str | None:
+            if estop.engaged or header.writer in allowed:
+                return None
+            return (
+                f"{header.writer} may not reset an e-stop; the launch file says whose hosts may: "
+                "hosts.NAME.may_reset_estop"
+            )
+
+        return objection
+
+    def renew_keys(self) -> None:
+        """Read the keys again if they have changed, and connect anew what that concerns."""
+        if self.keys is None:
+            return
+        try:
+            change = self.keys.reload()
+        except SecurityError as error:
+            if str(error) != self._keys_problem:
+                self._keys_problem = str(error)
+                self._log.error("keys", problem=self._keys_problem)
+            return
+        if change is not None:
+            self._keys_problem = ""
+            for publisher in self._publishers.values():
+                publisher.renew_keys(change)
+            for subscriber in self._subscribers:
+                subscriber.renew_keys(change)
 
     def send(self, topic: Topic, message: Message, header: Header) -> None:
         publisher = self._publishers.get(topic.name)
@@ -112,6 +182,13 @@ async def run_timer(node: Node, timer: Timer) -> None:
         if due_s <= now_s:
             due_s += period_s * int((now_s - due_s) / period_s + 1)
         await asyncio.sleep(due_s - now_s)
+
+
+async def run_keys(links: Links) -> None:
+    """Look once a second whether keys have changed."""
+    while True:
+        await asyncio.sleep(KEYS_PERIOD_S)
+        links.renew_keys()
 
 
 async def run_status(node: Node, process: psutil.Process) -> None:
@@ -165,7 +242,7 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
     process = psutil.Process()
     tasks: list[asyncio.Task[Any]] = []
     try:
-        links.open_outputs()
+        links.open_outputs(node)
         await node.setup()
     except BaseException:
         links.close()
@@ -175,6 +252,8 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         tasks = [asyncio.create_task(run_timer(node, timer)) for timer in timers_of(class_)]
         tasks.append(asyncio.create_task(run_status(node, process)))
         tasks.append(asyncio.create_task(stop.wait()))
+        if links.keys is not None:
+            tasks.append(asyncio.create_task(run_keys(links)))
         # What setup built lives on; without this the collector walks it in the middle of a cycle.
         gc.collect()
         gc.freeze()

@@ -178,7 +178,7 @@ def test_other_tools_can_read_it(whole: Path) -> None:
         assert schema is not None
         assert schema.encoding == "jsonschema"
         assert b"velocity_world_m_per_s" in schema.data
-        assert channel.message_encoding == "flexsheet/1"
+        assert channel.message_encoding == "flexsheet/2"
         assert message.publish_time == 10
         assert message.sequence == 1
 

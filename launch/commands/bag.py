@@ -187,8 +187,9 @@ async def _record(
     bag: Path, topics: list[str], plan: Plan, run: Run, duration_s: float | None
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
-    from launch.plan import RUN_DIRECTORY
-    from launch.supervisor import local_endpoints
+    from launch.keys import ring_file
+    from launch.plan import MAIN, RUN_DIRECTORY
+    from launch.supervisor import local_sources
     from messages.topics import TOPICS
     from nodes.recorder.node import RUN_FILES, Recorder, RecorderParameters
     from nodes.runner import NodeConfig, PortConfig, run_node
@@ -211,12 +212,13 @@ async def _record(
             PortConfig(
                 port=f"in/{name}",
                 topic=name,
-                endpoints=local_endpoints(run, plan.endpoints_to_read(name)),
+                endpoints=local_sources(run, plan.sources_to_read(name)),
             )
             for name in wanted
         ),
         outputs=(),
         plan_hash=plan.hash,
+        keys_file=ring_file(run, MAIN) if plan.keys else None,
         run_dir=str(run.directory),
     )
     stop = asyncio.Event()

@@ -192,10 +192,8 @@ async def _watch(
     import asyncio
     import time
 
-    from launch.commands.topic import endpoints_of
-    from messages.bus import Subscriber
+    from launch.commands.topic import listener
     from messages.topics import TOPICS
-    from nodes.node import PortCounts
 
     pictures: asyncio.Queue[tuple[Any, float]] = asyncio.Queue(maxsize=1)
 
@@ -208,13 +206,7 @@ async def _watch(
         taker.see_joints(state.joints_rad, time.monotonic())
 
     subscribers = [
-        Subscriber(
-            TOPICS[name],
-            endpoints_of(TOPICS[name], run),
-            handler,
-            PortCounts(),
-            on_problem=lambda text: words.print(text, markup=False),
-        )
+        listener(TOPICS[name], run, handler)
         for name, handler in ((arm, on_arm), ("stereo", on_stereo))
     ]
     said = ""

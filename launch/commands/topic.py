@@ -27,6 +27,7 @@ from launch.commands.output import (
 
 if TYPE_CHECKING:
     from messages.base import Header, Message
+    from messages.bus import Handler, Subscriber
     from messages.topics import Topic
 
 app = typer.Typer(no_args_is_help=True, help="Topics: the table, and what is on them now.")
@@ -299,18 +300,8 @@ def _field(message: Message, path: str | None, topic: str) -> Any:
 async def _read(
     topic: Topic, run: Path | None, show: Any, wanted: int | None, timeout_s: float | None
 ) -> int:
-    from messages.bus import Subscriber
-    from nodes.node import PortCounts
-
-    endpoints = endpoints_of(topic, run)
     arrived: asyncio.Queue[tuple[Any, Any]] = asyncio.Queue()
-    subscriber = Subscriber(
-        topic,
-        endpoints,
-        lambda message, header: arrived.put_nowait((message, header)),
-        PortCounts(),
-        on_problem=lambda text: words.print(text, markup=False),
-    )
+    subscriber = listener(topic, run, lambda message, header: arrived.put_nowait((message, header)))
     subscriber.start()
     try:
         shown = 0
@@ -330,17 +321,7 @@ async def _read(
 async def _collect_headers(
     topic: Topic, run: Path | None, headers: list[Header], duration_s: float
 ) -> int:
-    from messages.bus import Subscriber
-    from nodes.node import PortCounts
-
-    subscriber = Subscriber(
-        topic,
-        endpoints_of(topic, run),
-        lambda _, header: headers.append(header),
-        PortCounts(),
-        on_problem=lambda text: words.print(text, markup=False),
-        unopened=True,
-    )
+    subscriber = listener(topic, run, lambda _, header: headers.append(header), unopened=True)
     subscriber.start()
     try:
         await asyncio.sleep(duration_s)
@@ -349,15 +330,23 @@ async def _collect_headers(
     return 0
 
 
-def endpoints_of(topic: Topic, run_directory: Path | None) -> tuple[str, ...]:
-    """Where the graph that runs writes the topic; CommandError when nothing does."""
-    from launch.supervisor import local_endpoints
+def listener(
+    topic: Topic, run_directory: Path | None, handler: Handler, *, unopened: bool = False
+) -> Subscriber:
+    """A subscriber to the topic in the graph that runs; CommandError when nothing writes it."""
+    from launch.tools import subscriber_to
 
     plan, run = running_graph(run_directory)
-    endpoints = plan.endpoints_to_read(topic.name)
-    if not endpoints:
+    if not plan.endpoints_to_read(topic.name):
         raise CommandError(f'nobody writes "{topic.name}" in the graph that runs ({run.directory})')
-    return local_endpoints(run, endpoints)
+    return subscriber_to(
+        topic.name,
+        plan,
+        run,
+        handler,
+        on_problem=lambda text: words.print(text, markup=False),
+        unopened=unopened,
+    )
 
 
 def _parse_message(topic: Topic, text: str) -> Message:

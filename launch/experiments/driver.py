@@ -17,11 +17,9 @@ import numpy as np
 from launch.experiments import ExperimentError
 from launch.plan import TOOLS, Plan
 from launch.runs import Run
-from launch.supervisor import local_endpoints
-from launch.tools import ToolsWriter
+from launch.tools import ToolsWriter, subscriber_to
 from messages.base import Header, Message
 from messages.bus import Subscriber
-from messages.topics import topic_named
 from messages.types import (
     ArmState,
     Correction,
@@ -33,7 +31,6 @@ from messages.types import (
     TwinEye,
     TwinFinger,
 )
-from nodes.node import PortCounts
 
 READ = ("twin/finger", "twin/eye", "sheet_target", "arm_left", "arm_right", "soft_body", "status")
 WRITTEN = ("twin/finger_path", "display")
@@ -63,11 +60,11 @@ class Driver:
     async def __aenter__(self) -> Self:
         self._writer = ToolsWriter(self._plan, self._run, WRITTEN)
         for name in READ:
-            subscriber = Subscriber(
-                topic_named(name),
-                local_endpoints(self._run, self._plan.endpoints_to_read(name)),
+            subscriber = subscriber_to(
+                name,
+                self._plan,
+                self._run,
                 self._handler(name),
-                PortCounts(),
                 on_problem=self._note_problem,
             )
             subscriber.start()

@@ -8,6 +8,7 @@ Modern Robotics, ch. 4), inverse kinematics Gauss-Newton on it.
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import logging
 import math
 import struct
@@ -52,6 +53,16 @@ LATE_S = 0.05
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 CONTROLLER_CYCLE_S = 0.0071
+
+
+def refuse_beyond_loopback(address: str) -> str:
+    """An address that this computer alone reaches; ValueError: an arm obeys whoever reaches it."""
+    if not ipaddress.ip_address(address).is_loopback:
+        raise ValueError(
+            f"{address} is beyond loopback, and whoever reaches an arm's server moves the arm"
+        )
+    return address
+
 
 # Screw axes at the zero pose (all frames parallel to the base): direction, and a point on the axis.
 _AXES = np.array(

@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from messages.base import Header
 from messages.scene import ArmSpec, NonNegative, Positive, Scene
 from messages.types import TwinArms
 from nodes.models.rigid import inverse, transform, transform_from_rpy
 from nodes.node import Input, Node, NodeParameters, Output, periodic
-from nodes.twin.arms import ArmServer, Controller, Fault, Floats, forward, joints_for
+from nodes.twin.arms import (
+    ArmServer,
+    Controller,
+    Fault,
+    Floats,
+    forward,
+    joints_for,
+    refuse_beyond_loopback,
+)
 from nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
+
+Loopback = Annotated[str, AfterValidator(refuse_beyond_loopback)]
 
 START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
 class TwinArmsParameters(NodeParameters):
-    host: str = "127.0.0.1"
+    host: Loopback = "127.0.0.1"
     left_port: int = Field(default=5020, ge=0, le=65535, description="0: any free one")
     right_port: int = Field(default=5021, ge=0, le=65535)
     rate_hz: Positive = 140.8

@@ -1,0 +1,108 @@
+"""`flexsheet keys`: make this host's key pair, show it, put public keys into a launch file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import BAD_INPUT, FAILED, CommandError, print_json, print_table, words
+
+app = typer.Typer(no_args_is_help=True, help="Keys between hosts: one pair per host.")
+
+HostArgument = Annotated[str, typer.Argument(metavar="HOST", help="Its name in the launch file.")]
+
+
+@app.command()
+def new(
+    host: HostArgument,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Over the key that is there, which is then lost.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a host's key pair, on that host; prints the public key.
+
+    The secret key stays in a file that its owner alone may read.
+    """
+    import re
+
+    from launch.keys import secret_file
+    from messages.security import SecurityError, new_key_pair, write_secret
+
+    if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
+        raise CommandError(f'"{host}" is no name of a host: small letters, digits, _', BAD_INPUT)
+    public, secret = new_key_pair()
+    file = secret_file(host)
+    try:
+        write_secret(file, secret, replace=replace)
+    except SecurityError as error:
+        raise CommandError(str(error)) from error
+    words.print(f"the secret key is {file}; it stays on this computer", markup=False)
+    words.print(
+        f"on every computer: flexsheet keys install LAUNCH_FILE {host} '{public}'", markup=False
+    )
+    if as_json:
+        print_json({"host": host, "public": public, "secret_file": str(file)})
+    else:
+        print(public)
+
+
+@app.command()
+def show(
+    host: Annotated[str | None, typer.Argument(metavar="HOST", help="Without it: all.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Print the public keys whose secret halves are here; exit code 1 where one cannot be used."""
+    from launch.keys import directory, secret_file
+    from messages.security import SecurityError, public_of, read_secret
+
+    files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
+    if not files:
+        raise CommandError(f"there are no keys in {directory()}; make one: flexsheet keys new HOST")
+    rows = []
+    problems = []
+    for file in files:
+        try:
+            public = public_of(read_secret(file))
+            rows.append({"host": file.stem, "public": public, "secret_file": str(file)})
+        except SecurityError as error:
+            problems.append(str(error))
+    if as_json:
+        print_json({"keys": rows, "problems": problems})
+    elif host and rows:
+        print(rows[0]["public"])
+    elif rows:
+        columns = ("host", "public", "secret_file")
+        print_table(columns, [tuple(row[name] for name in columns) for row in rows])
+    for problem in problems:
+        words.print(problem, markup=False)
+    if problems:
+        raise typer.Exit(FAILED)
+
+
+@app.command()
+def install(
+    file: Annotated[Path, typer.Argument(metavar="LAUNCH_FILE", help="The same on every host.")],
+    host: HostArgument,
+    key: Annotated[
+        str | None, typer.Argument(metavar="KEY", help="Without it: the one made here.")
+    ] = None,
+) -> None:
+    """Put a host's public key into a launch file.
+
+    A graph that runs from that file takes it over within two seconds, without a restart.
+    """
+    from launch.keys import install as install_key
+    from launch.keys import secret_file
+    from messages.security import SecurityError, public_of, read_secret
+
+    if key is None:
+        try:
+            key = public_of(read_secret(secret_file(host)))
+        except SecurityError as error:
+            raise CommandError(str(error)) from error
+    install_key(file, host, key)
+    words.print(f"{file}: hosts.{host}.key is {key}", markup=False)
