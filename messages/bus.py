@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import zmq
+from zmq.utils.monitor import parse_monitor_message
 
 from messages.base import Header, Message
 from messages.security import Gatekeeper, KeyChange, KeyRing
@@ -52,9 +53,19 @@ IPC_CLOSING_S = 0.02
 REFUSABLE_BYTES = 256 << 20
 SUBSCRIPTION_BYTES = 1 << 16
 HANDSHAKE_MS = 5000
+GIVEN_UP_S = 0.5
 CLOCKS_REMEMBERED = 16
 
 _log = logging.getLogger("flexsheet.bus")
+
+
+HANDSHAKE_FAILED: dict[int, str] = {
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: "refuses our key; is it the one in its launch file?",
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not speak with our keys; does it run without any?",
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: "did not prove that it has its key",
+}
+COMING_BACK = (zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECT_RETRIED)
+WATCHED = zmq.EVENT_DISCONNECTED | sum(COMING_BACK) | sum(HANDSHAKE_FAILED)
 
 
 class BusError(RuntimeError):
@@ -408,7 +419,10 @@ class _Line:
         known = [one.writer for one in sources if one.writer is not None]
         self._writers = frozenset(known) if len(known) == len(sources) > 0 else None
         self._socket: zmq.Socket[bytes] | None = None
+        self._monitor: zmq.Socket[bytes] | None = None
         self._loop: asyncio.AbstractEventLoop | None = None
+        self._told: set[int] = set()
+        self._lost: set[bytes] = set()
 
     @property
     def closed(self) -> bool:
@@ -426,6 +440,10 @@ class _Line:
         self._socket = _open_socket(zmq.SUB, topic)
         try:
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
+            if self.secured:
+                self._monitor = self._socket.get_monitor_socket(WATCHED)
+                self._loop.add_reader(self._monitor.fileno(), self._hear_of_connections)
+                self._loop.call_soon(self._hear_of_connections)
             for source in self._sources:
                 _check_endpoint(topic, source.endpoint)
                 if self._keys is not None and self.host is not None:
@@ -440,18 +458,54 @@ class _Line:
                         f"{error.strerror}"
                     ) from error
         except BaseException:
-            self._socket.close(linger=0)
-            self._socket = None
+            self.close()
             raise
         self._loop.add_reader(self._socket.fileno(), self._read)
         # The calls above may have swallowed the first wake-up.
         self._loop.call_soon(self._read)
 
     def close(self) -> None:
-        if self._socket is not None and not self._socket.closed:
-            if self._loop is not None and not self._loop.is_closed():
-                self._loop.remove_reader(self._socket.fileno())
-            self._socket.close(linger=0)
+        if self._socket is None or self._socket.closed:
+            return
+        opened = [one for one in (self._socket, self._monitor) if one is not None]
+        if self._loop is not None and not self._loop.is_closed():
+            for one in opened:
+                self._loop.remove_reader(one.fileno())
+        if self._monitor is not None:
+            self._socket.disable_monitor()
+            self._monitor = None
+        for one in opened:
+            one.close(linger=0)
+        self._lost.clear()
+
+    def _hear_of_connections(self) -> None:
+        """The loop's callback: where ZeroMQ gives a connection up, make it anew by and by.
+
+        It does so where keys were refused, and where what came was not what the other end sent.
+        """
+        while self._monitor is not None:
+            try:
+                news = parse_monitor_message(self._monitor.recv_multipart(zmq.NOBLOCK))
+            except zmq.Again:
+                break
+            event, endpoint = int(news["event"]), bytes(news["endpoint"])
+            if event in COMING_BACK:
+                self._lost.discard(endpoint)
+                continue
+            self._lost.add(endpoint)
+            if self._loop is not None:
+                self._loop.call_later(GIVEN_UP_S, self._reopen, self._socket)
+            if event in HANDSHAKE_FAILED and event not in self._told:
+                self._told.add(event)
+                self._subscriber.on_problem(
+                    f'topic "{self._subscriber.topic.name}": host {self.host} '
+                    f"{HANDSHAKE_FAILED[event]}"
+                )
+
+    def _reopen(self, lost: zmq.Socket[bytes] | None) -> None:
+        if lost is self._socket and self._lost and not self.closed:
+            self.close()
+            self.open()
 
     def _read(self) -> None:
         """The loop's callback: deliver what is there, or a batch of it and come back."""

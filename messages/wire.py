@@ -183,6 +183,8 @@ def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Env
     for text in (clock_id, writer, plan):
         if type(text) is not str or len(text) > NAME_LENGTH:
             raise WireError("malformed", f"a name in the header is {_shown(text)}")
+    if not (clock_id and writer):
+        raise WireError("malformed", "neither clock nor writer may be without a name")
     if type(fields) is not dict:
         raise WireError("malformed", f"the fields of {codec.name} are {_shown(fields)}")
     header = Header(sequence, source, publish, clock_id, writer, epoch, plan)

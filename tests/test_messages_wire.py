@@ -94,9 +94,8 @@ statuses = st.builds(
 stops = st.builds(EStop, engaged=st.booleans(), reason=st.text(max_size=50))
 messages = st.one_of(fingertips, stereo_pairs, skins, statuses, stops)
 numbers = st.integers(0, 2**63 - 1)
-headers = st.builds(
-    Header, numbers, numbers, numbers, st.text(max_size=40), st.text(max_size=40), numbers
-)
+names = st.text(min_size=1, max_size=40)
+headers = st.builds(Header, numbers, numbers, numbers, names, names, numbers, st.text(max_size=40))
 
 
 def frame_with_pixels(count: int) -> Frame:
@@ -228,9 +227,9 @@ def test_right_header_with_foreign_parts(data: st.DataObject) -> None:
     }
     if data.draw(st.booleans()):
         fields[data.draw(st.sampled_from(sorted(Fingertip.model_fields)))] = data.draw(packable)
-    head: list[object] = [PROTOCOL, codec.name, codec.fingerprint, 1, 2, 3, "c", "w", 4, fields]
+    head: list[object] = [PROTOCOL, codec.name, codec.fingerprint, 1, 2, 3, "c", "w", 4, "", fields]
     if data.draw(st.booleans()):
-        head[data.draw(st.integers(0, 9))] = data.draw(packable)
+        head[data.draw(st.integers(0, 10))] = data.draw(packable)
     refused([msgpack.packb(head), *data.draw(st.lists(st.binary(max_size=100), max_size=2))])
 
 
@@ -282,7 +281,7 @@ def test_causes_are_told_apart() -> None:
     head[2] = bytes(8)
     assert refused([msgpack.packb(head)], EStop).cause == "fingerprint"
     head = msgpack.unpackb(good[0])
-    head[9] = {"engaged": True, "reason": "x", "colour": 1}
+    head[10] = {"engaged": True, "reason": "x", "colour": 1}
     extra = refused([msgpack.packb(head)], EStop)
     assert extra.cause == "field"
     assert "EStop.colour" in str(extra)

@@ -1,0 +1,59 @@
+"""Hosts with keys, for tests: their secret files and rings in a folder."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from messages.security import (
+    KeyRing,
+    new_key_pair,
+    public_of,
+    read_secret,
+    write_ring,
+    write_secret,
+)
+
+
+class Hosts:
+    """Key pairs of named hosts; `ring` is what a host's processes have, `stranger` is in none."""
+
+    def __init__(self, folder: Path, *names: str) -> None:
+        self.folder, self.names = folder, names
+        for name in (*names, "stranger"):
+            self.make_key(name)
+        self.public = {name: self.public_of(name) for name in names}
+
+    def secret_file(self, name: str) -> Path:
+        return self.folder / f"{name}.secret"
+
+    def public_of(self, name: str) -> str:
+        return public_of(read_secret(self.secret_file(name)))
+
+    def make_key(self, name: str) -> str:
+        public, secret = new_key_pair()
+        write_secret(self.secret_file(name), secret, replace=True)
+        return public
+
+    def ring_file(self, name: str) -> Path:
+        return self.folder / f"keys-{name}.json"
+
+    def ring(self, name: str) -> KeyRing:
+        """A stranger's ring holds himself beside the others: he says so, they do not."""
+        file = self.ring_file(name)
+        public = self.public if name in self.names else self.public | {name: self.public_of(name)}
+        write_ring(file, host=name, secret_file=self.secret_file(name), public=public)
+        return KeyRing(file)
+
+
+@contextmanager
+def hosts(*names: str) -> Iterator[Hosts]:
+    """Hosts in a folder with a short path."""
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    try:
+        yield Hosts(folder, *names)
+    finally:
+        shutil.rmtree(folder)

@@ -1,0 +1,447 @@
+"""Nobody is heard who should not be: strangers, forgers, replays, garbage."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+import socket
+from collections import Counter
+from collections.abc import AsyncIterator, Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import pytest_asyncio
+
+from messages import bus
+from messages.base import Header, Message
+from messages.bus import BusError, Publisher, Source, Subscriber
+from messages.security import KeyChange, KeyRing, SecurityError
+from messages.topics import TOPICS, Topic
+from messages.types import EStop, SheetTarget
+from messages.wire import encode
+from nodes.node import PortCounts
+from nodes.runner import Links, NodeConfig
+from tests.hosts import Hosts, hosts
+from tests.test_messages_bus import finger, pictures, stop
+
+PLAN = "0123456789abcdef"
+ESTOP, FINGER = TOPICS["estop"], TOPICS["twin/finger"]
+HEADER = Header(7, 7_000, 7_001, "main-0001", "planner", 500, PLAN)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+@dataclass
+class Ear:
+    """A subscriber's record."""
+
+    heard: list[tuple[Any, Header]] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+    counts: PortCounts = field(default_factory=PortCounts)
+
+    def hear(self, message: Any, header: Header) -> None:
+        self.heard.append((message, header))
+
+    @property
+    def sequences(self) -> list[int]:
+        return [header.sequence for _, header in self.heard]
+
+
+class Street:
+    """Main publishes at a tcp endpoint of its own; anybody may try to listen or to be it."""
+
+    def __init__(self, known: Hosts) -> None:
+        self.known = known
+        self.port = free_port()
+        self.refused: list[str] = []
+        self.closers: list[Callable[[], None]] = []
+        self.rings = {name: known.ring(name) for name in (*known.names, "stranger")}
+        self.sent = 0
+
+    def mouth(self, topic: Topic = ESTOP, host: str = "main") -> Publisher:
+        publisher = Publisher(
+            topic,
+            [f"tcp://127.0.0.1:{self.port}"],
+            keys=self.rings[host],
+            on_refused=self.refused.append,
+        )
+        self.closers.append(publisher.close)
+        return publisher
+
+    def ear(
+        self, ring: KeyRing | None, topic: Topic = ESTOP, *, port: int = 0, host: str = "main"
+    ) -> Ear:
+        ear = Ear()
+        source = Source(f"tcp://127.0.0.1:{port or self.port}", "planner", host)
+        subscriber = Subscriber(
+            topic, [source], ear.hear, ear.counts, keys=ring, plan=PLAN,
+            on_problem=ear.problems.append,
+        )  # fmt: skip
+        subscriber.start()
+        self.closers.append(subscriber.close)
+        ear.subscriber = subscriber  # type: ignore[attr-defined]  # for renewing its keys
+        return ear
+
+    async def speak(self, publisher: Publisher, until_: Callable[[], object]) -> None:
+        """Publish numbered e-stops until something has come true."""
+        while not until_():
+            self.sent += 1
+            header = replace(HEADER, sequence=self.sent)
+            publisher.send(stop(str(self.sent)), header)
+            await asyncio.sleep(0.002)
+
+
+@pytest_asyncio.fixture
+async def street() -> AsyncIterator[Street]:
+    with hosts("main", "left") as known:
+        street = Street(known)
+        yield street
+        for close in reversed(street.closers):
+            close()
+
+
+async def test_a_stranger_hears_nothing_and_is_told_apart(street: Street) -> None:
+    mouth = street.mouth()
+    friend, stranger = street.ear(street.rings["left"]), street.ear(street.rings["stranger"])
+    without = street.ear(None)
+    await street.speak(mouth, lambda: friend.heard and stranger.problems and street.refused)
+    await street.speak(mouth, lambda: len(friend.heard) > 100)
+    assert (stranger.heard, without.heard) == ([], [])
+    assert "refuses our key" in stranger.problems[0]
+    assert street.known.public_of("stranger") in street.refused[0]
+
+
+@pytest.mark.parametrize("impostor", ["left", "stranger", "without"])
+async def test_only_the_host_of_the_plan_is_heard(street: Street, impostor: str) -> None:
+    """Another host, even one of the plan, sits at main's endpoint: it lacks main's key."""
+    if impostor == "without":
+        mouth: Publisher = Publisher(ESTOP, [f"tcp://127.0.0.1:{street.port}"])
+        street.closers.append(mouth.close)
+    else:
+        mouth = street.mouth(host=impostor)
+    ear = street.ear(street.rings["left"])
+    await street.speak(mouth, lambda: ear.problems)
+    await street.speak(mouth, partial(next, iter([False] * 50 + [True])))
+    assert ear.heard == []
+    mouth.close()
+    right = street.mouth()
+    await street.speak(right, lambda: ear.heard)
+
+
+async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(street: Street) -> None:
+    mouth, ear = street.mouth(), street.ear(street.rings["left"])
+    subscriber: Subscriber = ear.subscriber  # type: ignore[attr-defined]  # see Street.ear
+    await street.speak(mouth, lambda: ear.heard)
+    street.known.public["left"] = street.known.make_key("left")
+    for name in ("main", "left"):
+        street.known.ring(name)
+    change = street.rings["main"].reload()
+    assert change == KeyChange(own=False, hosts=frozenset({"left"}))
+    mouth.renew_keys(change)
+    ear.heard.clear()
+    await street.speak(mouth, lambda: ear.problems)
+    assert ear.heard == [], "the old key is refused, also on the connection that was there"
+    change = street.rings["left"].reload()
+    assert change == KeyChange(own=True, hosts=frozenset({"left"}))
+    subscriber.renew_keys(change)
+    await street.speak(mouth, lambda: ear.heard)
+    street.known.public["main"] = street.known.make_key("main")
+    for name in ("main", "left"):
+        street.known.ring(name)
+        changed = street.rings[name].reload()
+        assert changed is not None
+        (mouth if name == "main" else subscriber).renew_keys(changed)
+    ear.heard.clear()
+    await street.speak(mouth, lambda: ear.heard)
+    assert street.rings["main"].reload() is None
+
+
+async def test_an_added_host_disturbs_no_connection(street: Street) -> None:
+    mouth, ear = street.mouth(), street.ear(street.rings["left"])
+    await street.speak(mouth, lambda: ear.heard)
+    street.known.public["right"] = street.known.public_of("stranger")
+    street.known.ring("main")
+    change = street.rings["main"].reload()
+    assert change == KeyChange(own=False, hosts=frozenset())
+    mouth.renew_keys(change)
+    late = street.ear(street.rings["stranger"])
+    await street.speak(mouth, lambda: late.heard)
+    assert ear.sequences == list(range(ear.sequences[0], ear.sequences[-1] + 1))
+
+
+async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(street: Street) -> None:
+    mouth, ear = street.mouth(), street.ear(street.rings["left"])
+    await street.speak(mouth, lambda: ear.heard)
+    chance = random.Random(1)
+    greeting = b"\xff" + bytes(8) + b"\x7f\x03\x01"
+    openers = [b"", b"GET / HTTP/1.1\r\n\r\n", greeting, greeting + b"CURVE".ljust(20, b"\0")]
+    openers.append(greeting + b"NULL".ljust(20, b"\0") + bytes(32))
+    for number in range(400):
+        with socket.create_connection(("127.0.0.1", street.port)) as stranger:
+            said = openers[number % len(openers)] + chance.randbytes(chance.randrange(2000))
+            stranger.sendall(said)
+        if number % 20 == 0:
+            await street.speak(mouth, partial(next, iter([False, True])))
+    ear.heard.clear()
+    await street.speak(mouth, lambda: len(ear.heard) > 20)
+    assert ear.counts.rejected == 0
+    assert {header.writer for _, header in ear.heard} == {"planner"}
+
+
+class Meddler:
+    """On the wire between two hosts: keeps what passes, and can change, repeat or replay it."""
+
+    def __init__(self, target: int) -> None:
+        self.target = target
+        self.meddle: Callable[[bytes], bytes] = lambda data: data
+        self.kept: list[bytes] = []
+        self.connections = 0
+        self.tasks: set[asyncio.Task[None]] = set()
+
+    async def __aenter__(self) -> Meddler:
+        self.server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
+        self.port = int(self.server.sockets[0].getsockname()[1])
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.server.close()
+        for task in self.tasks:
+            task.cancel()
+        await asyncio.gather(*self.tasks, return_exceptions=True)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.connections += 1
+        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self.target)
+        for source, sink, back in ((reader, far_writer, False), (far_reader, writer, True)):
+            task = asyncio.create_task(self._pass_on(source, sink, back))
+            self.tasks.add(task)
+
+    async def _pass_on(
+        self, source: asyncio.StreamReader, sink: asyncio.StreamWriter, back: bool
+    ) -> None:
+        try:
+            while data := await source.read(1 << 16):
+                if back:
+                    self.kept.append(data)
+                    data = self.meddle(data)
+                sink.write(data)
+        except ConnectionError:
+            pass
+        sink.transport.abort()
+
+
+async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(
+    street: Street, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bus, "GIVEN_UP_S", 0.02)
+    mouth = street.mouth()
+    chance = random.Random(2)
+
+    def flip(data: bytes) -> bytes:
+        # Not in the length at the front: then it would wait for more until a heartbeat is due.
+        place = chance.randrange(len(data) // 2, len(data))
+        return data[:place] + bytes([data[place] ^ 1 << chance.randrange(8)]) + data[place + 1 :]
+
+    async with Meddler(street.port) as meddler:
+        ear = street.ear(street.rings["left"], port=meddler.port)
+        await street.speak(mouth, lambda: len(ear.heard) > 20)
+        earlier = list(meddler.kept)
+        tricks: tuple[Callable[[bytes], bytes], ...] = (
+            flip,
+            lambda data: data + data,
+            lambda data: chance.choice(earlier),
+        )
+        for trick in tricks:
+            meddler.meddle = trick
+            before = meddler.connections
+            await street.speak(mouth, lambda: meddler.connections >= before + 3)  # noqa: B023
+        meddler.meddle = lambda data: data
+        done = len(ear.heard)
+        await street.speak(mouth, lambda: len(ear.heard) > done + 5)
+    for message, header in ear.heard:
+        assert message == stop(str(header.sequence))
+    assert ear.sequences == sorted(set(ear.sequences)), "each at most once, in order"
+    assert ear.counts.rejected == 0, "ZeroMQ's own seal catches it, before any message is made"
+
+
+async def test_nothing_speaks_beyond_loopback_without_keys() -> None:
+    for address in ("192.0.2.1", "0.0.0.0", "*", "[::]", "eth0", "example.org"):
+        with pytest.raises(BusError, match="beyond loopback and there are no keys"):
+            Publisher(FINGER, [f"tcp://{address}:7777"])
+        subscriber = Subscriber(FINGER, [f"tcp://{address}:7777"], lambda *_: None, PortCounts())
+        with pytest.raises(BusError, match="beyond loopback and there are no keys"):
+            subscriber.start()
+
+
+async def test_a_host_without_a_key_in_the_plan_is_not_connected_to(street: Street) -> None:
+    with pytest.raises(SecurityError, match='host "right" has no key'):
+        street.ear(street.rings["left"], host="right")
+
+
+# In bulk, where sockets would only take time: all that a host with a good key could try.
+
+OTHERS = ("stroker", "arm_left_bridge", "tools", "", "planner ", "PLANNER", "planner\0", "é" * 50)
+
+
+def target() -> SheetTarget:
+    return SheetTarget(
+        phase="contact",
+        reason="",
+        valid_at_ns=5,
+        world_from_sheet=np.eye(4),
+        twist_world=np.zeros(6),
+        stretch_ratio=1.05,
+        contact_world_m=np.zeros(3),
+        normal_world=np.array([0.0, 0.0, 1.0]),
+        contact_sheet_m=np.zeros(2),
+        push_depth_m=0.0,
+    )
+
+
+def plain(frames: list[Any]) -> list[bytes]:
+    return [bytes(frame) for frame in frames]
+
+
+def forgeries(message: Message, chance: random.Random) -> Iterator[tuple[str, list[bytes]]]:
+    """For ever: what must not be taken by one who has heard HEADER's message; no two alike."""
+    other: Message = stop("x") if not isinstance(message, EStop) else finger(1.0)
+    good = plain(encode(message, HEADER))
+    head = msgpack.unpackb(good[0], strict_map_key=False)
+    needed = {name for name, one in type(message).model_fields.items() if one.is_required()}
+    odd: tuple[Any, ...] = (None, -1, 1.5, b"", "", [], {}, True, 2**63, float("nan"), [[]] * 9)
+
+    def packed(values: list[Any]) -> list[bytes]:
+        return [msgpack.packb(values), *good[1:]]
+
+    def with_header(**changes: Any) -> list[bytes]:
+        newer = {"sequence": chance.randrange(8, 1 << 40), "source_ns": chance.randrange(1 << 60)}
+        return plain(encode(message, replace(HEADER, **{**newer, **changes})))
+
+    while True:
+        number = chance.randrange(1 << 62)
+        yield "another writer", with_header(writer=chance.choice(OTHERS))
+        yield "a name of a writer", with_header(writer=f"planner{number}")
+        yield "another plan", with_header(plan=f"{number:016x}"[-16:])
+        yield "no plan", with_header(plan="")
+        yield "replayed", with_header(sequence=chance.randrange(0, 7))
+        yield "before the start", with_header(epoch=chance.randrange(0, 500))
+        yield "of another boot", with_header(clock_id="main-0000", epoch=number)
+        yield "of another type", plain(encode(other, replace(HEADER, sequence=number)))
+        yield "cut", [good[0][: chance.randrange(len(good[0]))], *good[1:]]
+        yield "garbage", [chance.randbytes(chance.randrange(1, 300)), *good[1:]]
+        yield "too many frames", [*with_header()[:1], *good[1:], chance.randbytes(5)]
+        yield "old protocol", packed(["flexsheet/1", *head[1:9], head[10]])
+        place = chance.randrange(len(head) - 1)
+        yield "odd header", packed([*head[:place], chance.choice(odd), *head[place + 1 :]])
+        yield "a fingerprint", packed([*head[:2], chance.randbytes(8), *head[3:]])
+        names = list(head[10])
+        wrong = dict(head[10])
+        wrong[chance.choice(names)] = chance.choice((None, [1], {"a": 1}, [None]))
+        yield "a wrong field", packed([*head[:3], number + 8, *head[4:10], wrong])
+        wrong = {**head[10], f"extra{number}": 1}
+        yield "an extra field", packed([*head[:3], number + 9, *head[4:10], wrong])
+        wrong = dict(head[10])
+        del wrong[chance.choice([name for name in names if name in needed])]
+        yield "a field less", packed([*head[:3], number + 10, *head[4:10], wrong])
+
+
+@pytest.mark.parametrize("topic", ["estop", "sheet_target", "stereo"])
+def test_of_a_hundred_thousand_forgeries_none_is_taken(topic: str) -> None:
+    message = {"estop": stop("good"), "sheet_target": target(), "stereo": pictures(3)}[topic]
+    ear = Ear()
+    subscriber = Subscriber(
+        TOPICS[topic], [], ear.hear, ear.counts, plan=PLAN, on_problem=ear.problems.append
+    )
+    writers = frozenset({"planner"})
+
+    def offer(frames: list[bytes]) -> None:
+        envelope = subscriber.accept(frames, writers)
+        if envelope is not None:
+            subscriber.deliver(envelope)
+
+    offer(plain(encode(message, replace(HEADER, clock_id="main-0000", sequence=1))))
+    offer(plain(encode(message, HEADER)))
+    assert len(ear.heard) == 2
+    tried: Counter[str] = Counter()
+    accepted: Counter[str] = Counter()
+    for kind, frames in itertools.islice(forgeries(message, random.Random(topic)), 34_000):
+        tried[kind] += 1
+        offer(frames)
+        accepted[kind] += len(ear.heard) - 2
+        del ear.heard[2:]
+    assert accepted.total() == 0, {kind: n for kind, n in accepted.items() if n}
+    assert ear.counts.rejected == tried.total() == 34_000
+    assert len(ear.problems) <= 12, "each cause is told once"
+    assert len(subscriber._seen) == 1, "nobody makes it remember more"
+    offer(plain(encode(message, replace(HEADER, sequence=2**63 - 1))))
+    assert len(ear.heard) == 3, "the true writer is heard on"
+
+
+def test_the_newest_again_is_silent_where_it_is_latched_and_a_replay_where_not() -> None:
+    for topic, message, rejected in ((ESTOP, stop("a"), 0), (FINGER, finger(1.0), 1)):
+        ear = Ear()
+        subscriber = Subscriber(topic, [], ear.hear, ear.counts, on_problem=ear.problems.append)
+        frames = plain(encode(message, HEADER))
+        assert subscriber.accept(frames, None) is not None
+        assert subscriber.accept(frames, None) is None
+        assert ear.counts.rejected == rejected
+
+
+def test_a_restart_and_a_reboot_are_followed() -> None:
+    ear = Ear()
+    subscriber = Subscriber(FINGER, [], ear.hear, ear.counts, on_problem=ear.problems.append)
+
+    def takes(clock_id: str, epoch: int, sequence: int) -> bool:
+        header = replace(HEADER, clock_id=clock_id, epoch=epoch, sequence=sequence)
+        return subscriber.accept(plain(encode(finger(0.0), header)), None) is not None
+
+    assert takes("boot-1", 900, 5)
+    assert takes("boot-1", 901, 1)
+    assert not takes("boot-1", 900, 6)
+    assert takes("boot-2", 3, 1)
+    assert not takes("boot-1", 902, 1)
+    assert takes("boot-2", 4, 1)
+    assert ear.counts.gaps == 0
+
+
+def node_config(**keys: Any) -> NodeConfig:
+    return NodeConfig(
+        name="bridge", type="arm_bridge", parameters={}, inputs=(), outputs=(), plan_hash=PLAN,
+        run_dir="", **keys,
+    )  # fmt: skip
+
+
+def test_who_may_reset_an_estop() -> None:
+    links = Links(node_config(estop_resetters=("tools",)), None)
+    objection = links._objection(ESTOP)
+    assert objection is not None
+    reset = EStop(engaged=False, reason="")
+    arm, tools = replace(HEADER, writer="arm_left_bridge"), replace(HEADER, writer="tools")
+    assert "may not reset" in str(objection(reset, arm))
+    assert objection(reset, tools) is None
+    assert objection(stop("all may stop"), arm) is None
+    assert links._objection(FINGER) is None
+    assert Links(node_config(), None)._objection(ESTOP) is None
+
+
+def test_a_forbidden_message_is_counted_and_not_handed_over() -> None:
+    ear = Ear()
+    subscriber = Subscriber(
+        ESTOP, [], ear.hear, ear.counts, on_problem=ear.problems.append,
+        objection=lambda message, header: None if message.engaged else "not so",
+    )  # fmt: skip
+    for number, engaged in enumerate((True, False, True), start=8):
+        message = EStop(engaged=engaged, reason="")
+        envelope = subscriber.accept(plain(encode(message, replace(HEADER, sequence=number))), None)
+        assert envelope is not None
+        subscriber.deliver(envelope)
+    assert [message.engaged for message, _ in ear.heard] == [True, True]
+    assert (ear.counts.rejected, ear.problems) == (1, ['topic "estop": message refused: not so'])
