@@ -14,6 +14,7 @@ import asyncio
 import json
 import os
 import stat
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import count
@@ -52,7 +53,7 @@ def is_key(text: str) -> bool:
     """Whether a text is a key in Z85."""
     try:
         return len(text) == KEY_LENGTH and len(z85.decode(text.encode("ascii"))) == CURVE_KEY_BYTES
-    except (ValueError, KeyError, UnicodeError):
+    except (ValueError, KeyError, struct.error):
         return False
 
 
@@ -148,7 +149,7 @@ class KeyRing:
         try:
             ring = json.loads(self._file.read_text())
             host, secret_file, public = ring["host"], Path(ring["secret_file"]), ring["public"]
-            stamps = tuple(_stamp(one) for one in (self._file, secret_file))
+            stamps = (_stamp(self._file), _stamp(secret_file))
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise SecurityError(f"{self._file}: holds no keys: {error}") from error
         if stamps == self._stamps:
@@ -261,6 +262,10 @@ class Gatekeeper:
         return [ZAP_VERSION, number, b"200", b"OK", host.encode(), b""]
 
 
-def _stamp(path: Path) -> tuple[int, int, int]:
-    status = path.stat()
+def _stamp(path: Path) -> tuple[int, int, int] | None:
+    """Another one for each state of a file; None where there is none."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return None
     return status.st_mtime_ns, status.st_ino, status.st_size

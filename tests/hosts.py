@@ -38,15 +38,16 @@ class Hosts:
         write_secret(self.secret_file(name), secret, replace=True)
         return public
 
-    def ring_file(self, name: str) -> Path:
-        return self.folder / f"keys-{name}.json"
-
-    def ring(self, name: str) -> KeyRing:
-        """A stranger's ring holds himself beside the others: he says so, they do not."""
-        file = self.ring_file(name)
+    def write_ring(self, name: str) -> Path:
+        """What a host's processes read.  A stranger stands in his own beside the others, not in
+        theirs."""
+        file = self.folder / f"keys-{name}.json"
         public = self.public if name in self.names else self.public | {name: self.public_of(name)}
         write_ring(file, host=name, secret_file=self.secret_file(name), public=public)
-        return KeyRing(file)
+        return file
+
+    def ring(self, name: str) -> KeyRing:
+        return KeyRing(self.write_ring(name))
 
 
 @contextmanager

@@ -17,11 +17,12 @@ import numpy as np
 import pytest
 
 from messages.base import Header
-from messages.bus import Subscriber
+from messages.bus import Source, Subscriber
 from messages.topics import topic_named
 from messages.types import ArmState
 from nodes.node import PortCounts
 from nodes.runner import NodeConfig, PortConfig
+from tests.hosts import hosts
 from tests.network import Computers
 from tests.test_arm_loop import until as until_within
 
@@ -53,8 +54,10 @@ class Watch:
         return {side: self.states[side][began[side] :] for side in SIDES}
 
 
-def config(name: str, type_: str, inputs: Any, outputs: Any, **parameters: Any) -> str:
-    def ports(given: dict[str, tuple[str, tuple[str, ...]]]) -> tuple[PortConfig, ...]:
+def config(
+    name: str, type_: str, inputs: Any, outputs: Any, *, keys: Path, **parameters: Any
+) -> str:
+    def ports(given: dict[str, tuple[str, tuple[str | Source, ...]]]) -> tuple[PortConfig, ...]:
         return tuple(
             PortConfig(port=port, topic=topic, endpoints=endpoints)
             for port, (topic, endpoints) in given.items()
@@ -68,6 +71,7 @@ def config(name: str, type_: str, inputs: Any, outputs: Any, **parameters: Any) 
         outputs=ports(outputs),
         plan_hash="test",
         run_dir="",
+        keys_file=keys,
     ).model_dump_json()
 
 
@@ -78,26 +82,35 @@ async def three_computers() -> AsyncIterator[tuple[Computers, Watch]]:
         pytest.skip(missing)
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
     watch, started, subscribers = Watch(), [], []
-    with Computers("main", *SIDES) as computers:
+    with Computers("main", *SIDES) as computers, hosts("main", *SIDES) as known:
+        keys = {name: known.write_ring(name) for name in known.names}
         tcp = {name: f"tcp://{address}" for name, address in computers.address.items()}
         scene, target = f"{tcp['main']}:7000", f"{tcp['main']}:7001"
+        from_main = {
+            "scene": ("scene", (Source(scene, "stroker", "main"),)),
+            "sheet_target": ("sheet_target", (Source(target, "stroker", "main"),)),
+        }
         told = {side: f"{tcp[side]}:7002" for side in SIDES}
         outputs = {"scene": ("scene", (scene,)), "sheet_target": ("sheet_target", (target,))}
-        jobs = {"main": [config("stroker", "tests.arm_computer:Stroker", {}, outputs)]}
+        jobs = {
+            "main": [
+                config("stroker", "tests.arm_computer:Stroker", {}, outputs, keys=keys["main"])
+            ]
+        }
         for side, other in (SIDES, SIDES[::-1]):
             ports = {f"{one}_port": 5020 + number for number, one in enumerate(SIDES)}
-            seen = {"scene": ("scene", (scene,))}
+            seen = {"scene": from_main["scene"]}
+            from_other = Source(told[other], f"arm_{other}_bridge", other)
             jobs[side] = [
-                config(f"twin_{side}", "twin_arms", seen, {}, **ports, **PATIENT_TWIN),
+                config(
+                    f"twin_{side}", "twin_arms", seen, {}, keys=keys[side], **ports, **PATIENT_TWIN
+                ),
                 config(
                     f"arm_{side}_bridge",
                     "arm_bridge",
-                    seen
-                    | {
-                        "sheet_target": ("sheet_target", (target,)),
-                        "other_arm": (f"arm_{other}", (told[other],)),
-                    },
+                    from_main | {"other_arm": (f"arm_{other}", (from_other,))},
                     {"arm": (f"arm_{side}", (f"ipc://{folder}/{side}", told[side]))},
+                    keys=keys[side],
                     side=side,
                     port=ports[f"{side}_port"],
                     **PATIENT,

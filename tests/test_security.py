@@ -8,6 +8,7 @@ import random
 import socket
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -27,6 +28,7 @@ from messages.wire import encode
 from nodes.node import PortCounts
 from nodes.runner import Links, NodeConfig
 from tests.hosts import Hosts, hosts
+from tests.network import Cut
 from tests.test_messages_bus import finger, pictures, stop
 
 PLAN = "0123456789abcdef"
@@ -142,7 +144,7 @@ async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(street: S
     await street.speak(mouth, lambda: ear.heard)
     street.known.public["left"] = street.known.make_key("left")
     for name in ("main", "left"):
-        street.known.ring(name)
+        street.known.write_ring(name)
     change = street.rings["main"].reload()
     assert change == KeyChange(own=False, hosts=frozenset({"left"}))
     mouth.renew_keys(change)
@@ -155,7 +157,7 @@ async def test_a_new_key_of_ours_or_of_the_other_end_without_a_restart(street: S
     await street.speak(mouth, lambda: ear.heard)
     street.known.public["main"] = street.known.make_key("main")
     for name in ("main", "left"):
-        street.known.ring(name)
+        street.known.write_ring(name)
         changed = street.rings[name].reload()
         assert changed is not None
         (mouth if name == "main" else subscriber).renew_keys(changed)
@@ -168,7 +170,7 @@ async def test_an_added_host_disturbs_no_connection(street: Street) -> None:
     mouth, ear = street.mouth(), street.ear(street.rings["left"])
     await street.speak(mouth, lambda: ear.heard)
     street.known.public["right"] = street.known.public_of("stranger")
-    street.known.ring("main")
+    street.known.write_ring("main")
     change = street.rings["main"].reload()
     assert change == KeyChange(own=False, hosts=frozenset())
     mouth.renew_keys(change)
@@ -196,46 +198,28 @@ async def test_a_flood_from_strangers_does_not_keep_the_friend_from_hearing(stre
     assert {header.writer for _, header in ear.heard} == {"planner"}
 
 
-class Meddler:
+class Meddler(Cut):
     """On the wire between two hosts: keeps what passes, and can change, repeat or replay it."""
 
-    def __init__(self, target: int) -> None:
-        self.target = target
+    def __init__(self, target_port: int) -> None:
+        super().__init__(target_port)
         self.meddle: Callable[[bytes], bytes] = lambda data: data
         self.kept: list[bytes] = []
         self.connections = 0
-        self.tasks: set[asyncio.Task[None]] = set()
 
-    async def __aenter__(self) -> Meddler:
-        self.server = await asyncio.start_server(self._serve, "127.0.0.1", 0)
-        self.port = int(self.server.sockets[0].getsockname()[1])
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        self.server.close()
-        for task in self.tasks:
-            task.cancel()
-        await asyncio.gather(*self.tasks, return_exceptions=True)
-
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
-        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", self.target)
-        for source, sink, back in ((reader, far_writer, False), (far_reader, writer, True)):
-            task = asyncio.create_task(self._pass_on(source, sink, back))
-            self.tasks.add(task)
+        await super()._relay(reader, writer)
 
-    async def _pass_on(
-        self, source: asyncio.StreamReader, sink: asyncio.StreamWriter, back: bool
-    ) -> None:
-        try:
-            while data := await source.read(1 << 16):
-                if back:
+    async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        to_subscriber = writer.get_extra_info("sockname")[1] == self.port
+        with suppress(ConnectionError):
+            while data := await reader.read(1 << 16):
+                if to_subscriber:
                     self.kept.append(data)
                     data = self.meddle(data)
-                sink.write(data)
-        except ConnectionError:
-            pass
-        sink.transport.abort()
+                writer.write(data)
+        writer.transport.abort()
 
 
 async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(

@@ -1,0 +1,256 @@
+"""Key pairs: their files, the command, the launch file, and graphs that run with them."""
+
+from __future__ import annotations
+
+import os
+import random
+import string
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch import runs
+from launch.documents import BadInputError
+from launch.keys import KEYS_VARIABLE, install
+from launch.plan import Plan, load_plan
+from launch.supervisor import RunningGraph
+from launch.tools import subscriber_to
+from messages.security import (
+    SecurityError,
+    is_key,
+    new_key_pair,
+    public_of,
+    read_secret,
+    write_secret,
+)
+from messages.types import TwinFinger
+from tests.test_cli import Command
+from tests.test_launch_supervisor import DEADLINE_S, LISTENER, beacon, write
+from tests.test_messages_bus import until
+
+HOSTS = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+LAB = """\
+# the lab
+hosts:
+  main: {address: 192.0.2.10}   # upstairs
+  left:
+    address: 192.0.2.11
+nodes:
+  beacon: {type: "tests.launch_nodes:Beacon"}
+"""
+
+
+@pytest.fixture(autouse=True)
+def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A directory of runs of the test's own, with a short path."""
+    with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as folder:
+        monkeypatch.setenv(runs.ROOT_VARIABLE, folder)
+        yield
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    return Command(capsys, monkeypatch)
+
+
+@pytest.fixture(autouse=True)
+def keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "keys"
+    monkeypatch.setenv(KEYS_VARIABLE, str(folder))
+    return folder
+
+
+def make(folder: Path, host: str, *, replace: bool = False) -> str:
+    public, secret = new_key_pair()
+    write_secret(folder / f"{host}.secret", secret, replace=replace)
+    return public
+
+
+def test_a_secret_is_for_its_owner_alone(keys: Path) -> None:
+    public = make(keys, "main")
+    file = keys / "main.secret"
+    assert (file.stat().st_mode & 0o777, keys.stat().st_mode & 0o777) == (0o600, 0o700)
+    assert public_of(read_secret(file)) == public
+    with pytest.raises(SecurityError, match="there is a key already"):
+        make(keys, "main")
+    assert public_of(read_secret(file)) == public
+    assert make(keys, "main", replace=True) == public_of(read_secret(file)) != public
+    assert sorted(path.name for path in keys.iterdir()) == ["main.secret"]
+
+
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o622])
+def test_a_secret_that_others_may_read_is_not_used(keys: Path, mode: int) -> None:
+    make(keys, "main")
+    file = keys / "main.secret"
+    file.chmod(mode)
+    with pytest.raises(SecurityError, match=f"others may read it .mode {mode:04o}.*chmod 600"):
+        read_secret(file)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a file away")
+def test_a_secret_of_somebody_else_is_not_used(keys: Path) -> None:
+    make(keys, "main")
+    os.chown(keys / "main.secret", 12345, -1)
+    with pytest.raises(SecurityError, match="belongs to somebody else"):
+        read_secret(keys / "main.secret")
+
+
+@pytest.mark.parametrize("text", ["", "x" * 39, "x" * 41, "é" * 40, "~" * 40, "x" * 5000])
+def test_what_is_no_key_is_said(keys: Path, text: str) -> None:
+    make(keys, "main")
+    (keys / "main.secret").write_text(text)
+    with pytest.raises(SecurityError, match="holds no key"):
+        read_secret(keys / "main.secret")
+    assert not is_key(text)
+
+
+def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:
+    file = tmp_path / "lab.yaml"
+    file.write_text(LAB)
+    chance = random.Random(5)
+    # All of Z85; any five of them are four bytes, if not too large.
+    characters = string.digits + string.ascii_letters + ".-:+=^!/*?&<>()[]{}@%$#"
+    keys_tried = [new_key_pair()[0] for _ in range(30)]
+    keys_tried += [
+        key
+        for _ in range(2000)
+        if is_key(key := "".join(chance.choices(characters, k=40)))
+    ][:100]  # fmt: skip
+    assert len(keys_tried) == 130
+    install(file, "left", keys_tried[0])
+    for key in keys_tried[1:]:
+        install(file, "main", key)
+        assert load_plan(file).keys == {"main": key, "left": keys_tried[0]}
+    text = file.read_text()
+    assert "# the lab" in text
+    assert "# upstairs" in text
+    for host, key, said in (
+        ("lft", keys_tried[0], 'no host "lft"; did you mean "left"'),
+        ("left", "nonsense", '"nonsense" is no public key'),
+    ):
+        with pytest.raises(BadInputError, match=said):
+            install(file, host, key)
+
+
+def test_keys_are_no_part_of_the_plan_s_hash(tmp_path: Path) -> None:
+    hashes = set()
+    for _ in range(2):
+        given = {name: {**host, "key": new_key_pair()[0]} for name, host in HOSTS.items()}
+        hashes.add(load_plan(write(tmp_path, {"beacon": beacon()}, hosts=given)).hash)
+    hashes.add(load_plan(write(tmp_path, {"beacon": beacon()}, hosts=HOSTS)).hash)
+    assert len(hashes) == 1
+    given = {**HOSTS, "left": {**HOSTS["left"], "may_reset_estop": True}}
+    hashes.add(load_plan(write(tmp_path, {"beacon": beacon()}, hosts=given)).hash)
+    assert len(hashes) == 2
+
+
+ONE, TWO = new_key_pair()[0], new_key_pair()[0]
+
+
+@pytest.mark.parametrize(
+    ("main", "left", "said"),
+    [
+        (ONE, None, "hosts.left: has no key, others have; make one there .flexsheet keys new left"),
+        (ONE, ONE, 'hosts.left.key: is the key of host "main" too; each host has its own'),
+        (ONE, "secret", 'hosts.left.key: "secret" is no public key'),
+    ],
+)
+def test_keys_that_do_not_do(tmp_path: Path, main: str, left: str | None, said: str) -> None:
+    given = {"main": {**HOSTS["main"], "key": main}, "left": {**HOSTS["left"], "key": left}}
+    with pytest.raises(BadInputError, match=said):
+        load_plan(write(tmp_path, {"beacon": beacon()}, hosts=given))
+
+
+def test_an_arm_s_own_protocol_does_not_cross_the_network(tmp_path: Path) -> None:
+    given = {"main": {"address": "192.0.2.1"}, "left": {"address": "192.0.2.2"}}
+    twin = {"type": "twin_arms", "parameters": {"host": "192.0.2.2"}, "topics": {"scene": None}}
+    with pytest.raises(BadInputError, match=r"parameters.host: .*192.0.2.2 is beyond loopback"):
+        load_plan(write(tmp_path, {"twin": twin}, hosts=given))
+    bridge = {
+        "type": "arm_bridge",
+        "parameters": {"side": "left", "host": "192.0.2.2"},
+        "topics": {"arm": "arm_left", "other_arm": None, "sheet_target": None, "scene": None},
+    }
+    with pytest.raises(BadInputError, match=r'192.0.2.2 is host "left".*run bridge there'):
+        load_plan(write(tmp_path, {"bridge": bridge}, hosts=given))
+    bridge["host"] = "left"
+    load_plan(write(tmp_path, {"bridge": bridge}, hosts=given))
+
+
+def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_path: Path) -> None:
+    made = command("keys", "new", "left", "--json").json()
+    assert made["secret_file"] == str(keys / "left.secret")
+    assert command("keys", "show", "left").out.strip() == made["public"]
+    again = command("keys", "new", "left")
+    assert again.code == 1
+    assert "there is a key already" in again.err
+    file = tmp_path / "lab.yaml"
+    file.write_text(LAB)
+    assert command("keys", "install", file, "left").code == 0
+    assert command("keys", "install", file, "main", ONE).code == 0
+    assert load_plan(file).keys == {"left": made["public"], "main": ONE}
+    (keys / "left.secret").chmod(0o644)
+    shown = command("keys", "show", "--json")
+    assert shown.code == 1
+    assert "others may read it" in shown.json()["problems"][0]
+    assert command("keys", "new", "Left Arm").code == 2
+
+
+async def heard(plan: Plan, graph: RunningGraph) -> None:
+    """Until a tool on main has heard the beacon on left."""
+    fingers: list[TwinFinger] = []
+    said: list[str] = []
+    subscriber = subscriber_to(
+        "twin/finger", plan, graph.run, lambda message, _: fingers.append(message),
+        on_problem=said.append,
+    )  # fmt: skip
+    subscriber.start()
+    try:
+        await until(lambda: len(fingers) > 5)
+    finally:
+        subscriber.close()
+
+
+def plan_with_keys(folder: Path, public: dict[str, str], **more: Any) -> Plan:
+    given = {name: {**host, "key": public[name]} for name, host in HOSTS.items()}
+    nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
+    return load_plan(write(folder, nodes, hosts=given, **more))
+
+
+async def test_a_graph_with_keys_and_a_new_key_while_it_runs(tmp_path: Path, keys: Path) -> None:
+    public = {name: make(keys, name) for name in HOSTS}
+    plan = plan_with_keys(tmp_path, public)
+    said: list[str] = []
+
+    def report(_: str, line: str) -> None:
+        said.append(line)
+
+    async with (
+        RunningGraph(plan, host="main", report=report) as main,
+        RunningGraph(plan, host="left", report=report) as left,
+    ):
+        await main.wait_ready(DEADLINE_S)
+        await left.wait_ready(DEADLINE_S)
+        await heard(plan, main)
+        pids = main.pids | left.pids
+        new = make(keys, "left", replace=True)
+        await until(lambda: any("is not the key that the launch file has" in line for line in said))
+        install(Path(plan.launch_file), "left", new)
+        await until(lambda: sum("keys of" in line for line in said) >= 2)
+        plan = load_plan(Path(plan.launch_file))
+        await heard(plan, main)
+        assert main.pids | left.pids == pids, "nothing was started anew"
+
+
+async def test_a_host_without_its_secret_does_not_start(tmp_path: Path, keys: Path) -> None:
+    public = {name: make(keys, name) for name in HOSTS}
+    plan = plan_with_keys(tmp_path, public)
+    make(keys, "left", replace=True)
+    with pytest.raises(BadInputError, match="is not the key that the launch file has for host"):
+        await RunningGraph(plan, host="left").__aenter__()
+    (keys / "left.secret").unlink()
+    with pytest.raises(BadInputError, match="there is no key; make one: flexsheet keys new left"):
+        await RunningGraph(plan, host="left").__aenter__()
