@@ -66,11 +66,9 @@ class FemSolver(Node):
 
     async def setup(self) -> None:
         self._stop = threading.Event()
-        makers = {field.name for field in fields(Maker) if field.init} - {"cache_dir"}
-        self._maker = Maker(
-            cache_dir=self.parameters.cache_dir or cache.default_cache_dir(),
-            **self.parameters.model_dump(include=makers),
-        )
+        own = {field.name for field in fields(Maker) if field.init} - {"cache_dir"}
+        folder = self.parameters.cache_dir or cache.default_cache_dir()
+        self._maker = Maker(cache_dir=folder, **self.parameters.model_dump(include=own))
         self._making: asyncio.Task[None] | None = None
         self._use([])
         self._forget()
