@@ -17,7 +17,7 @@ from nodes.renderer.correction import (
     Screen,
     sector_normals,
 )
-from nodes.renderer.lens import ClipLens, set_lens
+from nodes.renderer.lens import ClipLens
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -90,6 +90,7 @@ class Canvas:
         self.context = context
         vertex, fragment = shader_text("object.vert.glsl"), shader_text("object.frag.glsl")
         self._program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
+        self._uniforms = Uniforms(self._program)
         samples = min(samples, self.context.max_samples)
         size = (width_px, height_px)
         self._frame = self.context.framebuffer(
@@ -133,12 +134,13 @@ class Canvas:
             self._image.build_mipmaps()
             self._image.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
             self._image.repeat_x = self._image.repeat_y = False
-        program = self._program
-        program["object_colour"] = paint.colour
-        program["texture_kind"] = TEXTURES[paint.texture]
-        program["texture_pitch_m"] = paint.pitch_m
-        program["image_from_world"] = tuple(paint.image_from_world.T.ravel())
-        program["object_from_world"] = tuple(paint.object_from_world.T.ravel())
+        self._uniforms.set(
+            object_colour=paint.colour,
+            texture_kind=TEXTURES[paint.texture],
+            texture_pitch_m=paint.pitch_m,
+            image_from_world=tuple(paint.image_from_world.T.ravel().tolist()),
+            object_from_world=tuple(paint.object_from_world.T.ravel().tolist()),
+        )
 
     def set_mesh(
         self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
@@ -173,9 +175,9 @@ class Canvas:
         mesh = self._grid if look.pattern in SCREEN_PATTERNS else self._object
         if look.pattern != "black" and mesh is not None:
             # A projector behind the screen draws mirrored: then front faces wind the other way.
-            mirrored = np.linalg.det(view.clip_from_screen) < 0
+            mirrored = _determinant(view.clip_from_screen) < 0.0
             self.context.front_face = "cw" if mirrored else "ccw"
-            set_view(self._program, view)
+            set_view(self._uniforms, view)
             self._set_look(look)
             if self._image is not None:
                 self._image.use()
@@ -204,46 +206,64 @@ class Canvas:
         program = self.context.program(
             vertex_shader=shader_text("object.vert.glsl"), varyings=("shifted",)
         )
-        set_view(program, view)
+        set_view(Uniforms(program), view)
         self._frame.use()  # without a window nothing runs, not even this, before a frame is bound
         captured = self.context.buffer(reserve=self._object.count * 16)
         self._object.array(program, indexed=False).transform(captured, moderngl.POINTS)
         return np.frombuffer(captured.read(), np.float32).reshape(-1, 4).astype(np.float64)
 
     def _set_look(self, look: Look) -> None:
-        program = self._program
-        program["flat_shading"] = look.flat
-        program["screen_pattern"] = SCREEN_PATTERNS.get(look.pattern, 0)
-        program["grid_pitch_m"] = GRID_PITCH_M
-        program["places_axis"] = PLACES_AXES.get(look.pattern, 0)
-        program["light_direction"] = tuple(LIGHT)
-        for name, point in (
-            ("fingertip_mark", look.fingertip_mark),
-            ("target_mark", look.target_mark),
-        ):
-            program[name] = (0.0,) * 4 if point is None else (*point, MARK_RADIUS_M)
+        self._uniforms.set(
+            flat_shading=look.flat,
+            screen_pattern=SCREEN_PATTERNS.get(look.pattern, 0),
+            grid_pitch_m=GRID_PITCH_M,
+            places_axis=PLACES_AXES.get(look.pattern, 0),
+            light_direction=tuple(LIGHT.tolist()),
+            fingertip_mark=_mark(look.fingertip_mark),
+            target_mark=_mark(look.target_mark),
+        )
 
 
-def set_view(program: moderngl.Program, view: View) -> None:
+def _mark(point: Floats | None) -> tuple[float, ...]:
+    return (0.0,) * 4 if point is None else (*point.tolist(), MARK_RADIUS_M)
+
+
+class Uniforms:
+    """A program's uniforms; one that has its value already is not written again."""
+
+    def __init__(self, program: moderngl.Program) -> None:
+        self._program = program
+        self._last: dict[str, object] = dict.fromkeys(program)
+
+    def set(self, **values: object) -> None:
+        """Give values; uniforms that the shader does not use are optimised away and left out."""
+        last = self._last
+        for name, value in values.items():
+            if name in last and last[name] != value:
+                self._program[name] = last[name] = value
+
+
+def set_view(uniforms: Uniforms, view: View) -> None:
     """Hand a view to the vertex shader; uniforms that it does not use are optimised away."""
     screen = view.screen
-    values: dict[str, object] = {
-        "eye": tuple(view.eye),
-        "projector": tuple(view.projector),
-        "corrected": screen is not None,
-        "grazing_sine": GRAZING_SINE,
-        "near_m": NEAR_M,
-        "far_m": FAR_M,
-        "clip_from_screen": tuple(view.clip_from_screen.T.ravel()),
-    }
+    uniforms.set(
+        eye=tuple(view.eye.tolist()),
+        projector=tuple(view.projector.tolist()),
+        corrected=screen is not None,
+        grazing_sine=GRAZING_SINE,
+        near_m=NEAR_M,
+        far_m=FAR_M,
+        clip_from_screen=tuple(view.clip_from_screen.T.ravel().tolist()),
+    )
     if screen is not None:
-        values["sheet_point"] = tuple(screen.point)
-        values["sheet_normals"] = [tuple(row) for row in screen.normals]
-        values["sector_normals"] = [tuple(row) for row in sector_normals(screen, view.eye)]
-    for name, value in values.items():
-        if name in program:
-            program[name] = value
-    set_lens(program, view.lens)
+        uniforms.set(
+            sheet_point=tuple(screen.point.tolist()),
+            sheet_normals=[tuple(row) for row in screen.normals.tolist()],
+            sector_normals=[tuple(row) for row in sector_normals(screen, view.eye).tolist()],
+        )
+    uniforms.set(lens_reach=0.0 if view.lens is None else view.lens.reach)
+    if view.lens is not None:
+        uniforms.set(lens=view.lens.focal_centre, lens_distortion=view.lens.distortion)
 
 
 class _Mesh:
@@ -289,6 +309,12 @@ class _Mesh:
             array.release()
         for buffer in (self._rest, self._moving, self._triangles):
             buffer.release()
+
+
+def _determinant(matrix: Floats) -> float:
+    """Of (3, 3), without the detours of numpy's for any size."""
+    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
+    return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
 
 def _interleaved(positions: Floats, normals: Floats) -> NDArray[np.float32]:

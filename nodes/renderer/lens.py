@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import moderngl
 import numpy as np
 
 from messages.scene import Lens
@@ -62,13 +61,3 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
         lens.distortion,
         reach**2,
     )
-
-
-def set_lens(program: moderngl.Program, lens: ClipLens | None) -> None:
-    """Hand the lens to a vertex shader that includes `lens.glsl`."""
-    if "lens_reach" not in program:
-        return
-    program["lens_reach"] = 0.0 if lens is None else lens.reach
-    if lens is not None:
-        program["lens"] = lens.focal_centre
-        program["lens_distortion"] = lens.distortion

@@ -14,9 +14,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.renderer.correction import GRAZING_SINE, NEAR_M
-from nodes.renderer.gl import FAR_M, SAMPLES, Canvas, Look, View, shader_text
-from nodes.renderer.lens import set_lens
+from nodes.renderer.gl import SAMPLES, Canvas, Look, Uniforms, View, set_view, shader_text
 from nodes.renderer.sheet_mesh import SheetMesh
 
 Floats = NDArray[np.float64]
@@ -67,6 +65,8 @@ class Projection:
             vertex_shader=shader_text("sheet.vert.glsl"),
             fragment_shader=shader_text("sheet.frag.glsl"),
         )
+        self._uniforms = Uniforms(self._program)
+        self._drawn: SheetMesh | None = None
         self._vertices: moderngl.Buffer | None = None
         self._array: moderngl.VertexArray | None = None
         self._triangles: NDArray[np.int32] | None = None
@@ -79,13 +79,8 @@ class Projection:
         canvas.paint(self._frame, seen, look)
         self._context.copy_framebuffer(self._resolved, self._frame)
         array = self._sheet_array(sheet)
-        program = self._program
-        program["eye"], program["projector"] = tuple(view.eye), tuple(view.projector)
-        program["clip_from_screen"] = tuple(view.clip_from_screen.T.ravel())
-        program["near_m"], program["far_m"] = NEAR_M, FAR_M
-        set_lens(program, view.lens)
-        program["grazing_sine"] = GRAZING_SINE
-        program["window"] = (window.left, window.bottom, window.width, window.height)
+        set_view(self._uniforms, view)
+        self._uniforms.set(window=(window.left, window.bottom, window.width, window.height))
         self._picture.use()
         canvas.begin()
         # The projector stands behind the sheet and sees its back.
@@ -100,17 +95,23 @@ class Projection:
 
     def _sheet_array(self, sheet: SheetMesh) -> moderngl.VertexArray:
         """The sheet's vertices in a buffer, with its triangles; made anew when those change."""
-        vertices = np.ascontiguousarray(sheet.vertices, np.float32)
-        same = self._triangles is not None and np.array_equal(self._triangles, sheet.triangles)
+        if self._array is not None and sheet is self._drawn:
+            return self._array
+        vertices, known = np.ascontiguousarray(sheet.vertices, np.float32), self._triangles
+        same = known is sheet.triangles or (
+            known is not None and np.array_equal(known, sheet.triangles)
+        )
         if self._array is None or self._vertices is None or not same:
             self._release_sheet()
-            self._vertices = self._context.buffer(vertices)
+            self._vertices = self._context.buffer(vertices, dynamic=True)
             triangles = self._context.buffer(np.ascontiguousarray(sheet.triangles, np.int32))
             content = [(self._vertices, "3f", "position")]
             self._array = self._context.vertex_array(self._program, content, triangles)
-            self._triangles = sheet.triangles.copy()
+            self._triangles = sheet.triangles
         else:
+            self._vertices.orphan()
             self._vertices.write(vertices)
+        self._drawn = sheet
         return self._array
 
     def _release_sheet(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +61,10 @@ def finer(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
     return SheetMesh(vertices, triangles.astype(np.int32), mesh.note)
 
 
+_grid_triangles = cache(triangles_of)
+"""The same array for the same grid, so that nobody need compare it."""
+
+
 def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
     """The sheet as it narrows by its stretch and dents by its fingertip.
 
@@ -74,16 +79,18 @@ def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
     place = (x, y)
     flat = dents.grid(stretch, place)
     offsets = dents.offsets(stretch, place, depth_m if depth_m >= LEAST_PUSH_M else 0.0)
-    share = (flat[..., 0] / sheet.edge_distance_m + 0.5)[..., None]
-    up = (flat[..., 1] / dents.rubber.height_m + 0.5)[..., None]
-    left_bottom, right_bottom, right_top, left_top = sheet.corners
-    ruled = (1.0 - share) * ((1.0 - up) * left_bottom + up * left_top) + share * (
-        (1.0 - up) * right_bottom + up * right_top
-    )
-    vertices = ruled + offsets @ sheet.world_from_sheet[:3, :3].T
     rows, columns = flat.shape[:2]
+    across = (flat[..., 0] / sheet.edge_distance_m + 0.5).ravel()
+    up = (flat[..., 1] / dents.rubber.height_m + 0.5).ravel()
+    left_bottom, right_bottom, right_top, left_top = sheet.corners
+    # Ruled between the edges: each point is bilinear in how far it is across and up.
+    ways = np.stack([right_bottom - left_bottom, left_top - left_bottom])
+    turn = right_top - right_bottom - left_top + left_bottom
+    vertices = offsets.reshape(-1, 3) @ sheet.world_from_sheet[:3, :3].T
+    vertices += np.stack([across, up, across * up], axis=1) @ np.vstack([ways, turn])
+    vertices += left_bottom
     return SheetMesh(
-        vertices.reshape(-1, 3),
-        triangles_of(rows, columns),
+        vertices,
+        _grid_triangles(rows, columns),
         dents.outside(stretch, place, depth_m),
     )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from messages.scene import Pose, Scene
+from messages.scene import Mesh, Pose, Scene
 from messages.types import Display, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import apply, inverse, transform, transform_from_rpy
 from nodes.models.shapes import make_shape
@@ -86,7 +86,10 @@ class Stage:
             world_from_object=self._world_from_object,
             spacing_m=spacing_m,
         )
-        self._near = cKDTree(self._surface.rest_world_m)
+        self._object_from_world = inverse(self._world_from_object)
+        # From the nearest vertex on, the nearest point of a mesh is found ten times as fast.
+        meshed = isinstance(geometry, Mesh)
+        self._near = cKDTree(self._surface.rest_world_m) if meshed else None
         self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
         self.canvas.set_mesh(
             self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
@@ -163,11 +166,11 @@ class Stage:
 
     def surface_point(self, world_point: Floats) -> Floats:
         """The point (3,) of the undeformed object nearest to a world point, for the marks."""
-        object_from_world = inverse(self._world_from_object)
-        # From the nearest vertex on, the nearest point of a mesh is found ten times as fast.
-        _, vertex = self._near.query(world_point)
-        start = apply(object_from_world, self._surface.rest_world_m[vertex])
-        nearest = self._shape.closest(apply(object_from_world, world_point), previous=start)
+        start = None
+        if self._near is not None:
+            _, vertex = self._near.query(world_point)
+            start = apply(self._object_from_world, self._surface.rest_world_m[vertex])
+        nearest = self._shape.closest(apply(self._object_from_world, world_point), previous=start)
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> Sheet:

@@ -1,0 +1,235 @@
+"""What a frame costs the processor, beside OpenGL: where the time between a soft body and the
+picture goes.
+
+    python -m benchmarks.frame_cpu [--scene FILE] [--triangles 20000] [--frames 300]
+
+Draws a stereo frame of a pushed sheet again and again, each with a new soft body, by the renderer's
+own steps.  Calls into OpenGL are timed apart from the rest: `GL calls` are their own time (they
+return early on a graphics card, on a software driver they may not), `GL finish` is the wait for the
+picture; both by the clock.  All else is the CPU side, in processor time of the drawing thread, so
+that what else runs on the machine counts little.  For it the picture is drawn small: a software
+driver that fills many pixels leaves nothing else in the caches, which a graphics card does not do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from messages.scene import Scene
+from messages.types import Display, Skin, SoftBody
+from nodes.fem_solver.mesh.from_scene import mesh_of_scene, world_from_mesh
+from nodes.models.rigid import apply
+from nodes.models.sheet import edge_poses
+from nodes.renderer import dent_cache
+from nodes.renderer.gl import headless_context
+from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.stage import Stage
+
+Floats = NDArray[np.float64]
+
+ROOT = Path(__file__).resolve().parents[1]
+SKIN_SPACING_M = 0.0045
+STRETCH = 1.05
+SMALL = 0.1
+"""Of the projector's width and height, while the CPU side is measured."""
+GL_TYPES: tuple[type, ...] = (
+    moderngl.Buffer,
+    moderngl.Context,
+    moderngl.Framebuffer,
+    moderngl.Program,
+    moderngl.Texture,
+    moderngl.Uniform,
+    moderngl.VertexArray,
+)
+
+
+class Clock:
+    """Seconds of one frame by name; inside a call set `apart` the span around it stands still."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+        self._inside = 0
+        self._apart_s = 0.0
+
+    @contextmanager
+    def span(self, name: str) -> Iterator[None]:
+        begun, before = time.thread_time(), self._apart_s
+        yield
+        taken = time.thread_time() - begun - (self._apart_s - before)
+        self.spent[name] += taken
+
+    def apart(
+        self, call: Callable[..., Any], name: str, now: Callable[[], float]
+    ) -> Callable[..., Any]:
+        """The call, its time put under `name` and taken from the span that it happens in."""
+
+        def timed(*args: Any, **rest: Any) -> Any:
+            if self._inside:
+                return call(*args, **rest)
+            self._inside, begun, cpu = 1, now(), time.thread_time()
+            try:
+                return call(*args, **rest)
+            finally:
+                self.spent[name] += now() - begun
+                self._inside, self._apart_s = 0, self._apart_s + time.thread_time() - cpu
+
+        return timed
+
+
+@contextmanager
+def gl_apart(clock: Clock) -> Iterator[None]:
+    """Every method of moderngl's objects timed by `clock` while this lasts."""
+    kept: list[tuple[type, str, Any]] = []
+    for kind in GL_TYPES:
+        for name, method in list(vars(kind).items()):
+            plain = callable(method) and (not name.startswith("__") or name == "__setitem__")
+            if not plain or isinstance(method, (staticmethod, classmethod)):
+                continue
+            kept.append((kind, name, method))
+            label = "GL finish" if name == "finish" else "GL calls"
+            setattr(kind, name, clock.apart(method, label, time.perf_counter))
+    try:
+        yield
+    finally:
+        for kind, name, method in kept:
+            setattr(kind, name, method)
+
+
+def shrunk(scene: Scene, share: float) -> Scene:
+    """The scene with a projector of fewer pixels."""
+    projector, lens = scene.projector, scene.projector.lens
+    sizes = {name: share * getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
+    changes = {
+        "lens": lens.model_copy(update=sizes),
+        "width_px": round(share * projector.width_px),
+        "height_px": round(share * projector.height_px),
+    }
+    return scene.model_copy(update={"projector": projector.model_copy(update=changes)})
+
+
+def stage_of(scene: Scene, triangles: int) -> Stage:
+    """A stage whose surface has about so many triangles."""
+    spacing_m = 0.0025
+    for _ in range(4):
+        stage = Stage(
+            scene,
+            headless_context(),
+            spacing_m=spacing_m,
+            dents=dent_cache.load_or_solve(scene, None),
+        )
+        have = len(stage._surface.triangles)
+        if abs(have - triangles) < 0.05 * triangles:
+            break
+        spacing_m *= float(np.sqrt(have / triangles))
+    return stage
+
+
+def skin_of(scene: Scene) -> Skin:
+    """The solver's skin, as fine as the demo's."""
+    mesh = mesh_of_scene(scene, SKIN_SPACING_M)
+    points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
+    return Skin(
+        mesh_id="bench",
+        vertices_world_m=points.astype(np.float32),
+        triangles=mesh.skin_triangles,
+    )
+
+
+def bodies(skin: Skin) -> Iterator[SoftBody]:
+    """Soft bodies that a finger pushes here and there, 15 mm deep."""
+    points = skin.vertices_world_m.astype(np.float64)
+    for number in range(10**6):
+        place = 0.02 * np.array([np.sin(0.1 * number), np.cos(0.1 * number)])
+        away = np.linalg.norm(points[:, :2] - place, axis=1)
+        depth = 0.015 * np.exp(-((away / 0.015) ** 2))
+        yield SoftBody(
+            mesh_id="bench",
+            method="bench",
+            in_range=True,
+            push_depth_m=0.015,
+            force_world_n=np.zeros(3),
+            stiffness_n_per_m=0.0,
+            displacement_world_m=(depth[:, None] * [0.0, 0.0, -1.0]).astype(np.float32),
+        )
+
+
+def believed(scene: Scene, edges: tuple[Floats, Floats], number: int) -> Sheet:
+    """The sheet between two edges, pushed here and there."""
+    tip = np.array([0.02 * np.sin(0.1 * number), 0.02 * np.cos(0.1 * number), -0.015])
+    sheet = sheet_between(
+        *edges,
+        height_m=scene.sheet.height_m,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=tip,
+    )
+    assert sheet is not None
+    return sheet
+
+
+def measure(scene: Scene, *, triangles: int, frames: int) -> tuple[Stage, list[dict[str, float]]]:
+    """Seconds of each frame by name."""
+    stage, skin = stage_of(scene, triangles), skin_of(scene)
+    stage.follow(skin)
+    shown = Display(correction="two_pass", stereo="side_by_side")
+    edges = edge_poses(np.eye(4), STRETCH * scene.sheet.width_m)
+    rows = []
+    clock = Clock()
+    shape = clock.apart(stage.sheet_mesh, "sheet's shape", time.thread_time)
+    setattr(stage, "sheet_mesh", shape)  # noqa: B010  (mypy takes no assignment to a method)
+    with gl_apart(clock):
+        for number, body in zip(range(frames + 20), bodies(skin), strict=False):
+            clock.spent = defaultdict(float)
+            with clock.span("sheet believed"):
+                sheet = believed(scene, edges, number)
+            with clock.span("object shaped"):
+                stage.shape(body)
+            with clock.span("look and marks"):
+                look = stage.look(shown, sheet.pushed_point, None)
+            with clock.span("two eyes drawn"):
+                stage.draw(shown, sheet, look, read=False)
+            rows.append(dict(clock.spent))
+    return stage, rows[20:]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--scene", default=ROOT / "launch" / "scenes" / "cylinder.yaml", type=Path)
+    parser.add_argument("--triangles", default=20_000, type=int)
+    parser.add_argument("--frames", default=300, type=int)
+    options = parser.parse_args()
+    scene = load_scene(options.scene)
+    stage, rows = measure(shrunk(scene, SMALL), triangles=options.triangles, frames=options.frames)
+    _, full = measure(scene, triangles=options.triangles, frames=options.frames // 5)
+    names = [name for name in dict.fromkeys(n for row in rows for n in row) if name[:2] != "GL"]
+    skin = stage._follower.vertices if stage._follower else 0
+    print(
+        f"{scene.name}: {len(stage._surface.triangles)} triangles that follow a skin of {skin} "
+        f"vertices, two eyes, two_pass, {stage.canvas.context.info['GL_RENDERER']}\n"
+    )
+    print("| ms | median | p99 |\n|---|---|---|")
+
+    def say(title: str, parts: list[str], rows: list[dict[str, float]]) -> None:
+        values = 1e3 * np.array([sum(row.get(part, 0.0) for part in parts) for row in rows])
+        print(f"| {title} | {np.median(values):.3f} | {np.quantile(values, 0.99):.3f} |")
+
+    for name in names:
+        say(name, [name], rows)
+    say("CPU side, all", names, rows)
+    for name in ("GL calls", "GL finish"):
+        say(f"{name}, {scene.projector.width_px}x{scene.projector.height_px}", [name], full)
+
+
+if __name__ == "__main__":
+    main()
