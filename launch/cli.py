@@ -63,6 +63,7 @@ def _exit_code(error: Exception) -> int | None:
     # Imported only now: a command that goes well should not wait for these.
     from launch.documents import BadInputError
     from launch.experiments import ExperimentError
+    from launch.export import ExportError
     from launch.runs import RunDirectoryError
     from launch.supervisor import NodeFailedError
     from messages.bag import BagError
@@ -74,7 +75,13 @@ def _exit_code(error: Exception) -> int | None:
     if isinstance(error, BadInputError):
         return BAD_INPUT
     failures = (
-        BusError | SecurityError | RunDirectoryError | BagError | ExperimentError | NodeFailedError
+        BusError
+        | SecurityError
+        | RunDirectoryError
+        | BagError
+        | ExperimentError
+        | ExportError
+        | NodeFailedError
     )
     if isinstance(error, failures):
         return FAILED

@@ -120,6 +120,26 @@ def recover(
 
 
 @app.command()
+def export(
+    bag: BagArgument,
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="MCAP file to write.")],
+    topics: TopicsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write what a bag holds for other tools: Foxglove and rerun open the file."""
+    from launch.export import export as export_bag
+
+    with _progress(f"exporting {bag.name}") as progress:
+        result = export_bag(bag, output, topics=topics, progress=progress)
+    for topic in result.unreadable:
+        words.print(f"not exported: {topic} (its type has changed since)", markup=False)
+    if as_json:
+        print_json({**asdict(result), "output": str(output)})
+        return
+    print_table(("channel", "messages"), sorted(result.messages.items()))
+
+
+@app.command()
 def verify(
     node: Annotated[str, typer.Argument(help="Name of the node in the bag's launch file.")],
     bag: BagArgument,

@@ -1,0 +1,365 @@
+"""Bags for other people's tools: an MCAP file of well-known schemas, which Foxglove and rerun open.
+
+Each topic becomes a JSON channel of the same name with its numbers (arrays beyond `PLOTTED` values
+are left out: plots have no use for them), and what can be looked at becomes a channel of its own:
+
+    stereo/left, stereo/right, frame/picture, twin/eye/seen, twin/eye/proper     foxglove.RawImage
+    tf          the sheet and both flanges                                foxglove.FrameTransforms
+    finger      the fingertip, with the path that is foreseen             foxglove.SceneUpdate
+    sheet       the sheet between the flanges                             foxglove.SceneUpdate
+    object      the soft body's skin, dented                              foxglove.SceneUpdate
+
+The world frame is flexsheet's (x right, y up, z towards the user).  Times are the recorder's; where
+the bag knows the time of day at its start they count from 1970, else from the host's start.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+from scipy.spatial.transform import Rotation
+
+from messages.bag import BagReader
+from messages.base import Message
+from messages.scene import Scene
+from messages.types import (
+    ArmState,
+    EStop,
+    Fingertip,
+    Frame,
+    SheetTarget,
+    Skin,
+    SoftBody,
+    StereoPair,
+    TwinEye,
+)
+from nodes.models.rigid import transform_from_rpy
+
+PLOTTED = 64
+"""Arrays of up to so many values are exported as numbers."""
+
+SKIN_COLOUR = (0.85, 0.55, 0.50, 1.0)
+SHEET_COLOUR = (0.80, 0.80, 0.85, 0.45)
+FINGER_COLOUR = (0.30, 0.65, 0.45, 1.0)
+LOST_COLOUR = (0.60, 0.60, 0.60, 0.5)
+SHEET_HEIGHT_M, FINGER_RADIUS_M = 0.24, 0.007
+
+Picture = tuple[str, NDArray[np.uint8]]
+Output = tuple[str, Any]
+
+
+class ExportError(RuntimeError):
+    """An export that cannot be made; the sentence says what to do."""
+
+
+@dataclass(slots=True)
+class Exported:
+    """What was written: messages per channel, and what could not be read."""
+
+    output: Path
+    messages: dict[str, int] = field(default_factory=dict)
+    unreadable: tuple[str, ...] = ()
+    wall_clock: bool = False
+
+
+def export(
+    bag: Path,
+    output: Path,
+    *,
+    topics: Iterable[str] | None = None,
+    progress: Callable[[float, float], None] = lambda done_s, whole_s: None,
+) -> Exported:
+    """Write the bag as an MCAP file of Foxglove's schemas.
+
+    topics: by name; default all.  Topics whose type has changed since the recording cannot be read
+    and are named in the result.  Raises ExportError, BagError.
+    """
+    foxglove = _foxglove()
+    if output.exists():
+        raise ExportError(f"{output}: exists already; an export is never written over")
+    reader = BagReader(bag)
+    summary = reader.info()
+    wanted = set(reader.topics if topics is None else topics)
+    if absent := sorted(wanted - reader.topics.keys()):
+        held = ", ".join(sorted(reader.topics)) or "nothing"
+        raise ExportError(f"{bag}: holds no topic {', '.join(absent)}; it holds {held}")
+    readable = {one.name for one in summary.topics if one.readable} & wanted
+    offset_ns = _wall_clock_offset_ns(reader)
+    result = Exported(output, unreadable=tuple(sorted(wanted - readable)))
+    result.wall_clock = offset_ns is not None
+    context = foxglove.Context()
+    channels: dict[str, Any] = {}
+    try:
+        writer = foxglove.open_mcap(output, context=context)
+    except Exception as error:
+        raise ExportError(f"{output}: cannot be written: {error}") from error
+    seen = Seen()
+    with writer:
+        for number, (topic, message, _, log_time_ns) in enumerate(BagReader(bag, readable)):
+            at_ns = log_time_ns + (offset_ns or 0)
+            for name, value in (*numbers_of(topic, message), *seen.views(topic, message, at_ns)):
+                channel = channels.get(name) or _channel(foxglove, name, value, context)
+                channels[name] = channel
+                channel.log(value, log_time=at_ns)
+                result.messages[name] = result.messages.get(name, 0) + 1
+            if number % 200 == 0:
+                progress((log_time_ns - summary.start_ns) * 1e-9, summary.duration_s)
+        writer.write_metadata("flexsheet", {"bag": bag.name, "complete": str(summary.complete)})
+    return result
+
+
+def numbers_of(topic: str, message: Message) -> Iterator[Output]:
+    """The message as JSON, without its large arrays."""
+    yield topic, _plain(message)
+
+
+@dataclass(slots=True)
+class Seen:
+    """What later messages are drawn with: the newest scene, skin and flanges."""
+
+    scene: Scene | None = None
+    skin: Skin | None = None
+    flanges: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+
+    def views(self, topic: str, message: Message, at_ns: int) -> Iterator[Output]:
+        """What of a message can be looked at: (channel, message of foxglove)."""
+        from foxglove import messages as fg
+
+        stamp = fg.Timestamp(sec=at_ns // 1_000_000_000, nsec=at_ns % 1_000_000_000)
+        match message:
+            case Scene():
+                self.scene = message
+            case Skin():
+                self.skin = message
+                yield "object", _mesh("object", message.vertices_world_m, message.triangles, stamp)
+            case SoftBody() if self.skin is not None and self.skin.mesh_id == message.mesh_id:
+                dented = self.skin.vertices_world_m + message.displacement_world_m
+                yield "object", _mesh("object", dented, self.skin.triangles, stamp)
+            case Fingertip():
+                yield "finger", self._finger(message, stamp)
+            case SheetTarget():
+                yield "tf", _frames({"sheet_target": message.world_from_sheet}, stamp)
+            case ArmState():
+                self.flanges[message.side] = message.world_from_flange
+                frame = {f"flange_{message.side}": message.world_from_flange}
+                yield "tf", _frames(frame, stamp)
+                sheet = self._sheet(stamp)
+                if sheet is not None:
+                    yield "sheet", sheet
+            case EStop():
+                level = fg.LogLevel.Fatal if message.engaged else fg.LogLevel.Info
+                said = "engaged" if message.engaged else "cleared"
+                text = f"e-stop {said}: {message.reason}"
+                yield "log", fg.Log(timestamp=stamp, level=level, message=text, name=topic)
+        for name, picture in pictures_of(topic, message):
+            yield name, _raw_image(name, picture, stamp)
+
+    def _finger(self, message: Fingertip, stamp: Any) -> Any:
+        from foxglove import messages as fg
+
+        radius_m = self.scene.finger.radius_m if self.scene else FINGER_RADIUS_M
+        colour = _colour(FINGER_COLOUR if message.valid else LOST_COLOUR)
+        ball = fg.SpherePrimitive(
+            pose=_pose(_at(message.position_world_m)),
+            size=_vector(np.full(3, 2 * radius_m)),
+            color=colour,
+        )
+        ahead = fg.LinePrimitive(
+            type=fg.LinePrimitiveLineType.LineStrip,
+            thickness=0.001,
+            points=[_point(one) for one in message.ahead_world_m],
+            color=colour,
+        )
+        entity = fg.SceneEntity(
+            timestamp=stamp, frame_id="world", id="finger", spheres=[ball], lines=[ahead]
+        )
+        return fg.SceneUpdate(entities=[entity])
+
+    def _sheet(self, stamp: Any) -> Any | None:
+        """The sheet as a flat quadrilateral between both clamped edges."""
+        if self.scene is None or len(self.flanges) < 2:
+            return None
+        half_m = 0.5 * self.scene.sheet.height_m
+        corners = []
+        for side, spec in (("left", self.scene.arms.left), ("right", self.scene.arms.right)):
+            pose = spec.flange_from_edge
+            flange_from_edge = transform_from_rpy(pose.position_m, pose.rpy_rad)
+            world_from_edge = self.flanges[side] @ flange_from_edge
+            corners += [(world_from_edge @ [0.0, y_m, 0.0, 1.0])[:3] for y_m in (-half_m, half_m)]
+        triangles = np.array([[0, 2, 1], [1, 2, 3]])
+        return _mesh("sheet", np.array(corners), triangles, stamp, SHEET_COLOUR)
+
+
+def pictures_of(topic: str, message: Message) -> Iterator[Picture]:
+    """The pictures in a message, each with the name of its channel."""
+    match message:
+        case StereoPair():
+            yield f"{topic}/left", message.left
+            yield f"{topic}/right", message.right
+        case Frame():
+            for picture in message.pixels:
+                yield f"{topic}/picture", picture
+        case TwinEye():
+            yield f"{topic}/seen", message.seen
+            yield f"{topic}/proper", message.proper
+
+
+def _foxglove() -> Any:
+    try:
+        import foxglove
+    except ImportError as error:
+        raise ExportError(
+            "bag export needs the package foxglove-sdk: pip install 'flexsheet[export]'"
+        ) from error
+    return foxglove
+
+
+def _wall_clock_offset_ns(reader: BagReader) -> int | None:
+    """From the recorder's clock to nanoseconds since 1970; None where the bag does not know."""
+    recording = reader.metadata.get("recording", {})
+    try:
+        started = datetime.fromisoformat(recording["started"])
+        return int(started.timestamp() * 1e9) - int(recording["started_ns"])
+    except (KeyError, ValueError):
+        return None
+
+
+def _channel(foxglove: Any, name: str, value: Any, context: Any) -> Any:
+    if isinstance(value, dict):
+        shape = json.dumps(_schema_of(value)).encode()
+        schema = foxglove.Schema(name=f"flexsheet.{name}", encoding="jsonschema", data=shape)
+        return foxglove.Channel(name, schema=schema, message_encoding="json", context=context)
+    channel_type = getattr(foxglove.channels, f"{type(value).__name__}Channel")
+    return channel_type(name, context=context)
+
+
+def _schema_of(value: Any) -> dict[str, Any]:
+    """The JSON Schema of a plain value: which fields there are, so that they can be chosen from."""
+    match value:
+        case dict():
+            fields = {name: _schema_of(item) for name, item in value.items()}
+            return {"type": "object", "properties": fields}
+        case list():
+            return {"type": "array", "items": _schema_of(value[0]) if value else {}}
+        case bool():
+            return {"type": "boolean"}
+        case int() | float():
+            return {"type": "number"}
+        case str():
+            return {"type": "string"}
+        case _:
+            return {}
+
+
+def _plain(value: Any) -> Any:
+    """A message as JSON's own types; arrays of more than PLOTTED values are left out."""
+    if isinstance(value, BaseModel):
+        plain = {name: _plain(getattr(value, name)) for name in type(value).model_fields}
+        return {name: item for name, item in plain.items() if item is not _TOO_LARGE}
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.size <= PLOTTED else _TOO_LARGE
+    if isinstance(value, (tuple, list)):
+        return [item for item in map(_plain, value) if item is not _TOO_LARGE]
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return value
+
+
+_TOO_LARGE = object()
+
+
+def _mesh(
+    name: str,
+    vertices: NDArray[Any],
+    triangles: NDArray[Any],
+    stamp: Any,
+    colour: tuple[float, float, float, float] = SKIN_COLOUR,
+) -> Any:
+    from foxglove import messages as fg
+
+    surface = fg.TriangleListPrimitive(
+        pose=_pose(np.eye(4)),
+        points=[_point(vertex) for vertex in vertices],
+        indices=[int(index) for index in np.ravel(triangles)],
+        color=_colour(colour),
+    )
+    entity = fg.SceneEntity(timestamp=stamp, frame_id="world", id=name, triangles=[surface])
+    return fg.SceneUpdate(entities=[entity])
+
+
+def _frames(world_from: dict[str, NDArray[np.float64]], stamp: Any) -> Any:
+    from foxglove import messages as fg
+
+    transforms = []
+    for name, matrix in world_from.items():
+        transforms.append(
+            fg.FrameTransform(
+                timestamp=stamp,
+                parent_frame_id="world",
+                child_frame_id=name,
+                translation=_vector(matrix[:3, 3]),
+                rotation=_rotation(matrix),
+            )
+        )
+    return fg.FrameTransforms(transforms=transforms)
+
+
+def _raw_image(name: str, picture: NDArray[np.uint8], stamp: Any) -> Any:
+    from foxglove import messages as fg
+
+    height, width = picture.shape[:2]
+    channels = 1 if picture.ndim == 2 else picture.shape[2]
+    return fg.RawImage(
+        timestamp=stamp,
+        frame_id=name,
+        width=width,
+        height=height,
+        encoding="mono8" if channels == 1 else "rgb8",
+        step=width * channels,
+        data=np.ascontiguousarray(picture).tobytes(),
+    )
+
+
+def _at(position: NDArray[np.float64]) -> NDArray[np.float64]:
+    matrix = np.eye(4)
+    matrix[:3, 3] = position
+    return matrix
+
+
+def _pose(matrix: NDArray[np.float64]) -> Any:
+    from foxglove import messages as fg
+
+    return fg.Pose(position=_vector(matrix[:3, 3]), orientation=_rotation(matrix))
+
+
+def _vector(vector: NDArray[np.float64]) -> Any:
+    from foxglove import messages as fg
+
+    return fg.Vector3(x=vector[0], y=vector[1], z=vector[2])
+
+
+def _rotation(matrix: NDArray[np.float64]) -> Any:
+    from foxglove import messages as fg
+
+    x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat()
+    return fg.Quaternion(x=x, y=y, z=z, w=w)
+
+
+def _point(position: NDArray[Any]) -> Any:
+    from foxglove import messages as fg
+
+    return fg.Point3(x=float(position[0]), y=float(position[1]), z=float(position[2]))
+
+
+def _colour(rgba: tuple[float, float, float, float]) -> Any:
+    from foxglove import messages as fg
+
+    return fg.Color(r=rgba[0], g=rgba[1], b=rgba[2], a=rgba[3])

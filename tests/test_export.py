@@ -1,0 +1,182 @@
+"""Exported bags: opened by the readers of those who open them, and right in what they show."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from launch.cli import main
+from launch.export import ExportError, export
+from launch.plan import load_scene
+from messages.bag import BagWriter
+from messages.base import Header, Message
+from messages.topics import TOPICS
+from messages.types import ArmState, EStop, Skin, SoftBody, StereoPair
+from nodes.models.rigid import transform
+from tests.fingertips import fingertip
+
+pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: pip install -e '.[dev]'")
+
+SCENE = load_scene(Path("launch/scenes/cylinder.yaml"))
+STARTED, STARTED_NS = "2026-11-22T10:00:00+00:00", 5_000_000_000
+STEP_NS = 10_000_000
+TIP = np.array([0.01, 0.02, 0.03])
+VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+DENT = np.array([[0, 0, -0.5], [0, 0, 0], [0, 0, 0]], np.float32)
+LEFT = np.arange(12, dtype=np.uint8).reshape(3, 4)
+
+
+def arm(side: Any, x_m: float) -> ArmState:
+    flange = transform(np.eye(3), np.array([x_m, 0.0, 0.0]))
+    return ArmState(
+        side=side,
+        mode="follow",
+        faults=(),
+        joints_rad=np.zeros(6),
+        joints_commanded_rad=np.zeros(6),
+        world_from_flange=flange,
+        world_from_flange_commanded=flange,
+        command_age_s=None,
+        target_source_ns=0,
+        command_sent_ns=0,
+        edge_distance_m=0.24,
+        edge_force_n=None,
+        cycle_s=0.005,
+    )
+
+
+RECORDED: tuple[tuple[str, Message], ...] = (
+    ("scene", SCENE),
+    ("skin", Skin(mesh_id="a", vertices_world_m=VERTICES, triangles=np.array([[0, 1, 2]], "i4"))),
+    ("fingertip", fingertip(TIP, np.array([0.1, 0.0, 0.0]))),
+    ("arm_left", arm("left", -0.15)),
+    ("arm_right", arm("right", 0.15)),
+    ("soft_body", SoftBody(mesh_id="a", method="linear", in_range=True, push_depth_m=0.001,
+                           force_world_n=np.zeros(3), stiffness_n_per_m=50.0,
+                           displacement_world_m=DENT)),
+    ("stereo", StereoPair(device="t", exposure_s=0.001, dropped_frames=0, left=LEFT,
+                          right=LEFT[:, ::-1].copy())),
+    ("estop", EStop(engaged=True, reason="a person")),
+)  # fmt: skip
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    path = tmp_path / "bag.mcap"
+    recording = {"clock_id": "c", "started": STARTED, "started_ns": str(STARTED_NS)}
+    with BagWriter(path, {"recording": recording}) as writer:
+        for number, (topic, message) in enumerate(RECORDED):
+            at_ns = STARTED_NS + number * STEP_NS
+            header = Header(1, at_ns, at_ns, "c", "node", 1)
+            writer.write(TOPICS[topic], message, header, at_ns)
+    return path
+
+
+def opened(path: Path) -> dict[str, list[tuple[int, Any]]]:
+    """Per channel (time, message): JSON as it is, protobuf by the schema that the file carries."""
+    protobuf = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support: no")
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[protobuf.DecoderFactory()])
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.message_encoding == "json":
+                value = json.loads(message.data)
+            else:
+                decode = protobuf.DecoderFactory().decoder_for("protobuf", schema)
+                value = decode(message.data)
+            found.setdefault(channel.topic, []).append((message.log_time, value))
+    return found
+
+
+def test_foxglove_gets_pictures_meshes_frames_and_numbers(bag: Path, tmp_path: Path) -> None:
+    result = export(bag, tmp_path / "out.mcap")
+    found = opened(result.output)
+    assert result.messages == {name: len(values) for name, values in found.items()}
+    assert result.unreadable == ()
+
+    started_ns = 1795341600 * 10**9
+    assert found["scene"][0][0] == started_ns, "the time of day, as the recorder knew it"
+    number = found["fingertip"][0][1]
+    assert number["position_world_m"] == TIP.tolist()
+    assert number["state"] == "tracking"
+    assert "displacement_world_m" in found["soft_body"][0][1], "small arrays are numbers to plot"
+
+    at_rest, dented = (update.entities[0].triangles[0] for _, update in found["object"])
+    assert [(p.x, p.y, p.z) for p in at_rest.points] == list(map(tuple, VERTICES.tolist()))
+    assert [(p.x, p.y, p.z) for p in dented.points] == list(map(tuple, (VERTICES + DENT).tolist()))
+    assert list(dented.indices) == [0, 1, 2]
+
+    left = found["stereo/left"][0][1]
+    assert (left.width, left.height, left.encoding, left.data) == (4, 3, "mono8", LEFT.tobytes())
+    ball = found["finger"][0][1].entities[0].spheres[0]
+    assert (ball.pose.position.x, ball.pose.position.y, ball.pose.position.z) == tuple(TIP)
+    assert ball.size.x == 2 * SCENE.finger.radius_m
+    flanges = {t.child_frame_id: t.translation.x for _, f in found["tf"] for t in f.transforms}
+    assert flanges == {"flange_left": -0.15, "flange_right": 0.15}
+    corners = found["sheet"][0][1].entities[0].triangles[0].points
+    below, above = (np.array([p.x, p.y, p.z]) for p in corners[:2])
+    assert np.linalg.norm(above - below) == pytest.approx(SCENE.sheet.height_m)
+    assert found["log"][0][1].message == "e-stop engaged: a person"
+
+
+def test_a_channel_tells_its_fields_before_a_message_is_opened(bag: Path, tmp_path: Path) -> None:
+    output = export(bag, tmp_path / "out.mcap").output
+    with output.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    schemas = {channel.topic: summary.schemas[channel.schema_id]
+               for channel in summary.channels.values()}  # fmt: skip
+    assert schemas["object"].name == "foxglove.SceneUpdate"
+    assert "position_world_m" in json.loads(schemas["fingertip"].data)["properties"]
+
+
+def test_rerun_finds_nothing_wrong(bag: Path, tmp_path: Path) -> None:
+    rerun = shutil.which("rerun", path=str(Path(sys.executable).parent))
+    if rerun is None:
+        pytest.skip("rerun-sdk is not installed: pip install rerun-sdk")
+    output = export(bag, tmp_path / "out.mcap").output
+    checked = subprocess.run([rerun, "mcap", "check", output], capture_output=True, text=True,
+                             check=False)  # fmt: skip
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    rrd = tmp_path / "out.rrd"
+    subprocess.run([rerun, "mcap", "convert", output, "-o", rrd], check=True, capture_output=True)
+    assert rrd.stat().st_size > 1000
+
+
+def test_only_the_topics_asked_for(bag: Path, tmp_path: Path) -> None:
+    result = export(bag, tmp_path / "out.mcap", topics=["fingertip"])
+    assert set(result.messages) == {"fingertip", "finger"}
+
+
+def test_a_topic_that_the_bag_lacks_is_named(bag: Path, tmp_path: Path) -> None:
+    with pytest.raises(Exception, match="twin/eye"):
+        export(bag, tmp_path / "out.mcap", topics=["twin/eye"])
+
+
+def test_an_export_is_never_written_over(bag: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    output.write_bytes(b"mine")
+    with pytest.raises(ExportError, match="exists already"):
+        export(bag, output)
+    assert output.read_bytes() == b"mine"
+
+
+def test_the_command(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out.mcap"
+    arguments = ["flexsheet", "bag", "export", str(bag), str(output), "--json"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code in (0, None)
+    assert json.loads(capsys.readouterr().out)["messages"]["object"] == 2
