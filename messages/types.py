@@ -30,6 +30,7 @@ from messages.scene import Finite, NonNegative, Part, Positive
 
 Side = Literal["left", "right"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
+Pattern = Literal["object", "grid", "checker", "white", "black", "places_x", "places_y"]
 Shading = Literal["soft", "flat"]
 StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "anaglyph"]
 
@@ -196,7 +197,7 @@ class Display(Message):
     stereo: StereoMode
     swap_eyes: bool = False
     shading: Shading = "soft"
-    pattern: Literal["object", "grid", "checker", "white", "black", "places_x", "places_y"] = Field(
+    pattern: Pattern = Field(
         default="object",
         description="grid, checker, white: 300 mm square on the imaginary screen, every 20 mm a "
         "line or a change; places_x, places_y: the object, painted with where it should be seen",

@@ -14,6 +14,7 @@ from nodes.models.sheet import dents
 from nodes.models.sheet.dents import DentShapes, Push, solve_push
 from tests.dent_shapes import (
     DEEPEST_M,
+    ELEMENT_CELLS,
     LARGEST_STRETCH,
     LEAST_STRETCH,
     RADIUS_M,
@@ -26,7 +27,7 @@ TIP = dents.HALF_CELLS
 
 
 def solved(stretch: float, place: tuple[float, float], depth: float) -> Floats:
-    return solve_push(Push(RUBBER, stretch, place, np.array([depth]), RADIUS_M))[0]
+    return solve_push(Push(RUBBER, stretch, place, np.array([depth]), RADIUS_M, ELEMENT_CELLS))[0]
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +115,7 @@ def test_what_is_out_of_range_is_named(shapes: DentShapes) -> None:
 def test_a_sheet_of_another_modulus_dents_alike() -> None:
     stiff = replace(RUBBER, young_modulus_pa=3e6, thickness_m=0.002)
     soft, hard = (
-        solve_push(Push(rubber, 1.05, (0.0, 0.0), np.array([0.015]), RADIUS_M))
+        solve_push(Push(rubber, 1.05, (0.0, 0.0), np.array([0.015]), RADIUS_M, ELEMENT_CELLS))
         for rubber in (RUBBER, stiff)
     )
     assert hard == pytest.approx(soft, abs=2e-5)

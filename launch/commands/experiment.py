@@ -30,6 +30,14 @@ SettingsOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NODE.PARAM=VALUE", help="Over what the file says."),
 ]
+MapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--map",
+        metavar="FILE.png",
+        help="Also measure the error at each visible point, and draw it; twice as long.",
+    ),
+]
 
 
 def _folder(output: Path | None, name: str) -> Path:
@@ -84,6 +92,7 @@ def stroke(
 @app.command()
 def tilt(
     *,
+    map_file: MapOption = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     output: OutputOption = None,
@@ -92,12 +101,22 @@ def tilt(
     """Errors of the picture on an inclined sheet (section VI-B, Fig. 11)."""
     from launch.experiments.image import TILT
 
-    _photograph(TILT, _folder(output, "tilt") / "tilt.mcap", launch_file, settings, as_json=as_json)
+    bag = _folder(output, "tilt") / "tilt.mcap"
+    _photograph(TILT, bag, launch_file, settings, map_file=map_file, as_json=as_json)
 
 
 @app.command()
 def push(
     *,
+    at_mm: Annotated[
+        float,
+        typer.Option("--at", metavar="MM", help="Along the cylinder's axis, from its middle."),
+    ] = 0.0,
+    tilt_deg: Annotated[
+        float,
+        typer.Option("--tilt", metavar="DEG", help="Around it, which inclines the sheet so far."),
+    ] = 0.0,
+    map_file: MapOption = None,
     launch_file: LaunchOption = DEMO_FILE,
     settings: SettingsOption = None,
     output: OutputOption = None,
@@ -108,11 +127,12 @@ def push(
     As in the paper the sheet is only tilted: it does not yield along its normal, and is dented by
     all of the push.  `--set planner.presents=curve` has it yield.
     """
-    from launch.experiments.image import PUSH
+    from launch.experiments.image import pushed_at
     from launch.experiments.run import settings_of_type
 
     settings = [*settings_of_type(launch_file, "planner", "presents=stretch"), *(settings or ())]
-    _photograph(PUSH, _folder(output, "push") / "push.mcap", launch_file, settings, as_json=as_json)
+    bag, series = _folder(output, "push") / "push.mcap", pushed_at(at_mm, tilt_deg)
+    _photograph(series, bag, launch_file, settings, map_file=map_file, as_json=as_json)
 
 
 @app.command()
@@ -154,21 +174,37 @@ def compliance(
 
 
 def _photograph(
-    series: Series, bag: Path, launch_file: Path, settings: list[str] | None, *, as_json: bool
+    series: Series,
+    bag: Path,
+    launch_file: Path,
+    settings: list[str] | None,
+    *,
+    map_file: Path | None,
+    as_json: bool,
 ) -> None:
     from launch.experiments import image
+    from launch.experiments.maps import draw_error_maps
     from launch.experiments.run import picture_procedure
 
+    mapped = map_file is not None
     with progress_words() as progress:
-        procedure = picture_procedure(series, series.values, image.CORRECTIONS, progress)
+        procedure = picture_procedure(
+            series, series.values, image.CORRECTIONS, progress, with_maps=mapped
+        )
         _record(launch_file, settings, bag, procedure, progress)
-        rows = image.rows(image.read_pictures(bag), series)
-    _print_rows(rows, bag, as_json=as_json)
+        pictures = image.read_pictures(bag)
+        rows = image.rows(pictures, series, with_maps=mapped)
+        if map_file is not None:
+            draw_error_maps(pictures, series, map_file)
+    _print_rows(rows, bag, map_file, as_json=as_json)
 
 
-def _print_rows(rows: list[dict[str, Any]], bag: Path, *, as_json: bool) -> None:
+def _print_rows(
+    rows: list[dict[str, Any]], bag: Path, map_file: Path | None, *, as_json: bool
+) -> None:
     if as_json:
-        print_json({"rows": rows, "bag": str(bag)})
+        maps = {} if map_file is None else {"map": str(map_file)}
+        print_json({"rows": rows, "bag": str(bag), **maps})
         return
     cells = [
         [f"{cell:.2f}" if isinstance(cell, float) else cell for cell in row.values()]
@@ -176,6 +212,8 @@ def _print_rows(rows: list[dict[str, Any]], bag: Path, *, as_json: bool) -> None
     ]
     print_table(list(rows[0]), cells)
     words.print(f"bag: {bag}")
+    if map_file is not None:
+        words.print(f"map: {map_file}")
 
 
 @app.command()

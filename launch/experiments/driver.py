@@ -25,6 +25,7 @@ from messages.types import (
     Correction,
     Display,
     FingerPath,
+    Pattern,
     Shading,
     SheetTarget,
     Status,
@@ -176,7 +177,12 @@ class Driver:
         self._publish("display", display)
 
     async def take_picture(
-        self, label: str, correction: Correction, shading: Shading = "flat"
+        self,
+        label: str,
+        correction: Correction,
+        shading: Shading = "flat",
+        *,
+        pattern: Pattern = "object",
     ) -> TwinEye:
         """Show the object with that correction, and wait for the eye's picture of it.
 
@@ -187,6 +193,7 @@ class Driver:
                 correction=correction,
                 stereo="mono",
                 shading=shading,
+                pattern=pattern,
                 marks=False,
                 pixels_every=PIXELS_EVERY,
                 label=label,

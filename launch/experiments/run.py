@@ -128,8 +128,12 @@ def picture_procedure(
     progress: Progress,
     *,
     shading: Shading = "flat",
+    with_maps: bool = False,
 ) -> Procedure:
-    """Bring the sheet into each case and photograph it with each correction."""
+    """Bring the sheet into each case and photograph it with each correction.
+
+    with_maps: and in the patterns that tell the error at each point.
+    """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for value in values:
@@ -139,6 +143,9 @@ def picture_procedure(
                 label = series.label(value, correction)
                 progress(label)
                 await driver.take_picture(label, correction, shading)
+                for pattern in image.PLACES if with_maps else ():
+                    of_pattern = image.places_label(label, pattern)
+                    await driver.take_picture(of_pattern, correction, pattern=pattern)
 
     return procedure
 

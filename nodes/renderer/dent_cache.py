@@ -21,7 +21,7 @@ from nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
 
-VERSION = 1
+VERSION = 2
 """Of the shapes' making; another one makes them anew."""
 
 STRETCH_SLACK = 0.01

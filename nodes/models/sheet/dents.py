@@ -29,7 +29,6 @@ HALF_CELLS = 14
 GRADING = 3.2
 """Cells grow from the finger outwards as sinh(GRADING a), a from 0 to 1: first 2 mm of 120."""
 
-ELEMENT_CELLS = 26
 KEPT_M = 2e-5
 """Root of the mean square of what the modes leave of the solved shapes."""
 
@@ -41,7 +40,8 @@ FARTHEST_X, FARTHEST_Y = 0.36, 0.40
 class DentRange:
     """For which pushes shapes are worked out: stretch ratios, and depths up to the deepest (m).
 
-    ..._nodes: how many of each are solved; places along either axis.
+    ..._nodes: how many of each are solved; places along either axis.  element_cells: of the finite
+    elements, along either side of the sheet.
     """
 
     least_stretch: float
@@ -50,6 +50,7 @@ class DentRange:
     stretch_nodes: int = 3
     place_nodes: int = 4
     depth_nodes: int = 8
+    element_cells: int = 26
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +129,14 @@ def triangles_of(rows: int, columns: int) -> NDArray[np.int32]:
 
 @dataclass(frozen=True, slots=True)
 class Push:
-    """One run of the elements: a stretch, a place and ascending depths (n,)."""
+    """One run of the elements: a stretch, a place, ascending depths (n,), cells along a side."""
 
     rubber: Rubber
     stretch_ratio: float
     place_m: tuple[float, float]
     depths_m: Floats
     finger_radius_m: float
+    element_cells: int
 
 
 Solved = Iterable[Floats]
@@ -159,7 +161,14 @@ def solve_dents(
     roots = _chebyshev(0.0, 1.0, within.depth_nodes)
     depths = within.deepest_m * roots**2
     pushes = [
-        Push(rubber, float(stretch), (float(x), float(y)), depths, finger_radius_m)
+        Push(
+            rubber,
+            float(stretch),
+            (float(x), float(y)),
+            depths,
+            finger_radius_m,
+            within.element_cells,
+        )
         for stretch, x, y in product(stretches, xs, ys)
     ]
     samples = np.array(list(solve_all(pushes))).reshape(len(pushes) * len(roots), -1)
@@ -187,7 +196,7 @@ def solve_push(push: Push) -> Floats:
         depths_m=push.depths_m,
         place_m=push.place_m,
         finger_radius_m=push.finger_radius_m,
-        cells=ELEMENT_CELLS,
+        cells=push.element_cells,
     )
     rest = pushed.rest_m
     flat = np.stack([stretch * rest[..., 0], rest[..., 1], np.zeros(rest.shape[:2])], axis=-1)

@@ -1,6 +1,6 @@
 """The sheet as a finite-element membrane: the most exact of its force laws, and the slowest.
 
-Constant-strain triangles of incompressible Mooney-Rivlin rubber in plane stress,
+Bilinear cells, integrated at four points, of incompressible Mooney-Rivlin rubber in plane stress,
 
     W = C1 (I1 - 3) + C2 (I2 - 3),    E = 6 (C1 + C2)
 
@@ -39,6 +39,8 @@ STEP_RADII = 0.4
 BED_PER_MODULUS = 2e5
 """Pressure of the finger per depth of penetration, in E t / width^2."""
 MOST_ITERATIONS = 120
+GAUSS = 0.5 / np.sqrt(3.0)
+"""Of the two points along a cell's side from its middle, over the side."""
 TOLERANCE = 1e-7
 """Residual at equilibrium, in E t width."""
 
@@ -148,7 +150,7 @@ def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floa
 
 
 class _Grid:
-    """Triangles of the rest sheet, their strain, and the pattern of the stiffness matrix."""
+    """Cells of the rest sheet, their strain, and the pattern of the stiffness matrix."""
 
     def __init__(self, rubber: Rubber, focus: Floats, finest_m: float, cells: int) -> None:
         x = graded(rubber.width_m, float(focus[0]), finest_m, cells)
@@ -162,41 +164,39 @@ class _Grid:
         self.force_scale = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
 
         number = np.arange(rows * columns).reshape(rows, columns)
-        a, b = number[:-1, :-1], number[:-1, 1:]
-        d, c = number[1:, :-1], number[1:, 1:]
-        # The diagonals point to the middle of the crosses of four cells, so that no direction of
-        # the sheet is favoured.
-        row, column = np.indices(a.shape)
-        rising = ((row + column) % 2 == 0)[..., None]
-        first = np.where(rising, np.stack([a, b, c], -1), np.stack([a, b, d], -1))
-        second = np.where(rising, np.stack([a, c, d], -1), np.stack([b, c, d], -1))
-        self.triangles = np.concatenate([first.reshape(-1, 3), second.reshape(-1, 3)])
-        corners = self.rest[self.triangles]
-        sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=-1)
-        area = 0.5 * np.linalg.det(sides)
-        self.volume = area * rubber.thickness_m
-        inverse = np.linalg.inv(sides)
-        # (triangles, 3 nodes, 2): gradient of the hat functions; F = sum of positions x gradient.
-        self.hats = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
-        node_area = np.bincount(self.triangles.ravel(), np.repeat(area / 3.0, 3), len(self.rest))
+        corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
+        self.cells = np.stack([each.ravel() for each in corners], axis=1)
+        width, height = (each.ravel() for each in np.meshgrid(np.diff(x), np.diff(y)))
+        u, v = (each.ravel() for each in np.meshgrid(*[[0.5 - GAUSS, 0.5 + GAUSS]] * 2))
+        by_u = np.stack([v - 1.0, 1.0 - v, v, -v], axis=1)
+        by_v = np.stack([u - 1.0, -u, u, 1.0 - u], axis=1)
+        # (cells, 4 points, 4 nodes, 2): gradient of the hat functions; F = sum of positions x
+        # gradient.
+        self.hats = np.stack(
+            [by_u / width[:, None, None], by_v / height[:, None, None]], axis=-1
+        ).reshape(-1, 4, 2)
+        area = width * height
+        self.volume = np.repeat(0.25 * area * rubber.thickness_m, 4)
+        node_area = np.bincount(self.cells.ravel(), np.repeat(0.25 * area, 4), len(self.rest))
         pressure = rubber.young_modulus_pa * rubber.thickness_m / rubber.width_m**2
         self.bed = np.asarray(BED_PER_MODULUS * pressure * node_area, dtype=np.float64)
         self.left, self.right = number[:, 0], number[:, -1]
         clamped = np.zeros(len(self.rest), dtype=bool)
         clamped[self.left] = clamped[self.right] = True
         self.clamped = clamped
-        coordinates = (3 * self.triangles[:, :, None] + np.arange(3)).reshape(-1, 9)
+        coordinates = (3 * self.cells[:, :, None] + np.arange(3)).reshape(-1, 12)
         self._coordinates = coordinates
         size = 3 * len(self.rest)
-        keys = np.repeat(coordinates, 9, axis=1) + size * np.tile(coordinates, (1, 9))
+        keys = np.repeat(coordinates, 12, axis=1) + size * np.tile(coordinates, (1, 12))
         self._keys, self._slots = np.unique(keys.ravel(), return_inverse=True)
         self._rows, self._columns = self._keys % size, self._keys // size
         self._size = size
         self._diagonal = np.searchsorted(self._keys, np.arange(size) * (size + 1))
 
     def strain(self, positions: Floats) -> tuple[Floats, Floats]:
-        """F (triangles, 3, 2) and C = F'F (triangles, 2, 2)."""
-        deformed = positions[self.triangles].transpose(0, 2, 1) @ self.hats
+        """F (points, 3, 2) and C = F'F (points, 2, 2); four points to a cell."""
+        at_corners = np.repeat(positions[self.cells].transpose(0, 2, 1), 4, axis=0)
+        deformed = at_corners @ self.hats
         return deformed, deformed.transpose(0, 2, 1) @ deformed
 
     def energy(self, positions: Floats) -> float:
@@ -212,13 +212,15 @@ class _Grid:
         return self._gathered(local)
 
     def _gathered(self, local: Floats) -> Floats:
-        """Element forces (triangles, 3, 3) summed at the nodes (3 nodes,)."""
-        sums = np.bincount(self._coordinates.ravel(), weights=local.ravel(), minlength=self._size)
+        """Forces of the points (points, 4, 3) summed at the nodes (3 nodes,)."""
+        by_cell = local.reshape(-1, 4, 12).sum(axis=1)
+        sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
     def _summed(self, blocks: Floats) -> Floats:
-        """Element stiffnesses summed into the entries of the pattern."""
-        sums = np.bincount(self._slots, weights=blocks.ravel(), minlength=len(self._keys))
+        """Stiffnesses of the points (points, ...) summed into the entries of the pattern."""
+        by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
+        sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
 
     def system(
@@ -231,14 +233,14 @@ class _Grid:
         local = volume * hats @ stress @ deformed.transpose(0, 2, 1)
         count = len(local)
         # Variation of E = (C - I)/2 as [E11, E22, 2 E12] with the nodes' coordinates.
-        by_node = np.empty((count, 3, 3, 3))
+        by_node = np.empty((count, 3, 4, 3))
         by_node[:, 0] = hats[:, :, :1] * deformed[:, None, :, 0]
         by_node[:, 1] = hats[:, :, 1:] * deformed[:, None, :, 1]
         by_node[:, 2] = (
             hats[:, :, 1:] * deformed[:, None, :, 0] + hats[:, :, :1] * deformed[:, None, :, 1]
         )
-        b = by_node.reshape(count, 3, 9)
-        blocks = (b.transpose(0, 2, 1) @ (volume * tangent @ b)).reshape(count, 3, 3, 3, 3)
+        b = by_node.reshape(count, 3, 12)
+        blocks = (b.transpose(0, 2, 1) @ (volume * tangent @ b)).reshape(count, 4, 3, 4, 3)
         geometric = volume * hats @ stress @ hats.transpose(0, 2, 1)
         for axis in range(3):
             blocks[:, :, axis, :, axis] += geometric

@@ -1,0 +1,54 @@
+"""Pictures of the image's error at each visible point, case by case and method by method."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from launch.experiments.image import CORRECTIONS, Picture, Series, error_map_of, map_figures
+from launch.experiments.pictures import CORRECTION_NAMES
+from nodes.twin.places import ErrorMap
+
+LEAST_MM, MOST_MM = 0.01, 10.0
+"""Of the colours, which are logarithmic."""
+
+
+def draw_error_maps(pictures: dict[str, Picture], series: Series, path: Path) -> None:
+    """A row for each value of the series, a column for each correction.
+
+    ExperimentError when a case was not pictured in both patterns.
+    """
+    cases = [
+        (series.name.format(value), [series.label(value, name) for name in CORRECTIONS])
+        for value in series.values
+    ]
+    maps = [(title, [error_map_of(pictures, label) for label in labels]) for title, labels in cases]
+    figure = Figure(figsize=(2.9 * len(CORRECTIONS) + 0.9, 2.3 * len(maps)), layout="constrained")
+    panels = figure.subplots(len(maps), len(CORRECTIONS), squeeze=False)
+    shown = None
+    for row, (title, errors) in zip(panels, maps, strict=True):
+        box = _box_of(errors)
+        for panel, correction, of_it in zip(row, CORRECTIONS, errors, strict=True):
+            panel.set_xticks([])
+            panel.set_yticks([])
+            sizes_mm = 1e3 * np.linalg.norm(of_it.errors_m[box], axis=2)
+            shown = panel.imshow(sizes_mm, norm=LogNorm(LEAST_MM, MOST_MM), cmap="viridis")
+            figures = [one for one in map_figures(of_it).values() if one is not None]
+            said = ", ".join(f"{one:.2f}" for one in figures) + " mm" if figures else "not seen"
+            panel.set_title(f"{title}\n{CORRECTION_NAMES[correction]}\n{said}", fontsize=8)
+    if shown is not None:
+        figure.colorbar(shown, ax=panels, shrink=0.6, label="error, mm", extend="both")
+    figure.suptitle("Error of the image at each visible point: mean, 95 %, maximum")
+    figure.savefig(path, dpi=90)
+
+
+def _box_of(maps: list[ErrorMap]) -> tuple[slice, slice]:
+    """Rows and columns in which any of the maps shows anything; all of them where none does."""
+    seen = np.any([np.isfinite(each.errors_m).all(axis=2) for each in maps], axis=0)
+    if not seen.any():
+        return slice(None), slice(None)
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
