@@ -1,34 +1,48 @@
-"""Figures 11 and 13 of the paper, without the graph: the renderer's pictures, judged by the twin.
+"""The renderer's pictures, judged by the twin, without the graph.
 
-    python -m benchmarks.image_correction [--scene FILE] [--stretch 1.05]
+    python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretches] [frames]
 
-Prints two tables in mm: the error of each size as the eye sees it on the true sheet.  The tilted
-sheet either rolls on the cylinder (its plane tangent, the touched line staying put on it) or turns
-about its own centre.  Positive tilts turn the sheet's front upwards, as a finger
-does that strokes up.
+sizes: figures 11 and 13 of the paper, the error of each size as the eye sees it on the true sheet
+(mm).  The tilted sheet either rolls on the cylinder (its plane tangent, the touched line staying
+put on it) or turns about its own centre; positive tilts turn the sheet's front upwards, as a finger
+does that strokes up.  The others give the errors at all points that the eye sees (mean, 95 %,
+maximum, mm) and what share of the object it sees: over tilt to 80 degrees, over depth to 70 mm,
+over the place of the push on upright and tilted sheets, and over the stretch.  frames: the time of
+a stereo frame over the floor's, both taken in turn.  Without a name: all.
 """
 
 from __future__ import annotations
 
 import argparse
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from ruamel.yaml import YAML
 
+from launch.plan import load_scene
+from launch.twin_sheet import true_sheet
 from messages.scene import Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
 from nodes.renderer import dent_cache
-from nodes.renderer.families import rolled_on
+from nodes.renderer.families import (
+    METHODS,
+    SIZES_PX,
+    draw_stereo,
+    places_pictures,
+    rolled_on,
+    with_projector_of,
+)
 from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.sheet import sheet_between
+from nodes.renderer.sheet import Sheet, sheet_between
 from nodes.renderer.stage import Stage
 from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen, tilt_sizes
-from nodes.twin.membrane import Rubber, solve
+from nodes.twin.membrane import DeformedSheet, NotConvergedError
+from nodes.twin.places import ErrorMap, error_map
 from nodes.twin.true_object import TrueBody
 
 Floats = NDArray[np.float64]
@@ -38,6 +52,7 @@ ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
 """Of a flat sheet; four triangles are then one plane."""
+ROUNDS = 40
 
 
 class Bench:
@@ -46,25 +61,18 @@ class Bench:
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
         dents = dent_cache.load_or_solve(scene, None)
-        self._stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
+        self.stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
         self._proper = proper(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
+        unmoved = self.situation(np.eye(4), None)
+        self._whole = len(self.errors("none", *unmoved).sizes_m)
 
-    def tilt_errors(self, correction: Correction, world_from_sheet: Floats) -> Floats:
-        """|height|, |upside width|, |downside width| (m) against the proper picture."""
-        picture = self._seen(correction, world_from_sheet, None)
-        wanted = np.array(tilt_sizes(self._proper, METRES_PER_PX))
-        return np.asarray(np.abs(np.array(tilt_sizes(picture, METRES_PER_PX)) - wanted))
-
-    def push_errors(self, correction: Correction, depth_m: float) -> Floats:
-        """|height|, |width| (m) against the proper picture; the drawn object is not deformed."""
-        picture = self._seen(correction, np.eye(4), np.array([0.0, 0.0, -depth_m]))
-        wanted = np.array(push_sizes(self._proper, METRES_PER_PX))
-        return np.asarray(np.abs(np.array(push_sizes(picture, METRES_PER_PX)) - wanted))
-
-    def _seen(self, correction: Correction, world_from_sheet: Floats, tip: Floats | None) -> Image:
+    def situation(
+        self, world_from_sheet: Floats, tip: Floats | None, *, stretch: float | None = None
+    ) -> tuple[Sheet, DeformedSheet]:
+        """The sheet as the renderer believes it to be, and as it is."""
         sheet = self.scene.sheet
-        edges = edge_poses(world_from_sheet, sheet.width_m * self.stretch)
+        edges = edge_poses(world_from_sheet, sheet.width_m * (stretch or self.stretch))
         believed = sheet_between(
             *edges,
             height_m=sheet.height_m,
@@ -73,38 +81,204 @@ class Bench:
             finger_tip=tip,
         )
         assert believed is not None
+        return believed, true_sheet(self.scene, *edges, tip)
+
+    def pushed(
+        self, depth_m: float, *, tilt_deg: float = 0.0, place_m: tuple[float, float] = (0.0, 0.0)
+    ) -> tuple[Floats, Floats | None]:
+        """world_from_sheet that touches the cylinder with that place, and the fingertip there."""
+        pose = rolled_on(self.scene, -np.radians(tilt_deg), place_m)
+        touched = pose[:3, 3] + pose[:3, :3] @ [*place_m, 0.0]
+        return pose, touched - depth_m * pose[:3, 2] if depth_m else None
+
+    def size_errors(
+        self,
+        correction: Correction,
+        believed: Sheet,
+        truth: DeformedSheet,
+        sizes: Callable[[Image, float], Sequence[float]],
+    ) -> Floats:
+        """Of each size (m), against the proper picture; the drawn object is not deformed."""
         shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
-        projected = self._stage.draw(shown, believed, Look(True, "object"), read=True)
+        projected = self.stage.draw(shown, believed, Look(True, "object"), read=True)
         assert projected is not None
-        rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
-        truth = solve(rubber, *edges, finger_tip=tip, finger_radius_m=self.scene.finger.radius_m)
-        return seen(projected, truth, self.scene, eye=self._eye)
+        picture = seen(projected, truth, self.scene, eye=self._eye)
+        wanted = np.array(sizes(self._proper, METRES_PER_PX))
+        return np.asarray(np.abs(np.array(sizes(picture, METRES_PER_PX)) - wanted))
+
+    def errors(self, method: str, believed: Sheet, truth: DeformedSheet) -> ErrorMap:
+        """At all points that the eye sees."""
+        pictures = places_pictures(self.stage, method, believed)
+        x, y = (seen(each, truth, self.scene, eye=self._eye) for each in pictures)
+        return error_map(x, y, METRES_PER_PX)
+
+    def cell(self, method: str, believed: Sheet, truth: DeformedSheet) -> str:
+        """Mean / 95 % / maximum of the errors, mm, and how much of the object is seen."""
+        sizes = 1e3 * self.errors(method, believed, truth).sizes_m
+        if len(sizes) == 0:
+            return "dark"
+        figures = f"{sizes.mean():.2f} / {np.quantile(sizes, 0.95):.2f} / {sizes.max():.2f}"
+        share = len(sizes) / self._whole
+        return figures if share > 0.985 else f"{figures} ({100 * share:.0f} %)"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scene", default=ROOT / "launch" / "scenes" / "cylinder.yaml", type=Path)
-    parser.add_argument("--stretch", default=1.05, type=float)
-    options = parser.parse_args()
-    scene = Scene.model_validate(YAML(typ="safe").load(options.scene.read_text()))
-    bench = Bench(scene, stretch=options.stretch)
-    print("| sheet | tilt (deg) | method | height | upside | downside | mean |")
-    print("|---|---|---|---|---|---|---|")
+def row(*cells: object) -> None:
+    print("| " + " | ".join(str(cell) for cell in cells) + " |", flush=True)
+
+
+def heading(*cells: str) -> None:
+    print()
+    row(*cells)
+    row(*("---" for _ in cells))
+
+
+def with_mean(errors: Floats) -> list[str]:
+    return [f"{error:.3f}" for error in (*errors, errors.mean())]
+
+
+def print_sizes(bench: Bench) -> None:
+    heading("sheet", "tilt, °", "method", "height", "upside", "downside", "mean")
     for name in ("rolls", "turns"):
         for degrees in (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50):
             tilt = -np.radians(degrees)
             turned = transform(rotation_from_vector([tilt, 0.0, 0.0]), np.zeros(3))
-            pose = rolled_on(scene, tilt) if name == "rolls" else turned
+            pose = rolled_on(bench.scene, tilt) if name == "rolls" else turned
+            situation = bench.situation(pose, None)
             for correction in TILT_CORRECTIONS:
-                errors = 1e3 * bench.tilt_errors(correction, pose)
-                cells = " | ".join(f"{value:.3f}" for value in (*errors, errors.mean()))
-                print(f"| {name} | {degrees:+d} | {correction} | {cells} |", flush=True)
-    print("\n| push (mm) | method | height | width | mean |\n|---|---|---|---|---|")
+                errors = 1e3 * bench.size_errors(correction, *situation, tilt_sizes)
+                row(
+                    name,
+                    f"{degrees:+d}",
+                    correction,
+                    *(f"{e:.3f}" for e in (*errors, errors.mean())),
+                )
+    heading("push, mm", "method", "height", "width", "mean")
     for depth_mm in (10, 20, 30, 40, 50):
+        situation = bench.situation(*bench.pushed(depth_mm * 1e-3))
         for correction in CORRECTIONS:
-            errors = 1e3 * bench.push_errors(correction, depth_mm * 1e-3)
-            cells = " | ".join(f"{value:.3f}" for value in (*errors, errors.mean()))
-            print(f"| {depth_mm} | {correction} | {cells} |", flush=True)
+            errors = 1e3 * bench.size_errors(correction, *situation, push_sizes)
+            row(depth_mm, correction, *with_mean(errors))
+
+
+def print_tilts(bench: Bench) -> None:
+    heading("tilt, °", *TILT_CORRECTIONS)
+    for degrees in (*range(-80, -50, 5), *range(-50, 60, 25), *range(55, 85, 5)):
+        situation = bench.situation(rolled_on(bench.scene, -np.radians(degrees)), None)
+        usable = bench.stage.usable(situation[0])
+        row(
+            f"{degrees:+d}{'' if usable else ' (held)'}",
+            *(bench.cell(method, *situation) for method in TILT_CORRECTIONS),
+        )
+
+
+def print_depths(bench: Bench) -> None:
+    methods = ("none", "four_triangles", "two_pass_triangles", "two_pass")
+    heading("push, mm", *methods)
+    for depth_mm in (1, 2, 3.5, 5, 10, 20, 30, 40, 50, 60, 70):
+        situation = bench.situation(*bench.pushed(depth_mm * 1e-3))
+        row(depth_mm, *(bench.cell(method, *situation) for method in methods))
+
+
+PLACES_MM = (
+    (0, 0),
+    (40, 50),
+    (0, 60),
+    (0, 84),
+    (0, -84),
+    (0, 96),
+    (0, 110),
+    (70, 0),
+    (86, 0),
+    (105, 0),
+)
+
+
+def print_places(bench: Bench) -> None:
+    tilts = (0, -30, 30)
+    heading("pushed 30 mm at, mm", *(f"tilted {tilt:+d}°" for tilt in tilts))
+    for place in PLACES_MM:
+        cells = []
+        for tilt in tilts:
+            place_m = (place[0] * 1e-3, place[1] * 1e-3)
+            situation = bench.situation(*bench.pushed(0.03, tilt_deg=tilt, place_m=place_m))
+            cells.append(bench.cell("two_pass", *situation))
+        row(f"{place[0]}, {place[1]}", *cells)
+
+
+def print_stretches(bench: Bench) -> None:
+    heading("stretch", "pushed 30 mm", "note")
+    for stretch in (0.98, 1.0, 1.01, 1.03, 1.05, 1.08, 1.09, 1.12):
+        pose, tip = bench.pushed(0.03)
+        try:
+            situation = bench.situation(pose, tip, stretch=stretch)
+        except NotConvergedError as error:
+            row(stretch, "no truth", error)
+            continue
+        cell = bench.cell("two_pass", *situation)
+        row(stretch, cell, bench.stage.note)
+
+
+def print_frames(scene: Scene) -> None:
+    """Wall time of a stereo frame: the median over rounds in which every method has its turn."""
+    dents, context = dent_cache.load_or_solve(scene, None), headless_context()
+    print(f"\n{context.info['GL_RENDERER']}")
+    heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")
+    for size in SIZES_PX:
+        shown = with_projector_of(scene, *size)
+        bench_stage = Stage(shown, context, spacing_m=0.0025, dents=dents)
+        edges = edge_poses(np.eye(4), scene.sheet.width_m * 1.05)
+        tip = np.array([0.0, 0.0, -0.03])
+        sheet = sheet_between(
+            *edges,
+            height_m=scene.sheet.height_m,
+            twist_world=np.zeros(6),
+            ahead_s=0.0,
+            finger_tip=tip,
+        )
+        assert sheet is not None
+        wall, cpu = ({method: np.empty(ROUNDS) for method in METHODS} for _ in range(2))
+        for method in METHODS:
+            draw_stereo(bench_stage, method, sheet)
+        for turn in range(ROUNDS):
+            for method in METHODS:
+                begun, begun_cpu = time.perf_counter(), time.process_time()
+                draw_stereo(bench_stage, method, sheet)
+                wall[method][turn] = time.perf_counter() - begun
+                cpu[method][turn] = time.process_time() - begun_cpu
+        for method in METHODS:
+            cells = []
+            for taken in (wall, cpu):
+                median, floor = np.median(taken[method]), np.median(taken[METHODS[0]])
+                cells += [f"{1e3 * median:.1f}", f"{median / floor:.2f}"]
+            row(f"{size[0]}x{size[1]}", method, *cells)
+        bench_stage.release()
+    context.release()
+
+
+TABLES: dict[str, Callable[[Bench], None]] = {
+    "sizes": print_sizes,
+    "tilts": print_tilts,
+    "depths": print_depths,
+    "places": print_places,
+    "stretches": print_stretches,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("tables", nargs="*", choices=[*TABLES, "frames", []], metavar="TABLE")
+    parser.add_argument("--scene", default=ROOT / "launch" / "scenes" / "cylinder.yaml", type=Path)
+    parser.add_argument("--stretch", default=1.05, type=float)
+    options = parser.parse_args()
+    wanted = options.tables or [*TABLES, "frames"]
+    scene = load_scene(options.scene)
+    if "frames" in wanted:
+        print_frames(scene)
+    if set(wanted) & set(TABLES):
+        bench = Bench(scene, stretch=options.stretch)
+        for name in wanted:
+            if name in TABLES:
+                TABLES[name](bench)
 
 
 if __name__ == "__main__":

@@ -7,18 +7,17 @@ from collections.abc import Mapping
 import numpy as np
 
 from launch.experiments.stroke import stroke_path
-from launch.twin_sheet import twin_force, twin_points
+from launch.twin_sheet import twin_errors, twin_force, twin_points
 from messages.scene import Scene
 from messages.types import FingerPath
 from nodes.planner.sheet_force import sheet_force_family
 from nodes.renderer.families import correction_family
 from nodes.renderer.shape_families import sheet_shape_family
 from nodes.triangulator.tracking_family import Motion, tracking_family
-from nodes.twin.eye import seen_at
 from nodes.twin.finger import FingerMotion
 from nodes.twin.gestures import GESTURES
 
-CORRECTION = correction_family(seen_at)
+CORRECTION = correction_family(twin_errors)
 
 TRACKED_GESTURES = ("hold", "reach", "tap", "stop", "stroke-push")
 RESTING = ("hold",)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene, SheetSpec
 from nodes.models.rigid import transform
-from nodes.twin.membrane import CELLS, SLACK_TENSION, Rubber, solve
+from nodes.twin.eye import METRES_PER_PX, seen
+from nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, Rubber, solve
+from nodes.twin.places import error_map
 
 Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
 
 JUST_TAUT_TENSION = 2e-6
 """What the twin's rubber keeps of tension where it is slack, in shear moduli.  A hundredth of what
@@ -57,12 +62,42 @@ def twin_points(
     scene: Scene, world_from_left_edge: Floats, world_from_right_edge: Floats, finger_tip: Floats
 ) -> Floats:
     """Points (n, 3) of the twin's sheet in the world, between two edges and under a fingertip."""
+    pushed = true_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
+    return pushed.positions.reshape(-1, 3)
+
+
+def true_sheet(
+    scene: Scene,
+    world_from_left_edge: Floats,
+    world_from_right_edge: Floats,
+    finger_tip: Floats | None,
+) -> DeformedSheet:
+    """The twin's sheet between two edges (4, 4), under a fingertip (3,) or none."""
     sheet = scene.sheet
-    pushed = solve(
+    return solve(
         Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
         world_from_left_edge,
         world_from_right_edge,
         finger_tip=finger_tip,
         finger_radius_m=scene.finger.radius_m,
     )
-    return pushed.positions.reshape(-1, 3)
+
+
+def twin_errors(
+    scene: Scene,
+    world_from_left_edge: Floats,
+    world_from_right_edge: Floats,
+    finger_tip: Floats | None,
+) -> Callable[[Image, Image], Floats]:
+    """Judges the projector's pictures of both patterns of places on the twin's sheet.
+
+    Returns a function to the errors (n,), m, at all points that the scene's eye sees.
+    """
+    sheet = true_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
+    eye = scene.eyes.centre_world_m
+
+    def errors(places_x: Image, places_y: Image) -> Floats:
+        x, y = (seen(picture, sheet, scene, eye=eye) for picture in (places_x, places_y))
+        return error_map(x, y, METRES_PER_PX).sizes_m
+
+    return errors

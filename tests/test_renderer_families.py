@@ -1,56 +1,67 @@
-"""The correction family: errors as the geometry says, and ranges that hold."""
+"""The correction family: errors at the eye as each method's range says, and what is compared."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from nodes.methods import Point, measure
-from nodes.renderer import families
-from nodes.renderer.families import correction_family, covers
-from nodes.twin.eye import seen_at
+from launch.plan import load_scene
+from launch.twin_sheet import twin_errors
+from nodes.methods import Point, measure, pareto_front
+from nodes.renderer import dent_cache, families
+from nodes.renderer.families import correction_family, covers, with_projector_of
+from nodes.renderer.stage import projector_homography
+from tests.dent_shapes import few_dents
 
-ROOT = Path(__file__).parents[1]
+SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
 
 
 @pytest.fixture(scope="module")
 def points() -> list[Point]:
-    path = ROOT / "launch" / "scenes" / "cylinder.yaml"
-    scene = Scene.model_validate(YAML(typ="safe").load(path.read_text()))
-    family = correction_family(seen_at)
+    family = correction_family(twin_errors)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(families, "TILTS_DEG", (-50, 50))
-        patch.setattr(families, "PUSHES_MM", (0, 30))
-        return [measure(trial, repeats=1) for trial in family.trials(scene)]
+        patch.setattr(dent_cache, "load_or_solve", lambda scene, folder: few_dents())
+        patch.setattr(families, "CASES", ((-50, 0), (0, 25)))
+        patch.setattr(families, "SIZES_PX", ((640, 480),))
+        return [measure(trial, repeats=1) for trial in family.trials(SCENE)]
 
 
 def error(points: list[Point], method: str, tilt_deg: int, push_mm: int) -> float:
     (point,) = [
         point
         for point in points
-        if point.method == method and point.params == {"tilt_deg": tilt_deg, "push_mm": push_mm}
+        if point.method == method
+        and (point.case["tilt_deg"], point.case["push_mm"]) == (tilt_deg, push_mm)
     ]
-    assert point.in_range == covers(point.method, tilt_deg=tilt_deg, push_mm=push_mm)  # type: ignore[arg-type]  # one of three names
+    assert point.in_range == covers(point.method, tilt_deg=tilt_deg, push_mm=push_mm)
     return point.error
 
 
-def test_a_plane_is_corrected_by_both_methods(points: list[Point]) -> None:
-    for tilt in (-50, 50):
-        assert error(points, "none", tilt, 0) > 5.0
-        assert error(points, "one_plane", tilt, 0) < 1e-3
-        assert error(points, "four_triangles", tilt, 0) < 1e-3
+def test_a_plane_is_corrected_by_all_but_none(points: list[Point]) -> None:
+    assert error(points, "none", -50, 0) > 5.0
+    for method in families.METHODS[2:]:
+        assert error(points, method, -50, 0) < 0.2
 
 
-def test_nothing_needs_correcting_on_the_imaginary_screen(points: list[Point]) -> None:
-    for method in ("none", "one_plane", "four_triangles"):
-        assert error(points, method, 0, 0) < 1e-3
+def test_only_two_passes_onto_the_dents_shape_hold_a_dent(points: list[Point]) -> None:
+    uncorrected = error(points, "none", 0, 25)
+    assert error(points, "one_plane", 0, 25) == pytest.approx(uncorrected, abs=0.02)
+    assert error(points, "two_pass_flat", 0, 25) == pytest.approx(uncorrected, abs=0.1)
+    for method in ("four_triangles", "two_pass_triangles"):
+        assert 0.5 < error(points, method, 0, 25) < 0.7 * uncorrected
+    assert error(points, "two_pass", 0, 25) < 0.1
 
 
-def test_four_triangles_help_on_a_dent_but_do_not_hold_it(points: list[Point]) -> None:
-    uncorrected = error(points, "none", 0, 30)
-    corrected = error(points, "four_triangles", 0, 30)
-    assert error(points, "one_plane", 0, 30) == pytest.approx(uncorrected, abs=1e-6)
-    assert 0.5 < corrected < 0.7 * uncorrected
+def test_the_floor_corrects_nothing_and_is_no_choice(points: list[Point]) -> None:
+    assert error(points, "floor", 0, 25) == pytest.approx(error(points, "none", 0, 25))
+    assert "floor" not in pareto_front(points)
+    assert not covers("floor", tilt_deg=0, push_mm=0)
+
+
+def test_a_projector_of_other_pixels_lights_the_same_place() -> None:
+    large = with_projector_of(SCENE, 1280, 720)
+    middle = projector_homography(large) @ [0.0, 0.0, 1.0]
+    assert middle[:2] / middle[2] == pytest.approx([639.5, 359.5])
+    small, other = projector_homography(SCENE), projector_homography(large)
+    assert other[0, 0] == pytest.approx(1.6 * small[0, 0])

@@ -1,88 +1,152 @@
-"""The image correction's method family: how long a picture's vertices take, how far off they land.
+"""The image correction's method family: how long a stereo frame takes, how far off its picture is.
 
-What is timed is the numpy form of the vertex shader's work, `correction.correct`, on every vertex
-of the drawn surface.  What is judged is where the eye sees the light of each vertex on the true
-sheet; that answer comes from a judge which shares no code with the renderer, and which whoever
-asks for the family brings along.
+What is timed is a whole stereo frame, both eyes drawn and the drawing waited for; nothing is read.
+`floor` is the least that any of them does: clear, draw the same triangles once for each eye, with
+as many samples.  What is judged is the error at each point that the eye sees on the true sheet; the
+judge shares no code with the renderer, and whoever asks for the family brings it along.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene, cylinder_of
-from messages.types import Correction
+from messages.types import Correction, Display, Pattern
 from nodes.methods import Case, Family, Trial
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer.correction import correct, on_imaginary_screen
-from nodes.renderer.sheet import Sheet, screen_for, sheet_between
-from nodes.renderer.stage import projector_homography, transform_of
-from nodes.renderer.surface import cylinder_surface, normals_of
+from nodes.renderer import dent_cache
+from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.output import Image
+from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.sheet_mesh import SheetMesh, flat_mesh, pyramid_mesh
+from nodes.renderer.stage import Stage, transform_of
 
 Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
-SeenAt = Callable[[Floats], tuple[Floats, Bools]]
-"""Projector pixels (n, 2) to where the eye sees their light, (n, 2) metres on the imaginary screen,
-and whether it does."""
+Judgement = Callable[[Image, Image], Floats]
+"""Projector's pictures of the patterns `places_x` and `places_y` to the errors (n,), m, at all
+points of the object that the eye sees."""
 
-Judge = Callable[[Scene, Floats, Floats, Floats | None], SeenAt]
-"""Makes a `SeenAt` for a scene whose sheet has its left and right edge at two poses (4, 4) and is
-pushed by a fingertip (3,), or by none."""
+Judge = Callable[[Scene, Floats, Floats, Floats | None], Judgement]
+"""Makes a `Judgement` for a scene whose sheet has its left and right edge at two poses (4, 4) and
+is pushed by a fingertip (3,), or by none."""
 
-METHODS: tuple[Correction, ...] = ("none", "one_plane", "four_triangles")
-"""Those that move vertices; two passes move none."""
-TILTS_DEG = (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50)
-PUSHES_MM = (0, 10, 20, 30, 40, 50)
+CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
+SHAPES: dict[str, Callable[[Sheet], SheetMesh]] = {
+    "two_pass_flat": flat_mesh,
+    "two_pass_triangles": pyramid_mesh,
+}
+"""Two passes onto cheaper shapes than the dent's own."""
+FLOOR = "floor"
+METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
+CASES: tuple[tuple[float, float], ...] = (
+    *((tilt, 0) for tilt in (-50, -30, 30, 50)),
+    *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
+)
+"""Tilts (degrees) and pushes (mm)."""
+LARGE_CASES: tuple[tuple[float, float], ...] = ((-30, 0), (0, 30))
+SIZES_PX = ((800, 600), (1280, 720))
 STRETCH = 1.05
 SPACING_M = 0.0025
 
 
 def correction_family(judge: Judge) -> Family:
     """Every correction over the tilts and pushes of the paper's figures 11 and 13."""
-
-    def trials(scene: Scene) -> Iterator[Trial]:
-        for degrees in TILTS_DEG:
-            yield from _case(scene, judge, tilt_deg=degrees, push_mm=0)
-        for depth_mm in PUSHES_MM:
-            if depth_mm <= 1e3 * scene.working_range.push_depth_m + 1e-9:
-                yield from _case(scene, judge, tilt_deg=0, push_mm=depth_mm)
-
     return Family(
         name="correction",
         unit="mm",
-        reference="rms displacement at the eye on the twin's sheet",
+        reference="rms error at the points the eye sees on the twin's sheet",
         methods=METHODS,
-        trials=trials,
+        trials=partial(_trials, judge),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
 
 TRIANGLES_TO_MM = 3.5
-"""To this push a pyramid leaves half a millimetre (rms) of a true dent; see the chart."""
+"""To this push a pyramid leaves half a millimetre (rms) of a true dent."""
 
 
-def covers(method: Correction, *, tilt_deg: float, push_mm: float) -> bool:
+def covers(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     """A method's stated range: `none` is for the sheet on the imaginary screen, `one_plane` for a
-    flat one, `four_triangles` for one that is pushed no deeper than `TRIANGLES_TO_MM`."""
+    flat one, `four_triangles` for one that is pushed no deeper than `TRIANGLES_TO_MM`; two passes
+    reach as far as their shape does, and to 50 degrees of tilt."""
     if method == "none":
         return tilt_deg == 0 and push_mm == 0
-    return push_mm <= (TRIANGLES_TO_MM if method == "four_triangles" else 0.0)
+    deepest_mm = {
+        FLOOR: -1.0,
+        "four_triangles": TRIANGLES_TO_MM,
+        "two_pass_triangles": TRIANGLES_TO_MM,
+        "two_pass": 60.0,
+    }.get(method, 0.0)
+    return push_mm <= deepest_mm and abs(tilt_deg) <= 50.0
 
 
-def rolled_on(scene: Scene, tilt_rad: float) -> Floats:
-    """world_from_sheet tangent to the cylinder, rolled there without slip from the upright pose."""
+def rolled_on(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None = None) -> Floats:
+    """world_from_sheet tangent to the cylinder there.
+
+    place_m: (x, y) of the sheet where it touches; None: where it would if it had rolled there
+    without slip from the upright pose.
+    """
     radius = cylinder_of(scene).radius_m
     axis = transform_of(scene.object.world_from_object)[:3, 3]
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
-    return transform(rotation, axis + radius * (rotation[:, 2] + tilt_rad * rotation[:, 1]))
+    x, y = (0.0, -radius * tilt_rad) if place_m is None else place_m
+    return transform(rotation, axis + rotation @ np.array([-x, -y, radius]))
 
 
-def _case(scene: Scene, judge: Judge, *, tilt_deg: float, push_mm: float) -> Iterator[Trial]:
+def with_projector_of(scene: Scene, width_px: int, height_px: int) -> Scene:
+    """The scene with a projector of other pixels that lights the same width, and its middle."""
+    projector = scene.projector
+    lens, scale = projector.lens, width_px / projector.width_px
+    cut = 0.5 * (projector.height_px * scale - height_px)
+    lens = lens.model_copy(
+        update={
+            "fx_px": lens.fx_px * scale,
+            "fy_px": lens.fy_px * scale,
+            "cx_px": (lens.cx_px + 0.5) * scale - 0.5,
+            "cy_px": (lens.cy_px + 0.5) * scale - 0.5 - cut,
+        }
+    )
+    size = {"width_px": width_px, "height_px": height_px, "lens": lens}
+    return scene.model_copy(update={"projector": projector.model_copy(update=size)})
+
+
+def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
+    dents, context = dent_cache.load_or_solve(scene, None), headless_context()
+    for size in SIZES_PX:
+        shown = with_projector_of(scene, *size)
+        stage = Stage(shown, context, spacing_m=SPACING_M, dents=dents)
+        for tilt_deg, push_mm in CASES if size == SIZES_PX[0] else LARGE_CASES:
+            if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
+                continue
+            case: Case = {
+                "tilt_deg": tilt_deg,
+                "push_mm": push_mm,
+                "width_px": size[0],
+                "height_px": size[1],
+            }
+            sheet, judgement = _situation(shown, judge, tilt_deg=tilt_deg, push_mm=push_mm)
+            for method in METHODS:
+                yield Trial(
+                    method=method,
+                    case=case,
+                    run=partial(draw_stereo, stage, method, sheet),
+                    error=partial(_error_mm, stage, method, sheet, judgement),
+                    in_range=covers(method, tilt_deg=tilt_deg, push_mm=push_mm),
+                )
+        stage.release()
+    context.release()
+
+
+def _situation(
+    scene: Scene, judge: Judge, *, tilt_deg: float, push_mm: float
+) -> tuple[Sheet, Judgement]:
     pose = rolled_on(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
@@ -94,50 +158,48 @@ def _case(scene: Scene, judge: Judge, *, tilt_deg: float, push_mm: float) -> Ite
         finger_tip=tip,
     )
     assert believed is not None
-    seen_at = judge(scene, *edges, tip)
-    case: Case = {"tilt_deg": tilt_deg, "push_mm": push_mm}
-    for method in METHODS:
-        in_range = covers(method, tilt_deg=tilt_deg, push_mm=push_mm)
-        yield _trial(scene, method, believed, seen_at, case=case, in_range=in_range)
+    return believed, judge(scene, *edges, tip)
 
 
-def _trial(
-    scene: Scene,
-    method: Correction,
-    sheet: Sheet,
-    seen_at: SeenAt,
-    *,
-    case: Case,
-    in_range: bool,
-) -> Trial:
-    cylinder = cylinder_of(scene)
-    surface = cylinder_surface(
-        radius_m=cylinder.radius_m,
-        length_m=cylinder.length_m,
-        world_from_object=transform_of(scene.object.world_from_object),
-        spacing_m=SPACING_M,
-    )
-    points, eye = surface.rest_world_m, scene.eyes.centre_world_m
-    visible = np.einsum("ij,ij->i", normals_of(surface, points), eye - points) > 0.0
-    screen, projector = screen_for(method, sheet), scene.projector.world_from_projector.position_m
-    homography = projector_homography(scene)
-    wanted = on_imaginary_screen(points[visible], eye)
+def draw_stereo(stage: Stage, method: str, sheet: Sheet) -> None:
+    """One stereo frame by a method, or the floor."""
+    display = Display(correction=_correction_of(method), stereo="side_by_side")
+    look = Look(flat=False, pattern="object")
+    if method == FLOOR:
+        for eye in stage.eyes(display):
+            stage.canvas.draw_unresolved(stage.view(eye), look)
+    elif method in SHAPES:
+        stage.draw_onto(display, SHAPES[method](sheet), look, read=False)
+    else:
+        stage.draw(display, sheet, look, read=False)
 
-    def run() -> tuple[Floats, Bools]:
-        """Where on the imaginary screen (n, 2) the light of each vertex is sent, and whether."""
-        if screen is None:
-            return on_imaginary_screen(points, eye), np.ones(len(points), bool)
-        corrected = correct(points, eye=eye, projector=projector, screen=screen)
-        return corrected.on_screen[:, :2], corrected.valid
 
-    def error_mm(result: tuple[Floats, Bools]) -> float:
-        sent, valid = result[0][visible], result[1][visible]
-        homogeneous = np.column_stack([sent, np.ones(len(sent))]) @ homography.T
-        seen, lit = seen_at(homogeneous[:, :2] / homogeneous[:, 2:])
-        counted = valid & lit
-        if not counted.any():
-            return float("inf")
-        off = np.sum((seen[counted] - wanted[counted]) ** 2, axis=1)
-        return 1e3 * float(np.sqrt(off.mean()))
+def places_pictures(stage: Stage, method: str, sheet: Sheet) -> tuple[Image, Image]:
+    """The projector's pictures of both patterns of places, for the scene's point of view."""
+    pictures = []
+    for pattern in PLACES:
+        display = Display(correction=_correction_of(method), stereo="mono", pattern=pattern)
+        look = Look(flat=True, pattern=pattern)
+        if method in SHAPES:
+            picture = stage.draw_onto(display, SHAPES[method](sheet), look, read=True)
+        else:
+            picture = stage.draw(display, sheet, look, read=True)
+        assert picture is not None
+        pictures.append(picture)
+    return pictures[0], pictures[1]
 
-    return Trial(method=method, case=case, run=run, error=error_mm, in_range=in_range)
+
+PLACES: tuple[Pattern, Pattern] = ("places_x", "places_y")
+
+
+def _error_mm(stage: Stage, method: str, sheet: Sheet, judgement: Judgement, _drawn: None) -> float:
+    """Root mean square of all points seen; infinite when none is.  The floor corrects nothing."""
+    errors_m = judgement(*places_pictures(stage, method, sheet))
+    return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
+
+
+def _correction_of(method: str) -> Correction:
+    for correction in CORRECTIONS:
+        if method == correction:
+            return correction
+    return "none" if method == FLOOR else "two_pass"

@@ -168,6 +168,11 @@ class Canvas:
         self.paint(self._frame, view, look)
         self.finish()
 
+    def draw_unresolved(self, view: View, look: Look) -> None:
+        """The least that any drawing takes, to compare with; its picture cannot be read."""
+        self.paint(self._frame, view, look)
+        self.context.finish()
+
     def paint(self, frame: moderngl.Framebuffer, view: View, look: Look) -> None:
         """Draw the object, or the pattern, into a frame."""
         frame.use()

@@ -17,6 +17,7 @@ from nodes.models.shapes import make_shape
 from nodes.models.sheet import corners
 from nodes.models.sheet.dents import DentShapes
 from nodes.renderer.correction import (
+    Screen,
     clip_from_screen,
     on_imaginary_screen,
     pixel_from_screen,
@@ -35,7 +36,8 @@ Floats = NDArray[np.float64]
 OVERSAMPLING = 1.5
 """Pixels of the eye's picture to one of the projector's."""
 
-BULGE_M, WINDOW_MARGIN_M = 0.012, 0.004
+WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
+"""The window goes by steps, lest an outline's pixels swim as the object moves."""
 NO_DENTS = "no dent shapes at hand: a pushed sheet is taken for four triangles (flexsheet prepare)"
 
 GRID_WINDOW = Window(-0.151, -0.151, 0.302, 0.302)
@@ -143,10 +145,13 @@ class Stage:
             return
         if body is None:
             self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
+            self._box_world = _box_around(self._surface.rest_world_m)
         elif self._follower is None:
             raise ValueError("a soft body came before its skin")
         else:
-            self.canvas.set_moved(self._follower.moved(body.displacement_world_m))
+            moved = self._follower.moved(body.displacement_world_m)
+            self.canvas.set_moved(moved)
+            self._box_world = _box_around(moved[:, :3])
         self._shaped_by = body
 
     def look(self, shown: Display, finger_tip: Floats | None, target: SheetTarget | None) -> Look:
@@ -204,19 +209,53 @@ class Stage:
         eyes: (1 or 2, 3), one picture each; None: the scene's, one when mono.  `drawn(number)` is
         called when an eye's picture is in `canvas.resolved`, which the next one takes.
         """
+        if display.correction == "two_pass":
+            mesh = self.sheet_mesh(sheet)
+            return self.draw_onto(display, mesh, look, read=read, eyes=eyes, drawn=drawn)
+        screen = screen_for(display.correction, sheet)
+
+        def draw_eye(eye: Floats) -> None:
+            self.canvas.draw(self.view(eye, screen), look)
+
+        return self._draw_eyes(display, draw_eye, read=read, eyes=eyes, drawn=drawn)
+
+    def draw_onto(
+        self,
+        display: Display,
+        mesh: SheetMesh,
+        look: Look,
+        *,
+        read: bool,
+        eyes: Floats | None = None,
+        drawn: Callable[[int], None] = lambda number: None,
+    ) -> Image | None:
+        """As `draw`, in two passes onto a sheet of that shape."""
+
+        def draw_eye(eye: Floats) -> None:
+            window = GRID_WINDOW if look.pattern in SCREEN_PATTERNS else self._window(eye)
+            self._projection.draw(self.canvas, mesh, self.view(eye), look, window)
+
+        return self._draw_eyes(display, draw_eye, read=read, eyes=eyes, drawn=drawn)
+
+    def view(self, eye: Floats, screen: Screen | None = None) -> View:
+        """What an eye's picture is drawn with; corrected for a screen, or not."""
+        projector = self._world_from_projector[:3, 3]
+        return View(eye, projector, screen, self._clip_from_screen, self._lens)
+
+    def _draw_eyes(
+        self,
+        display: Display,
+        draw_eye: Callable[[Floats], None],
+        *,
+        read: bool,
+        eyes: Floats | None,
+        drawn: Callable[[int], None],
+    ) -> Image | None:
         if eyes is None:
             eyes = self.eyes(display)[: 1 if display.stereo == "mono" else 2]
-        screen = screen_for(display.correction, sheet)
-        mesh = self.sheet_mesh(sheet) if display.correction == "two_pass" else None
         pictures = []
         for number, eye in enumerate(eyes):
-            projector = self._world_from_projector[:3, 3]
-            view = View(eye, projector, screen, self._clip_from_screen, self._lens)
-            if mesh is None:
-                self.canvas.draw(view, look)
-            else:
-                window = GRID_WINDOW if look.pattern in SCREEN_PATTERNS else self._window(eye)
-                self._projection.draw(self.canvas, mesh, view, look, window)
+            draw_eye(eye)
             drawn(number)
             if read:
                 pictures.append(self.canvas.read())
@@ -240,9 +279,10 @@ class Stage:
         return mesh
 
     def _window(self, eye: Floats) -> Window:
-        """What of the imaginary screen the object can cover, as the eye sees it."""
+        """What of the imaginary screen the object covers, as the eye sees it."""
         crossings = on_imaginary_screen(self._box_world, eye)
-        low, high = crossings.min(axis=0) - WINDOW_MARGIN_M, crossings.max(axis=0) + WINDOW_MARGIN_M
+        low = np.floor((crossings.min(axis=0) - WINDOW_MARGIN_M) / WINDOW_STEP_M) * WINDOW_STEP_M
+        high = np.ceil((crossings.max(axis=0) + WINDOW_MARGIN_M) / WINDOW_STEP_M) * WINDOW_STEP_M
         return Window(float(low[0]), float(low[1]), *(float(side) for side in high - low))
 
     def release(self) -> None:
@@ -251,7 +291,7 @@ class Stage:
         self._projection.release()
 
 
-def _box_around(points: Floats) -> Floats:
-    """Corners (8, 3) of the box around points, with room for a skin that bulges."""
-    low, high = points.min(axis=0) - BULGE_M, points.max(axis=0) + BULGE_M
+def _box_around(points: NDArray[np.floating]) -> Floats:
+    """Corners (8, 3) of the box around points."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return np.array(list(product(*zip(low, high, strict=True))))

@@ -10,7 +10,6 @@ It shares no code with the renderer: own rays, own projector, own object.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -429,31 +428,6 @@ def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
     top, bottom = _height(shape)
     left, right = shape.columns_of_row(0.5 * (top + bottom))
     return (bottom - top) * metres_per_px, (right - left) * metres_per_px
-
-
-def seen_at(
-    scene: Scene,
-    world_from_left_edge: Floats,
-    world_from_right_edge: Floats,
-    finger_tip: Floats | None,
-) -> Callable[[Floats], tuple[Floats, Bools]]:
-    """Judge of single points of light on the true sheet between two edges (4, 4).
-
-    Returns a function of projector pixels (n, 2): where on the imaginary screen (n, 2) the eye sees
-    their light, metres, and whether it falls on the sheet before the eye.
-    """
-    sheet = _sheet_between(scene, world_from_left_edge, world_from_right_edge, finger_tip)
-    projector = TrueProjector(scene.projector, sheet.positions.reshape(-1, 3), sheet.triangles())
-    eye = scene.eyes.centre_world_m
-
-    def judge(pixels: Floats) -> tuple[Floats, Bools]:
-        points, lit = projector.lands_at(pixels)
-        ahead = eye[2] - points[:, 2]
-        lit = lit & (ahead > 1e-3)
-        share = eye[2] / np.where(lit, ahead, 1.0)
-        return eye[:2] + (points[:, :2] - eye[:2]) * share[:, None], lit
-
-    return judge
 
 
 def _sheet_between(

@@ -24,6 +24,10 @@ PERIOD_M, RANGE_M = 0.02, 0.24
 PURE = 0.06
 """Red and green lie on a circle; farther off it than this share of its radius they are blended."""
 
+AGREES_M = 0.002
+"""Blue and the phase tell the same place; farther apart than this they are blended.  One step of
+blue is 1.2 mm."""
+
 RIM_PX = 3
 """Pixels of the outline that are left out: a bit of black in them would shift their place."""
 
@@ -72,5 +76,6 @@ def _places(picture: Image) -> tuple[Floats, Bools]:
     phase = np.arctan2(green, red) / (2.0 * np.pi)
     coarse = ((0.5 * (blue + 1.0) - 0.2) / 0.8 - 0.5) * RANGE_M
     turns = np.rint(coarse / PERIOD_M - phase)
-    pure = np.abs(np.hypot(red, green) - 1.0) < PURE
-    return (turns + phase) * PERIOD_M, pure
+    places = (turns + phase) * PERIOD_M
+    pure = (np.abs(np.hypot(red, green) - 1.0) < PURE) & (np.abs(places - coarse) < AGREES_M)
+    return places, pure
