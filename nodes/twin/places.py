@@ -78,4 +78,6 @@ def _places(picture: Image) -> tuple[Floats, Bools]:
     turns = np.rint(coarse / PERIOD_M - phase)
     places = (turns + phase) * PERIOD_M
     pure = (np.abs(np.hypot(red, green) - 1.0) < PURE) & (np.abs(places - coarse) < AGREES_M)
-    return places, pure
+    # A lone pixel that is a whole period off its neighbours is blended too.
+    about = cv2.medianBlur(places.astype(np.float32), 5)
+    return places, pure & (np.abs(places - about) < 0.5 * PERIOD_M)
