@@ -14,12 +14,18 @@ LEAST_MOTION_M = 1e-6
 
 
 def lag_s(
-    times_s: Floats, follower: Floats, leader: Floats, *, max_lag_s: float = 0.15
+    times_s: Floats,
+    follower: Floats,
+    leader: Floats,
+    *,
+    leader_times_s: Floats | None = None,
+    max_lag_s: float = 0.15,
 ) -> float | None:
     """By how much `follower` is later than `leader`; negative: it is ahead.
 
     times_s: (n,), increasing, not necessarily even.  follower, leader: (n,) or (n, k), m, at those
-    times.  The lag is where their normalised cross-correlation, all axes together, is greatest: the
+    times; or the leader at `leader_times_s` (m,), which cover them and are dense enough for it to
+    be smooth between them.  The lag is where their normalised cross-correlation, all axes together, is greatest: the
     leader is shifted (by a cubic spline, so by any time) against the follower's part that all
     shifts within +-max_lag_s cover, and a parabola through the best shift and its neighbours tells
     the place between them.  A mean and a straight trend are taken off both: how late something is
@@ -34,14 +40,17 @@ def lag_s(
     and a motion not longer than four times `max_lag_s`.
     """
     followed, led = (_rows(values) for values in (follower, leader))
-    if followed.shape != led.shape or len(followed) != len(times_s):
+    led_at = times_s if leader_times_s is None else leader_times_s
+    same = followed.shape[1] == led.shape[1] and len(led) == len(led_at)
+    if not same or len(followed) != len(times_s):
         raise ValueError(
             f"{len(times_s)} times, follower {np.shape(follower)} and leader {np.shape(leader)}: "
             "one row per time, of the same axes"
         )
-    if not (np.isfinite(followed).all() and np.isfinite(led).all() and np.isfinite(times_s).all()):
+    numbers = (followed, led, times_s, led_at)
+    if not all(np.isfinite(values).all() for values in numbers):
         raise ValueError("a lag needs finite times and values; leave out what is not known")
-    if not (np.diff(times_s) > 0.0).all():
+    if not ((np.diff(times_s) > 0.0).all() and (np.diff(led_at) > 0.0).all()):
         raise ValueError("a lag needs times that increase")
     if len(times_s) < 8 or times_s[-1] - times_s[0] <= 4.0 * max_lag_s:
         raise ValueError(
@@ -49,8 +58,9 @@ def lag_s(
             f"to find a lag of up to {max_lag_s:g} s in"
         )
     times = np.asarray(times_s - times_s[0], dtype=np.float64)
-    shifted = CubicSpline(times, led)
-    inner = (times >= max_lag_s) & (times <= times[-1] - max_lag_s)
+    known = np.asarray(led_at - times_s[0], dtype=np.float64)
+    shifted = CubicSpline(known, led)
+    inner = (times >= known[0] + max_lag_s) & (times <= known[-1] - max_lag_s)
     at = times[inner]
     trend, _ = np.linalg.qr(np.stack([np.ones(len(at)), at - at.mean()], axis=1))
 
@@ -58,7 +68,7 @@ def lag_s(
         return np.asarray(values - trend @ (trend.T @ values))
 
     ours = moving(followed[inner])
-    if min(_size(moving(led[inner])), _size(ours)) < LEAST_MOTION_M:
+    if min(_size(moving(shifted(at))), _size(ours)) < LEAST_MOTION_M:
         return None
 
     def correlation(shift_s: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,30 @@ PAPER_TABLE_1 = {
 
 
 NOTHING: Floats = np.empty(0)
+
+
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """What was drawn, at the middle of its light.
+
+    fingertip: (3,) rows, where the finger was drawn.  sheet: (4, 4) poses drawn for, as (6,) rows
+    of centre and normal.  dented: (1,) rows, the light's age over the finger that dents the object.
+    """
+
+    fingertip: list[tuple[int, Floats]]
+    sheet: list[tuple[int, Floats]]
+    dented: list[tuple[int, Floats]]
+
+    def take(self, frame: Frame) -> None:
+        if not frame.light_ns:
+            return
+        pose = frame.world_from_sheet
+        self.sheet.append((frame.light_ns, np.concatenate([pose[:3, 3], pose[:3, 2]])))
+        if len(frame.fingertip_world_m):
+            self.fingertip.append((frame.light_ns, frame.fingertip_world_m[0]))
+        if frame.shaped_for_ns:
+            age_s = (frame.light_ns - frame.shaped_for_ns) * 1e-9
+            self.dented.append((frame.light_ns, np.array([age_s])))
 
 
 def stroke_label(seconds: float) -> str:
@@ -145,6 +169,7 @@ class Recording:
     true_edges: tuple[Track, Track]
     delays_s: dict[str, Floats]
     drops: int
+    pictures: Pictures = field(default_factory=lambda: Pictures([], [], []))
 
     def arm_delays_s(self) -> Floats:
         """From exposure to the command being written, both arms together."""
@@ -176,6 +201,7 @@ def read_recording(bag: Path) -> Recording:
         key: [] for key in ("left", "right", "true_left", "true_right")
     }
     delays: dict[tuple[str, int], float] = {}
+    pictures = Pictures([], [], [])
 
     def delay(event: str, source_ns: int, event_ns: int) -> None:
         delays.setdefault((event, source_ns), (event_ns - source_ns) * 1e-9)
@@ -207,9 +233,12 @@ def read_recording(bag: Path) -> Recording:
             case SoftBody():
                 delay("soft body", header.source_ns, header.publish_ns)
             case Frame():
-                begun_ns = header.publish_ns - round(message.draw_s * 1e9)
-                delay("frame begun", header.source_ns, begun_ns)
-                delay("frame drawn", header.source_ns, header.publish_ns)
+                pictures.take(message)
+                drawn_ns = message.drawn_ns or header.publish_ns
+                delay("frame begun", header.source_ns, drawn_ns - round(message.draw_s * 1e9))
+                delay("frame drawn", header.source_ns, drawn_ns)
+                if message.light_ns:
+                    delay("light", header.source_ns, message.light_ns)
             case Status():
                 for port in message.inputs:
                     # Each start of a node counts anew; its last word is what it lost in all.
@@ -239,6 +268,7 @@ def read_recording(bag: Path) -> Recording:
         true_edges=(edges("true_left", scene.arms.left), edges("true_right", scene.arms.right)),
         delays_s=by_event(delays),
         drops=sum(losses.values()),
+        pictures=pictures,
     )
 
 
@@ -341,16 +371,20 @@ class StrokeErrors:
     arcs_m: Floats
 
 
-def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
-    """Errors at every exposure of that stroke; ExperimentError when the bag does not have it."""
+def stroke_span_ns(recording: Recording, seconds: float) -> tuple[int, int]:
+    """When that stroke began and ended; ExperimentError when the bag does not have it."""
     label = stroke_label(seconds)
     if label not in recording.windows_ns:
         have = ", ".join(recording.windows_ns) or "none"
         raise ExperimentError(f'the bag has no finger path "{label}"; it has: {have}')
     zero_ns, end_ns = recording.windows_ns[label]
     begin_s, finish_s = stroke_window_s(seconds)
-    begin_ns = zero_ns + round(begin_s * 1e9)
-    finish_ns = min(zero_ns + round(finish_s * 1e9), end_ns)
+    return zero_ns + round(begin_s * 1e9), min(zero_ns + round(finish_s * 1e9), end_ns)
+
+
+def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
+    """Errors at every exposure of that stroke; ExperimentError when the bag does not have it."""
+    begin_ns, finish_ns = stroke_span_ns(recording, seconds)
 
     def in_stroke(times: NDArray[np.int64]) -> NDArray[np.int64]:
         keep = (times >= begin_ns) & (times <= finish_ns)
@@ -362,6 +396,7 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
         in_stroke(track.times_ns) for track in (recording.fingertip, recording.finger)
     )
     if len(times) < 10:
+        label = stroke_label(seconds)
         raise ExperimentError(f'only {len(times)} fingertips were recorded during "{label}"')
     scene = recording.scene
     delta_d, delta_theta = sheet_errors(scene, recording.fingertip, recording.measured_edges, times)
@@ -410,6 +445,52 @@ def tangential_distance(
     return np.asarray(np.linalg.norm(on_surface[0] - on_surface[1], axis=1))
 
 
+def visible_lag_ms(recording: Recording, seconds: float) -> dict[str, float | None]:
+    """How late what was drawn is when its light leaves, after all prediction; None: not to tell.
+
+    fingertip, sheet: the mark and the sheet's turn about the object, as drawn, against the true
+    ones, by the shift in time that makes them most alike.  object: the median age of the finger
+    that dents the drawn object, less what the solver predicted it by.
+    """
+    span = stroke_span_ns(recording, seconds)
+    world_from_object = object_pose(recording.scene)
+    radius = cylinder_of(recording.scene).radius_m
+
+    def within(samples: list[tuple[int, Floats]]) -> list[tuple[int, Floats]]:
+        return [sample for sample in samples if span[0] <= sample[0] <= span[1]]
+
+    def lag(
+        samples: list[tuple[int, Floats]], times_ns: NDArray[np.int64], truth: Floats
+    ) -> float | None:
+        if len(samples) < 20:
+            return None
+        drawn = track(samples, "frame")
+        inside = drawn.times_ns < times_ns[-1]
+        found = lag_s(
+            np.asarray((drawn.times_ns[inside] - span[0]) * 1e-9, dtype=np.float64),
+            drawn.values[inside],
+            truth,
+            leader_times_s=np.asarray((times_ns - span[0]) * 1e-9, dtype=np.float64),
+        )
+        return None if found is None else 1e3 * found
+
+    def turns(normals: Floats) -> Floats:
+        local = normals @ world_from_object[:3, :3]
+        return np.asarray(radius * np.arctan2(local[:, 1], local[:, 2])[:, None])
+
+    true_ns = recording.true_edges[0].times_ns
+    true_ns = true_ns[recording.true_edges[1].covers(true_ns)]
+    _, angles = presented(recording.true_edges, world_from_object, true_ns, np.zeros(len(true_ns)))
+    sheet = [(time, turns(row[None, 3:])[0]) for time, row in within(recording.pictures.sheet)]
+    finger = recording.finger
+    dented = within(recording.pictures.dented)
+    return {
+        "fingertip": lag(within(recording.pictures.fingertip), finger.times_ns, finger.values),
+        "sheet": lag(sheet, true_ns, radius * angles),
+        "object": 1e3 * float(np.median([age[0] for _, age in dented])) if dented else None,
+    }
+
+
 def stroke_result(
     recording: Recording, errors: StrokeErrors, seconds: float, bag: Path
 ) -> dict[str, Any]:
@@ -428,6 +509,7 @@ def stroke_result(
         "smoother_mm": summary(errors.smoother_m, 1e3),
         "true_over_smoother": float(errors.true_delta_d_m.mean() / errors.smoother_m.mean()),
         "lag_ms": None if lag is None else 1e3 * lag,
+        "visible_lag_ms": visible_lag_ms(recording, seconds),
         "fingertip_mm": summary(errors.fingertip_m, 1e3),
         "latency_ms": {
             "exposure_to_arm": percentiles_ms(recording.arm_delays_s()),
@@ -435,6 +517,7 @@ def stroke_result(
             "exposure_to_frame_begun": percentiles_ms(
                 recording.delays_s.get("frame begun", NOTHING)
             ),
+            "exposure_to_light": percentiles_ms(recording.delays_s.get("light", NOTHING)),
         },
         "drops": recording.drops,
         "bag": str(bag),

@@ -1,0 +1,126 @@
+"""Structured light: Gray code patterns, and what two cameras make of pictures of them.
+
+A camera's pixel is wider than a projector's, so the finest stripes are not told apart: each picture
+is decoded to cells of a few projector pixels.  Where a projector pixel is in a picture to a small
+part of a camera's pixel follows from the cells around it, by a smooth map fitted to them (after
+Moreno and Taubin 2012, who fit local homographies).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Image = NDArray[np.uint8]
+
+LEAST_CONTRAST = 24
+"""Levels between white and black below which a camera's pixel is not lit by the projector."""
+
+FINEST_PX = 4
+"""Width of the finest stripes that are used, projector pixels."""
+
+REACH_PX = 22.0
+"""Half the side of the window that a projector pixel's place is fitted in, projector pixels."""
+
+LEAST_CELLS = 60
+WORST_FIT_PX = 0.6
+"""A fit that leaves more than this (rms, camera pixels) spans an edge or a fold of the sheet."""
+
+
+class DecodeError(ValueError):
+    """Pictures that are not of the patterns; the message says what is wrong."""
+
+
+def patterns(width_px: int, height_px: int) -> list[Image]:
+    """What the projector shows in turn: each stripe and its inverse, then white, then black."""
+    coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
+    made, images = coder.generate()
+    if not made:
+        raise DecodeError(f"no Gray code of {width_px}x{height_px}")
+    white = np.full((height_px, width_px), 255, np.uint8)
+    return [*(np.asarray(image, np.uint8) for image in images), white, np.zeros_like(white)]
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """Of one camera: pixels (n, 2) that are lit, and the projector's pixels (n, 2) that light them,
+    each the middle of its cell."""
+
+    pixels: Floats
+    lit_by: Floats
+
+
+def decoded(pictures: Sequence[Image], width_px: int, height_px: int) -> Decoded:
+    """One camera's pictures (height, width) of `patterns(width_px, height_px)`, in their order.
+
+    DecodeError for another number of pictures, sizes that differ, or nothing lit.
+    """
+    bits = [_bits(width_px), _bits(height_px)]
+    wanted = 2 * sum(bits) + 2
+    if len(pictures) != wanted:
+        raise DecodeError(f"{len(pictures)} pictures; the patterns are {wanted}")
+    if len({picture.shape for picture in pictures}) != 1:
+        raise DecodeError("the pictures are not of one size")
+    white, black = (picture.astype(np.int16) for picture in pictures[-2:])
+    row, column = np.nonzero(white - black >= LEAST_CONTRAST)
+    if len(row) < LEAST_CELLS:
+        raise DecodeError(
+            f"{len(row)} of the camera's pixels are lit by the projector: make the room darker, "
+            "the exposure longer, or aim both at the sheet"
+        )
+    axes, begin = [], 0
+    for count in bits:
+        value = np.zeros(len(row), np.int64)
+        before = np.zeros(len(row), np.int64)
+        unused = min(int(np.log2(FINEST_PX)), count - 1)
+        for number in range(count - unused):
+            shown, inverse = pictures[begin + 2 * number], pictures[begin + 2 * number + 1]
+            before ^= shown[row, column] > inverse[row, column]
+            value = 2 * value + before
+        axes.append(value * 2.0**unused + 0.5 * (2.0**unused - 1.0))
+        begin += 2 * count
+    return Decoded(np.column_stack([column, row]).astype(np.float64), np.column_stack(axes))
+
+
+def _bits(size_px: int) -> int:
+    return int(np.ceil(np.log2(size_px)))
+
+
+def places(view: Decoded, wanted: Floats) -> tuple[Floats, Bools]:
+    """Where (n, 2) a camera sees the projector's pixels (n, 2), and which it sees at all."""
+    found, seen = np.zeros((len(wanted), 2)), np.zeros(len(wanted), np.bool_)
+    order = np.argsort(view.lit_by[:, 0], kind="stable")
+    lit_by, pixels = view.lit_by[order], view.pixels[order]
+    for index, pixel in enumerate(wanted):
+        first, last = np.searchsorted(lit_by[:, 0], [pixel[0] - REACH_PX, pixel[0] + REACH_PX])
+        near = np.abs(lit_by[first:last, 1] - pixel[1]) <= REACH_PX
+        place = _fitted((lit_by[first:last][near] - pixel) / REACH_PX, pixels[first:last][near])
+        if place is not None:
+            found[index], seen[index] = place, True
+    return found, seen
+
+
+def _fitted(offsets: Floats, pixels: Floats) -> Floats | None:
+    """The camera's pixel (2,) at offset 0 of a quadratic map fitted to offsets (n, 2) in -1..1."""
+    for _ in range(2):
+        # Cells on all sides, or it would be a guess beyond the sheet's edge.
+        quadrants = (offsets > 0.0) @ np.array([1, 2])
+        if len(pixels) < LEAST_CELLS or len(np.unique(quadrants)) < 4:
+            return None
+        x, y = offsets.T
+        terms = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
+        solution, *_ = np.linalg.lstsq(terms, pixels, rcond=None)
+        off = np.linalg.norm(pixels - terms @ solution, axis=1)
+        keep = off <= 3.0 * np.median(off)
+        if keep.all():
+            break
+        offsets, pixels = offsets[keep], pixels[keep]
+    if float(np.sqrt(np.mean(off[keep] ** 2))) > WORST_FIT_PX * FINEST_PX:
+        return None
+    return np.asarray(solution[0], dtype=np.float64)

@@ -1,0 +1,335 @@
+"""The projector's optics and where it stands, from the points that its pixels light.
+
+A projector is a camera run backwards: each of its pixels lights a point, and two cameras measure
+that point.  So points are measured, not assumed, and the sheet may be held anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from messages.scene import Lens, Pose, Projector, StereoCamera
+from nodes.models.camera import camera_matrix, normalize, project
+from nodes.models.rigid import (
+    apply,
+    inverse,
+    rotation_from_vector,
+    rpy_from_rotation,
+    transform,
+    transform_from_rpy,
+    vector_from_rotation,
+)
+from nodes.renderer.gray_code import DecodeError, Image, decoded, places
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+GRID_PX = 20
+"""Between the projector pixels that are looked for."""
+
+LEAST_POSES, LEAST_POINTS = 3, 200
+LEAST_DEPTH_M = 0.03
+LEAST_COVERAGE = 0.25
+WORST_RMS_PX = 0.7
+COVERAGE_CELLS = (8, 6)
+STRAY_RATIO = 4.0
+
+
+class ProjectorError(ValueError):
+    """Pictures or points that make no calibration; the message says what to change."""
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """World points (n, 3), the projector's pixels (n, 2) that light them, the pose (n,) of each.
+
+    skew_m: (n,) how far the two cameras' rays pass one another.
+    """
+
+    world: Floats
+    pixels: Floats
+    pose: Indices
+    skew_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A calibrated projector and what it leaves, in projector pixels and, on the sheet, metres.
+
+    held_out_rms_px: of poses that it was fitted without.  before_rms_px: of the projector that it
+    began with.  coverage_ratio: share of the picture's cells with points.
+    """
+
+    projector: Projector
+    rms_px: float
+    held_out_rms_px: float
+    before_rms_px: float
+    rms_m: float
+    coverage_ratio: float
+    depth_range_m: float
+    poses: int
+    points: int
+    strays: int
+
+
+def measured(
+    poses: Sequence[tuple[Sequence[Image], Sequence[Image]]],
+    camera: StereoCamera,
+    projector: Projector,
+) -> Points:
+    """Triangulate what the projector's pixels light: left and right pictures of each pose.
+
+    camera: its optics as calibrated, `world_from_left` from the scene.  ProjectorError names the
+    pose whose pictures are not of the patterns.
+    """
+    size = projector.width_px, projector.height_px
+    columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
+    wanted = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    parts: list[tuple[Floats, Floats, Indices, Floats]] = []
+    for number, views in enumerate(poses):
+        found = []
+        for side, pictures in zip(("left", "right"), views, strict=True):
+            try:
+                found.append(places(decoded(pictures, *size), wanted))
+            except DecodeError as error:
+                raise ProjectorError(f"pose {number + 1}, {side} camera: {error}") from error
+        both = found[0][1] & found[1][1]
+        world, skew_m = triangulated(found[0][0][both], found[1][0][both], camera)
+        parts.append((world, wanted[both], np.full(int(both.sum()), number), skew_m))
+    world, pixels, pose, skew = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return Points(world, pixels, pose, skew)
+
+
+def triangulated(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
+    """World points (n, 3) midway between the rays of pixels (n, 2), and the rays' distance (n,)."""
+    from_right = inverse(camera.right_from_left)
+    slopes = [
+        normalize(
+            pixels,
+            camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px),
+            np.array(lens.distortion),
+        )
+        for pixels, lens in ((left, camera.left), (right, camera.right))
+    ]
+    a, b = (np.column_stack([slope, np.ones(len(slope))]) for slope in slopes)
+    b = b @ from_right[:3, :3].T
+    base = from_right[:3, 3]
+    aa, ab, bb = ((p * q).sum(axis=1) for p, q in ((a, a), (a, b), (b, b)))
+    da, db = a @ base, b @ base
+    share = aa * bb - ab * ab
+    on_a = ((bb * da - ab * db) / share)[:, None] * a
+    on_b = base + ((ab * da - aa * db) / share)[:, None] * b
+    pose = camera.world_from_left
+    world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    return apply(world_from_left, 0.5 * (on_a + on_b)), np.linalg.norm(on_a - on_b, axis=1)
+
+
+def projected(projector: Projector, world: Floats) -> Floats:
+    """The projector's pixels (n, 2) that light world points (n, 3)."""
+    lens, pose = projector.lens, projector.world_from_projector
+    local = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), world)
+    matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
+    return project(local, matrix, np.array(lens.distortion))
+
+
+def calibrated(points: Points, guess: Projector) -> Fit:
+    """The projector that lights the points, fitted from a rough one.
+
+    ProjectorError where the points are too few, too alike in depth, cover too little of the
+    picture, or are not of one projector.
+    """
+    kept = np.ones(len(points.world), np.bool_)
+    poses, depth_m = len(np.unique(points.pose)), _depth_range(points, guess)
+    coverage = _coverage(points.pixels, guess)
+    if poses < LEAST_POSES or len(points.world) < LEAST_POINTS:
+        raise ProjectorError(
+            f"{len(points.world)} points in {poses} poses: hold the sheet in {LEAST_POSES} or more, "
+            f"lit and seen by both cameras, for {LEAST_POINTS} points at least"
+        )
+    if depth_m < LEAST_DEPTH_M:
+        raise ProjectorError(
+            f"all points lie within {1e3 * depth_m:.0f} mm along the light: tilt the sheet and hold "
+            f"it nearer and farther, over {1e3 * LEAST_DEPTH_M:.0f} mm at least"
+        )
+    if coverage < LEAST_COVERAGE:
+        raise ProjectorError(
+            f"the points cover {100 * coverage:.0f} % of the projector's picture, "
+            f"{100 * LEAST_COVERAGE:.0f} % are needed: the lens is not told elsewhere"
+        )
+    for _ in range(3):
+        projector = _fitted(points, kept, guess)
+        off = np.linalg.norm(projected(projector, points.world) - points.pixels, axis=1)
+        now = off <= STRAY_RATIO * np.median(off)
+        if (now == kept).all():
+            break
+        kept = now
+    rms = _rms(off[kept])
+    if rms > WORST_RMS_PX or kept.mean() < 0.8:
+        raise ProjectorError(
+            f"{rms:.2f} px rms and {int((~kept).sum())} strays of {len(kept)} points: not one "
+            "projector, or the sheet moved between its pictures; hold it still, check the cameras "
+            "(flexsheet calibrate check)"
+        )
+    held_out = [
+        np.linalg.norm(
+            projected(_fitted(points, kept & (points.pose != pose), guess), points.world[here])
+            - points.pixels[here],
+            axis=1,
+        )
+        for pose in np.unique(points.pose)
+        if (here := kept & (points.pose == pose)).any()
+    ]
+    position = projector.world_from_projector.position_m
+    distance_m = float(np.median(np.linalg.norm(points.world - position, axis=1)))
+    before = np.linalg.norm(projected(guess, points.world) - points.pixels, axis=1)
+    return Fit(
+        projector=projector,
+        rms_px=rms,
+        held_out_rms_px=_rms(np.concatenate(held_out)),
+        before_rms_px=_rms(before[kept]),
+        rms_m=rms * distance_m / projector.lens.fx_px,
+        coverage_ratio=coverage,
+        depth_range_m=depth_m,
+        poses=poses,
+        points=int(kept.sum()),
+        strays=int((~kept).sum()),
+    )
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _depth_range(points: Points, guess: Projector) -> float:
+    """How far (m) the points reach along the projector's axis, the middle nine tenths of them."""
+    pose = guess.world_from_projector
+    along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
+    return float(np.ptp(np.quantile(along, [0.05, 0.95]))) if len(along) else 0.0
+
+
+def _coverage(pixels: Floats, projector: Projector) -> float:
+    size = np.array([projector.width_px, projector.height_px])
+    cells = np.floor(pixels / size * COVERAGE_CELLS).astype(int)
+    return len(np.unique(cells, axis=0)) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
+
+
+def _fitted(points: Points, kept: NDArray[np.bool_], guess: Projector) -> Projector:
+    """The projector of least squared pixels: square pixels, k1, k2, p1, p2; k3 as guessed.
+
+    OpenCV's own fit refuses a principal point outside the picture, where lens shift puts it; its
+    projection and that one's derivatives serve here.
+    """
+    world, pixels = points.world[kept], points.pixels[kept]
+    lens, pose = guess.lens, guess.world_from_projector
+    from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
+    aspect, k3 = lens.fy_px / lens.fx_px, lens.distortion[4]
+    start = [
+        *vector_from_rotation(from_world[:3, :3]),
+        *from_world[:3, 3],
+        *(lens.fx_px, lens.cx_px, lens.cy_px),
+        *lens.distortion[:4],
+    ]
+
+    def split(x: Floats) -> tuple[Floats, Floats]:
+        return camera_matrix(x[6], aspect * x[6], x[7], x[8]), np.array([*x[9:13], k3])
+
+    def residuals(x: Floats) -> Floats:
+        seen, _ = cv2.projectPoints(world, x[:3], x[3:6], *split(x))
+        return np.asarray((seen.reshape(-1, 2) - pixels).ravel())
+
+    def derivatives(x: Floats) -> Floats:
+        """By turn (3), shift (3), focal length, principal point (2) and k1, k2, p1, p2."""
+        _, by = cv2.projectPoints(world, x[:3], x[3:6], *split(x))
+        focal = by[:, 6:7] + aspect * by[:, 7:8]
+        return np.hstack([by[:, :6], focal, by[:, 8:14]])
+
+    solved = least_squares(residuals, start, jac=derivatives, x_scale="jac", method="lm")
+    matrix, distortion = split(solved.x)
+    found = transform(rotation_from_vector(solved.x[:3]), solved.x[3:6])
+    return _projector(guess, matrix, distortion, inverse(found))
+
+
+def _projector(
+    like: Projector, matrix: Floats, distortion: Floats, world_from_projector: Floats
+) -> Projector:
+    k = [float(value) for value in distortion]
+    return like.model_copy(
+        update={
+            "lens": Lens(
+                fx_px=float(matrix[0, 0]),
+                fy_px=float(matrix[1, 1]),
+                cx_px=float(matrix[0, 2]),
+                cy_px=float(matrix[1, 2]),
+                distortion=(k[0], k[1], k[2], k[3], k[4]),
+            ),
+            "world_from_projector": Pose(
+                position_m=world_from_projector[:3, 3],
+                rpy_rad=rpy_from_rotation(world_from_projector[:3, :3]),
+            ),
+        }
+    )
+
+
+def keystone(corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector) -> Fit:
+    """The projector whose pixels (4, 2) light the corners of a rectangle on the imaginary screen.
+
+    corners_px: left bottom, right bottom, right top, left top, as the user sees them.  The picture
+    on the screen, a homography, is met exactly; eight numbers (pose, focal length, one of the
+    principal point's) take it up, nearest to the guess's, whose distortion stays.  ProjectorError
+    where the corners are no convex quadrangle.
+    """
+    x, y = half_width_m, half_height_m
+    world = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], dtype=np.float64)
+    edges = np.roll(corners_px, -1, axis=0) - corners_px
+    turns = np.cross(edges, np.roll(edges, -1, axis=0))
+    if not ((turns > 1.0).all() or (turns < -1.0).all()):
+        raise ProjectorError(
+            f"corners {corners_px.tolist()} are no convex quadrangle: give them left bottom, right "
+            "bottom, right top, left top, as the user sees them"
+        )
+    lens, pose = guess.lens, guess.world_from_projector
+    start = transform_from_rpy(pose.position_m, pose.rpy_rad)
+
+    def projector(numbers: Floats) -> Projector:
+        turned = transform(rotation_from_vector(numbers[:3]), 1e3 * numbers[3:6] / lens.fx_px)
+        focal = np.exp(numbers[6])
+        matrix = camera_matrix(
+            lens.fx_px * focal,
+            lens.fy_px * focal,
+            lens.cx_px + 1e3 * numbers[7],
+            lens.cy_px + 1e3 * numbers[8],
+        )
+        return _projector(guess, matrix, np.array(lens.distortion), start @ turned)
+
+    def residuals(numbers: Floats) -> Floats:
+        off = projected(projector(numbers), world) - corners_px
+        return np.concatenate([off.ravel(), 1e-3 * numbers])
+
+    solved = least_squares(residuals, np.zeros(9), x_scale="jac", xtol=1e-14, ftol=1e-14)
+    found = projector(solved.x)
+    off = np.linalg.norm(projected(found, world) - corners_px, axis=1)
+    before = np.linalg.norm(projected(guess, world) - corners_px, axis=1)
+    if _rms(off) > WORST_RMS_PX:
+        raise ProjectorError(
+            f"no projector near the scene's lights these corners ({_rms(off):.1f} px left): "
+            "check their order, and the pose in the scene"
+        )
+    distance_m = float(np.linalg.norm(found.world_from_projector.position_m))
+    return Fit(
+        projector=found,
+        rms_px=_rms(off),
+        held_out_rms_px=float("nan"),
+        before_rms_px=_rms(before),
+        rms_m=_rms(off) * distance_m / found.lens.fx_px,
+        coverage_ratio=_coverage(corners_px, guess),
+        depth_range_m=0.0,
+        poses=1,
+        points=4,
+        strays=0,
+    )

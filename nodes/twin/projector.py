@@ -1,0 +1,193 @@
+"""The projector as it really is, the light that it throws on a flat sheet, and how far a wrong
+belief about it puts the picture off.
+
+Its projection is the twin's own.  An unpushed sheet between two parallel edges is flat, so a plane
+stands for it here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Lens, Pose, Projector, Scene, StereoCamera
+from nodes.models.rigid import apply, inverse, rotation_from_vector, transform, transform_from_rpy
+from nodes.twin.pixels import Sensor, quantized
+from nodes.twin.rig import pixels_of, slopes_of
+
+Floats = NDArray[np.float64]
+Singles = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+RAYS = 2
+"""Rays per camera pixel and direction."""
+
+ROOM_LEVEL, LIT_LEVEL, DARK_LEVEL = 14.0, 150.0, 9.0
+"""Of the room behind, of the sheet at full light, and of the sheet by the projector's black."""
+
+SPREAD_PX = 0.5
+"""Standard deviation of a projector's pixel on the sheet: lens and rubber."""
+
+FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
+OFFSET_DEVIATION_M, TURN_DEVIATION_RAD = 0.004, 0.006
+RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
+
+
+def true_projector(projector: Projector, *, seed: int) -> Projector:
+    """A projector as it might really stand where a scene has it by tape measure and data sheet."""
+    random = np.random.default_rng(seed)
+
+    def deviation(*shape: int) -> Floats:
+        return np.clip(random.standard_normal(shape), -2.0, 2.0)
+
+    lens, pose = projector.lens, projector.world_from_projector
+    focal = 1.0 + FOCAL_DEVIATION * float(deviation(1)[0])
+    centre = CENTRE_DEVIATION_PX * deviation(2)
+    k1, k2 = RADIAL_DEVIATION * deviation(2)
+    p1, p2 = TANGENTIAL_DEVIATION * deviation(2)
+    added = (k1, 0.5 * k2, p1, p2, 0.0)
+    k = [float(old + new) for old, new in zip(lens.distortion, added, strict=True)]
+    turned = rotation_from_vector(TURN_DEVIATION_RAD * deviation(3))
+    return projector.model_copy(
+        update={
+            "lens": Lens(
+                fx_px=lens.fx_px * focal,
+                fy_px=lens.fy_px * focal,
+                cx_px=float(lens.cx_px + centre[0]),
+                cy_px=float(lens.cy_px + centre[1]),
+                distortion=(k[0], k[1], k[2], k[3], k[4]),
+            ),
+            "world_from_projector": Pose(
+                position_m=pose.position_m + OFFSET_DEVIATION_M * deviation(3),
+                rpy_rad=_rpy(turned @ transform_from_rpy([0.0] * 3, pose.rpy_rad)[:3, :3]),
+            ),
+        }
+    )
+
+
+def _rpy(rotation: Floats) -> Floats:
+    """Roll, pitch, yaw about fixed x, y, z (rad), away from a pitch of 90 degrees."""
+    return np.array(
+        [
+            np.arctan2(rotation[2, 1], rotation[2, 2]),
+            -np.arcsin(np.clip(rotation[2, 0], -1.0, 1.0)),
+            np.arctan2(rotation[1, 0], rotation[0, 0]),
+        ]
+    )
+
+
+def sheet_poses(count: int) -> list[Floats]:
+    """Poses `world_from_sheet` (4, 4) as arms would hold the sheet: near and far, tilted about."""
+    poses = []
+    for number in range(count):
+        share = number / max(count - 1, 1)
+        towards = 2.399963 * number  # the golden angle: no two lean alike
+        tilt = 0.0 if number == 0 else 0.15 + 0.25 * share
+        turn = rotation_from_vector(tilt * np.array([np.cos(towards), np.sin(towards), 0.0]))
+        depth_m = 0.05 * np.cos(np.pi * number * 0.618)
+        poses.append(transform(turn, [0.0, 0.0, depth_m]))
+    return poses
+
+
+class LitSheet:
+    """A stereo rig before a flat sheet that the projector lights from behind."""
+
+    def __init__(self, scene: Scene, camera: StereoCamera, projector: Projector, *, seed: int):
+        """camera, projector: the true ones."""
+        self._scene, self._camera, self._projector = scene, camera, projector
+        self._random = np.random.default_rng(seed)
+        self._sensor = Sensor()
+        height, width = camera.height_px, camera.width_px
+        columns = (np.arange(RAYS * width) + 0.5) / RAYS - 0.5
+        rows = (np.arange(RAYS * height) + 0.5) / RAYS - 0.5
+        grid = np.stack(np.meshgrid(columns, rows), axis=-1)
+        self._rays = [slopes_of(lens, grid) for lens in (camera.left, camera.right)]
+
+    def pair(
+        self, patterns: Sequence[Image], world_from_sheet: Floats
+    ) -> tuple[list[Image], list[Image]]:
+        """What the left and the right camera see of each pattern on the sheet held there."""
+        pose = self._camera.world_from_left
+        world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        views = (world_from_left, world_from_left @ inverse(self._camera.right_from_left))
+        left, right = (
+            self._pictures(patterns, rays, world_from_eye, world_from_sheet)
+            for rays, world_from_eye in zip(self._rays, views, strict=True)
+        )
+        return left, right
+
+    def _pictures(
+        self, patterns: Sequence[Image], rays: Floats, world_from_eye: Floats, sheet: Floats
+    ) -> list[Image]:
+        x, y, inside = self._lit_by(rays, world_from_eye, sheet)
+        height, width = self._camera.height_px, self._camera.width_px
+        pictures = []
+        for pattern in patterns:
+            thrown = cv2.GaussianBlur(pattern.astype(np.float32), (0, 0), SPREAD_PX)
+            light = cv2.remap(thrown, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+            level = np.where(inside, DARK_LEVEL + LIT_LEVEL / 255.0 * light, ROOM_LEVEL)
+            level = cv2.GaussianBlur(level.astype(np.float32), (0, 0), RAYS * self._sensor.blur_px)
+            mean = level.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3), dtype=np.float32)
+            noise = self._random.standard_normal(mean.shape, dtype=np.float32)
+            pictures.append(quantized(mean + self._sensor.noise(mean) * noise))
+        return pictures
+
+    def _lit_by(
+        self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
+    ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
+        """The projector's column and row that light what each ray sees, and if that is the sheet."""
+        directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
+        points, ahead = on_plane(
+            world_from_eye[:3, 3], directions @ world_from_eye[:3, :3].T, world_from_sheet
+        )
+        local = apply(inverse(world_from_sheet), points.reshape(-1, 3)).reshape(points.shape)
+        half = 0.5 * np.array([self._scene.sheet.width_m, self._scene.sheet.height_m])
+        inside = ahead & (np.abs(local[..., :2]) <= half).all(axis=-1)
+        pixels = pixels_lighting(self._projector, np.where(inside[..., None], points, 0.0))
+        return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32), inside
+
+
+def on_plane(origin: Floats, directions: Floats, plane: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Where rays (..., 3) from a point meet the x-y plane of a pose (4, 4), and if before it."""
+    normal = plane[:3, 2]
+    slant = directions @ normal
+    share = ((plane[:3, 3] - origin) @ normal) / np.where(np.abs(slant) < 1e-9, np.nan, slant)
+    ahead = np.nan_to_num(share, nan=-1.0) > 0.0
+    return origin + np.where(ahead, share, 1.0)[..., None] * directions, ahead
+
+
+def pixels_lighting(projector: Projector, points: Floats) -> Floats:
+    """The projector's pixels (..., 2) that light world points (..., 3) before it."""
+    pose = projector.world_from_projector
+    from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
+    local = points @ from_world[:3, :3].T + from_world[:3, 3]
+    return pixels_of(projector.lens, local[..., :2] / local[..., 2:])
+
+
+def errors_at_eye(
+    believed: Projector, true: Projector, eye: Floats, planes: Sequence[Floats], half_m: float
+) -> Floats:
+    """How far (n,), m on the imaginary screen, points appear from where they ought to.
+
+    Points on a grid of +-half_m on planes (4, 4) are lit by the pixels that `believed` names; the
+    true projector puts that light elsewhere on the plane.
+    """
+    axis = np.linspace(-half_m, half_m, 9)
+    flat = np.stack([*np.meshgrid(axis, axis), np.zeros((9, 9))], axis=-1).reshape(-1, 3)
+    pose = true.world_from_projector
+    world_from_true = transform_from_rpy(pose.position_m, pose.rpy_rad)
+    errors = []
+    for plane in planes:
+        meant = apply(plane, flat)
+        slopes = slopes_of(true.lens, pixels_lighting(believed, meant))
+        rays = np.column_stack([slopes, np.ones(len(slopes))]) @ world_from_true[:3, :3].T
+        lit, _ = on_plane(world_from_true[:3, 3], rays, plane)
+        seen = [
+            eye[:2] + (points[:, :2] - eye[:2]) * (eye[2] / (eye[2] - points[:, 2:]))
+            for points in (meant, lit)
+        ]
+        errors.append(np.linalg.norm(seen[0] - seen[1], axis=1))
+    return np.concatenate(errors)
