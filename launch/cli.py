@@ -10,6 +10,7 @@ from launch.commands import (
     bag,
     calibrate,
     calibrate_arms,
+    calibrate_projector,
     calibrate_sheet,
     chart,
     doctor,
@@ -37,6 +38,7 @@ app.add_typer(topic.app, name="topic")
 app.add_typer(bag.app, name="bag")
 app.add_typer(keys.app, name="keys")
 calibrate_arms.register(calibrate.app)
+calibrate_projector.register(calibrate.app)
 calibrate_sheet.register(calibrate.app)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(experiment.app, name="experiment")

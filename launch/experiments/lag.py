@@ -25,10 +25,11 @@ def lag_s(
 
     times_s: (n,), increasing, not necessarily even.  follower, leader: (n,) or (n, k), m, at those
     times; or the leader at `leader_times_s` (m,), which cover them and are dense enough for it to
-    be smooth between them.  The lag is where their normalised cross-correlation, all axes together, is greatest: the
-    leader is shifted (by a cubic spline, so by any time) against the follower's part that all
-    shifts within +-max_lag_s cover, and a parabola through the best shift and its neighbours tells
-    the place between them.  A mean and a straight trend are taken off both: how late something is
+    be smooth between them.  The lag is where their normalised cross-correlation, all axes
+    together, is greatest: the leader is shifted (by a cubic spline, so by any time) against the
+    follower's part that all shifts within +-max_lag_s cover, and a parabola through the best shift
+    and its neighbours tells the place between them.  A mean and a straight trend are taken off
+    both: how late something is
     that goes evenly cannot be told from how far it is off.  A lag that is not the same for slow and
     quick parts of the motion comes out as that of the larger ones.  Ten seconds at 60 Hz of a hand
     that wanders by 0.5 mm per axis tell it to 0.6 ms (standard error) under white noise of 0.1 mm,

@@ -190,6 +190,22 @@ def edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
     return np.concatenate([edge[:3, 3], edge[:3, 1], edge[:3, 2]])
 
 
+def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
+    """What happened to a picture, and when, ns."""
+    drawn_ns = frame.drawn_ns or published_ns
+    begun_ns = drawn_ns - round(frame.draw_s * 1e9)
+    events = [("frame begun", begun_ns), ("frame drawn", drawn_ns)]
+    return [*events, ("light", frame.light_ns)] if frame.light_ns else events
+
+
+def _windows_ns(times_by_label: dict[str, list[tuple[int, float]]]) -> dict[str, tuple[int, int]]:
+    """When each path began and when it was last heard of, from (stamp, time on the path)."""
+    return {
+        label: (samples[-1][0] - round(samples[-1][1] * 1e9), samples[-1][0])
+        for label, samples in times_by_label.items()
+    }
+
+
 def read_recording(bag: Path) -> Recording:
     """Collect from a bag what the stroke's figures are computed from."""
     scene: Scene | None = None
@@ -234,11 +250,8 @@ def read_recording(bag: Path) -> Recording:
                 delay("soft body", header.source_ns, header.publish_ns)
             case Frame():
                 pictures.take(message)
-                drawn_ns = message.drawn_ns or header.publish_ns
-                delay("frame begun", header.source_ns, drawn_ns - round(message.draw_s * 1e9))
-                delay("frame drawn", header.source_ns, drawn_ns)
-                if message.light_ns:
-                    delay("light", header.source_ns, message.light_ns)
+                for event, at_ns in frame_events(message, header.publish_ns):
+                    delay(event, header.source_ns, at_ns)
             case Status():
                 for port in message.inputs:
                     # Each start of a node counts anew; its last word is what it lost in all.
@@ -254,16 +267,12 @@ def read_recording(bag: Path) -> Recording:
         rows = [(time, edge_row(flange, flange_from_edge)) for time, flange in flanges[key]]
         return track(rows, f"arm {key}")
 
-    windows = {}
-    for label, samples in times_by_label.items():
-        zero_ns = samples[-1][0] - round(samples[-1][1] * 1e9)
-        windows[label] = (zero_ns, samples[-1][0])
     return Recording(
         scene=scene,
         fingertip=track(fingertip, "fingertip"),
         measured=track(measured, "fingertip"),
         finger=track(finger, "twin/finger"),
-        windows_ns=windows,
+        windows_ns=_windows_ns(times_by_label),
         measured_edges=(edges("left", scene.arms.left), edges("right", scene.arms.right)),
         true_edges=(edges("true_left", scene.arms.left), edges("true_right", scene.arms.right)),
         delays_s=by_event(delays),

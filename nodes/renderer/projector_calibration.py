@@ -39,6 +39,9 @@ LEAST_COVERAGE = 0.25
 WORST_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 STRAY_RATIO = 4.0
+USUAL_OFF = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
+"""How far a projector is from a scene's by tape measure: turn (rad), place (m), focal length (as a
+share), principal point (px).  Only the ratios count."""
 
 
 class ProjectorError(ValueError):
@@ -149,13 +152,13 @@ def calibrated(points: Points, guess: Projector) -> Fit:
     coverage = _coverage(points.pixels, guess)
     if poses < LEAST_POSES or len(points.world) < LEAST_POINTS:
         raise ProjectorError(
-            f"{len(points.world)} points in {poses} poses: hold the sheet in {LEAST_POSES} or more, "
-            f"lit and seen by both cameras, for {LEAST_POINTS} points at least"
+            f"{len(points.world)} points in {poses} poses: hold the sheet in {LEAST_POSES} or "
+            f"more, lit and seen by both cameras, for {LEAST_POINTS} points at least"
         )
     if depth_m < LEAST_DEPTH_M:
         raise ProjectorError(
-            f"all points lie within {1e3 * depth_m:.0f} mm along the light: tilt the sheet and hold "
-            f"it nearer and farther, over {1e3 * LEAST_DEPTH_M:.0f} mm at least"
+            f"all points lie within {1e3 * depth_m:.0f} mm along the light: tilt the sheet and "
+            f"hold it nearer and farther, over {1e3 * LEAST_DEPTH_M:.0f} mm at least"
         )
     if coverage < LEAST_COVERAGE:
         raise ProjectorError(
@@ -276,7 +279,9 @@ def _projector(
     )
 
 
-def keystone(corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector) -> Fit:
+def keystone(
+    corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector
+) -> Fit:
     """The projector whose pixels (4, 2) light the corners of a rectangle on the imaginary screen.
 
     corners_px: left bottom, right bottom, right top, left top, as the user sees them.  The picture
@@ -287,7 +292,8 @@ def keystone(corners_px: Floats, half_width_m: float, half_height_m: float, gues
     x, y = half_width_m, half_height_m
     world = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], dtype=np.float64)
     edges = np.roll(corners_px, -1, axis=0) - corners_px
-    turns = np.cross(edges, np.roll(edges, -1, axis=0))
+    after = np.roll(edges, -1, axis=0)
+    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
     if not ((turns > 1.0).all() or (turns < -1.0).all()):
         raise ProjectorError(
             f"corners {corners_px.tolist()} are no convex quadrangle: give them left bottom, right "
@@ -297,21 +303,19 @@ def keystone(corners_px: Floats, half_width_m: float, half_height_m: float, gues
     start = transform_from_rpy(pose.position_m, pose.rpy_rad)
 
     def projector(numbers: Floats) -> Projector:
-        turned = transform(rotation_from_vector(numbers[:3]), 1e3 * numbers[3:6] / lens.fx_px)
-        focal = np.exp(numbers[6])
+        x = numbers * USUAL_OFF
+        turned = transform(rotation_from_vector(x[:3]), x[3:6])
+        focal = np.exp(x[6])
         matrix = camera_matrix(
-            lens.fx_px * focal,
-            lens.fy_px * focal,
-            lens.cx_px + 1e3 * numbers[7],
-            lens.cy_px + 1e3 * numbers[8],
+            lens.fx_px * focal, lens.fy_px * focal, lens.cx_px + x[7], lens.cy_px + x[8]
         )
         return _projector(guess, matrix, np.array(lens.distortion), start @ turned)
 
     def residuals(numbers: Floats) -> Floats:
         off = projected(projector(numbers), world) - corners_px
-        return np.concatenate([off.ravel(), 1e-3 * numbers])
+        return np.concatenate([off.ravel(), 1e-2 * numbers])
 
-    solved = least_squares(residuals, np.zeros(9), x_scale="jac", xtol=1e-14, ftol=1e-14)
+    solved = least_squares(residuals, np.zeros(9), x_scale="jac", max_nfev=60)
     found = projector(solved.x)
     off = np.linalg.norm(projected(found, world) - corners_px, axis=1)
     before = np.linalg.norm(projected(guess, world) - corners_px, axis=1)

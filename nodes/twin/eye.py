@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from messages.scene import Projector, Scene
 from nodes.models.rigid import apply, inverse, transform_from_rpy
+from nodes.twin import rig
 from nodes.twin.membrane import DeformedSheet, Rubber, solve
+from nodes.twin.rig import slopes_of
 from nodes.twin.true_object import TrueBody, TrueObject
 
 Floats = NDArray[np.float64]
@@ -128,26 +130,37 @@ class TrueProjector:
         pose, lens = projector.world_from_projector, projector.lens
         self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._lens = lens
+        self._size = np.array([projector.width_px, projector.height_px])
+        # Rays are of a picture without distortion, with a margin for pixels that a lens bends in.
+        edge = np.array([(x, y) for x in np.linspace(0, 1, 9) for y in np.linspace(0, 1, 9)])
+        border = edge * (self._size - 1)
+        self._margin = 0
+        if any(lens.distortion):
+            self._margin = int(np.ceil(np.abs(self._straight(border) - border).max())) + 2
         rotation = self._world_from_projector[:3, :3]
-        corner = np.array([-lens.cx_px / lens.fx_px, -lens.cy_px / lens.fy_px, 1.0])
+        start = -np.array([lens.cx_px, lens.cy_px]) - self._margin
+        corner = np.array([start[0] / lens.fx_px, start[1] / lens.fy_px, 1.0])
         self._rays = Rays(
             origin=self._world_from_projector[:3, 3],
             first=rotation @ corner,
             right=rotation[:, 0] / lens.fx_px,
             down=rotation[:, 1] / lens.fy_px,
-            width=projector.width_px,
-            height=projector.height_px,
+            width=projector.width_px + 2 * self._margin,
+            height=projector.height_px + 2 * self._margin,
         )
-        if any(lens.distortion):
-            raise ValueError(
-                f"projector.lens.distortion: {lens.distortion}: the twin's projector is a pinhole; "
-                "give zeros"
-            )
         self._vertices, self._triangles = vertices, triangles
 
     @cached_property
     def _hits(self) -> Hits:
         return first_hits(self._rays, self._vertices, self._triangles)
+
+    def _straight(self, pixels: Floats) -> Floats:
+        """Where pixels (..., 2) would be without the lens's distortion."""
+        lens = self._lens
+        if not any(lens.distortion):
+            return pixels
+        focal, centre = np.array([lens.fx_px, lens.fy_px]), np.array([lens.cx_px, lens.cy_px])
+        return np.asarray(slopes_of(lens, pixels) * focal + centre)
 
     def pixels_of(self, points: Floats) -> tuple[Floats, Bools]:
         """Projector pixels (..., 2) that send light towards points (..., 3), and which are lit.
@@ -158,28 +171,30 @@ class TrueProjector:
         depth = local[..., 2]
         ahead = depth > 1e-6
         share = 1.0 / np.where(ahead, depth, 1.0)
-        column = self._lens.fx_px * local[..., 0] * share + self._lens.cx_px
-        row = self._lens.fy_px * local[..., 1] * share + self._lens.cy_px
-        nearest = np.rint(np.stack([column, row], axis=-1))
-        size = np.array([self._rays.width, self._rays.height])
-        inside = ahead & ((nearest >= 0) & (nearest < size)).all(axis=-1)
-        at = np.where(inside[..., None], nearest, 0).astype(int)
+        slopes = local[..., :2] * share[..., None]
+        pixels = rig.pixels_of(self._lens, slopes)
+        nearest = np.rint(pixels)
+        inside = ahead & ((nearest >= 0) & (nearest < self._size)).all(axis=-1)
+        lens = self._lens
+        straight = slopes * [lens.fx_px, lens.fy_px] + [lens.cx_px, lens.cy_px] + self._margin
+        at = np.where(inside[..., None], np.rint(straight), 0).astype(int)
         first = self._hits.inverse_range[at[..., 1], at[..., 0]]
         lit = inside & (share >= first * (1.0 - SHADOW_TOLERANCE))
-        return np.stack([column, row], axis=-1), lit
+        return pixels, lit
 
     def lands_at(self, pixels: Floats) -> tuple[Floats, Bools]:
         """World points (n, 3) of the sheet that pixels (n, 2) light first, and which do."""
+        inside: Bools = np.all((pixels >= -0.5) & (pixels <= self._size - 0.5), axis=1)
+        places = self._straight(np.where(inside[:, None], pixels, 0.0)) + self._margin
         limit = np.array([self._rays.width - 1, self._rays.height - 1])
-        inside: Bools = np.all((pixels >= -0.5) & (pixels <= limit + 0.5), axis=1)
-        at = np.clip(np.rint(np.where(inside[:, None], pixels, 0)), 0, limit).astype(int)
+        at = np.clip(np.rint(places), 0, limit).astype(int)
         triangle = self._hits.triangle[at[:, 1], at[:, 0]]
         inside &= triangle >= 0
-        ones = np.column_stack([np.ones(len(pixels)), pixels])
+        ones = np.column_stack([np.ones(len(places)), places])
         total = np.einsum("nij,nj->n", self._hits.weights[triangle], ones)
         inside &= total > 0.0
         rays = self._rays
-        directions = rays.first + pixels[:, :1] * rays.right + pixels[:, 1:] * rays.down
+        directions = rays.first + places[:, :1] * rays.right + places[:, 1:] * rays.down
         return rays.origin + directions / np.where(inside, total, 1.0)[:, None], inside
 
 

@@ -9,10 +9,10 @@ from functools import partial
 from pydantic import Field
 
 from messages.base import Header
-from messages.scene import Positive, Scene
-from messages.types import Display, Frame, Skin, SoftBody, TwinArms, TwinEye, TwinFinger
+from messages.scene import Positive, Projector, Scene
+from messages.types import Display, Eye, Frame, Skin, SoftBody, TwinArms, TwinEye, TwinFinger
 from nodes.node import Input, Node, NodeParameters, Output
-from nodes.twin.eye import METRES_PER_PX, Camera, Situation
+from nodes.twin.eye import METRES_PER_PX, Camera, Floats, Situation
 
 Key = tuple[str, str]
 
@@ -20,6 +20,11 @@ Key = tuple[str, str]
 class TwinEyeParameters(NodeParameters):
     metres_per_px: Positive = Field(default=METRES_PER_PX, description="on the imaginary screen")
     most_waiting: int = Field(default=32, ge=1, description="labels that may wait for a picture")
+    projector: Projector | None = Field(
+        default=None,
+        description="the true one, as the scene's key writes it; null: as the scene says",
+    )
+    eye_stale_s: Positive = Field(default=0.1, description="an older `eye` is the scene's")
     again_after_s: Positive = Field(
         default=5.0, description="the same label is pictured anew after this long at the earliest"
     )
@@ -38,6 +43,7 @@ class TwinEyeNode(Node):
     scene: Input[Scene]
     frame: Input[Frame]
     display: Input[Display]
+    eye: Input[Eye]
     twin__arms: Input[TwinArms]
     twin__finger: Input[TwinFinger]
     soft_body: Input[SoftBody]
@@ -47,7 +53,7 @@ class TwinEyeNode(Node):
     async def setup(self) -> None:
         self._camera = Camera()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=self.name)
-        self._waiting: dict[Key, tuple[Situation, Frame, Header]] = {}
+        self._waiting: dict[Key, tuple[Situation, Floats, Frame, Header]] = {}
         self._last: tuple[Key, int] | None = None
         self._refused: set[Key] = set()
         self._before_light: tuple[Frame, Header] | None = None
@@ -83,7 +89,8 @@ class TwinEyeNode(Node):
             return
         self._before_light = None
         situation = self._situation(scene, arms)
-        self._waiting[frame.label, frame.correction] = (situation, frame, frame_header)
+        eye = self._true_eye(scene)
+        self._waiting[frame.label, frame.correction] = (situation, eye, frame, frame_header)
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
@@ -91,6 +98,8 @@ class TwinEyeNode(Node):
         finger, body, skin = self.twin__finger.message, self.soft_body.message, self.skin.message
         matching = body is not None and skin is not None and body.mesh_id == skin.mesh_id
         display = self.display.message
+        if self.parameters.projector is not None:
+            scene = scene.model_copy(update={"projector": self.parameters.projector})
         return Situation(
             scene=scene,
             world_from_flange_left=arms.world_from_flange_left,
@@ -103,6 +112,12 @@ class TwinEyeNode(Node):
             metres_per_px=self.parameters.metres_per_px,
         )
 
+    def _true_eye(self, scene: Scene) -> Floats:
+        """Where the eyes are now, (3,): what tracks them is right, without it the scene."""
+        tracked = self.eye.message if self.eye.age_s() <= self.parameters.eye_stale_s else None
+        seen = tracked is not None and tracked.valid
+        return tracked.centre_world_m if tracked and seen else scene.eyes.centre_world_m
+
     def _just_taken(self, key: Key) -> bool:
         if self._last is None or self._last[0] != key:
             return False
@@ -110,14 +125,15 @@ class TwinEyeNode(Node):
 
     async def _picture_all(self) -> None:
         while self._waiting:
-            key, (situation, frame, header) = next(iter(self._waiting.items()))
-            await self.call("picture", self._picture, situation, frame, header)
+            key, (situation, eye, frame, header) = next(iter(self._waiting.items()))
+            await self.call("picture", self._picture, situation, eye, frame, header)
             self._waiting.pop(key, None)
             self._refused.discard(key)
             self._last = (key, self.clock.now_ns())
 
-    async def _picture(self, situation: Situation, frame: Frame, header: Header) -> None:
-        eye = frame.eyes_world_m.mean(axis=0)
+    async def _picture(
+        self, situation: Situation, eye: Floats, frame: Frame, header: Header
+    ) -> None:
         job = partial(self._camera.take, frame.pixels[0], situation, eye=eye)
         seen, proper = await asyncio.get_running_loop().run_in_executor(self._worker, job)
         picture = TwinEye(

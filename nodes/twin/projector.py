@@ -138,7 +138,7 @@ class LitSheet:
     def _lit_by(
         self, rays: Floats, world_from_eye: Floats, world_from_sheet: Floats
     ) -> tuple[Singles, Singles, NDArray[np.bool_]]:
-        """The projector's column and row that light what each ray sees, and if that is the sheet."""
+        """The projector's column and row that light what rays see, and if that is the sheet."""
         directions = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1)
         points, ahead = on_plane(
             world_from_eye[:3, 3], directions @ world_from_eye[:3, :3].T, world_from_sheet

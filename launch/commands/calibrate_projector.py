@@ -1,0 +1,302 @@
+"""`flexsheet calibrate projector`: where the projector stands and how its lens bends, measured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, words
+
+if TYPE_CHECKING:
+    from messages.scene import Projector, Scene, StereoCamera
+    from nodes.renderer.gray_code import Image
+    from nodes.renderer.projector_calibration import Fit
+
+    Views = tuple[list[Image], list[Image]]
+
+VOLUME_HALF_M = 0.1
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command to `flexsheet calibrate`."""
+    app.command("projector")(projector)
+
+
+def projector(
+    *,
+    scene_file: Annotated[
+        Path, typer.Option("--scene", metavar="FILE", help="Scene with the projector by its data.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Scene file to write; may be the same one."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The stereo camera's; default: the scene's.")
+    ] = None,
+    write_patterns: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Write the patterns to show, and end.")
+    ] = None,
+    pictures: Annotated[
+        Path | None,
+        typer.Option(metavar="FOLDER", help="A folder per pose with left00.png, right00.png, ..."),
+    ] = None,
+    corners: Annotated[
+        str | None,
+        typer.Option(
+            metavar="'X,Y X,Y X,Y X,Y'",
+            help="By hand: pixels that light the corners of --rectangle-mm on the imaginary "
+            "screen; left bottom, right bottom, right top, left top, as the user sees them.",
+        ),
+    ] = None,
+    rectangle_mm: Annotated[
+        str, typer.Option(metavar="WIDTHxHEIGHT", help="About the screen's centre, for --corners.")
+    ] = "200x200",
+    twin: Annotated[
+        bool, typer.Option("--twin", help="A projector that deviates from the scene's, unknown.")
+    ] = False,
+    poses: Annotated[int, typer.Option(min=3, help="Of the twin's sheet.")] = 6,
+    seed: Annotated[int, typer.Option(help="Of the twin's deviations and noise.")] = 1,
+    as_json: JsonOption = False,
+) -> None:
+    """Calibrate the projector and write it into a scene.
+
+    From pictures of Gray code on the sheet, seen by the stereo camera in three poses or more
+    (--pictures), from four corners found by hand (--corners), or in the twin (--twin).
+    """
+    from launch.plan import load_scene
+    from nodes.renderer import gray_code
+    from nodes.renderer.projector_calibration import ProjectorError, calibrated, measured
+
+    scene = load_scene(scene_file)
+    size = scene.projector.width_px, scene.projector.height_px
+    if write_patterns is not None:
+        _write_patterns(gray_code.patterns(*size), write_patterns)
+        return
+    if (pictures is not None) + (corners is not None) + twin != 1:
+        raise CommandError(
+            "give pictures by --pictures, corners by --corners, or the twin by --twin; one of the "
+            "three (or --write-patterns FOLDER first)",
+            BAD_INPUT,
+        )
+    if output is not None and not output.parent.is_dir():
+        raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
+    true: Projector | None = None
+    try:
+        if corners is not None:
+            fit = _by_corners(scene, corners, rectangle_mm)
+        else:
+            if twin:
+                from nodes.twin.projector import true_projector
+
+                true = true_projector(scene.projector, seed=seed)
+                views = list(_twin_views(scene, true, poses, seed))
+            else:
+                assert pictures is not None
+                views = list(_read_views(pictures, len(gray_code.patterns(*size))))
+            camera = _camera(scene, calibration)
+            fit = calibrated(measured(views, camera, scene.projector), scene.projector)
+    except ProjectorError as error:
+        raise CommandError(str(error), BAD_INPUT) from error
+    if output is not None:
+        write_scene(scene_file, fit.projector, output)
+    _tell(scene, fit, true, output, as_json=as_json)
+
+
+def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
+    import cv2
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, pattern in enumerate(patterns):
+        cv2.imwrite(str(folder / f"pattern{number:02}.png"), pattern)
+    words.print(
+        f"{len(patterns)} patterns in {folder}: show them pixel for pixel, take a picture of each",
+        markup=False,
+    )
+
+
+def _read_views(folder: Path, count: int) -> Iterator[Views]:
+    from nodes.camera.corners import CalibrationError, read_gray
+
+    poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    if not poses:
+        raise CommandError(f"--pictures {folder}: no folders in it, one for each pose", BAD_INPUT)
+    for pose in poses:
+        sides = []
+        for side in ("left", "right"):
+            paths = sorted(pose.glob(f"{side}*.png"))
+            if len(paths) != count:
+                raise CommandError(
+                    f"--pictures {pose}: {len(paths)} pictures {side}*.png, the patterns are "
+                    f"{count}",
+                    BAD_INPUT,
+                )
+            try:
+                sides.append([read_gray(path) for path in paths])
+            except CalibrationError as error:
+                raise CommandError(str(error), BAD_INPUT) from error
+        yield sides[0], sides[1]
+
+
+def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterator[Views]:
+    """What the twin's true rig sees of the patterns on the sheet, in one pose after the other."""
+    from rich.progress import track
+
+    from nodes.renderer.gray_code import patterns
+    from nodes.twin.projector import LitSheet, sheet_poses
+    from nodes.twin.rig import true_camera
+
+    shown = patterns(scene.projector.width_px, scene.projector.height_px)
+    lit = LitSheet(scene, true_camera(scene.camera), true, seed=seed)
+    held = track(sheet_poses(poses), "taking pictures", console=words, transient=True)
+    for world_from_sheet in held:
+        yield lit.pair(shown, world_from_sheet)
+
+
+def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
+    """The scene's camera with the optics of a calibration file."""
+    from messages.calibration import (
+        CalibrationFileError,
+        CalibrationMismatchError,
+        load_calibration,
+        refuse_other_camera,
+    )
+
+    if calibration is None:
+        return scene.camera
+    try:
+        optics = load_calibration(calibration)
+        refuse_other_camera(optics, scene.camera)
+    except (CalibrationFileError, CalibrationMismatchError) as error:
+        raise CommandError(f"--calibration {calibration}: {error}", BAD_INPUT) from error
+    return scene.camera.model_copy(
+        update={
+            "left": optics.left,
+            "right": optics.right,
+            "right_from_left": optics.right_from_left,
+        }
+    )
+
+
+def _by_corners(scene: Scene, corners: str, rectangle_mm: str) -> Fit:
+    import numpy as np
+
+    from nodes.renderer.projector_calibration import keystone
+
+    try:
+        pixels = np.array([[float(x) for x in pair.split(",")] for pair in corners.split()])
+        width_mm, height_mm = (float(side) for side in rectangle_mm.lower().split("x"))
+        if pixels.shape != (4, 2) or not min(width_mm, height_mm) > 0.0:
+            raise ValueError("wants four pairs and two lengths")
+    except ValueError as error:
+        raise CommandError(
+            f"--corners '{corners}' --rectangle-mm {rectangle_mm}: {error}; write four pixels as "
+            "'599,499 199,499 199,99 599,99' and the rectangle as 200x200",
+            BAD_INPUT,
+        ) from error
+    return keystone(pixels, 5e-4 * width_mm, 5e-4 * height_mm, scene.projector)
+
+
+def write_scene(scene_file: Path, found: Projector, copy: Path) -> None:
+    """Write the scene with this projector; comments and layout stay."""
+    from ruamel.yaml import YAML
+
+    from launch.plan import load_scene
+
+    yaml = YAML(typ="rt", pure=True)
+    yaml.width = 4096
+    yaml.preserve_quotes = True
+    yaml.indent(sequence=4, offset=2)
+    tree = yaml.load(scene_file.read_text(encoding="utf-8"))
+    lens, pose = tree["projector"]["lens"], tree["projector"]["world_from_projector"]
+    for key in ("fx_px", "fy_px", "cx_px", "cy_px"):
+        lens[key] = _rounded(getattr(found.lens, key))
+    if any(found.lens.distortion) or "distortion" in lens:
+        lens["distortion"] = _in_a_row([_rounded(value) for value in found.lens.distortion])
+    for key in ("position_m", "rpy_rad"):
+        values = getattr(found.world_from_projector, key)
+        pose[key] = _in_a_row([_rounded(value) for value in values])
+    with copy.open("w", encoding="utf-8") as file:
+        yaml.dump(tree, file)
+    load_scene(copy)
+
+
+def _in_a_row(values: list[float]) -> Any:
+    from ruamel.yaml.comments import CommentedSeq
+
+    row = CommentedSeq(values)
+    row.fa.set_flow_style()
+    return row
+
+
+def _rounded(value: float) -> float:
+    """To a nanometre, nanoradian or billionth of a pixel: what is beyond is noise."""
+    return round(float(value), 9) + 0.0
+
+
+def _tell(
+    scene: Scene, fit: Fit, true: Projector | None, output: Path | None, *, as_json: bool
+) -> None:
+    held_out = None if fit.held_out_rms_px != fit.held_out_rms_px else fit.held_out_rms_px
+    lens, pose = fit.projector.lens, fit.projector.world_from_projector
+    result: dict[str, Any] = {
+        "scene": None if output is None else str(output),
+        "poses": fit.poses,
+        "points": fit.points,
+        "strays": fit.strays,
+        "rms_px": fit.rms_px,
+        "rms_mm": 1e3 * fit.rms_m,
+        "held_out_rms_px": held_out,
+        "before_rms_px": fit.before_rms_px,
+        "coverage_ratio": fit.coverage_ratio,
+        "depth_range_mm": 1e3 * fit.depth_range_m,
+        "lens": lens.model_dump(),
+        "position_m": [float(value) for value in pose.position_m],
+        "rpy_rad": [float(value) for value in pose.rpy_rad],
+    }
+    if true is not None:
+        result["eye_error_mm"] = _eye_errors_mm(scene, fit.projector, true)
+        result["true_projector"] = {
+            "width_px": true.width_px,
+            "height_px": true.height_px,
+            "lens": true.lens.model_dump(),
+            "world_from_projector": {
+                "position_m": true.world_from_projector.position_m.tolist(),
+                "rpy_rad": true.world_from_projector.rpy_rad.tolist(),
+            },
+        }
+    if as_json:
+        print_json(result)
+        return
+    apart = "-" if held_out is None else f"{held_out:.2f} px rms"
+    print_fields(
+        [
+            ("scene", "not written (-o FILE)" if output is None else output),
+            ("points", f"{fit.points} in {fit.poses} poses, {fit.strays} strays left out"),
+            ("before", f"{fit.before_rms_px:.2f} px rms"),
+            ("after", f"{fit.rms_px:.2f} px rms, {1e3 * fit.rms_m:.2f} mm on the sheet"),
+            ("poses held out", apart),
+            ("coverage", f"{100 * fit.coverage_ratio:.0f} % of the picture"),
+            ("depth", f"{1e3 * fit.depth_range_m:.0f} mm along the light"),
+        ]
+    )
+    for when, error in result.get("eye_error_mm", {}).items():
+        words.print(
+            f"true error at the eye {when}: {error['mean']:.3f} mm mean, {error['max']:.3f} mm max"
+        )
+
+
+def _eye_errors_mm(scene: Scene, found: Projector, true: Projector) -> dict[str, dict[str, float]]:
+    """True errors at the eye, on sheets held about, before and after the calibration."""
+    from nodes.twin.projector import errors_at_eye, sheet_poses
+
+    eye, planes = scene.eyes.centre_world_m, sheet_poses(7)
+    told = {}
+    for when, believed in (("before", scene.projector), ("after", found)):
+        errors = 1e3 * errors_at_eye(believed, true, eye, planes, VOLUME_HALF_M)
+        told[when] = {"mean": float(errors.mean()), "max": float(errors.max())}
+    return told

@@ -1,0 +1,231 @@
+"""The projector's calibration: Gray code read back, optics recovered, bad pictures refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from launch.cli import app
+from launch.commands.calibrate_projector import write_scene
+from launch.plan import load_scene
+from messages.scene import Lens, Projector, Scene, StereoCamera
+from nodes.renderer.gray_code import FINEST_PX, DecodeError, decoded, patterns, places
+from nodes.renderer.projector_calibration import (
+    Points,
+    ProjectorError,
+    calibrated,
+    keystone,
+    measured,
+    projected,
+)
+from nodes.twin.eye import TrueProjector
+from nodes.twin.projector import (
+    LitSheet,
+    errors_at_eye,
+    pixels_lighting,
+    sheet_poses,
+    true_projector,
+)
+from nodes.twin.rig import true_camera
+
+SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
+
+
+def halved(lens: Lens) -> Lens:
+    return lens.model_copy(
+        update={
+            "fx_px": lens.fx_px / 2,
+            "fy_px": lens.fy_px / 2,
+            "cx_px": (lens.cx_px + 0.5) / 2 - 0.5,
+            "cy_px": (lens.cy_px + 0.5) / 2 - 0.5,
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """The demo's scene with camera and projector of half the pixels, to be quick."""
+    full = load_scene(SCENE_FILE)
+    camera, projector = full.camera, full.projector
+    return full.model_copy(
+        update={
+            "camera": camera.model_copy(
+                update={
+                    "width_px": 320,
+                    "height_px": 240,
+                    "left": halved(camera.left),
+                    "right": halved(camera.right),
+                }
+            ),
+            "projector": projector.model_copy(
+                update={"width_px": 400, "height_px": 300, "lens": halved(projector.lens)}
+            ),
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def true_rig(scene: Scene) -> StereoCamera:
+    return true_camera(scene.camera)
+
+
+@pytest.fixture(scope="module")
+def true(scene: Scene) -> Projector:
+    return true_projector(scene.projector, seed=3)
+
+
+@pytest.fixture(scope="module")
+def points(scene: Scene, true_rig: StereoCamera, true: Projector) -> Points:
+    """What the rig, its optics known, measures of the true projector's light."""
+    lit = LitSheet(scene, true_rig, true, seed=3)
+    shown = patterns(scene.projector.width_px, scene.projector.height_px)
+    views = [lit.pair(shown, pose) for pose in sheet_poses(4)]
+    return measured(views, true_rig, scene.projector)
+
+
+def test_the_patterns_are_decoded_to_the_cell_as_opencv_decodes_them() -> None:
+    shown = patterns(70, 50)
+    assert len(shown) == 2 * (7 + 6) + 2
+    view = decoded(shown, 70, 50)
+    assert len(view.pixels) == 70 * 50
+    assert np.abs(view.lit_by - view.pixels).max() <= 0.5 * (FINEST_PX - 1)
+    coder = cv2.structured_light.GrayCodePattern.create(70, 50)
+    for x, y in ((0, 0), (69, 49), (33, 17)):
+        failed, pixel = coder.getProjPixel(shown[:-2], x, y)
+        assert not failed
+        assert pixel == (x, y)
+
+
+def test_a_pixel_is_found_between_the_cameras_pixels() -> None:
+    """A camera that sees the projector's picture turned, shrunk and bent."""
+    shown = patterns(256, 192)
+    rows, columns = np.mgrid[:110, :140].astype(np.float64)
+
+    def lit_by(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.stack([20 + 1.6 * x + 0.1 * y + 4e-4 * x * y, 10 - 0.08 * x + 1.5 * y], axis=-1)
+
+    source = lit_by(columns, rows).astype(np.float32)
+    pictures = [
+        cv2.remap(pattern, source[..., 0], source[..., 1], cv2.INTER_LINEAR) for pattern in shown
+    ]
+    wanted = np.array([[100.0, 80.0], [150.0, 120.0], [3.0, 3.0]])
+    found, seen = places(decoded(pictures, 256, 192), wanted)
+    assert seen.tolist() == [True, True, False]
+    again = lit_by(found[:2, 0], found[:2, 1])
+    assert np.abs(again - wanted[:2]).max() < 0.35
+
+
+def test_the_twins_projector_is_recovered(scene: Scene, true: Projector, points: Points) -> None:
+    lens = true.lens
+    assert any(lens.distortion)
+    off = np.linalg.norm(pixels_lighting(true, points.world) - points.pixels, axis=1)
+    assert np.median(off) < 0.4
+    fit = calibrated(points, scene.projector)
+    assert fit.rms_px < 0.4
+    assert fit.held_out_rms_px < 1.2 * fit.rms_px
+    assert fit.before_rms_px > 2.0
+    eye, planes = scene.eyes.centre_world_m, sheet_poses(7)
+    before = errors_at_eye(scene.projector, true, eye, planes, 0.1)
+    after = errors_at_eye(fit.projector, true, eye, planes, 0.1)
+    assert before.mean() > 1e-3
+    assert after.mean() < 0.15e-3
+    assert after.max() < 0.4e-3
+
+
+def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Points) -> None:
+    def some(keep: np.ndarray) -> Points:
+        return Points(
+            points.world[keep], points.pixels[keep], points.pose[keep], points.skew_m[keep]
+        )
+
+    with pytest.raises(ProjectorError, match="in 2 poses"):
+        calibrated(some(points.pose < 2), scene.projector)
+    flat = points.world * [1.0, 1.0, 0.0]
+    with pytest.raises(ProjectorError, match="nearer and farther"):
+        calibrated(Points(flat, points.pixels, points.pose, points.skew_m), scene.projector)
+    near = np.linalg.norm(points.pixels - points.pixels.mean(axis=0), axis=1) < 60
+    corner = Points(*(np.repeat(part[near], 6, axis=0) for part in (
+        points.world, points.pixels, points.pose, points.skew_m)))  # fmt: skip
+    with pytest.raises(ProjectorError, match="% of the projector's picture"):
+        calibrated(corner, scene.projector)
+    moved = points.world + np.where(points.pose == 1, 0.01, 0.0)[:, None]
+    with pytest.raises(ProjectorError, match="not one projector"):
+        calibrated(Points(moved, points.pixels, points.pose, points.skew_m), scene.projector)
+    with pytest.raises(ProjectorError, match="0 points"):
+        calibrated(some(points.pose < 0), scene.projector)
+
+
+def test_pictures_that_are_not_of_the_patterns_are_refused(scene: Scene) -> None:
+    dark = [np.full((60, 80), 10, np.uint8)] * 38
+    with pytest.raises(DecodeError, match="5 pictures; the patterns are 38"):
+        decoded(dark[:5], 400, 300)
+    with pytest.raises(ProjectorError, match="pose 1, left camera: 0 of the camera's pixels"):
+        measured([(dark, dark)], scene.camera, scene.projector)
+
+
+@pytest.mark.parametrize("off", np.random.default_rng(4).uniform(-12.0, 12.0, (6, 8)))
+def test_four_corners_by_hand_are_met_exactly(off: np.ndarray) -> None:
+    guess = load_scene(SCENE_FILE).projector
+    world = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
+    wanted = projected(guess, world) + np.reshape(off, (4, 2))
+    fit = keystone(wanted, 0.1, 0.1, guess)
+    assert np.abs(projected(fit.projector, world) - wanted).max() < 0.2
+
+
+def test_corners_in_no_order_are_refused() -> None:
+    guess = load_scene(SCENE_FILE).projector
+    crossed = np.array([[599.0, 499], [199, 99], [199, 499], [599, 99]])
+    with pytest.raises(ProjectorError, match="no convex quadrangle"):
+        keystone(crossed, 0.1, 0.1, guess)
+    mirrored = np.array([[199.0, 499], [599, 499], [599, 99], [199, 99]])
+    with pytest.raises(ProjectorError, match="no projector near"):
+        keystone(mirrored, 0.1, 0.1, guess)
+
+
+def test_the_scene_keeps_its_comments_and_takes_the_projector(tmp_path: Path) -> None:
+    scene = load_scene(SCENE_FILE)
+    found = true_projector(scene.projector, seed=5)
+    copy = tmp_path / "scene.yaml"
+    write_scene(SCENE_FILE, found, copy)
+    before, after = (path.read_text().splitlines() for path in (SCENE_FILE, copy))
+    changed = [line for line in after if line not in before]
+    assert len(changed) == 2, changed
+    assert [line for line in before if line.strip().startswith("#")] == [
+        line for line in after if line.strip().startswith("#")
+    ]
+    written = load_scene(copy).projector
+    assert np.allclose(written.lens.distortion, found.lens.distortion, atol=1e-8)
+    world = np.array([[0.05, -0.03, 0.02]])
+    assert np.allclose(projected(written, world), projected(found, world), atol=1e-4)
+
+
+def test_the_command_names_what_is_missing(tmp_path: Path) -> None:
+    def failing(*arguments: str) -> str:
+        result = CliRunner().invoke(
+            app, ["calibrate", "projector", "--scene", str(SCENE_FILE), *arguments]
+        )
+        assert result.exit_code != 0
+        return str(result.exception)
+
+    assert "one of the three" in failing()
+    assert "no folders in it" in failing("--pictures", str(tmp_path))
+    (tmp_path / "pose1").mkdir()
+    assert "0 pictures left*.png, the patterns are 42" in failing("--pictures", str(tmp_path))
+    assert "four pairs" in failing("--corners", "1,2 3,4")
+
+
+def test_the_twins_eye_bends_light_as_the_true_lens(scene: Scene, true: Projector) -> None:
+    """What a pixel lights, and the pixel that lights it, agree through a bent lens."""
+    vertices = np.array([[-0.12, -0.12, 0], [0.12, -0.12, 0], [0.12, 0.12, 0], [-0.12, 0.12, 0]])
+    projector = TrueProjector(true, vertices, np.array([[0, 1, 2], [0, 2, 3]]))
+    pixels = np.array([[200.0, 150.0], [20.5, 30.25], [380.0, 280.0]])
+    landed, lands = projector.lands_at(pixels)
+    assert lands[0]
+    assert np.allclose(pixels_lighting(true, landed[lands]), pixels[lands], atol=1e-6)
+    again, lit = projector.pixels_of(landed[lands])
+    assert lit.all()
+    assert np.allclose(again, pixels[lands], atol=1e-6)
