@@ -474,7 +474,7 @@ class Bridge:
             self.unanswered -= 1
             self.control.fail_exchange("no answer", silent=True)
 
-    def suffer(self, random: Random, stamp: tuple[str, int]) -> None:
+    def suffer(self, random: Random, stamp_ns: int) -> None:
         """Now and then the arm freezes or falls silent, somebody stops it, or clears it."""
         chance = random.random()
         if chance < 0.0005:
@@ -482,9 +482,9 @@ class Bridge:
         elif chance < 0.001:
             self.unanswered = int(random.integers(1, 5))
         elif chance < 0.0015:
-            self.control.take_estop(EStop(engaged=True, reason="drill"), stamp)
+            self.control.take_estop(EStop(engaged=True, reason="drill"), stamp_ns)
         elif chance > 0.98 and (self.control.faults or self.control.estop_reason):
-            self.control.take_estop(EStop(engaged=False, reason=""), stamp)
+            self.control.take_estop(EStop(engaged=False, reason=""), stamp_ns)
 
 
 def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
@@ -566,7 +566,7 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
             if bridge.frozen > 0:
                 bridge.frozen -= 1
                 moving[number], thaw_s[number] = -1.0, THAW_S
-            bridge.suffer(random, ("clock", cycle))
+            bridge.suffer(random, cycle)
         tally.commands += len(bridges)
 
 

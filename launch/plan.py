@@ -109,6 +109,18 @@ class NodeSpec(Strict):
     )
 
 
+class ClocksSpec(Strict):
+    """What is asked of the hosts' clocks where there are several; see docs/clocks.md."""
+
+    max_offset_uncertainty_s: float = Field(
+        default=0.005, gt=0, allow_inf_nan=False, description="beyond it the arms do not move"
+    )
+    max_drift_ratio: float = Field(
+        default=5e-4, gt=0, lt=0.1, description="by how much one clock may gain on another"
+    )
+    rate_hz: float = Field(default=8.0, ge=1, le=100, description="of the pings")
+
+
 class LaunchFile(Strict):
     """A launch file's keys."""
 
@@ -118,6 +130,7 @@ class LaunchFile(Strict):
     from_tools: list[str] = Field(
         default=[], description="topics that a tool writes into the graph, as `bag play` does"
     )
+    clocks: ClocksSpec = ClocksSpec()
     record: dict[str, Any] | None = Field(
         default=None, description="parameters of a recorder on the main host"
     )
@@ -218,6 +231,10 @@ class Plan(Strict):
 
     def scene_message(self) -> Scene | None:
         return None if self.scene is None else Scene.model_validate(self.scene)
+
+
+_PARAMETERS_THEMSELVES: tuple[Key, ...] = (("record",), ("clocks",))
+"""Keys of the launch file that hold a node's parameters; other nodes have them one key deeper."""
 
 
 class _Member:
@@ -481,7 +498,7 @@ def _members(spec: LaunchFile, document: Document, problems: list[Problem]) -> l
     members = []
     for name, node_spec in spec.nodes.items():
         members.append(_Member(name, node_spec, ("nodes", name)))
-        if name in (LAUNCHER, TOOLS):
+        if name in (LAUNCHER, TOOLS, *map(clock_node, spec.hosts)):
             problems.append(
                 document.problem(("nodes", name), f'"{name}" is taken', "give another name")
             )
@@ -507,7 +524,24 @@ def _members(spec: LaunchFile, document: Document, problems: list[Problem]) -> l
         else:
             recorder = NodeSpec(type="recorder", parameters=spec.record, nice=RECORDER_NICE)
             members.append(_Member("recorder", recorder, ("record",)))
+    if len(spec.hosts) > 1:
+        members += [_clock_member(host, spec.clocks) for host in spec.hosts]
     return members
+
+
+def _clock_member(host: str, clocks: ClocksSpec) -> _Member:
+    node_spec = NodeSpec(
+        type="clock",
+        host=host,
+        parameters=clocks.model_dump(),
+        topics={"clock_ping_out": "clock_ping"},
+    )
+    return _Member(clock_node(host), node_spec, ("clocks",))
+
+
+def clock_node(host: str) -> str:
+    """The node that measures the other hosts' clocks for a host."""
+    return f"clock_{host}"
 
 
 def _resolve_member(member: _Member, document: Document, problems: list[Problem]) -> None:
@@ -538,7 +572,7 @@ def _resolve_member(member: _Member, document: Document, problems: list[Problem]
     member.type = class_
     _connect_ports(member, class_, document, problems)
 
-    parameters_key = key if key == ("record",) else (*key, "parameters")
+    parameters_key = key if key in _PARAMETERS_THEMSELVES else (*key, "parameters")
     try:
         member.parameters = parameters_of(class_).model_validate(member.spec.parameters)
     except ValidationError:
@@ -650,7 +684,7 @@ def _writers(
         elif not TOPICS[name].many_writers:
             writers[name] = [(TOOLS, MAIN)]
     for topic in TOPICS.values():
-        if topic.many_writers:
+        if topic.many_writers and topic.open_to_tools:
             writers.setdefault(topic.name, []).append((TOOLS, MAIN))
     return writers
 
@@ -830,7 +864,7 @@ def _parameters(member: _Member, document: Document, *, resolve_paths: bool) -> 
     values = member.parameters.model_dump(mode="json")
     if not resolve_paths:
         return values
-    section = member.key if member.key == ("record",) else (*member.key, "parameters")
+    section = member.key if member.key in _PARAMETERS_THEMSELVES else (*member.key, "parameters")
     for name in member.parameters.model_fields_set:
         base = _base(document, (*section, name))
         values[name] = _with_absolute_paths(getattr(member.parameters, name), values[name], base)

@@ -13,6 +13,7 @@ from launch.tools import READER_RECONNECT_S, ToolsWriter, topics_for_tools
 from messages.bag import BagError, BagReader
 from messages.base import Header, Message
 from messages.clock import SystemClock
+from messages.clock_table import shifted
 from messages.topics import Delivery, topic_named
 
 Progress = Callable[[float, float], None]
@@ -109,13 +110,3 @@ def latched_before(
     for entry in BagReader(bag, latched, end_ns=begin_ns):
         last[entry[0]] = entry
     return list(last.values())
-
-
-def shifted(message: Message, shift_ns: int) -> Message:
-    """The message with its instants moved: top-level integers named `..._ns`; 0 means none."""
-    moved = {
-        name: value + shift_ns
-        for name in type(message).model_fields
-        if name.endswith("_ns") and isinstance(value := getattr(message, name), int) and value
-    }
-    return message.model_copy(update=moved) if moved else message

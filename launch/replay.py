@@ -24,10 +24,12 @@ from messages.bag import BagError, BagReader
 from messages.base import Header, Message
 from messages.clock import VirtualClock
 from messages.topics import TOPICS, Topic
+from messages.types import Clocks
 from messages.wire import decode, encode
 from nodes import node_class
 from nodes.node import Node, parameters_of, timers_of
 
+CLOCKS = "clocks"
 EPOCH = 0
 """Of the replayed writers; a live one is random, a replay must not be."""
 
@@ -139,7 +141,7 @@ async def replay(bag: Path, planned: PlannedNode) -> Pass:
     ports: dict[str, list[str]] = {}
     for port in planned.inputs:
         ports.setdefault(port.topic, []).append(port.port)
-    reader = BagReader(bag, set(ports) & set(BagReader(bag).topics))
+    reader = BagReader(bag, {*ports, CLOCKS} & set(BagReader(bag).topics))
     start_ns = reader.info().start_ns
     clock_id = reader.metadata.get("recording", {}).get("clock_id", "recorded")
     clock = VirtualClock(start_ns, clock_id=clock_id)
@@ -163,8 +165,10 @@ async def replay(bag: Path, planned: PlannedNode) -> Pass:
         for topic, message, header, log_ns in reader:
             await timers.call_until(log_ns, clock)
             clock.move_to(log_ns)
-            result.messages_in += 1
-            for port_name in ports[topic]:
+            if isinstance(message, Clocks) and header.clock_id == clock.id:
+                node.clock_table.update(message)
+            result.messages_in += topic in ports
+            for port_name in ports.get(topic, ()):
                 await node.step(port_name, message, header)
     finally:
         node.stop_mailboxes()

@@ -28,7 +28,16 @@ from typing import Any, Self
 from launch.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from launch.documents import BadInputError, Problem, read_document
 from launch.keys import KeyWatch, make_rings, ring_file
-from launch.plan import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort, is_loopback
+from launch.plan import (
+    LAUNCHER,
+    MAIN,
+    RUN_DIRECTORY,
+    Plan,
+    PlannedNode,
+    PlannedPort,
+    clock_node,
+    is_loopback,
+)
 from launch.runs import RUN_VARIABLE, Run, create_run, is_free, sweep
 from messages.base import Header
 from messages.bus import Publisher, Source
@@ -504,7 +513,16 @@ def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
         run_dir=str(run.directory),
         keys_file=ring_file(run, node.host) if plan.keys else None,
         estop_resetters=plan.may_reset_estop(),
+        clocks=_clocks_port(plan, node.host, run),
     )
+
+
+def _clocks_port(plan: Plan, host: str, run: Run) -> PortConfig | None:
+    writer = plan.writer("clocks", clock_node(host))
+    if writer is None:
+        return None
+    endpoints = local_sources(run, [writer.source_for(host)])
+    return PortConfig(port="clocks", topic="clocks", endpoints=endpoints)
 
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:

@@ -35,6 +35,7 @@ class Topic:
     logged: recorded unless the launch file says otherwise.
     many_writers: any number of nodes may publish it; else exactly one.
     max_bytes: larger messages are refused at both ends.
+    open_to_tools: where many may write, so may command-line tools.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Topic:
     about: str
     many_writers: bool = False
     max_bytes: int = 1 << 20
+    open_to_tools: bool = True
 
 
 _LATEST, _EVERY, _LATCHED = Delivery.LATEST, Delivery.EVERY, Delivery.LATCHED
@@ -69,6 +71,10 @@ _ROWS = (
     Topic("eye", types.Eye, _LATEST, None, True, "where the user's eyes are", many_writers=True),
     Topic("estop", types.EStop, _LATCHED, None, True, "stop, latched", many_writers=True),
     Topic("status", types.Status, _EVERY, (0.5, 3), True, "how each node is", many_writers=True),
+    Topic("clock_ping", types.ClockPing, _EVERY, (1, 100), True, "among the hosts' clock nodes",
+          many_writers=True, open_to_tools=False),
+    Topic("clocks", types.Clocks, _LATCHED, None, True, "what each host knows of other clocks",
+          many_writers=True, open_to_tools=False),
     Topic("twin/finger_path", types.FingerPath, _LATCHED, None, True, "what the twin's finger does",
           many_writers=True, max_bytes=16 << 20),
     Topic("twin/stereo", types.StereoPair, _LATEST, (30, 130), False, "the twin camera's pixels",

@@ -263,6 +263,40 @@ class PortStatus(Part):
     rejected: int = Field(ge=0, description="malformed or of another type")
 
 
+class ClockEcho(Part):
+    """The newest ping that came from another clock."""
+
+    clock_id: str
+    sent_ns: int = Field(ge=0, description="its publish stamp, on its own clock")
+    received_ns: int = Field(ge=0, description="on the clock of this message's header")
+
+
+class ClockPing(Message):
+    """From each host's clock node to the others; with the header's publish stamp and the moment of
+    its arrival, an echo in it is a ping of four stamps."""
+
+    echoes: tuple[ClockEcho, ...]
+
+
+class ClockOffset(Part):
+    """What another clock shows, less the clock of the header, when that shows `at_ns`."""
+
+    clock_id: str
+    at_ns: int = Field(ge=0)
+    offset_ns: int
+    uncertainty_s: NonNegative = Field(description="it is surely within so much of that")
+    drift_ratio: Finite = Field(description="by how much it gains on the header's clock")
+    resets: int = Field(ge=0, description="how often it was found to have been stepped")
+
+
+class Clocks(Message):
+    """What a host's clock node knows of the other clocks, for the nodes of its host."""
+
+    max_offset_uncertainty_s: Positive = Field(description="beyond it no arm moves")
+    max_drift_ratio: Positive = Field(description="by how much a clock may gain on another")
+    offsets: tuple[ClockOffset, ...]
+
+
 class Status(Message):
     """How a node is; each node sends one a second."""
 
@@ -278,6 +312,10 @@ class Status(Message):
     last_error: str
     note: str = Field(description="what the node itself wants to say, one line")
     plan_hash: str
+    clock_id: str
+    clock_offsets: tuple[ClockOffset, ...] = Field(
+        default=(), description="of the other clocks that it hears, as it knows them"
+    )
 
 
 PathJoin = Literal["rounded_lines", "spline"]

@@ -20,6 +20,7 @@ NODES: dict[str, str] = {
     "arm_bridge": "nodes.arm_bridge.node:ArmBridge",
     "fem_solver": "nodes.fem_solver.node:FemSolver",
     "renderer": "nodes.renderer.node:Renderer",
+    "clock": "nodes.clock.node:ClockNode",
     "recorder": "nodes.recorder.node:Recorder",
     "twin_finger": "nodes.twin.finger_node:TwinFingerNode",
     "twin_arms": "nodes.twin.arms_node:TwinArmsNode",

@@ -31,6 +31,7 @@ from pydantic import BaseModel, ConfigDict
 
 from messages.base import Header, Message
 from messages.clock import Clock
+from messages.clock_table import ClockTable
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import PortStatus, Status
 
@@ -85,30 +86,31 @@ class PortCounts:
 
 
 class Input(Generic[M]):
-    """A subscribed topic: the newest message with its header, and what was counted."""
+    """A subscribed topic: the newest message with its header, and what was counted.
+
+    All stamps are of our own clock; clock_trouble says why they cannot be trusted, empty: they can.
+    """
 
     def __init__(self, topic: Topic, clock: Clock) -> None:
         self.topic = topic
         self.message: M | None = None
         self.header: Header | None = None
         self.received_ns: int = 0
+        self.clock_trouble = ""
         self.counts = PortCounts()
         self._clock = clock
 
     def age_s(self) -> float:
         """Seconds since the newest message's source stamp; infinite before the first.
 
-        A stamp of another host's clock cannot be compared with ours: then the time since it was
-        received counts.
+        Of another host's clock that is not measured, the time since it was received counts.
         """
         if self.header is None:
             return float("inf")
-        same_clock = self.header.clock_id == self._clock.id
-        since_ns = self.header.source_ns if same_clock else self.received_ns
-        return (self._clock.now_ns() - since_ns) * 1e-9
+        return (self._clock.now_ns() - self.header.source_ns) * 1e-9
 
-    def accept(self, message: M, header: Header) -> None:
-        self.message, self.header = message, header
+    def accept(self, message: M, header: Header, clock_trouble: str = "") -> None:
+        self.message, self.header, self.clock_trouble = message, header, clock_trouble
         self.received_ns = self._clock.now_ns()
         self.counts.count(header, self.received_ns)
 
@@ -206,6 +208,8 @@ class Node:
     handler_errors_shown: ClassVar[int] = 3
     takes_frames: ClassVar[bool] = False
     """Whether `deliver` is given each message as the wire's frames, unopened."""
+    measures_clocks: ClassVar[bool] = False
+    """Whether it wants the stamps of other hosts as they are, of their clocks."""
     opens_devices: ClassVar[bool] = False
     """Whether it reaches for devices, ports or files of its own: a replay must not start it."""
 
@@ -233,6 +237,7 @@ class Node:
         self.parameters = parameters
         self.name, self.clock, self.plan_hash = name, clock, plan_hash
         self.log = structlog.get_logger().bind(node=name)
+        self.clock_table = ClockTable(clock.id)
         self.inputs: dict[str, Input[Any]] = {}
         self.outputs: dict[str, Output[Any]] = {}
         self.errors = 0
@@ -274,11 +279,12 @@ class Node:
 
     def deliver(self, port: str, message: Message, header: Header) -> None:
         """Hand a message to the input; a plain handler runs now, a coroutine in its own task."""
+        message, header, clock_trouble = self._localised(message, header)
         mailbox = self._mailboxes.get(port)
         if mailbox is not None:
-            mailbox.put(message, header)
+            mailbox.put(message, header, clock_trouble)
             return
-        self.inputs[port].accept(message, header)
+        self.inputs[port].accept(message, header, clock_trouble)
         handler = self._handler(port)
         if handler is not None:
             try:
@@ -288,7 +294,16 @@ class Node:
 
     async def step(self, port: str, message: Message, header: Header) -> None:
         """Hand a message to the input and wait until its handler is through: replay, tests."""
-        self.inputs[port].accept(message, header)
+        await self.take(port, *self._localised(message, header))
+
+    def _localised(self, message: Message, header: Header) -> tuple[Message, Header, str]:
+        if self.measures_clocks:
+            return message, header, ""
+        return self.clock_table.localised(message, header, self.clock.now_ns())
+
+    async def take(self, port: str, message: Message, header: Header, clock_trouble: str) -> None:
+        """`step` with a message whose stamps are of our own clock already."""
+        self.inputs[port].accept(message, header, clock_trouble)
         handler = self._handler(port)
         if handler is not None:
             await self.call(f"on_{port}", handler, message, header)
@@ -335,10 +350,10 @@ class Mailbox:
         latest = self._input.topic.delivery is Delivery.LATEST
         self._capacity = 1 if latest else EVERY_QUEUE_LENGTH
         self._overflow_is_error = not latest
-        self._waiting: deque[tuple[Message, Header]] = deque()
+        self._waiting: deque[tuple[Message, Header, str]] = deque()
         self.task: asyncio.Task[None] | None = None
 
-    def put(self, message: Message, header: Header) -> None:
+    def put(self, message: Message, header: Header, clock_trouble: str) -> None:
         if len(self._waiting) >= self._capacity:
             self._waiting.popleft()
             self._input.counts.dropped += 1
@@ -346,14 +361,13 @@ class Mailbox:
                 self._node.report_error(
                     f"on_{self._port}", OverflowError(f"queue of {self._capacity} overflowed")
                 )
-        self._waiting.append((message, header))
+        self._waiting.append((message, header, clock_trouble))
         if self.task is None or self.task.done():
             self.task = asyncio.get_running_loop().create_task(self._drain())
 
     async def _drain(self) -> None:
         while self._waiting:
-            message, header = self._waiting.popleft()
-            await self._node.step(self._port, message, header)
+            await self._node.take(self._port, *self._waiting.popleft())
 
     def stop(self) -> None:
         if self.task is not None:

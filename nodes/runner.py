@@ -53,6 +53,7 @@ class NodeConfig(BaseModel):
 
     keys_file: of a `KeyRing`, where there are keys.
     estop_resetters: writers that may reset an e-stop; None: all.
+    clocks: where the host's clock node says what the others' clocks show; None: there is one host.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -66,6 +67,7 @@ class NodeConfig(BaseModel):
     run_dir: str
     keys_file: Path | None = None
     estop_resetters: tuple[str, ...] | None = None
+    clocks: PortConfig | None = None
     ready_fd: int | None = None
 
 
@@ -100,6 +102,18 @@ class Links:
         return refused
 
     def open_inputs(self, node: Node) -> None:
+        if self._config.clocks is not None:
+            subscriber = Subscriber(
+                topic_named(self._config.clocks.topic),
+                self._config.clocks.endpoints,
+                lambda clocks, _: node.clock_table.update(clocks),
+                PortCounts(),
+                on_problem=partial(self._tell, node),
+                plan=self._config.plan_hash,
+            )
+            subscriber.start()
+            self._subscribers.append(subscriber)
+
         def deliver_to(port: str) -> Any:
             return lambda message, header: node.deliver(port, message, header)
 
@@ -223,6 +237,8 @@ def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
         last_error=node.last_error,
         note=node.note,
         plan_hash=node.plan_hash,
+        clock_id=node.clock.id,
+        clock_offsets=tuple(node.clock_table.offsets.values()),
     )
 
 

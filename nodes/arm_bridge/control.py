@@ -164,7 +164,7 @@ class ArmControl:
         self._clear_arm = False
         self._has_pulled = False
         self._interrupted = False
-        self._engaged = ("", 0)
+        self._engaged_ns = 0
         self._missed = False
         self._goal_rad: Floats | None = None
         self._relax_from: float | None = None
@@ -230,16 +230,19 @@ class ArmControl:
     def engage_estop(self, reason: str) -> None:
         self.estop_reason = reason
 
-    def take_estop(self, estop: EStop, stamp: tuple[str, int]) -> str | None:
+    def take_estop(self, estop: EStop, stamp_ns: int, clock_trouble: str = "") -> str | None:
         """Engage or reset; returns why a reset is refused.
 
-        stamp: clock and time of the message.  Several nodes may write e-stops, and the last word of
-        each comes anew to a late reader: a reset from before the stop does not clear it.
+        stamp_ns: when the message was made, which clock_trouble says not to be sure of.  Several
+        nodes may write e-stops, and the last word of each comes anew to a late reader: a reset from
+        before the stop does not clear it.
         """
         if estop.engaged:
-            self._engaged = stamp
+            self._engaged_ns = stamp_ns
             self.engage_estop(estop.reason)
-        elif stamp[0] == self._engaged[0] and stamp[1] < self._engaged[1]:
+        elif clock_trouble:
+            return clock_trouble
+        elif stamp_ns < self._engaged_ns:
             return "it is older than the stop"
         elif not self.reset():
             return "the arm still moves"
@@ -256,9 +259,17 @@ class ArmControl:
         return True
 
     def step(
-        self, geometry: ArmGeometry, goal: Goal | None, other: OtherArm | None, step_s: float
+        self,
+        geometry: ArmGeometry,
+        goal: Goal | None,
+        other: OtherArm | None,
+        step_s: float,
+        clock_trouble: str = "",
     ) -> Command:
-        """Decide and compute this cycle's command; `step_s` is the time that it covers."""
+        """Decide and compute this cycle's command; `step_s` is the time that it covers.
+
+        clock_trouble: why it cannot be known how old goal and other arm are; empty: it is.
+        """
         measured = self.measured_rad
         if measured is None:
             return Command("idle", self.commanded_rad)
@@ -275,6 +286,8 @@ class ArmControl:
             return self._stop(rest_mode, "other arm: e-stop", geometry, step_s)
         if self.faults:
             return self._stop_and_relax("fault", self.faults[0], geometry, other, step_s)
+        if clock_trouble:
+            return self._stop("idle", clock_trouble, geometry, step_s)
         return self._serve(geometry, goal, other, measured, step_s)
 
     def _serve(

@@ -11,7 +11,6 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.base import Header
 from messages.types import SheetTarget
 from nodes.models.motion import SheetBounds, SheetMotion, extrapolated
 from nodes.models.rigid import transform, vector_from_rotation
@@ -63,21 +62,17 @@ class Timing:
 
 def goal_of(
     target: SheetTarget,
-    header: Header,
     *,
     received_ns: int,
     now_ns: int,
-    clock_id: str,
     timing: Timing,
 ) -> Goal:
-    """A target's goal for a command that is sent now, by the clock `clock_id`.
+    """A target's goal for a command that is sent now.
 
-    A target with another host's stamps counts as if it had arrived in no time.  It states no rate
-    of stretch, which the arms therefore trail.
+    A target states no rate of stretch, which the arms therefore trail.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
-    foreign_ns = received_ns - header.publish_ns if header.clock_id != clock_id else 0
-    ahead_s = (now_ns - target.valid_at_ns - foreign_ns) * 1e-9 + timing.servo_lag_s
+    ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
     overdue_s = (now_ns - received_ns) * 1e-9 - timing.target_period_s
     return goal_ahead(motion, ahead_s, overdue_s, furthest_s=timing.furthest_s)
 

@@ -83,7 +83,8 @@ class ArmBridge(Node):
         self._pace = Pace(1.0 / given.rate_hz, due_s)
 
     def on_estop(self, estop: EStop, header: Header) -> None:
-        if refusal := self._control.take_estop(estop, (header.clock_id, header.source_ns)):
+        doubt = self.estop.clock_trouble
+        if refusal := self._control.take_estop(estop, header.source_ns, doubt):
             self.log.warning("reset refused", reason=refusal)
 
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
@@ -118,7 +119,8 @@ class ArmBridge(Node):
 
     async def _exchange(self, geometry: ArmGeometry, step_s: float) -> None:
         control, newest = self._control, self._newest
-        command = control.step(geometry, self._goal(), self._other(), step_s)
+        doubt = self.sheet_target.clock_trouble or self.other_arm.clock_trouble
+        command = control.step(geometry, self._goal(), self._other(), step_s, doubt)
         if answer := self._lookout.answer(control.question):
             control.take_way(*answer)
         # A target that comes while the arm answers is not behind the command that it answers.
@@ -137,15 +139,13 @@ class ArmBridge(Node):
 
     def _goal(self) -> Goal | None:
         """The newest sheet target, carried on to the moment when this cycle's command acts."""
-        target, header = self.sheet_target.message, self.sheet_target.header
-        if target is None or header is None:
+        target = self.sheet_target.message
+        if target is None:
             return None
         return goal_of(
             target,
-            header,
             received_ns=self.sheet_target.received_ns,
             now_ns=self.clock.now_ns(),
-            clock_id=self.clock.id,
             timing=self._timing,
         )
 

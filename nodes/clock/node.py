@@ -1,0 +1,94 @@
+"""Measures what the other hosts' clocks show, by pings among the clock nodes, one per host."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from messages.base import Header
+from messages.scene import Positive
+from messages.types import ClockEcho, ClockOffset, ClockPing, Clocks
+from nodes.clock.offset import OtherClock, sample_of
+from nodes.node import Input, Node, NodeParameters, Output, periodic
+
+SILENT_NS = 2_000_000_000
+FORGOTTEN_NS = 60_000_000_000
+
+
+class ClockParameters(NodeParameters):
+    """Limits that the launch file gives under "clocks"."""
+
+    rate_hz: Positive = 8.0
+    max_offset_uncertainty_s: Positive = 0.005
+    max_drift_ratio: float = Field(default=5e-4, gt=0, lt=0.1)
+
+
+class ClockNode(Node):
+    """Pings all others, answers them with its next ping, and tells its host what it found."""
+
+    measures_clocks = True
+    parameters: ClockParameters
+    clock_ping: Input[ClockPing]
+    clock_ping_out: Output[ClockPing]
+    clocks: Output[Clocks]
+
+    async def setup(self) -> None:
+        self._heard: dict[str, ClockEcho] = {}
+        self._others: dict[str, OtherClock] = {}
+
+    def on_clock_ping(self, ping: ClockPing, header: Header) -> None:
+        if header.clock_id == self.clock.id:
+            return
+        received_ns = self.clock_ping.received_ns
+        other = self._others.setdefault(
+            header.clock_id, OtherClock(self.parameters.max_drift_ratio)
+        )
+        self._heard[header.clock_id] = ClockEcho(
+            clock_id=header.clock_id, sent_ns=header.publish_ns, received_ns=received_ns
+        )
+        for echo in ping.echoes:
+            if echo.clock_id == self.clock.id and received_ns - echo.sent_ns < 2 * SILENT_NS:
+                sample = sample_of(
+                    echo.sent_ns,
+                    echo.received_ns,
+                    header.publish_ns,
+                    received_ns,
+                    max_drift_ratio=self.parameters.max_drift_ratio,
+                )
+                if sample is not None:
+                    other.take(sample)
+
+    @periodic("rate_hz")
+    def ping(self) -> None:
+        now_ns = self.clock.now_ns()
+        for clock_id, echo in list(self._heard.items()):
+            if echo.received_ns < now_ns - FORGOTTEN_NS:
+                del self._heard[clock_id], self._others[clock_id]
+        echoes = [one for one in self._heard.values() if one.received_ns > now_ns - SILENT_NS]
+        self.clock_ping_out.publish(ClockPing(echoes=tuple(echoes)))
+        offsets = tuple(self._offset(clock_id, now_ns) for clock_id in self._others)
+        self.clocks.publish(
+            Clocks(
+                max_offset_uncertainty_s=self.parameters.max_offset_uncertainty_s,
+                max_drift_ratio=self.parameters.max_drift_ratio,
+                offsets=tuple(one for one in offsets if one is not None),
+            )
+        )
+        self.note = ", ".join(
+            f"{one.clock_id} {one.offset_ns * 1e-9:+.6f} s within {one.uncertainty_s * 1e3:.3f} ms"
+            for one in offsets
+            if one is not None
+        )
+
+    def _offset(self, clock_id: str, now_ns: int) -> ClockOffset | None:
+        other = self._others[clock_id]
+        found = other.estimate(now_ns)
+        if found is None:
+            return None
+        return ClockOffset(
+            clock_id=clock_id,
+            at_ns=found.at_ns,
+            offset_ns=found.offset_ns,
+            uncertainty_s=found.half_ns * 1e-9,
+            drift_ratio=found.drift_ratio,
+            resets=other.resets,
+        )
