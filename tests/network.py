@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -74,8 +75,9 @@ class Computers:
         try:
             _ip("netns", "add", name)
             _ip("netns", "del", name)
+            subprocess.run(["unshare", "--time", "--fork", "true"], check=True, capture_output=True)
         except (OSError, subprocess.CalledProcessError) as error:
-            return f"no network namespaces can be made here: {error}"
+            return f"no namespaces of network and time can be made here: {error}"
         return None
 
     def __enter__(self) -> Computers:
@@ -112,12 +114,23 @@ class Computers:
         """Draw a computer's cable, or put it in again."""
         _ip("-n", self._switch, "link", "set", name, "up" if into_switch else "down")
 
-    def start(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
-        """Run this Python with those arguments on a computer."""
+    def start(self, name: str, *arguments: str, ahead_s: int = 0) -> subprocess.Popen[bytes]:
+        """Run this Python with those arguments on a computer, whose clock is that much ahead."""
+        command = ["ip", "netns", "exec", self._space(name)]
+        if ahead_s:
+            # Of a process of its own, which is why `end` speaks to a group of them.
+            command += ["unshare", "--time", "--monotonic", str(ahead_s)]
+            command += ["--fork", "--kill-child=SIGTERM"]
         return subprocess.Popen(
-            ["ip", "netns", "exec", self._space(name), sys.executable, *arguments],
+            [*command, sys.executable, *arguments],
             cwd=Path(__file__).parent.parent,
+            start_new_session=True,
         )
+
+    @staticmethod
+    def end(process: subprocess.Popen[bytes]) -> None:
+        """Ask what runs on a computer to end."""
+        os.killpg(process.pid, signal.SIGTERM)
 
     def _space(self, name: str) -> str:
         return f"{self._tag}-{name}"

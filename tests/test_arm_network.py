@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import shutil
-import signal
 import tempfile
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -19,7 +18,7 @@ import pytest
 from messages.base import Header
 from messages.bus import Source, Subscriber
 from messages.topics import topic_named
-from messages.types import ArmState
+from messages.types import ArmState, Clocks, Status
 from nodes.node import PortCounts
 from nodes.runner import NodeConfig, PortConfig
 from tests.hosts import hosts
@@ -40,6 +39,24 @@ class Watch:
     """What both bridges say."""
 
     states: dict[str, list[ArmState]] = field(default_factory=lambda: {side: [] for side in SIDES})
+    clocks: dict[str, tuple[Clocks, str]] = field(default_factory=dict)
+    notes: dict[str, str] = field(default_factory=dict)
+
+    def take_status(self, status: Status, _: Header) -> None:
+        self.notes[status.node] = status.note
+
+    def take_clocks(self, host: str, clocks: Clocks, header: Header) -> None:
+        self.clocks[host] = clocks, header.clock_id
+
+    def worst_clock_error_s(self) -> float:
+        """Of what the hosts know of one another's clocks; infinite if somebody is not known."""
+        ahead_s = {clock_id: AHEAD_S[host] for host, (_, clock_id) in self.clocks.items()}
+        errors = [
+            abs(one.offset_ns * 1e-9 - (ahead_s[one.clock_id] - AHEAD_S[host]))
+            for host, (clocks, _) in self.clocks.items()
+            for one in clocks.offsets
+        ]
+        return max(errors) if len(errors) == len(AHEAD_S) * (len(AHEAD_S) - 1) else float("inf")
 
     def take(self, side: str, state: ArmState, _: Header) -> None:
         self.states[side].append(state)
@@ -55,7 +72,14 @@ class Watch:
 
 
 def config(
-    name: str, type_: str, inputs: Any, outputs: Any, *, keys: Path, **parameters: Any
+    name: str,
+    type_: str,
+    inputs: Any,
+    outputs: Any,
+    *,
+    keys: Path,
+    clocks: PortConfig | None = None,
+    **parameters: Any,
 ) -> str:
     def ports(given: dict[str, tuple[str, tuple[str | Source, ...]]]) -> tuple[PortConfig, ...]:
         return tuple(
@@ -72,12 +96,37 @@ def config(
         plan_hash="test",
         run_dir="",
         keys_file=keys,
+        clocks=clocks,
     ).model_dump_json()
 
 
+AHEAD_S = {"main": 0, "left": 7 * 3600, "right": 123}
+"""How long the computers have been up before main was: their clocks have nothing in common."""
+
+
+def clock_config(host: str, folder: Path, tcp: dict[str, str], keys: Path, limit_s: float) -> str:
+    """The clock node of a host."""
+    pings = tuple(
+        Source(f"{address}:7003", f"clock_{other}", other)
+        for other, address in tcp.items()
+        if other != host
+    )
+    return config(
+        f"clock_{host}",
+        "clock",
+        {"clock_ping": ("clock_ping", pings)},
+        {
+            "clock_ping_out": ("clock_ping", (f"{tcp[host]}:7003",)),
+            "clocks": ("clocks", (f"ipc://{folder}/clocks-{host}",)),
+        },
+        keys=keys,
+        max_offset_uncertainty_s=limit_s,
+    )
+
+
 @asynccontextmanager
-async def three_computers() -> AsyncIterator[tuple[Computers, Watch]]:
-    """main strokes; left and right have an arm and its bridge each.  Yields when both follow."""
+async def three_computers(*, clock_limit_s: float = 0.05) -> AsyncIterator[tuple[Computers, Watch]]:
+    """main strokes; left and right have an arm and its bridge each.  Yields once all have begun."""
     if missing := Computers.missing():
         pytest.skip(missing)
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
@@ -109,8 +158,14 @@ async def three_computers() -> AsyncIterator[tuple[Computers, Watch]]:
                     f"arm_{side}_bridge",
                     "arm_bridge",
                     from_main | {"other_arm": (f"arm_{other}", (from_other,))},
-                    {"arm": (f"arm_{side}", (f"ipc://{folder}/{side}", told[side]))},
+                    {
+                        "arm": (f"arm_{side}", (f"ipc://{folder}/{side}", told[side])),
+                        "status": ("status", (f"ipc://{folder}/status-{side}",)),
+                    },
                     keys=keys[side],
+                    clocks=PortConfig(
+                        port="clocks", topic="clocks", endpoints=(f"ipc://{folder}/clocks-{side}",)
+                    ),
                     side=side,
                     port=ports[f"{side}_port"],
                     **PATIENT,
@@ -118,21 +173,29 @@ async def three_computers() -> AsyncIterator[tuple[Computers, Watch]]:
             ]
         try:
             for name, configs in jobs.items():
-                started.append(computers.start(name, "-m", "tests.arm_computer", *configs))
-            for side in SIDES:
-                take = partial(watch.take, side)
-                topic = topic_named(f"arm_{side}")
+                configs.append(clock_config(name, folder, tcp, keys[name], clock_limit_s))
+                started.append(
+                    computers.start(
+                        name, "-m", "tests.arm_computer", *configs, ahead_s=AHEAD_S[name]
+                    )
+                )
+            heard: list[tuple[str, str, Any]] = [
+                *((f"arm_{side}", side, partial(watch.take, side)) for side in SIDES),
+                *(("status", f"status-{side}", watch.take_status) for side in SIDES),
+                *(("clocks", f"clocks-{one}", partial(watch.take_clocks, one)) for one in AHEAD_S),
+            ]
+            for topic, file, take in heard:
                 subscribers.append(
-                    Subscriber(topic, [f"ipc://{folder}/{side}"], take, PortCounts())
+                    Subscriber(topic_named(topic), [f"ipc://{folder}/{file}"], take, PortCounts())
                 )
                 subscribers[-1].start()
-            await until(lambda: watch.modes() == {"follow"})
+            await until(lambda: "none" not in watch.modes() and len(watch.clocks) == len(AHEAD_S))
             yield computers, watch
         finally:
             for subscriber in subscribers:
                 subscriber.close()
             for process in started:
-                process.send_signal(signal.SIGTERM)
+                computers.end(process)
             codes = [await asyncio.to_thread(process.wait) for process in started]
             shutil.rmtree(folder)
     assert codes == [0] * len(started)
@@ -141,6 +204,8 @@ async def three_computers() -> AsyncIterator[tuple[Computers, Watch]]:
 @pytest.mark.timeout(180)
 async def test_a_cable_drawn_in_mid_stroke_holds_then_stops_both_arms_until_it_is_back() -> None:
     async with three_computers() as (computers, watch):
+        await until(lambda: watch.modes() == {"follow"})
+        assert watch.worst_clock_error_s() < 0.05
         for cut in ("main", "left"):
             before = await watch.lasts(60)
             assert {state.mode for states in before.values() for state in states} >= {"follow"}
@@ -160,3 +225,14 @@ async def test_a_cable_drawn_in_mid_stroke_holds_then_stops_both_arms_until_it_i
         everything = [state for states in watch.states.values() for state in states]
         assert max(state.edge_distance_m or 0.0 for state in everything) <= LONGEST_M
         assert {state.faults for state in everything if state.mode != "disconnected"} == {()}
+
+
+@pytest.mark.timeout(180)
+async def test_arms_do_not_move_while_the_clocks_are_not_known_well_enough() -> None:
+    async with three_computers(clock_limit_s=1e-7) as (_, watch):
+        await until(lambda: watch.worst_clock_error_s() < 0.05)
+        await until(lambda: all("ms are allowed" in note for note in watch.notes.values()))
+        states = await watch.lasts(100)
+    for side in SIDES:
+        assert {state.mode for state in states[side]} == {"idle"}
+        assert np.ptp([state.joints_rad for state in states[side]], axis=0).max() < 1e-4

@@ -66,13 +66,13 @@ delays = st.lists(
 
 @settings(max_examples=150)
 @given(
-    delays,
-    st.integers(-(10**14), 10**14),
-    st.floats(-1e-4, 1e-4),
-    st.floats(-1e-4, 1e-4),
-    st.floats(0, 2e-4),
-    st.integers(10 * MS, 2 * S),
-    st.integers(0, 10 * S),
+    delays=delays,
+    ours=st.builds(Other, st.just(0), st.floats(-1e-4, 1e-4)),
+    theirs=st.builds(
+        Other, st.integers(-(10**14), 10**14), st.floats(-1e-4, 1e-4), st.floats(0, 2e-4)
+    ),
+    every=st.integers(10 * MS, 2 * S),
+    later=st.integers(0, 10 * S),
 )
 def test_the_true_offset_is_always_within_the_bounds(
     delays: list[tuple[int, int]], ours: Other, theirs: Other, every: int, later: int
