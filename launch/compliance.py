@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from nodes import cache
-from nodes.fem_solver import body, precompute
+from nodes.fem_solver.making import Maker
 from nodes.models.sheet.laws import SheetLaw
 from nodes.planner.compliance import (
     GOOD_RATIO,
@@ -30,17 +31,20 @@ SHOWN_SHARES = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Depths that are told, over the deepest push."""
 
 
-def front_curve(scene: Scene) -> Floats:
-    """The object's force over depth (n, 2), m and N, where it faces the user; precomputes its soft
-    body if that is not kept from before."""
-    spec = body.spec_of(scene, SKIN_SPACING_M)
-    model = precompute.load_or_compute(
-        spec, cache.default_cache_dir(), lambda done, total, need: None
+def front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
+    """The object's force over depth (n, 2), m and N, where it faces the user: by the nonlinear
+    table if that is kept for this object, else by the linear method, which is worked out if it is
+    not kept.  cache_dir: None: the user's."""
+    maker = Maker(
+        skin_spacing_m=SKIN_SPACING_M,
+        linear_depth_m=LINEAR_DEPTH_M,
+        largest_depth_m=LARGEST_DEPTH_M,
+        friction_ratio=0.0,
+        cache_dir=cache_dir or cache.default_cache_dir(),
+        workers=0,
     )
-    built = body.scene_body(
-        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, largest_depth_m=LARGEST_DEPTH_M
-    )
-    return built.at_rest().force_curve
+    best, *_ = maker.bodies(scene, "auto", lambda done, total, need: None)
+    return best.at_rest().force_curve
 
 
 def scene_compliance(

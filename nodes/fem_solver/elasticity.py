@@ -179,7 +179,13 @@ def solve(stiffness: csc_matrix, held: Ints, values: Floats, loads: Floats) -> F
     result[held] = values
     inner = stiffness[free][:, free].tocsc()
     try:
-        factor = splu(inner, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+        # positive definite: the diagonal serves as pivots, which keeps the factor sparse
+        factor = splu(
+            inner,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
     except RuntimeError as error:
         raise MeshError(f"the body is free to move: {error}") from error
     pivots = np.abs(factor.U.diagonal())
