@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import math
 import platform
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
 
 from messages.scene import Scene
 from nodes.methods import Family, Point, measure, pareto_front
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 FAMILIES: dict[str, str] = {
     "mark": "nodes.triangulator.families:MARK",
@@ -30,6 +35,7 @@ FAMILIES: dict[str, str] = {
 """Families by their name on the command line; each node's folder describes its own."""
 
 REPEATS = 30
+TITLE_WIDTH = 95
 
 
 class UnknownFamilyError(KeyError):
@@ -58,7 +64,21 @@ def measure_family(
     repeats: int = REPEATS,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Point]:
-    """Measure every trial of the family; `progress` is told of each."""
+    """Measure every trial of the family; `progress` is told of each, and what is left of what has
+    to be worked out before."""
+    begun, last = time.monotonic(), -1
+
+    def told(done: int, total: int) -> None:
+        nonlocal last
+        if done == last:
+            return
+        last, left = done, ""
+        if 0 < done < total:
+            left_s = (time.monotonic() - begun) / done * (total - done)
+            left = f", about {left_s:.0f} s left"
+        progress(f"working out what it takes to judge: {done} of {total}{left}")
+
+    family.prepare(scene, told)
     points = []
     for trial in family.trials(scene):
         progress(f"{trial.method} {trial.case}")
@@ -74,6 +94,7 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
         "reference": family.reference,
         "scene": scene.name,
         "tolerance": family.tolerance(scene),
+        "along": family.along,
         "machine": f"{platform.machine()}, Python {platform.python_version()}",
         "points": [asdict(point) for point in points],
         "front": pareto_front(points),
@@ -83,33 +104,47 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
 def draw_chart(result: dict[str, Any], path: Path) -> None:
     """Draw the result: log time across, error up; a line is the front of one case.
 
-    The scene's tolerance is dashed.  Errors below a ten-thousandth of it are drawn there: they are
-    rounding, and would press all the rest into a corner.
+    A family that says so gets its errors along the case, too, and further figures: with the
+    reference's own doubt, a band below which nothing can be told.
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8, 5.5), layout="constrained")
-    axes = figure.subplots()
+    also = (
+        [] if result["along"] is None else sorted({k for p in result["points"] for k in p["also"]})
+    )
+    panels = 1 if result["along"] is None else 2 + len(also)
+    figure = Figure(figsize=(8, 5.5) if panels == 1 else (7 * panels, 6.5), layout="constrained")
+    first, *others = figure.subplots(1, panels, squeeze=False)[0]
+    _draw_time(first, result)
+    for axes, name in zip(others, ["error", *also], strict=False):
+        _draw_along(axes, result, name)
+    figure.savefig(path, dpi=110 if panels == 1 else 90)
+
+
+def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
+    """Errors below a ten-thousandth of the scene's tolerance (dashed) are drawn there: they are
+    rounding, and would press all the rest into a corner."""
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
     least = 1e-4 * result["tolerance"]
     for index, method in enumerate(methods):
-        color = f"C{index % 10}"
         mine = [point for point in result["points"] if point["method"] == method]
         for in_range, marker in ((True, "o"), (False, "x")):
-            shown = [point for point in mine if point["in_range"] == in_range]
+            shown = [point for point in mine if point["in_range"] == in_range and _judged(point)]
             if shown:
                 front = "" if method not in result["front"] else ", on the front"
                 axes.plot(
                     [point["median_s"] * 1e6 for point in shown],
                     [max(point["error"], least) for point in shown],
                     marker,
-                    color=color,
+                    color=f"C{index % 10}",
                     alpha=0.7,
                     label=f"{method}{front if in_range else ' (out of its range)'}",
                 )
     for case in unique_cases(result["points"]):
         usable = [
-            point for point in result["points"] if point["in_range"] and point["case"] == case
+            point
+            for point in result["points"]
+            if point["in_range"] and point["case"] == case and _judged(point)
         ]
         steps = sorted((point["median_s"] * 1e6, max(point["error"], least)) for point in usable)
         best = [
@@ -124,10 +159,60 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
     axes.set_yscale("log")
     axes.set_xlabel("time per call, µs (median)")
     axes.set_ylabel(f"error, {result['unit']}")
-    axes.set_title(f"{result['family']} — scene {result['scene']}, against {result['reference']}")
+    title = f"{result['family']} — scene {result['scene']}, against {result['reference']}"
+    axes.set_title("\n".join(wrap(title, TITLE_WIDTH)), fontsize=10)
     axes.grid(visible=True, which="both", alpha=0.2)
     axes.legend(fontsize=8)
-    figure.savefig(path, dpi=110)
+
+
+def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
+    """One figure over the case, a line for each method, hollow out of its range; grey: what the
+    reference itself does not know."""
+    along, points = result["along"], result["points"]
+
+    def value(point: dict[str, Any]) -> float | None:
+        return point["error"] if name == "error" else point["also"].get(name)
+
+    doubts = sorted(
+        {p["case"][along]: p["doubts"][name] for p in points if name in p["doubts"]}.items()
+    )
+    if doubts:
+        at, doubt = zip(*doubts, strict=True)
+        low = [0.0 if name == "error" else -each for each in doubt]
+        axes.fill_between(at, low, doubt, color="0.85", label="the reference's own doubt")
+    methods = list(dict.fromkeys(point["method"] for point in points))
+    for index, method in enumerate(methods):
+        shown = [
+            (point["case"][along], value(point), point["in_range"])
+            for point in points
+            if point["method"] == method and _number(value(point))
+        ]
+        if not shown:
+            continue
+        at, values, sure = zip(*sorted(shown), strict=True)
+        color = f"C{index % 10}"
+        axes.plot(at, values, "-", color=color, alpha=0.6, label=method)
+        for x, y, inside in zip(at, values, sure, strict=True):
+            axes.plot(x, y, "o", color=color, markerfacecolor=color if inside else "white")
+    if name == "error":
+        axes.axhline(result["tolerance"], linestyle="--", color="0.2")
+        axes.set_yscale("symlog", linthresh=result["tolerance"])
+        axes.set_ylabel(f"error, {result['unit']}")
+    else:
+        axes.axhline(0.0, color="0.2", linewidth=0.8)
+        axes.set_ylabel(name.replace("_", " "))
+    axes.set_xlabel(f"{along.replace('_', ' ')} (hollow: out of the method's range)")
+    axes.grid(visible=True, alpha=0.2)
+    axes.legend(fontsize=8)
+
+
+def _number(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _judged(point: dict[str, Any]) -> bool:
+    """Whether there was a reference to judge a point by."""
+    return _number(point["error"])
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -8,7 +8,7 @@ scene's working range, and draws speed against accuracy.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,10 @@ import numpy as np
 
 from messages.scene import Scene
 
+LONGEST_S, FEWEST_REPEATS = 3.0, 3
+"""A trial is not repeated after so long in all, but so often at least."""
+
+Progress = Callable[[int, int], None]
 Case = dict[str, float | int | str]
 """What a measurement was taken at, in the scene's units: {"depth_mm": 10}."""
 
@@ -28,6 +32,8 @@ class Trial:
     error: takes the result of `run`, gives the error in the family's unit.
     in_range: whether the method's stated range covers this case.
     size: how large the method made its work of it ({"skin_nodes": 1210}), reported with the case.
+    also: further figures of what `run` returned, in units that their names tell.
+    doubts: how unsure the reference itself is, of the error ("error") and of further figures.
     """
 
     method: str
@@ -36,6 +42,12 @@ class Trial:
     error: Callable[[Any], float]
     in_range: bool
     size: Case = field(default_factory=dict)
+    also: Callable[[Any], Mapping[str, float]] = lambda result: {}
+    doubts: Mapping[str, float] = field(default_factory=dict)
+
+
+def nothing_to_prepare(scene: Scene, told: Progress) -> None:
+    """Of a family whose trials are at hand at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +56,8 @@ class Family:
 
     trials: yields the trials of every method over a scene's working range.
     tolerance: the scene's tolerance, in `unit`.
+    along: the part of the case that errors are drawn over in a picture of their own, if any.
+    prepare: works out, and keeps, what takes long and `trials` needs; told of done and total steps.
     """
 
     name: str
@@ -52,13 +66,15 @@ class Family:
     methods: Sequence[str]
     trials: Callable[[Scene], Iterable[Trial]]
     tolerance: Callable[[Scene], float]
+    along: str | None = None
+    prepare: Callable[[Scene, Progress], None] = nothing_to_prepare
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
     """One method at one case: how long it takes and how wrong it is.
 
-    params: the case and the method's size together.
+    params: the case and the method's size together.  also, doubts: as of its trial.
     """
 
     method: str
@@ -68,16 +84,23 @@ class Point:
     p99_s: float
     error: float
     in_range: bool
+    also: Mapping[str, float] = field(default_factory=dict)
+    doubts: Mapping[str, float] = field(default_factory=dict)
 
 
 def measure(trial: Trial, *, repeats: int) -> Point:
-    """Time `trial.run` `repeats` times (after one run that is not counted) and judge its result."""
+    """Time `trial.run` `repeats` times (after one run that is not counted) and judge its result.
+
+    What takes long is repeated less often, as `LONGEST_S` says.
+    """
     result = trial.run()
-    durations = np.empty(repeats)
-    for i in range(repeats):
+    durations: list[float] = []
+    while len(durations) < repeats:
         start = time.perf_counter()
         result = trial.run()
-        durations[i] = time.perf_counter() - start
+        durations.append(time.perf_counter() - start)
+        if len(durations) >= FEWEST_REPEATS and sum(durations) > LONGEST_S:
+            break
     return Point(
         method=trial.method,
         case=trial.case,
@@ -86,6 +109,8 @@ def measure(trial: Trial, *, repeats: int) -> Point:
         p99_s=float(np.quantile(durations, 0.99)),
         error=float(trial.error(result)),
         in_range=trial.in_range,
+        also=dict(trial.also(result)),
+        doubts=dict(trial.doubts),
     )
 
 

@@ -55,17 +55,26 @@ def chart(
 
 
 def _print_points(result: dict[str, Any]) -> None:
+    also = list(dict.fromkeys(name for point in result["points"] for name in point["also"]))
     rows = [
         (
             point["method"],
-            ", ".join(f"{key} {value}" for key, value in point["params"].items()),
+            ", ".join(f"{key} {_short(value)}" for key, value in point["params"].items()),
             f"{point['median_s'] * 1e6:.1f}",
             f"{point['p99_s'] * 1e6:.1f}",
             "-" if point["error"] is None else f"{point['error']:.4g}",
+            *(_short(point["also"].get(name)) for name in also),
             "yes" if point["in_range"] else "no",
             "front" if point["method"] in result["front"] else "",
         )
         for point in result["points"]
     ]
     error = f"error, {result['unit']}"
-    print_table(("method", "case", "median, µs", "p99, µs", error, "in range", ""), rows)
+    named = (name.replace("_", " ") for name in also)
+    print_table(("method", "case", "median, µs", "p99, µs", error, *named, "in range", ""), rows)
+
+
+def _short(value: float | int | str | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -24,7 +24,17 @@ Floats = NDArray[np.float64]
 
 
 def spec_of(scene: Scene, skin_spacing_m: float, *, sticking: bool = False) -> SoftBodySpec:
-    """What has to be precomputed for this scene's object; ValueError as `mesh_spec`."""
+    """What has to be precomputed for this scene's object.
+
+    ValueError as `mesh_spec`, and for a skin coarser than the fingertip, which would resist far too
+    much: twice where it is 1.7 times as coarse, seven times where it is 7 times.
+    """
+    if skin_spacing_m > scene.finger.radius_m:
+        raise ValueError(
+            f"skin_spacing_m: {skin_spacing_m:g} is more than finger.radius_m "
+            f"({scene.finger.radius_m:g}): a skin so coarse would answer so small a fingertip with "
+            "far too much force; lower skin_spacing_m to that or less"
+        )
     mesh = mesh_spec(scene, skin_spacing_m)
     return SoftBodySpec(mesh, scene.object.material.poisson_ratio, sticking)
 

@@ -1,0 +1,327 @@
+"""What an answer of the soft body costs in time and memory, by skin nodes and by contact nodes.
+
+    OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_size [--output docs/charts]
+
+Bodies of 500 to 20,000 skin nodes answer fingers at random places and at slowly moving ones.  Their
+geometry is the demo's cylinder, meshed as finely as that takes, and the steps are those that the
+node runs; but the numbers in the tables are made up, and only some places have rows, as many as fit
+into `TABLE_BYTES`: to solve for 20,000 nodes would take hours, and 10,000 places some 100 GB by the
+nonlinear table.  What a whole table would take is said beside it.  The floor is how long this
+machine takes, there and then, to read as many bytes as the answer needs, by a plain dot product.
+
+Writes soft-body-size.png and soft-body-size.json.  A minute, 3 GB.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from messages.scene import Scene, cylinder_of
+from nodes.fem_solver.body import spec_of
+from nodes.fem_solver.contact import LinearSoftBody, SkinResponse
+from nodes.fem_solver.mesh import SolidMesh, build_mesh
+from nodes.fem_solver.place import Push
+from nodes.fem_solver.pushes import DEPTHS_M
+from nodes.fem_solver.table import LINEAR_DEPTHS_M, Table, TableSoftBody, table_bytes
+from nodes.models.shapes import Shape, make_shape
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
+SPACINGS_M = (0.007, 0.006, 0.0045, 0.003, 0.0022, 0.0016, 0.00106)
+DEPTH_M = 0.005
+CONTACT_SPACING_M = 0.0022
+CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
+LINEAR_RANGE_M = (0.012, 0.018)
+"""Wider than the method is good for, so that the contact grows with the depth."""
+TABLE_BYTES, MOST_PLACES = 400_000_000, 800
+FLOOR_BYTES = 400_000_000
+STEPS = 150
+SLOW_STEP_M = 2e-5
+ROWS_PER_ANSWER = 6 * 4
+"""Of the nonlinear table: six nodes, four depths."""
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One measurement; times in s: median and 99 of 100 at random places, median of a slow slide,
+    and what reading `read_bytes` from random places of memory takes."""
+
+    method: str
+    skin_nodes: int
+    contact_nodes: float
+    depth_m: float
+    read_bytes: float
+    random_s: float
+    random_p99_s: float
+    slow_s: float
+    floor_s: float
+    whole_table_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Synthetic:
+    """A body of the right size: rows of made-up numbers at the touch nodes of a patch."""
+
+    mesh: SolidMesh
+    response: SkinResponse
+    shape: Shape
+    centre: Floats
+    half_m: float
+
+
+def patch_of(mesh: SolidMesh, row_bytes: int) -> tuple[Ints, Ints]:
+    """The touch nodes (numbers among them) around the front whose rows fit into `TABLE_BYTES`, and
+    their faces."""
+    touched = mesh.nodes[mesh.touch]
+    front = touched[int(touched[:, 2].argmax())]
+    order = np.argsort(np.abs(touched - front).max(axis=1), kind="stable")
+    kept = np.zeros(len(touched), dtype=bool)
+    kept[order[: min(MOST_PLACES, TABLE_BYTES // row_bytes)]] = True
+    faces = mesh.touch_faces[kept[mesh.touch_faces].all(axis=1)]
+    return np.unique(faces), faces
+
+
+def synthetic(scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int) -> Synthetic:
+    """rows_per_place: 1 of the linear table, more of the nonlinear."""
+    numbers, faces = patch_of(mesh, rows_per_place * 12 * len(mesh.skin))
+    rest = mesh.nodes[mesh.skin]
+    touch = np.searchsorted(mesh.skin, mesh.touch[numbers])
+    places = rest[touch]
+    # the half-space under a load, blunt below the spacing: positive definite, right in size
+    apart = np.linalg.norm(places[:, None] - places[None], axis=2)
+    blunt = 0.5 * float(np.median(np.partition(apart, 1, axis=1)[:, 1]))
+    nu = scene.object.material.poisson_ratio
+    compliance = (1.0 - nu**2) / (np.pi * np.sqrt(apart**2 + blunt**2))
+    made_up = np.random.default_rng(0).random(3 * len(rest), dtype=np.float32)
+    linear_rows = len(touch) if rows_per_place == 1 else 1
+    response = SkinResponse(
+        rest=rest,
+        touch=touch,
+        normals=mesh.touch_normals[numbers],
+        faces=np.searchsorted(numbers, faces),
+        compliance=compliance,
+        table=np.tile(made_up, (linear_rows, 1)),
+    )
+    centre = places.mean(axis=0)
+    half = 0.7 * float(np.abs(places - centre)[:, :2].max(axis=0).min())
+    return Synthetic(mesh, response, shape, centre, half)
+
+
+def floor_s(read_bytes: float) -> float:
+    """Median time to read so much in one piece from random places of memory."""
+    source, rng = np.ones(FLOOR_BYTES // 4, dtype=np.float32), np.random.default_rng(1)
+    count = max(16, int(read_bytes / 4))
+    took = []
+    for start in rng.integers(0, len(source) - count, 60):
+        piece = source[start : start + count]
+        begun = time.perf_counter()
+        piece.dot(piece)
+        took.append(time.perf_counter() - begun)
+    return float(np.median(took))
+
+
+def pushes_on(body: Synthetic, depth_m: float, *, slow: bool) -> list[Push]:
+    """At random places of the patch, or along a line at 0.02 mm a step."""
+    rng = np.random.default_rng(2)
+    ways = rng.uniform(-body.half_m, body.half_m, (STEPS, 2))
+    if slow:
+        ways = np.column_stack([np.arange(STEPS), 0.7 * np.arange(STEPS)]) * SLOW_STEP_M
+    found = body.shape.closest(body.centre + np.column_stack([ways, np.zeros(STEPS)]))
+    return [Push(at, way, depth_m) for at, way in zip(found.point, found.normal, strict=True)]
+
+
+def timed(respond: Callable[[Push], Any], pushes: Sequence[Push]) -> Floats:
+    took = np.empty(len(pushes))
+    for number, push in enumerate(pushes):
+        begun = time.perf_counter()
+        respond(push)
+        took[number] = time.perf_counter() - begun
+    return took
+
+
+def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> Point:
+    body = synthetic(scene, mesh, shape, rows_per_place=1)
+    method = LinearSoftBody(
+        body.response,
+        shape,
+        np.empty((0, 3)),
+        young_modulus_pa=scene.object.material.young_modulus_pa,
+        finger_radius_m=scene.finger.radius_m,
+        linear_depth_m=LINEAR_RANGE_M[0],
+        largest_depth_m=LINEAR_RANGE_M[1],
+    )
+    pushes = pushes_on(body, depth_m, slow=False)
+    contacts = [method.contact.solve(push, depth_m) for push in pushes]
+    count = float(np.median([0 if one is None else len(one.nodes) for one in contacts]))
+    whole = len(mesh.touch) * (12 * len(mesh.skin) + 8 * len(mesh.touch))
+    return measured(
+        method,
+        body,
+        pushes,
+        depth_m=depth_m,
+        contact_nodes=count,
+        rows=count,
+        whole_table_bytes=whole,
+    )
+
+
+def table_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> Point:
+    levels = len(DEPTHS_M) + len(LINEAR_DEPTHS_M)
+    body = synthetic(scene, mesh, shape, rows_per_place=levels)
+    places = len(body.response.touch)
+    row = np.tile(body.response.table[0], levels).reshape(1, levels, -1)
+    depths = np.array([0.0, *LINEAR_DEPTHS_M, *DEPTHS_M])
+    table = Table(
+        depths_m=depths,
+        fields=np.tile(row, (places, 1, 1)),
+        force_n=body.response.normals[:, None] * depths[:, None],
+        reach_m=np.full(places, depths[-1]),
+    )
+    method = TableSoftBody(
+        body.response,
+        np.empty((0, 3)),
+        table,
+        young_modulus_pa=scene.object.material.young_modulus_pa,
+        finger_radius_m=scene.finger.radius_m,
+        push_depth_m=LINEAR_RANGE_M[1],
+        linear_depth_m=0.006,
+    )
+    whole = table_bytes(len(mesh.touch), len(mesh.skin), len(DEPTHS_M))
+    pushes = pushes_on(body, depth_m, slow=False)
+    return measured(
+        method,
+        body,
+        pushes,
+        depth_m=depth_m,
+        contact_nodes=6.0,
+        rows=ROWS_PER_ANSWER,
+        whole_table_bytes=whole,
+    )
+
+
+def measured(
+    method: LinearSoftBody | TableSoftBody,
+    body: Synthetic,
+    pushes: Sequence[Push],
+    *,
+    depth_m: float,
+    contact_nodes: float,
+    rows: float,
+    whole_table_bytes: int,
+) -> Point:
+    read = rows * 12.0 * len(body.response.rest)
+    slow = pushes_on(body, depth_m, slow=True)
+    timed(method.respond, pushes[:20])
+    at_random, slowly = timed(method.respond, pushes), timed(method.respond, slow)
+    return Point(
+        method=method.name,
+        skin_nodes=len(body.response.rest),
+        contact_nodes=contact_nodes,
+        depth_m=depth_m,
+        read_bytes=read,
+        random_s=float(np.median(at_random)),
+        random_p99_s=float(np.quantile(at_random, 0.99)),
+        slow_s=float(np.median(slowly)),
+        floor_s=floor_s(read),
+        whole_table_bytes=whole_table_bytes,
+    )
+
+
+def draw(by_size: Sequence[Point], by_contact: Sequence[Point], path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(16, 5), layout="constrained")
+    size, contact, memory = figure.subplots(1, 3)
+    for number, method in enumerate(dict.fromkeys(point.method for point in by_size)):
+        color = f"C{number}"
+        for axes, points, across in (
+            (size, by_size, "skin_nodes"),
+            (contact, by_contact, "contact_nodes"),
+        ):
+            mine = [point for point in points if point.method == method]
+            if not mine:
+                continue
+            at = [getattr(point, across) for point in mine]
+            for name, what, style in (
+                ("random_s", "random places", "o-"),
+                ("random_p99_s", "random places, p99", "v:"),
+                ("slow_s", "slow slide", "s--"),
+                ("floor_s", "floor: reading as much", "_-."),
+            ):
+                shown = [1e6 * getattr(point, name) for point in mine]
+                light = 0.5 if name == "floor_s" else 1.0
+                axes.plot(at, shown, style, color=color, alpha=light, label=f"{method}, {what}")
+        mine = [point for point in by_size if point.method == method]
+        at = [point.skin_nodes for point in mine]
+        memory.plot(at, [p.whole_table_bytes / 1e6 for p in mine], "o-", color=color, label=method)
+    for axes, across, up in (
+        (size, f"skin nodes (push of {1e3 * DEPTH_M:g} mm)", "time of an answer, µs"),
+        (contact, "contact nodes", "time of an answer, µs"),
+        (memory, "skin nodes", "whole table, MB"),
+    ):
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_xlabel(across)
+        axes.set_ylabel(up)
+        axes.grid(visible=True, which="both", alpha=0.2)
+        axes.legend(fontsize=7)
+    contact.set_title(f"{by_contact[0].skin_nodes} skin nodes", fontsize=10)
+    figure.savefig(path, dpi=90)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--output", type=Path, default=Path("runs/charts"))
+    folder = parser.parse_args().output
+    scene = load_scene(SCENE_FILE)
+    shape = make_shape(dict(cylinder_of(scene)))
+    by_size, by_contact = [], []
+    for spacing in SPACINGS_M:
+        mesh = build_mesh(spec_of(scene, spacing).mesh)
+        for measure in (linear_point, table_point):
+            by_size.append(measure(scene, mesh, shape, DEPTH_M))
+            say(by_size[-1])
+        if spacing == CONTACT_SPACING_M:
+            for depth in CONTACT_DEPTHS_M:
+                by_contact.append(linear_point(scene, mesh, shape, depth))
+                say(by_contact[-1])
+    folder.mkdir(parents=True, exist_ok=True)
+    draw(by_size, by_contact, folder / "soft-body-size.png")
+    content = {
+        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        "tables": "of made-up numbers and of the right size, at some of the places",
+        "by_skin_nodes": [asdict(point) for point in by_size],
+        "by_contact_nodes": [asdict(point) for point in by_contact],
+    }
+    (folder / "soft-body-size.json").write_text(json.dumps(content, indent=1) + "\n")
+
+
+def say(point: Point) -> None:
+    print(
+        f"| {point.method} | {point.skin_nodes} | {point.contact_nodes:g} |"
+        f" {point.read_bytes / 1e6:.2f} MB | {1e6 * point.slow_s:.0f} |"
+        f" {1e6 * point.random_s:.0f} / {1e6 * point.random_p99_s:.0f} |"
+        f" {1e6 * point.floor_s:.0f} | {point.whole_table_bytes / 1e6:.0f} MB |",
+        flush=True,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
