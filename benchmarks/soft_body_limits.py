@@ -38,7 +38,8 @@ Floats = NDArray[np.float64]
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SPACING_M = 0.005
-CYLINDER = {"shape": "cylinder", "radius_m": 0.02, "length_m": 0.05}
+RADIUS_M = 0.02
+CYLINDER = {"shape": "cylinder", "radius_m": RADIUS_M, "length_m": 0.05}
 STRIP = {"kind": "strip", "angle_rad": 1.57}
 DEPTHS_M = tuple(1e-3 * d for d in range(1, 36))
 STEP_M = 2e-5
@@ -174,14 +175,14 @@ def inversion() -> None:
     for spacing in (0.005, 0.004, 0.003):
         body = body_of(cylinder(), spacing)
         site = site_of(body)
-        end = deepest_mm(newton(body, site)) if spacing > 0.003 else np.nan
+        end = "not run" if spacing <= 0.003 else f"{deepest_mm(newton(body, site)):g} mm"
         answer = body.soft.method.respond(Push(site.place, site.normal, 0.050))
         largest = 1e3 * float(np.linalg.norm(answer.displacement, axis=1).max())
         flag = "in range" if answer.in_range else "flagged"
         row(
             f"{1e3 * spacing:g} mm",
             f"{linear_inversion_mm(body, site):g} mm",
-            f"{end:g} mm",
+            end,
             f"skin moves {largest:.1f} mm, {flag}",
             overturned(body, answer.displacement),
         )
@@ -253,14 +254,14 @@ def two_supports() -> None:
 
 def slivers() -> None:
     """Elements flattened: the nodes inside the cylinder drawn towards a plane."""
-    row("flattened to", "least height over edge", "linear: force at 3 mm", "Newton: to")
+    row("flattened to", "least height over edge", "Newton: force at 3 mm", "Newton: to")
     base = body_of(cylinder())
     site = site_of(base)
     for share in (1.0, 0.3, 0.1, 0.03, 0.01, 0.001, 0.0):
         nodes = flattened(base.mesh, share)
         try:
             NeoHookeanSolid(nodes, base.mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
-            force = linear_force_n(base, nodes, site)
+            force = force_n(base, nodes, site)
         except ValueError as error:
             row(share, "-", f"refused: {error}", "-")
             continue
@@ -308,9 +309,8 @@ def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
     return float((volume / largest / np.linalg.norm(edges, axis=2).max(axis=1)).min())
 
 
-def linear_force_n(body: Body, nodes: Floats, site: Site) -> float:
-    """Of the finger 3 mm deep, by Newton at a hundredth of that, in proportion: what a linear body
-    on these nodes answers to small pushes."""
+def force_n(body: Body, nodes: Floats, site: Site) -> float:
+    """Of the finger 3 mm deep by Newton on these nodes; NaN where it cannot follow."""
     mesh = replace(body.mesh, nodes=nodes)
     answer = newton(replace(body, mesh=mesh), site, (0.003,))
     modulus = body.scene.object.material.young_modulus_pa
@@ -352,7 +352,7 @@ def small_tip() -> None:
         body = body_of(cylinder(finger_m=radius), meshed_for=cylinder())
         site, depth = site_of(body), 0.5 * radius
         modulus = body.scene.object.material.young_modulus_pa
-        bend = np.sqrt(1.0 / radius * (1.0 / radius + 1.0 / CYLINDER["radius_m"]))
+        bend = np.sqrt(1.0 / radius * (1.0 / radius + 1.0 / RADIUS_M))
         hertz = 4.0 / 3.0 * modulus / (1.0 - 0.45**2) * np.sqrt(1.0 / bend) * depth**1.5
         force = float(
             body.soft.method.respond(Push(site.place, site.normal, depth)).force_n @ site.normal

@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import platform
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -324,4 +323,4 @@ def say(point: Point) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

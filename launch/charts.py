@@ -171,7 +171,8 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     along, points = result["along"], result["points"]
 
     def value(point: dict[str, Any]) -> float | None:
-        return point["error"] if name == "error" else point["also"].get(name)
+        found: float | None = point["error"] if name == "error" else point["also"].get(name)
+        return found
 
     doubts = sorted(
         {p["case"][along]: p["doubts"][name] for p in points if name in p["doubts"]}.items()

@@ -1,0 +1,68 @@
+"""Where the soft body's methods end: refused, flagged, or answered all the same."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmarks.soft_body_limits import (
+    CYLINDER,
+    Body,
+    body_of,
+    cylinder,
+    deepest_mm,
+    newton,
+    overturned,
+    scene_of,
+    site_of,
+)
+from nodes.fem_solver.place import Entry, Push
+from nodes.models import rigid
+
+ENDS = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
+
+
+@pytest.fixture(scope="module")
+def body() -> Body:
+    return body_of(cylinder())
+
+
+def test_a_skin_coarser_than_the_fingertip_is_refused() -> None:
+    """It would answer with twice the force and more, and not know."""
+    with pytest.raises(ValueError, match=r"skin_spacing_m: 0.005 .* finger.radius_m \(0.0045\)"):
+        body_of(cylinder(finger_m=0.0045))
+
+
+def test_an_incompressible_body_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"poisson_ratio: 0.49995 .* take 0.499"):
+        body_of(cylinder(nu=0.49995))
+
+
+def test_two_supports_hold_and_one_point_is_refused(body: Body) -> None:
+    hanging = body_of(scene_of(CYLINDER, ENDS, height_m=0.02))
+    site = site_of(hanging)
+    answers = [
+        one.soft.method.respond(Push(site.place, site.normal, 0.005)) for one in (hanging, body)
+    ]
+    forces = [float(answer.force_n @ site.normal) for answer in answers]
+    assert 0.3 * forces[1] < forces[0] < forces[1]
+    assert deepest_mm(newton(hanging, site, (0.002, 0.004))) == 4.0
+    point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
+    with pytest.raises(ValueError, match=r"object.support: .* at least three"):
+        body_of(scene_of(CYLINDER, point, height_m=0.02))
+
+
+def test_a_finger_that_jumps_is_answered_where_it_is(body: Body) -> None:
+    """Anywhere within a right angle of where it was; nothing is turned over anywhere."""
+    rng = np.random.default_rng(7)
+    jumped: Entry | None = None
+    for _ in range(40):
+        x, angle, depth = rng.uniform([-0.02, -0.7, -0.002], [0.02, 0.7, 0.012])
+        normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+        point = (0.02 - depth) * normal + np.array([x, 0.0, 0.0])
+        there = rigid.apply(body.soft.world_from_mesh, point)
+        answer, jumped = body.soft.respond(there, jumped)
+        fresh, _ = body.soft.respond(there, None)
+        assert np.array_equal(answer.displacement, fresh.displacement)
+        assert answer.in_range == fresh.in_range
+        assert overturned(body, answer.displacement) == 0
