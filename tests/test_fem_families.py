@@ -45,7 +45,7 @@ def test_every_method_is_judged_by_a_finer_newton(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(pushes, "DEPTHS_M", (0.0015, 0.003, 0.005, 0.0075))
-    monkeypatch.setattr(pushes, "SPACING_RATIO", 0.7)
+    monkeypatch.setattr(pushes, "SPACING_RATIO", 1.0)
     monkeypatch.setattr(pushes, "STATIONS", (0.0,))
     monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
     # pushes are solved here: other processes would not know of the few sites
@@ -58,7 +58,7 @@ def test_every_method_is_judged_by_a_finer_newton(
         table_m={"table": 0.005},
         newton_m=(0.003,),
         peers_m=(0.003,),
-        focused=(0.6,),
+        focused=(0.7,),
         even_m=(0.005,),
     )
     told: list[tuple[int, int]] = []
