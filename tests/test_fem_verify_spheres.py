@@ -51,9 +51,7 @@ def unit_answers(layers: int, nu: float) -> tuple[Floats, Ints, Floats, Floats]:
     matrix = stiffness_matrix(nodes, elements, young_modulus_pa=E, poisson_ratio=nu)
     free = np.setdiff1d(np.arange(nodes.size), symmetry(nodes))
     # positive definite: no pivot needs looking for
-    factor = splu(
-        matrix[free][:, free].tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0
-    )
+    factor = splu(matrix[free][:, free].tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0)
     moved = np.zeros((nodes.size, 2))
     moved[free] = factor.solve(np.column_stack(loads)[free])
     inner, outer = moved.T
