@@ -58,7 +58,10 @@ class SheetBelief:
         if sheet is not None and stage.usable(sheet, eye):
             self._sheet, self.note = sheet, ""
             return sheet
-        why = f"arm poses {age_s:.2f} s old" if sheet is None else "sheet edge-on or turned away"
+        why = "sheet edge-on or turned away"
+        if sheet is None:
+            fresh = age_s <= self._stale_s
+            why = "the flanges hold no sheet" if fresh else f"arm poses {age_s:.2f} s old"
         self.note = f"{why}: holding the last good sheet plane"
         if self._sheet is None:
             self._sheet = stage.sheet_at_rest()

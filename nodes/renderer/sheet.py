@@ -57,9 +57,12 @@ def sheet_between(
     """The sheet between two edges, moved on by `twist_world` (6,) for `ahead_s`.
 
     finger_tip: (3,) at that instant, or None.  It pushes the sheet when it is below the plane and
-    over the sheet.  None when the edges are too near to one another to hold a sheet.
+    over the sheet.  None when the edges are too near to one another to hold a sheet, or a pose or
+    the twist is not finite.
     """
     left, right = world_from_left_edge, world_from_right_edge
+    if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
+        return None
     distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
     if distance < LEAST_EDGE_DISTANCE_M:
         return None

@@ -1,0 +1,150 @@
+"""Where the picture cannot be right: dark there, or the last good plane held, and never wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from launch.twin_sheet import true_sheet
+from messages.types import Display
+from nodes.models.rigid import rotation_from_vector, transform
+from nodes.models.sheet import edge_poses
+from nodes.renderer.families import PLACES, draw_stereo, places_pictures, rolled_on
+from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.sheet_mesh import SheetMesh
+from nodes.renderer.stage import Stage
+from nodes.twin.eye import seen
+from nodes.twin.places import error_map
+from tests.dent_shapes import DEEPEST_M, few_dents
+
+Floats = NDArray[np.float64]
+SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
+STRETCH = 1.05
+WHOLE = 14600
+"""Points of the whole object at 0.7 mm a pixel."""
+METHODS = ("one_plane", "four_triangles", "two_pass")
+EYE = SCENE.eyes.centre_world_m
+PROJECTOR = np.array(SCENE.projector.world_from_projector.position_m)
+
+
+@pytest.fixture(scope="module")
+def stage() -> Iterator[Stage]:
+    context = headless_context()
+    made = Stage(SCENE, context, spacing_m=0.005, dents=few_dents())
+    yield made
+    made.release()
+    context.release()
+
+
+def sheet_at(pose: Floats, tip: Floats | None = None) -> Sheet:
+    sheet = sheet_between(
+        *edge_poses(pose, STRETCH * SCENE.sheet.width_m),
+        height_m=SCENE.sheet.height_m,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=tip,
+    )
+    assert sheet is not None
+    return sheet
+
+
+def plane_through(point: Floats) -> Floats:
+    """world_from_sheet about the world's origin, turned about x until it contains the point."""
+    angle = float(np.arctan2(point[1], point[2])) - 0.5 * np.pi
+    return transform(rotation_from_vector([-angle, 0.0, 0.0]), np.zeros(3))
+
+
+@pytest.mark.parametrize("seer", ["eye", "projector"])
+@pytest.mark.parametrize("turned_deg", [-2.0, 0.0, 2.0])
+def test_a_sheet_with_eye_or_projector_in_its_plane_is_dark(
+    stage: Stage, seer: str, turned_deg: float
+) -> None:
+    pose = plane_through(EYE if seer == "eye" else PROJECTOR)
+    turn = transform(rotation_from_vector([np.radians(turned_deg), 0.0, 0.0]), np.zeros(3))
+    sheet = sheet_at(pose @ turn)
+    towards = (EYE if seer == "eye" else PROJECTOR) - sheet.plane.point
+    assert abs(sheet.plane.normal @ towards) < 0.04 * np.linalg.norm(towards)
+    assert not stage.usable(sheet)
+    for method in METHODS:
+        for picture in places_pictures(stage, method, sheet):
+            # Near the plane a few rays to the object's ends are not quite grazing.
+            assert (picture.max(axis=2) > 0).mean() < 0.002, method
+
+
+@pytest.mark.parametrize("tilt_deg", [-85, -80, 80, 85, 100, 180])
+def test_beyond_the_steepest_tilts_the_plane_is_not_usable(stage: Stage, tilt_deg: int) -> None:
+    sheet = sheet_at(rolled_on(SCENE, -np.radians(tilt_deg)))
+    assert stage.usable(sheet) == (tilt_deg == 80)
+    for method in ("none", *METHODS):
+        draw_stereo(stage, method, sheet)
+
+
+@pytest.mark.parametrize("what", ["left", "right", "twist", "corner"])
+def test_poses_that_are_not_finite_hold_no_sheet(what: str) -> None:
+    left, right = edge_poses(np.eye(4), STRETCH * SCENE.sheet.width_m)
+    twist = np.zeros(6)
+    {"left": left, "right": right, "corner": right[:1]}.get(what, twist[None])[0, 1] = np.nan
+    found = sheet_between(
+        left, right, height_m=0.24, twist_world=twist, ahead_s=0.01, finger_tip=None
+    )
+    assert found is None
+
+
+@pytest.mark.parametrize(
+    ("tip", "pushes"),
+    [
+        ((0.0, 0.0, 0.001), False),
+        ((0.0, 0.121, -0.01), False),
+        ((0.127, 0.0, -0.01), False),
+        ((np.nan, 0.0, -0.01), False),
+        ((0.0, 0.0, np.nan), False),
+        ((0.0, 0.119, -0.01), True),
+        ((0.125, 0.0, -0.01), True),
+    ],
+)
+def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) -> None:
+    sheet = sheet_at(np.eye(4), np.array(tip))
+    assert (sheet.pushed_point is not None) == pushes
+
+
+@pytest.mark.parametrize(
+    ("tip", "said"),
+    [
+        ((0.0, 0.119, -0.01), "too near to the sheet's edge"),
+        ((0.125, 0.0, -0.01), "too near to the sheet's edge"),
+        ((0.0, 0.0, -0.065), "deeper than"),
+        ((0.0, 0.0, -0.02), ""),
+    ],
+)
+def test_a_push_out_of_range_is_drawn_and_said(
+    stage: Stage, tip: tuple[float, float, float], said: str
+) -> None:
+    picture, _ = places_pictures(stage, "two_pass", sheet_at(np.eye(4), np.array(tip)))
+    assert picture.max() > 150
+    assert stage.note == "" if not said else said in stage.note
+
+
+def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(stage: Stage) -> None:
+    """The dent of a sheet that faces down stands in the light's way: what is lit is as it should
+    be, the rest is lost."""
+    place = np.array([0.0, 0.05, 0.0])
+    pose = rolled_on(SCENE, np.radians(40.0), (0.0, 0.05))
+    tip = pose[:3, 3] + pose[:3, :3] @ (place - [0.0, 0.0, DEEPEST_M])
+    edges = edge_poses(pose, STRETCH * SCENE.sheet.width_m)
+    truth = true_sheet(SCENE, *edges, tip)
+    mesh = SheetMesh(truth.positions.reshape(-1, 3), truth.triangles().astype(np.int32))
+    found = []
+    for pattern in PLACES:
+        display = Display(correction="two_pass", stereo="mono", pattern=pattern)
+        picture = stage.draw_onto(display, mesh, Look(flat=True, pattern=pattern), read=True)
+        assert picture is not None
+        found.append(seen(picture, truth, SCENE, eye=EYE, metres_per_px=0.0007))
+    sizes = error_map(*found, 0.0007).sizes_m
+    assert 0.3 * WHOLE < len(sizes) < 0.97 * WHOLE
+    assert np.quantile(sizes, 0.99) < 0.001
