@@ -38,8 +38,9 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from messages.base import Header, Message, schema_fingerprint
+from messages.migrations import Migration, migration_for
 from messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
-from messages.wire import PROTOCOL, WireError, decode, encode
+from messages.wire import PROTOCOL, WireError, encode, read_envelope
 
 PROFILE = "flexsheet"
 CHUNK_BYTES = 1 << 20
@@ -247,7 +248,10 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """What a bag holds of one topic; readable: the type's fields are what they are in this code."""
+    """What a bag holds of one topic.
+
+    readable: the type's fields are what they are in this code, or can be made so (`migrations`).
+    """
 
     name: str
     type: str
@@ -320,11 +324,19 @@ class BagReader:
         self._check_topics()
 
     def __iter__(self) -> Iterator[tuple[str, Message, Header, int]]:
-        """Decoded messages; raises BagError for a topic whose type has changed since."""
-        readable = {channel.topic: self._topic_of(channel) for channel in self._selected().values()}
+        """Decoded messages, as of today: see `messages.migrations` for types that have changed.
+
+        Raises BagError for a topic whose type has changed in a way that nobody knows how to follow.
+        """
+        readable = {
+            channel.topic: self._reading_of(channel) for channel in self._selected().values()
+        }
         for number, (name, frames, log_time_ns) in enumerate(self.frames()):
+            topic, fingerprint, migrate = readable[name]
             try:
-                message, header = decode(frames, readable[name])
+                envelope = read_envelope(frames, topic, fingerprint=fingerprint)
+                envelope.fields = migrate(envelope.fields)
+                message, header = envelope.open(), envelope.header
             except WireError as error:
                 raise BagError(
                     f'{self.path}: topic "{name}", message {number} at {log_time_ns} ns: {error}'
@@ -401,7 +413,7 @@ class BagReader:
                     type=channel.metadata.get("type", ""),
                     count=len(stamps),
                     rate_hz=(len(stamps) - 1) / span_s if span_s > 0.0 else 0.0,
-                    readable=self._is_readable(channel),
+                    readable=self._migration_of(channel) is not None,
                 )
             )
         stamps = [stamp for channel_stamps in times.values() for stamp in channel_stamps]
@@ -557,26 +569,34 @@ class BagReader:
             if self._topics is None or channel.topic in self._topics
         }
 
-    def _is_readable(self, channel: mcap_records.Channel) -> bool:
-        topic = TOPICS.get(channel.topic)
-        return (
-            topic is not None
-            and channel.metadata.get("fingerprint") == schema_fingerprint(topic.message).hex()
-        )
+    def _migration_of(self, channel: mcap_records.Channel) -> Migration | None:
+        topic, schema = TOPICS.get(channel.topic), self.schemas.get(channel.schema_id)
+        if topic is None or schema is None:
+            return None
+        try:
+            recorded, fingerprint = json.loads(schema.data), channel.metadata["fingerprint"]
+            bytes.fromhex(fingerprint)
+        except (ValueError, KeyError):
+            return None  # damaged
+        return migration_for(topic.message, fingerprint, recorded)
 
-    def _topic_of(self, channel: mcap_records.Channel) -> Topic:
+    def _reading_of(self, channel: mcap_records.Channel) -> tuple[Topic, bytes, Migration]:
+        """Topic, fingerprint and migration of a channel's messages."""
         if channel.topic not in TOPICS:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" does not exist any more; '
                 "`BagReader.frames` still gives its bytes"
             )
-        if not self._is_readable(channel):
+        migration = self._migration_of(channel)
+        if migration is None:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" was recorded when '
-                f"{channel.metadata.get('type', 'its type')} had other fields; read it with the "
-                "code of that time, or leave the topic out (`BagReader.frames` gives its bytes)"
+                f"{channel.metadata.get('type', 'its type')} had other fields, and nothing in "
+                "messages/migrations.py says how to follow; read it with the code of that time, or "
+                "leave the topic out (`BagReader.frames` gives its bytes)"
             )
-        return TOPICS[channel.topic]
+        fingerprint = bytes.fromhex(channel.metadata["fingerprint"])
+        return TOPICS[channel.topic], fingerprint, migration
 
 
 def info(path: Path | str) -> BagInfo:

@@ -148,21 +148,25 @@ class Envelope:
             raise WireError("field", _describe(error, self.codec.name)) from error
 
 
-def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Envelope:
+def read_envelope(
+    frames: Sequence[Any], expected: Topic | type[Message], *, fingerprint: bytes | None = None
+) -> Envelope:
     """Check everything but the values of the fields; raises WireError.
 
     frames: buffers (bytes, memoryview, zmq.Frame), header first.
     expected: the topic, whose size limit then holds, or the type alone.
+    fingerprint: of the type as it was recorded; None: as it is today.
     """
     if isinstance(expected, Topic):
         codec = codec_of(expected.message)
         _check_size(frames, expected.max_bytes, f'topic "{expected.name}"')
     else:
         codec = codec_of(expected)
+    wanted = codec.fingerprint if fingerprint is None else fingerprint
     unpacked = _unpack(frames)
     if type(unpacked) is not tuple or len(unpacked) not in (10, 11):
         raise WireError("malformed", "not a message of flexsheet: no header of eleven elements")
-    protocol, name, fingerprint, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
+    protocol, name, carried, sequence, source, publish, clock_id, writer, epoch = unpacked[:9]
     if type(protocol) is not str or ELEMENTS.get(protocol) != len(unpacked):
         raise WireError(
             "malformed", f"speaks {_shown(protocol)}, wanted {PROTOCOL}: not a flexsheet node?"
@@ -171,11 +175,11 @@ def read_envelope(frames: Sequence[Any], expected: Topic | type[Message]) -> Env
     fields = unpacked[-1]
     if name != codec.name:
         raise WireError("type", f"carries {_shown(name)}, wanted {codec.name}")
-    if fingerprint != codec.fingerprint:
+    if carried != wanted:
         raise WireError(
             "fingerprint",
-            f"{codec.name} of another version: fingerprint {_shown(fingerprint)}, "
-            f"here {codec.fingerprint.hex()}; both ends must run the same code",
+            f"{codec.name} of another version: fingerprint {_shown(carried)}, "
+            f"here {wanted.hex()}; both ends must run the same code",
         )
     for number in (sequence, source, publish, epoch):
         if type(number) is not int or not 0 <= number <= _MAX_INTEGER:

@@ -1,0 +1,158 @@
+"""Bags outlive the types in them: what was recorded by earlier code is read by today's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from messages import migrations
+from messages.bag import BagError, BagReader, BagWriter, info
+from messages.base import Header, Message, schema_fingerprint
+from messages.migrations import fits, migration_for
+from messages.scene import Scene
+from messages.topics import TOPICS, Delivery, Topic
+from messages.types import Fingertip, Frame
+
+FIRST_RELEASE = Path(__file__).parent / "recorded" / "first-release.mcap"
+HEADER = Header(1, 10, 11, "clock", "node", 5, "plan")
+
+
+def test_the_first_release_is_read_whole() -> None:
+    summary = info(FIRST_RELEASE)
+    assert {topic.name for topic in summary.topics if topic.readable} == set(
+        BagReader(FIRST_RELEASE).topics
+    )
+    found = {name: message for name, message, _, _ in BagReader(FIRST_RELEASE)}
+    scene, frame, finger = found["scene"], found["frame"], found["fingertip"]
+    assert isinstance(scene, Scene)
+    assert scene.name == "cylinder"
+    assert isinstance(frame, Frame)
+    assert frame.light_ns == 0, "a field that came later has its default"
+    assert isinstance(finger, Fingertip)
+    assert np.isfinite(finger.position_world_m).all()
+
+
+class Before(Message):
+    mode: Literal["on", "off"]
+    size_mm: float
+    note: str | None = None
+
+
+class More(Message):
+    """What Before could become without anybody's help."""
+
+    mode: Literal["on", "off", "auto"]
+    size_mm: float
+    note: str | int | None = None
+    rate_hz: float = 60.0
+
+
+class Renamed(Message):
+    mode: Literal["on", "off"]
+    size_m: float
+    note: str | None = None
+
+
+class Demanding(Before):
+    rate_hz: float
+
+
+class Narrower(Message):
+    mode: Literal["on"]
+    size_mm: float
+    note: str | None = None
+
+
+class Poorer(Message):
+    mode: Literal["on", "off"]
+    note: str | None = None
+
+
+class Retyped(Message):
+    mode: Literal["on", "off"]
+    size_mm: int
+    note: str | None = None
+
+
+@pytest.mark.parametrize("today", [Before, More])
+def test_gains_need_nothing(today: type[Message]) -> None:
+    assert fits(Before.model_json_schema(), today.model_json_schema())
+    today.model_validate(Before(mode="on", size_mm=1.0).model_dump())
+
+
+@pytest.mark.parametrize("today", [Renamed, Demanding, Narrower, Poorer, Retyped])
+def test_anything_else_does(today: type[Message]) -> None:
+    assert not fits(Before.model_json_schema(), today.model_json_schema())
+    fingerprint = schema_fingerprint(Before).hex()
+    assert migration_for(today, fingerprint, Before.model_json_schema()) is None
+
+
+@pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda topic: topic.name)
+def test_each_type_fits_itself(topic: Topic) -> None:
+    schema = topic.message.model_json_schema()
+    assert fits(schema, schema)
+
+
+def row(message_type: type[Message]) -> Topic:
+    return Topic("size", message_type, Delivery.EVERY, None, True, "a size")
+
+
+@pytest.fixture
+def changed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A bag with a size in millimetres, opened when sizes are in metres."""
+    path = tmp_path / "before.mcap"
+    with BagWriter(path) as writer:
+        writer.write(row(Before), Before(mode="off", size_mm=2.5), HEADER, 10)
+    monkeypatch.setitem(TOPICS, "size", row(renamed()))
+    return path
+
+
+def renamed() -> type[Message]:
+    class Before(Message):
+        mode: Literal["on", "off"]
+        size_m: float
+        note: str | None = None
+
+    return Before
+
+
+KEY = ("Before", schema_fingerprint(Before).hex())
+
+
+def test_a_renamed_field_is_followed_by_a_migration(
+    changed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(BagError, match=r"had other fields.*migrations\.py"):
+        list(BagReader(changed))
+    assert not info(changed).topics[0].readable
+
+    def in_metres(fields: dict[str, Any]) -> dict[str, Any]:
+        size_m = fields["size_mm"] * 1e-3
+        return {"mode": fields["mode"], "size_m": size_m, "note": fields["note"]}
+
+    monkeypatch.setitem(migrations.MIGRATIONS, KEY, in_metres)
+    ((_, message, header, log_time_ns),) = BagReader(changed)
+    assert message.model_dump() == {"mode": "off", "size_m": 0.0025, "note": None}
+    assert (header, log_time_ns) == (HEADER, 10)
+
+
+def test_a_migration_that_gives_a_wrong_field_is_an_error(
+    changed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(migrations.MIGRATIONS, KEY, lambda fields: {"mode": "sideways"})
+    with pytest.raises(BagError, match=r'topic "size", message 0 .*mode'):
+        list(BagReader(changed))
+
+
+@given(st.recursive(st.none() | st.booleans() | st.integers() | st.text(),
+                    lambda parts: st.lists(parts) | st.dictionaries(
+                        st.sampled_from(["$ref", "properties", "required", "enum", "anyOf",
+                                         "items", "type", "$defs"]), parts)))  # fmt: skip
+def test_a_damaged_schema_fits_nothing_and_breaks_nothing(schema: Any) -> None:
+    if schema != {}:
+        assert not fits(schema, Before.model_json_schema())
