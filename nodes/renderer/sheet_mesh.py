@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nodes.models.rigid import apply, inverse
 from nodes.models.sheet.dents import DentShapes, triangles_of
-from nodes.renderer.correction import LEAST_PUSH_M
+from nodes.renderer.correction import GRAZING_SINE, LEAST_PUSH_M
 from nodes.renderer.sheet import Sheet
 
 Floats = NDArray[np.float64]
@@ -94,3 +94,29 @@ def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
         _grid_triangles(rows, columns),
         dents.outside(stretch, place, depth_m),
     )
+
+
+def lost_share(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
+    """About what share of the sheet, by its area as the eye sees it, folds keep the light from.
+
+    Lost is what the projector sees turned away or edge-on, within `GRAZING_SINE`, and as much again
+    that lies in its shadow.  0 for a sheet without folds, 1 at most.
+    """
+    # By rows of one coordinate, which is several times faster than by points.
+    places = np.ascontiguousarray(mesh.vertices.T)
+    a, b, c = (places.take(mesh.triangles[:, i], axis=1) for i in range(3))
+    b -= a
+    c -= a
+    x = b[1] * c[2] - b[2] * c[1]
+    y = b[2] * c[0] - b[0] * c[2]
+    z = b[0] * c[1] - b[1] * c[0]
+    light = (a[0] - projector[0]) * x + (a[1] - projector[1]) * y + (a[2] - projector[2]) * z
+    way = a - projector[:, None]
+    lengths = np.sqrt((x * x + y * y + z * z) * (way * way).sum(axis=0))
+    unlit = light <= GRAZING_SINE * lengths
+    if not unlit.any():
+        return 0.0
+    to_eye = eye[:, None] - a
+    seen = np.abs(to_eye[0] * x + to_eye[1] * y + to_eye[2] * z) / (to_eye**2).sum(axis=0) ** 1.5
+    shadow = 2.0 * float(seen[unlit].sum())
+    return min(1.0, shadow / max(float(seen.sum()), 1e-12))

@@ -17,6 +17,7 @@ from nodes.models.shapes import make_shape
 from nodes.models.sheet import corners
 from nodes.models.sheet.dents import DentShapes
 from nodes.renderer.correction import (
+    NEAR_M,
     Screen,
     clip_from_screen,
     on_imaginary_screen,
@@ -28,7 +29,7 @@ from nodes.renderer.lens import clip_lens
 from nodes.renderer.output import Image, both_eyes, pack
 from nodes.renderer.projection import Projection, Window
 from nodes.renderer.sheet import Sheet, screen_for
-from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, finer, pyramid_mesh
+from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, finer, lost_share, pyramid_mesh
 from nodes.renderer.surface import Follower, surface_of
 
 Floats = NDArray[np.float64]
@@ -38,6 +39,10 @@ OVERSAMPLING = 1.5
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
 """The window goes by steps, lest an outline's pixels swim as the object moves."""
+WIDEST_M = 0.3
+"""The window's reach from the screen's middle: farther out no sheet is."""
+LEAST_LOST = 0.005
+"""A smaller share that folds take is not told."""
 NO_DENTS = "no dent shapes at hand: a pushed sheet is taken for four triangles (flexsheet prepare)"
 
 GRID_WINDOW = Window(-0.151, -0.151, 0.302, 0.302)
@@ -98,6 +103,7 @@ class Stage:
         )
         self.canvas.set_paint(self._paint())
         self.dents, self.note = dents, ""
+        self.lost_share = 0.0
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
         across_px = OVERSAMPLING * projector_homography(scene)[0, 0]
@@ -208,9 +214,13 @@ class Stage:
 
         eyes: (1 or 2, 3), one picture each; None: the scene's, one when mono.  `drawn(number)` is
         called when an eye's picture is in `canvas.resolved`, which the next one takes.
+        ValueError for a sheet that is nowhere (NaN).
         """
+        if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
+            raise ValueError("the sheet's pose is not finite")
         if display.correction == "two_pass":
             mesh = self.sheet_mesh(sheet)
+            self._tell_folds(mesh, self.eyes(display)[0] if eyes is None else eyes[0])
             return self.draw_onto(display, mesh, look, read=read, eyes=eyes, drawn=drawn)
         screen = screen_for(display.correction, sheet)
 
@@ -278,11 +288,24 @@ class Stage:
         self.note = mesh.note
         return mesh
 
+    def _tell_folds(self, mesh: SheetMesh, eye: Floats) -> None:
+        """Measure and note what of the sheet gets no light because it is folded."""
+        self.lost_share = lost_share(mesh, eye, self._world_from_projector[:3, 3])
+        if self.lost_share > LEAST_LOST:
+            told = f"{100.0 * self.lost_share:.0f} % of the sheet is folded and gets no light"
+            self.note = "; ".join(filter(None, (self.note, told)))
+
     def _window(self, eye: Floats) -> Window:
-        """What of the imaginary screen the object covers, as the eye sees it."""
-        crossings = on_imaginary_screen(self._box_world, eye)
-        low = np.floor((crossings.min(axis=0) - WINDOW_MARGIN_M) / WINDOW_STEP_M) * WINDOW_STEP_M
-        high = np.ceil((crossings.max(axis=0) + WINDOW_MARGIN_M) / WINDOW_STEP_M) * WINDOW_STEP_M
+        """What of the imaginary screen the object covers, as the eye sees it.
+
+        What is level with the eye or behind it is not drawn; the window ends at `WIDEST_M`.
+        """
+        box = np.minimum(self._box_world, [np.inf, np.inf, eye[2] - NEAR_M])
+        crossings = on_imaginary_screen(box, eye)
+        low = np.clip(crossings.min(axis=0) - WINDOW_MARGIN_M, -WIDEST_M, WIDEST_M - WINDOW_STEP_M)
+        high = np.clip(crossings.max(axis=0) + WINDOW_MARGIN_M, low + WINDOW_MARGIN_M, WIDEST_M)
+        low = np.floor(low / WINDOW_STEP_M) * WINDOW_STEP_M
+        high = np.ceil(high / WINDOW_STEP_M) * WINDOW_STEP_M
         return Window(float(low[0]), float(low[1]), *(float(side) for side in high - low))
 
     def release(self) -> None:

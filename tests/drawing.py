@@ -1,0 +1,59 @@
+"""What the tests of pictures share: dented objects and sheets that are pushed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from messages.types import Skin, SoftBody
+from nodes.models.sheet import edge_poses
+from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.stage import Stage
+
+Floats = NDArray[np.float64]
+
+
+def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> Sheet:
+    """The scene's sheet, stretched a little, its middle at a pose (4, 4)."""
+    sheet = sheet_between(
+        *edge_poses(pose, 1.05 * scene.sheet.width_m),
+        height_m=scene.sheet.height_m,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=tip,
+    )
+    assert sheet is not None
+    return sheet
+
+
+def follow(stage: Stage, displacement: Floats | None) -> None:
+    """Deform the stage by a displacement (vertices, 3) of its own surface, or put it to rest."""
+    if displacement is None:
+        stage.shape(None)
+        return
+    surface = stage._surface
+    vertices = surface.rest_world_m.astype(np.float32)
+    stage.follow(Skin(mesh_id="own", vertices_world_m=vertices, triangles=surface.triangles))
+    stage.shape(body_of(displacement))
+
+
+def body_of(displacement: Floats) -> SoftBody:
+    return SoftBody(
+        mesh_id="own",
+        method="linear",
+        in_range=True,
+        push_depth_m=0.0,
+        force_world_n=np.zeros(3),
+        stiffness_n_per_m=0.0,
+        displacement_world_m=displacement.astype(np.float32),
+    )
+
+
+def dent(stage: Stage, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
+    """Displacement (vertices, 3) of the stage's surface, pushed from the front; its back stays."""
+    points = stage._surface.rest_world_m
+    away = np.linalg.norm(points[:, :2] - np.array(place), axis=1)
+    facing = np.clip(1.0 + points[:, 2] / 0.05, 0.0, 1.0)
+    depth = depth_m * facing * np.exp(-((away / 0.018) ** 2))
+    return depth[:, None] * np.array([0.0, 0.0, -1.0])

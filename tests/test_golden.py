@@ -1,0 +1,70 @@
+"""The renderer draws what it drew; see `tests/golden_pictures.py` for how to draw anew."""
+
+from __future__ import annotations
+
+import cv2
+import moderngl
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from nodes.renderer import gl
+from nodes.renderer.gl import headless_context
+from tests.golden_pictures import CASES, FOLDER
+
+Image = NDArray[np.uint8]
+
+MOST_MEAN = 1.0
+"""Levels of 255, over the lit pixels and as many more: rounding and other samples leave 0.3."""
+MOST_OFF, OFF_LEVELS = 0.02, 40
+"""Share of those pixels that may differ by more levels: outlines between other samples."""
+
+
+@pytest.fixture(scope="module")
+def context() -> moderngl.Context:
+    return headless_context()
+
+
+def golden(name: str) -> Image:
+    picture = cv2.imread(str(FOLDER / f"{name}.png"), cv2.IMREAD_COLOR)
+    assert picture is not None, f"python -m tests.golden_pictures {name}"
+    return np.asarray(picture[..., ::-1], np.uint8)
+
+
+def difference(picture: Image, wanted: Image) -> tuple[float, float]:
+    """Mean difference (levels) and share of pixels that are quite other, of those that are lit."""
+    assert picture.shape == wanted.shape
+    off = np.abs(picture.astype(int) - wanted).max(axis=2)
+    lit = max(int((wanted.max(axis=2) > 8).sum()), 1000)
+    return float(off.sum() / lit), float((off > OFF_LEVELS).sum() / lit)
+
+
+def agree(picture: Image, wanted: Image) -> bool:
+    mean, share = difference(picture, wanted)
+    return mean <= MOST_MEAN and share <= MOST_OFF
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_picture_is_as_it_was(context: moderngl.Context, name: str) -> None:
+    mean, share = difference(CASES[name](context), golden(name))
+    assert mean <= MOST_MEAN
+    assert share <= MOST_OFF
+
+
+def test_no_two_goldens_are_alike() -> None:
+    pictures = [golden(name) for name in CASES]
+    for i, one in enumerate(pictures):
+        assert not any(agree(one, other) for other in pictures[i + 1 :]), list(CASES)[i]
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_light_from_elsewhere_is_noticed(
+    context: moderngl.Context, monkeypatch: pytest.MonkeyPatch, axis: int
+) -> None:
+    monkeypatch.setattr(gl, "LIGHT", gl.LIGHT * np.where(np.arange(3) == axis, -1.0, 1.0))
+    assert not agree(CASES["shape-cylinder"](context), golden("shape-cylinder"))
+
+
+def test_a_picture_moved_by_a_pixel_is_noticed() -> None:
+    wanted = golden("texture-grid")
+    assert not agree(np.roll(wanted, 1, axis=1), wanted)

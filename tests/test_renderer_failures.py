@@ -1,0 +1,154 @@
+"""Where drawing fails: behind the eye, before the sheet, without an area, folded, nowhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import moderngl
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from launch.plan import load_scene
+from messages.scene import Scene
+from messages.types import Correction, Display
+from nodes.models.rigid import transform
+from nodes.models.sheet import edge_poses
+from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.sheet import Sheet
+from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, lost_share
+from nodes.renderer.stage import Stage
+from nodes.twin.eye import proper, seen
+from nodes.twin.membrane import Rubber, solve
+from nodes.twin.true_object import TrueBody
+from tests.dent_shapes import few_dents
+from tests.drawing import body_of, dent, follow, sheet_at
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
+EYE = SCENE.eyes.centre_world_m
+PROJECTOR = SCENE.projector.world_from_projector.position_m
+CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "four_triangles", "two_pass")
+
+
+@pytest.fixture(scope="module")
+def context() -> moderngl.Context:
+    return headless_context()
+
+
+@pytest.fixture(scope="module")
+def stage(context: moderngl.Context) -> Stage:
+    return Stage(SCENE, context, spacing_m=0.004, dents=few_dents())
+
+
+def drawn(stage: Stage, correction: Correction, sheet: Sheet) -> Image:
+    shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
+    picture = stage.draw(shown, sheet, Look(True, "object"), read=True)
+    assert picture is not None
+    return picture
+
+
+def with_object_at(z_m: float) -> Scene:
+    pose = SCENE.object.world_from_object.model_copy(
+        update={"position_m": np.array([0.0, 0.0, z_m])}
+    )
+    return SCENE.model_copy(
+        update={"object": SCENE.object.model_copy(update={"world_from_object": pose})}
+    )
+
+
+def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
+    behind = Stage(with_object_at(0.6), context, spacing_m=0.006)
+    for correction in CORRECTIONS:
+        assert drawn(behind, correction, behind.sheet_at_rest()).max() == 0
+    behind.release()
+    # Half of it behind: the rest is there, ahead of the eye it fills the view.
+    half = Stage(with_object_at(0.39), context, spacing_m=0.006)
+    for correction in CORRECTIONS:
+        assert drawn(half, correction, half.sheet_at_rest()).max() in (0, 255)
+    half.release()
+
+
+def test_what_is_before_the_sheet_is_seen_at_its_place(stage: Stage) -> None:
+    """A sheet 25 mm behind the object's front is no obstacle to the equations or two passes."""
+    pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
+    spec = SCENE.sheet
+    rubber = Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
+    edges = edge_poses(pose, 1.05 * spec.width_m)
+    truth = solve(rubber, *edges, finger_tip=None, finger_radius_m=SCENE.finger.radius_m)
+    wanted = proper(TrueBody(SCENE).at_rest(), eye=EYE, flat=True, metres_per_px=0.001) / 255.0
+    for correction in ("one_plane", "two_pass"):
+        picture = drawn(stage, correction, sheet_at(SCENE, pose))
+        off = seen(picture, truth, SCENE, eye=EYE, metres_per_px=0.001) / 255.0 - wanted
+        assert abs(off.sum()) < 0.005 * wanted.sum()
+        assert np.abs(off).sum() < 0.02 * wanted.sum()
+
+
+def folded(overhang_m: float) -> SheetMesh:
+    """A sheet that goes on above, then back below itself by an overhang, then on, in the y axis.
+
+    Seen from far off along z its middle strip is turned over.
+    """
+    y = np.array([-0.1, 0.02, 0.02 - overhang_m, 0.1])
+    z = np.array([0.0, 0.0, -0.02, -0.02])
+    points = [[x, *place] for place in zip(y, z, strict=True) for x in (-0.1, 0.1)]
+    triangles = [[[2 * i, 2 * i + 1, 2 * i + 3], [2 * i, 2 * i + 3, 2 * i + 2]] for i in range(3)]
+    return SheetMesh(np.array(points), np.array(triangles, np.int32).reshape(-1, 3))
+
+
+def test_what_folds_take_is_measured() -> None:
+    far_eye, far_light = np.array([0.0, 0.0, 1e3]), np.array([0.0, 0.0, -1e3])
+    turned = folded(0.04)
+    # 40 mm turned over, and 40 in their shadow, of 120 + 40 + 120.
+    assert lost_share(turned, far_eye, far_light) == pytest.approx(80 / 280, abs=1e-3)
+    assert lost_share(folded(-0.01), far_eye, far_light) == 0.0
+    tip = np.array([0.01, 0.02, -0.025])
+    assert (
+        lost_share(dented_mesh(sheet_at(SCENE, np.eye(4), tip), few_dents()), EYE, PROJECTOR) == 0
+    )
+
+
+def test_a_folded_sheet_is_drawn_and_told(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The projector lights what is nearest to it; of two places on its ray one has the light."""
+    monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: folded(0.03))
+    stage.note = ""
+    picture = drawn(stage, "two_pass", stage.sheet_at_rest())
+    assert picture.max() == 255
+    assert 0.1 < stage.lost_share < 0.4
+    assert "is folded and gets no light" in stage.note
+    monkeypatch.undo()
+    drawn(stage, "two_pass", stage.sheet_at_rest())
+    assert stage.lost_share == 0.0
+    assert "folded" not in stage.note
+
+
+def test_triangles_without_area_are_nothing(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    sheet = stage.sheet_at_rest()
+    before, mesh = drawn(stage, "two_pass", sheet), stage.sheet_mesh(sheet)
+    needles = np.concatenate([mesh.triangles, [[0, 0, 1], [2, 2, 2]]]).astype(np.int32)
+    monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: SheetMesh(mesh.vertices, needles))
+    assert np.array_equal(drawn(stage, "two_pass", sheet), before)
+    assert stage.lost_share < 0.001
+
+
+def test_what_is_nowhere_is_refused(stage: Stage) -> None:
+    lost = np.full((4, 4), np.nan)
+    rest = stage.sheet_at_rest()
+    nowhere = Sheet(lost, rest.corners, None)
+    assert not stage.usable(nowhere)
+    for correction in CORRECTIONS:
+        with pytest.raises(ValueError, match="pose is not finite"):
+            drawn(stage, correction, nowhere)
+    follow(stage, dent(stage, 0.01))
+    before = drawn(stage, "none", rest)
+    for value in (np.nan, np.inf):
+        displacement = dent(stage, 0.02)
+        displacement[5] = value
+        bad = body_of(np.zeros_like(displacement)).model_copy(
+            update={"displacement_world_m": displacement.astype(np.float32)}
+        )
+        with pytest.raises(ValueError, match="NaN or infinity"):
+            stage.shape(bad)
+    assert np.array_equal(drawn(stage, "none", rest), before)
+    follow(stage, None)
