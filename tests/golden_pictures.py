@@ -66,7 +66,9 @@ def draw(
     context: moderngl.Context, scene: Scene, display: Display, sheet: Sheet | None = None
 ) -> Image:
     """A dented object with both its marks."""
-    stage = Stage(scene, context, spacing_m=0.004, dents=few_dents())
+    sheet = sheet_at(scene, np.eye(4)) if sheet is None else sheet
+    dented = display.correction == "two_pass" and sheet.pushed_point is not None
+    stage = Stage(scene, context, spacing_m=0.004, dents=few_dents() if dented else None)
     follow(stage, dent(stage, 0.014, (0.008, -0.006)))
     marked = display.marks and display.pattern == "object"
     look = Look(
@@ -75,7 +77,7 @@ def draw(
         fingertip_mark=stage.surface_point(np.array([0.008, -0.006, 0.01])) if marked else None,
         target_mark=stage.surface_point(np.array([-0.02, 0.012, 0.01])) if marked else None,
     )
-    picture = stage.draw(display, sheet or stage.sheet_at_rest(), look, read=True)
+    picture = stage.draw(display, sheet, look, read=True)
     stage.release()
     assert picture is not None
     return picture

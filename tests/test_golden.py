@@ -52,7 +52,7 @@ def test_the_picture_is_as_it_was(context: moderngl.Context, name: str) -> None:
 
 
 def test_no_two_goldens_are_alike() -> None:
-    pictures = [golden(name) for name in CASES]
+    pictures = [golden(name)[::2, ::2] for name in CASES]
     for i, one in enumerate(pictures):
         assert not any(agree(one, other) for other in pictures[i + 1 :]), list(CASES)[i]
 

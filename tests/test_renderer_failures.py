@@ -16,12 +16,11 @@ from nodes.models.rigid import transform
 from nodes.models.sheet import edge_poses
 from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.sheet import Sheet
-from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, lost_share
+from nodes.renderer.sheet_mesh import SheetMesh, lost_share, pyramid_mesh
 from nodes.renderer.stage import Stage
 from nodes.twin.eye import proper, seen
 from nodes.twin.membrane import Rubber, solve
 from nodes.twin.true_object import TrueBody
-from tests.dent_shapes import few_dents
 from tests.drawing import body_of, dent, follow, sheet_at
 
 Floats = NDArray[np.float64]
@@ -39,7 +38,7 @@ def context() -> moderngl.Context:
 
 @pytest.fixture(scope="module")
 def stage(context: moderngl.Context) -> Stage:
-    return Stage(SCENE, context, spacing_m=0.004, dents=few_dents())
+    return Stage(SCENE, context, spacing_m=0.004)
 
 
 def drawn(stage: Stage, correction: Correction, sheet: Sheet) -> Image:
