@@ -14,8 +14,9 @@ from tests.golden_pictures import CASES, FOLDER
 
 Image = NDArray[np.uint8]
 
-MOST_MEAN = 1.0
-"""Levels of 255, over the lit pixels and as many more: rounding and other samples leave 0.3."""
+MOST_MEAN = 3.0
+"""Levels of 255, over the lit pixels: other windows and samples leave up to 2.7, a pixel's shift of
+the object 4.5 and more."""
 MOST_OFF, OFF_LEVELS = 0.02, 40
 """Share of those pixels that may differ by more levels: outlines between other samples."""
 
@@ -54,7 +55,8 @@ def test_the_picture_is_as_it_was(context: moderngl.Context, name: str) -> None:
 def test_no_two_goldens_are_alike() -> None:
     pictures = [golden(name)[::2, ::2] for name in CASES]
     for i, one in enumerate(pictures):
-        assert not any(agree(one, other) for other in pictures[i + 1 :]), list(CASES)[i]
+        least = min((difference(one, other)[0] for other in pictures[i + 1 :]), default=np.inf)
+        assert least > 1.0, list(CASES)[i]
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])

@@ -103,9 +103,7 @@ def test_what_folds_take_is_measured() -> None:
     assert lost_share(turned, far_eye, far_light) == pytest.approx(80 / 280, abs=1e-3)
     assert lost_share(folded(-0.01), far_eye, far_light) == 0.0
     tip = np.array([0.01, 0.02, -0.025])
-    assert (
-        lost_share(dented_mesh(sheet_at(SCENE, np.eye(4), tip), few_dents()), EYE, PROJECTOR) == 0
-    )
+    assert lost_share(pyramid_mesh(sheet_at(SCENE, np.eye(4), tip)), EYE, PROJECTOR) == 0.0
 
 
 def test_a_folded_sheet_is_drawn_and_told(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
