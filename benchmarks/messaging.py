@@ -248,12 +248,18 @@ MEASURE, WARM_UP, END_ROUND, END = range(4)
 class Sender:
     """The parent's end of one design: a publisher and the child that listens to it."""
 
-    def __init__(self, design: Design, payload: Payload, endpoint: str) -> None:
+    def __init__(
+        self,
+        design: Design,
+        payload: Payload,
+        endpoint: str,
+        open_publisher: Callable[[Topic, list[str]], Publisher] = Publisher,
+    ) -> None:
         self.design, self.payload = design, payload
         self.sequence = 0
         topic = payload.topic
         self._raw = [bytearray(frame) for frame in encode(payload.make(0), self.header(0))]
-        self._publisher = Publisher(topic, [endpoint])
+        self._publisher = open_publisher(topic, [endpoint])
         spawn = multiprocessing.get_context("spawn")
         self.results, childs_end = spawn.Pipe()
         self._child = spawn.Process(

@@ -1,0 +1,203 @@
+"""What keys cost: a message between processes by tcp, with CURVE and without, in turns.
+
+    python -m benchmarks.keys [--rounds N] [--seconds S] [--json FILE]
+
+As `benchmarks.messaging`: one process publishes, one per design receives; the latency is one way,
+from before the message is constructed to its handler.  What counts is the ratio within a round.
+Also: what a subscriber's own checks (writer, plan, order) cost a message within one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import random
+import statistics
+import tempfile
+import threading
+import timeit
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import uvloop
+
+from benchmarks import messaging
+from benchmarks.messaging import NODES_USE, PAYLOADS, Design, Sender, machine, percentile_us
+from messages.base import Header
+from messages.bus import Publisher, Source, Subscriber
+from messages.security import KeyRing, new_key_pair, write_ring, write_secret
+from messages.topics import Topic
+from messages.wire import encode, read_envelope
+
+T = TypeVar("T")
+RING_VARIABLE = "FLEXSHEET_BENCHMARK_RING"
+WITHOUT, WITH = NODES_USE, "the same with keys"
+
+
+def listen(topic: Topic, endpoint: str, arrived: Callable[[int, int], bool]) -> None:
+    """As nodes listen to another host; the key ring is the one that the environment names."""
+
+    async def run() -> None:
+        ended = asyncio.get_running_loop().create_future()
+
+        def on_message(_: Any, header: Header) -> None:
+            if not arrived(header.sequence, header.publish_ns) and not ended.done():
+                ended.set_result(None)
+
+        keys = KeyRing(Path(os.environ[RING_VARIABLE]))
+        source = Source(endpoint, "bench", "main")
+        subscriber = Subscriber(topic, [source], on_message, messaging.Counts(), keys=keys)
+        subscriber.start()
+        await ended
+        subscriber.close()
+
+    uvloop.run(run())
+
+
+DESIGNS = (
+    Design(WITHOUT, "tcp on loopback", True, messaging.flexsheet_uvloop),
+    Design(WITH, "CURVE, the other's key known", True, listen),
+)
+
+
+class Loop:
+    """A loop in a thread, for the gatekeeper: the benchmark's sender sleeps between messages."""
+
+    def __init__(self) -> None:
+        self.loop = asyncio.new_event_loop()
+        self.thread = threading.Thread(target=self.loop.run_forever)
+        self.thread.start()
+
+    def do(self, work: Coroutine[Any, Any, T]) -> T:
+        return asyncio.run_coroutine_threadsafe(work, self.loop).result()
+
+    def close(self) -> None:
+        self.loop.call_soon_threadsafe(self.loop.stop)
+        self.thread.join()
+        self.loop.close()
+
+
+@contextmanager
+def ring_of_two(folder: Path) -> Iterator[KeyRing]:
+    """Keys of two hosts; the other's ring is what children read."""
+    public = {}
+    for host in ("main", "left"):
+        public[host], secret = new_key_pair()
+        write_secret(folder / f"{host}.secret", secret)
+    for host in public:
+        write_ring(
+            folder / f"{host}.json",
+            host=host,
+            secret_file=folder / f"{host}.secret",
+            public=public,
+        )
+    os.environ[RING_VARIABLE] = str(folder / "left.json")
+    yield KeyRing(folder / "main.json")
+    del os.environ[RING_VARIABLE]
+
+
+def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict[str, Any]]:
+    """Per payload: p50 and p99 of both designs, and the medians of their ratios per round."""
+
+    async def open_publisher(topic: Topic, endpoint: str) -> Publisher:
+        return Publisher(topic, [endpoint], keys=keys)
+
+    async def close_publisher(publisher: Publisher) -> None:
+        publisher.close()
+
+    rows = []
+    for payload in PAYLOADS:
+        count = round(seconds * payload.rate_hz)
+        senders = {}
+        secured: list[Publisher] = []
+
+        def secure(topic: Topic, bind: list[str], secured: list[Publisher] = secured) -> Publisher:
+            secured.append(loop.do(open_publisher(topic, bind[0])))
+            return secured[-1]
+
+        for design in DESIGNS:
+            opener = secure if design.name == WITH else Publisher
+            senders[design.name] = Sender(design, payload, "tcp://127.0.0.1:*", opener)
+        found: dict[str, list[tuple[float, float]]] = {design.name: [] for design in DESIGNS}
+        for _ in range(rounds):
+            for name in random.sample(list(senders), len(senders)):
+                taken = senders[name].round(count)
+                found[name].append((percentile_us(taken, 50), percentile_us(taken, 99)))
+        for name, sender in senders.items():
+            if name == WITHOUT:
+                sender.close()
+            else:
+                sender.send(messaging.END)
+        for one in secured:
+            loop.do(close_publisher(one))
+        row: dict[str, Any] = {"payload": payload.name}
+        for number, percent in enumerate(("p50", "p99")):
+            for name, short in ((WITHOUT, "without"), (WITH, "with")):
+                row[f"{percent}_{short}_us"] = statistics.median(one[number] for one in found[name])
+            ratios = [
+                own[number] / base[number]
+                for own, base in zip(found[WITH], found[WITHOUT], strict=True)
+            ]
+            row[f"{percent}_ratio"] = statistics.median(ratios)
+            row[f"{percent}_ratio_range"] = [min(ratios), max(ratios)]
+        rows.append(row)
+    return rows
+
+
+def cost_of_checks() -> dict[str, float]:
+    """Microseconds per message: reading a header, and reading it with all that is checked."""
+    payload = PAYLOADS[0]
+    plan, writers = "0123456789abcdef", frozenset({"bench"})
+    header = Header(1, 2, 3, "bench", "bench", 1, plan)
+    many = [
+        [bytes(one) for one in encode(payload.make(0), replace(header, sequence=number))]
+        for number in range(1, 20_001)
+    ]
+
+    def read() -> None:
+        for frames in many:
+            read_envelope(frames, payload.topic)
+
+    def accept() -> None:
+        subscriber = Subscriber(payload.topic, [], lambda *_: None, messaging.Counts(), plan=plan)
+        for frames in many:
+            subscriber.accept(frames, writers)
+
+    return {
+        name: min(timeit.repeat(work, number=1, repeat=7)) / len(many) * 1e6
+        for name, work in (("read_us", read), ("accept_us", accept))
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=8)
+    parser.add_argument("--seconds", type=float, default=2.0, help="per design and round")
+    parser.add_argument("--json", type=Path, help="also write the figures there")
+    options = parser.parse_args()
+    load = os.getloadavg()[0]
+    loop = Loop()
+    try:
+        with tempfile.TemporaryDirectory() as folder, ring_of_two(Path(folder)) as keys:
+            rows = measure(options.rounds, options.seconds, keys, loop)
+    finally:
+        loop.close()
+    report = {
+        "machine": machine(),
+        "load": [load, os.getloadavg()[0]],
+        "rounds": options.rounds,
+        "latency": rows,
+        "checks": cost_of_checks(),
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+    print(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()
