@@ -312,7 +312,7 @@ class Status(Message):
     last_error: str
     note: str = Field(description="what the node itself wants to say, one line")
     plan_hash: str
-    clock_id: str
+    clock_id: str = ""
     clock_offsets: tuple[ClockOffset, ...] = Field(
         default=(), description="of the other clocks that it hears, as it knows them"
     )

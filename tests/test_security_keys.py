@@ -31,7 +31,9 @@ from tests.test_cli import Command
 from tests.test_launch_supervisor import DEADLINE_S, LISTENER, beacon, write
 from tests.test_messages_bus import until
 
-HOSTS = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+# Of this process's own: ports follow from names, and tests may run beside each other.
+NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"
+HOSTS = {"main": {"address": f"{NET}.1"}, "left": {"address": f"{NET}.2"}}
 LAB = """\
 # the lab
 hosts:
