@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: setup demo test lint bench limits docs clean
+.PHONY: setup demo try test lint bench limits docs clean
 
 setup: $(STAMP)
 	@$(BIN)/python -m launch.system
@@ -19,6 +19,10 @@ $(STAMP): requirements.lock pyproject.toml
 
 demo: setup
 	$(BIN)/flexsheet demo
+
+# A page in the browser, to touch the object with the mouse.
+try: setup
+	$(BIN)/flexsheet try
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

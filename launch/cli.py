@@ -21,6 +21,7 @@ from launch.commands import (
     node,
     prepare,
     topic,
+    trying,
 )
 from launch.commands.output import BAD_INPUT, FAILED, CommandError, words
 
@@ -43,6 +44,7 @@ calibrate_sheet.register(calibrate.app)
 app.add_typer(calibrate.app, name="calibrate")
 app.add_typer(experiment.app, name="experiment")
 app.command()(experiment.demo)
+app.command("try")(trying.try_it)
 app.command()(chart.chart)
 doctor_compliance.register(doctor.app)
 app.add_typer(doctor.app, name="doctor")

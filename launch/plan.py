@@ -56,6 +56,12 @@ LAUNCHER, TOOLS = "launch", "tools"
 RECORDER_NICE = 5
 """What it reads waits for it in queues; nothing else waits."""
 
+CONSOLE_NICE = 10
+"""Who looks on must not slow what is looked at."""
+
+RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
+"""Where a recorder that waits for the console puts its bags, from where the command was given."""
+
 RUN_DIRECTORY = "@run"
 """Stands for the run's directory in endpoints and parameters; known only when the run starts."""
 
@@ -262,16 +268,25 @@ class _Member:
         )
 
 
-def load_plan(path: Path, *, settings: Sequence[str] = (), record: Path | None = None) -> Plan:
+def load_plan(
+    path: Path,
+    *,
+    settings: Sequence[str] = (),
+    record: Path | None = None,
+    console: bool = False,
+) -> Plan:
     """Read, check and resolve a launch file.
 
     settings: "node.parameter=value" each, value in YAML, over what the file says.
     record: a bag to record to, over what the file says.
+    console: add a console, and a recorder that waits for its word, where the file has none.
     Raises BadInputError with everything that is wrong.
     """
     document = read_document(path)
     if record is not None:
         _apply_record(document, record)
+    if console:
+        _apply_console(document)
     for setting in settings:
         _apply_setting(document, setting)
     spec = validate(LaunchFile, document)
@@ -387,6 +402,22 @@ def _apply_record(document: Document, bag: Path) -> None:
             document.set(("nodes", name, "parameters", "bag"), str(bag), origin)
             return
     document.set(("record", "bag"), str(bag), origin)
+
+
+def _apply_console(document: Document) -> None:
+    origin = "--console"
+    nodes = document.values.get("nodes")
+    specs = [one for one in nodes.values() if isinstance(one, dict)] if nodes else []
+    types = {str(spec.get("type")) for spec in specs}
+    if "console" not in types:
+        added: dict[str, Any] = {"type": "console", "nice": CONSOLE_NICE}
+        if "twin_finger" not in types:
+            added["parameters"] = {"drives_finger": False}
+        document.set(("nodes", "console"), added, origin)
+    if "recorder" not in types and "record" not in document.values:
+        parameters = {"bag": str(RECORDINGS.absolute()), "waits": True}
+        recorder = {"type": "recorder", "nice": RECORDER_NICE, "parameters": parameters}
+        document.set(("nodes", "recorder"), recorder, origin)
 
 
 def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
@@ -651,7 +682,8 @@ def _writers(
 ) -> dict[str, list[tuple[str, str]]]:
     """(writer, host) of every topic, in the order of the file."""
     writers: dict[str, list[tuple[str, str]]] = {}
-    if has_scene:
+    has_editor = any(topic.name == "scene" for one in members for _, topic in one.topics("output"))
+    if has_scene and not has_editor:
         writers["scene"] = [(LAUNCHER, MAIN)]
     for member in members:
         for port_name, topic in member.topics("output"):

@@ -37,6 +37,7 @@ from launch.plan import (
     PlannedPort,
     clock_node,
     is_loopback,
+    load_scene,
 )
 from launch.runs import RUN_VARIABLE, Run, create_run, is_free, sweep
 from messages.base import Header
@@ -446,11 +447,23 @@ class RunningGraph:
         (directory / "launch.yaml").write_text(self.plan.launch_text)
         (directory / "scene.yaml").write_text(self.plan.scene_text)
         (directory / "git.json").write_text(git_state(ENTRY.parent))
+        if any(port.topic == "scene" for node in self.nodes for port in node.outputs):
+            self._write_scenes(directory / "scenes")
         # Last and at once: tools that look for a graph read this file.
         text = self.plan.model_dump_json(indent=1)
         temporary = self.run.plan_file.with_suffix(".part")
         temporary.write_text(text)
         temporary.rename(self.run.plan_file)
+
+    def _write_scenes(self, folder: Path) -> None:
+        """The scenes that a node may publish: those beside the plan's own, checked, as JSON."""
+        folder.mkdir()
+        own = self.plan.scene_file
+        for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
+            try:
+                (folder / f"{path.stem}.json").write_text(load_scene(path).model_dump_json())
+            except BadInputError as error:
+                self._report(LAUNCHER, f"scene {path.name} is left out: {error}")
 
     def _fail(self, text: str) -> NodeFailedError:
         self.failure = NodeFailedError(f"{text}; its log is {self.run.logs}")

@@ -439,6 +439,11 @@ class _Line:
         self._loop = asyncio.get_running_loop()
         self._socket = _open_socket(zmq.SUB, topic)
         try:
+            if self._unopened:
+                # Who takes frames gives way to others, for seconds on a busy computer.  A full
+                # queue would leave the publisher's heartbeats unread, and what follows once it has
+                # hung up is the abort that `_open_socket` tells of.
+                self._socket.setsockopt(zmq.RCVHWM, 0)
             self._socket.setsockopt(zmq.SUBSCRIBE, b"")
             if self.secured:
                 self._monitor = self._socket.get_monitor_socket(WATCHED)

@@ -251,6 +251,18 @@ class EStop(Message):
     reason: str
 
 
+class Recording(Message):
+    """Whether a recorder that waits for it is to record; each start opens a bag of its own."""
+
+    running: bool
+
+
+class Moment(Message):
+    """A moment that somebody wants to find again in a bag; the source stamp is when it was."""
+
+    label: str = Field(max_length=200)
+
+
 class PortStatus(Part):
     """One input or output of a node over the last second and since its start."""
 

@@ -22,6 +22,7 @@ NODES: dict[str, str] = {
     "renderer": "nodes.renderer.node:Renderer",
     "clock": "nodes.clock.node:ClockNode",
     "recorder": "nodes.recorder.node:Recorder",
+    "console": "nodes.console.node:Console",
     "twin_finger": "nodes.twin.finger_node:TwinFingerNode",
     "twin_arms": "nodes.twin.arms_node:TwinArmsNode",
     "twin_eye": "nodes.twin.eye_node:TwinEyeNode",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -35,6 +36,9 @@ def launch(
     record: Annotated[
         Path | None, typer.Option(metavar="BAG", help="Record the logged topics to this bag.")
     ] = None,
+    console: Annotated[
+        bool, typer.Option("--console", help="With a page in the browser, and a recorder for it.")
+    ] = False,
     duration: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Stop by itself, counted from ready.")
     ] = None,
@@ -46,17 +50,24 @@ def launch(
     """
     from launch.plan import load_plan
 
-    plan = load_plan(file, settings=settings or (), record=record)
+    plan = load_plan(file, settings=settings or (), record=record, console=console)
     if dry_run:
         if as_json:
             print_json(plan.model_dump(mode="json"))
         else:
             _print_plan(plan, host)
         return
-    raise typer.Exit(asyncio.run(_run(plan, host, duration)))
+    raise typer.Exit(asyncio.run(run_graph(plan, host, duration)))
 
 
-async def _run(plan: Plan, host: str | None, duration_s: float | None) -> int:
+async def run_graph(
+    plan: Plan,
+    host: str | None,
+    duration_s: float | None,
+    *,
+    when_ready: Callable[[], None] = lambda: None,
+) -> int:
+    """Run the plan's nodes until a signal, or `duration_s` after they are ready; the exit code."""
     from launch.supervisor import NodeFailedError, RunningGraph
 
     asked_to_stop = asyncio.Event()
@@ -82,6 +93,7 @@ async def _run(plan: Plan, host: str | None, duration_s: float | None) -> int:
                 if ready.done():
                     ready.result()
                     words.print(f"[green]all {len(graph.nodes)} nodes are ready[/]; Ctrl-C ends")
+                    when_ready()
                     await asyncio.wait(
                         (end, stop), timeout=duration_s, return_when=asyncio.FIRST_COMPLETED
                     )

@@ -1,0 +1,54 @@
+"""`flexsheet try`: the whole display on this machine, with a page in the browser to touch it."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import webbrowser
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from launch.commands.launching import run_graph
+from launch.commands.output import progress_words, words
+
+DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
+
+
+def try_it(
+    *,
+    launch_file: Annotated[
+        Path, typer.Option("--launch", metavar="FILE", help="Another graph.")
+    ] = DEMO_FILE,
+    port: Annotated[int, typer.Option(help="Of the page.", min=1, max=65535)] = 8080,
+    browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="NODE.PARAM=VALUE", help="Over what the file says."),
+    ] = None,
+    duration: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Stop by itself, counted from ready.")
+    ] = None,
+) -> None:
+    """Touch a virtual object in the browser: no hardware is needed.
+
+    Starts the demo's graph with a console and prints its address; Ctrl-C ends it.  From another
+    computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address there.
+    """
+    from launch.plan import load_plan
+    from launch.prepare import prepare_plan
+
+    page = [f"console.page_port={port}"]
+    plan = load_plan(launch_file, settings=[*page, *(settings or ())], console=True)
+    with progress_words() as progress:
+        prepare_plan(plan, progress)
+    given = plan.nodes["console"].parameters
+    url = f"http://{given['address']}:{given['page_port']}/"
+
+    def ready() -> None:
+        words.print(f"[bold]open {url}[/] and drag on the sheet")
+        if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            webbrowser.open(url)
+
+    raise typer.Exit(asyncio.run(run_graph(plan, None, duration, when_ready=ready)))

@@ -1,0 +1,90 @@
+"""What the arms look like: their links as boxes and tubes, and where those are.
+
+The lengths are the RV-1A's own (base to shoulder, upper arm, elbow, forearm, flange); thicknesses
+are drawn, not measured.  A link's frame is where its joint turns; at zero every frame is parallel
+to the base.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.models.rigid import rotation_from_vector, transform
+
+Floats = NDArray[np.float64]
+
+JOINTS = (
+    ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ((0.0, 0.0, 0.3), (0.0, 1.0, 0.0)),
+    ((0.0, 0.0, 0.25), (0.0, 1.0, 0.0)),
+    ((-0.09, 0.0, 0.16), (0.0, 0.0, 1.0)),
+    ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+    ((0.0, 0.0, 0.072), (0.0, 0.0, 1.0)),
+)
+"""Where each joint is in the frame of the link before it (m), and the axis it turns about."""
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A box of a link: its size and middle (m) in the link's frame; link 0 is the base."""
+
+    link: int
+    size_m: tuple[float, float, float]
+    middle_m: tuple[float, float, float]
+    dark: bool = False
+
+
+PIECES = (
+    Piece(0, (0.19, 0.19, 0.13), (-0.01, 0.0, 0.065), dark=True),
+    Piece(1, (0.13, 0.13, 0.13), (0.0, 0.0, 0.195)),
+    Piece(1, (0.105, 0.15, 0.105), (0.0, 0.0, 0.3)),
+    Piece(2, (0.085, 0.085, 0.2), (0.0, 0.0, 0.13)),
+    Piece(2, (0.1, 0.12, 0.09), (0.0, 0.0, 0.25), dark=True),
+    Piece(3, (0.12, 0.08, 0.08), (-0.05, 0.0, 0.0)),
+    Piece(3, (0.07, 0.07, 0.13), (-0.09, 0.0, 0.085)),
+    Piece(4, (0.06, 0.075, 0.06), (0.0, 0.0, 0.0), dark=True),
+    Piece(5, (0.05, 0.05, 0.062), (0.0, 0.0, 0.035)),
+    Piece(6, (0.044, 0.044, 0.012), (0.0, 0.0, -0.006), dark=True),
+)
+
+CLAMP_SIZE_M = (0.012, 1.04, 0.012)
+"""Of the bar that holds the sheet: across, along the edge as a share of it, through."""
+
+
+def link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
+    """world_from_link (7, 4, 4) of the base and the six links, the last one the flange."""
+    poses = [world_from_base]
+    for (offset_m, axis), angle_rad in zip(JOINTS, joints_rad.tolist(), strict=True):
+        turn = rotation_from_vector(angle_rad * np.array(axis))
+        poses.append(poses[-1] @ transform(turn, offset_m))
+    return np.stack(poses)
+
+
+def rounded_box(
+    size_m: tuple[float, float, float], middle_m: tuple[float, float, float], bevel: float = 0.18
+) -> tuple[Floats, NDArray[np.int32]]:
+    """A box with bevelled edges: vertices (24, 3) and triangles (44, 3), counter-clockwise outside.
+
+    bevel: share of the least half side that is cut off.
+    """
+    half = 0.5 * np.array(size_m)
+    cut = bevel * half.min()
+    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    # Three vertices at each corner, each on one of its faces.
+    vertices = np.concatenate([signs * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)])
+    triangles = _hull(vertices)
+    return vertices + np.array(middle_m), triangles
+
+
+def _hull(vertices: Floats) -> NDArray[np.int32]:
+    """Triangles of the convex hull, wound so that normals point outwards."""
+    from scipy.spatial import ConvexHull  # only where something is drawn
+
+    triangles: NDArray[np.int32] = ConvexHull(vertices).simplices.astype(np.int32)
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) < 0.0
+    triangles[inward] = triangles[inward][:, ::-1]
+    return triangles

@@ -1,0 +1,70 @@
+"""What the strip charts show: the last half minute of a few latencies."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.types import ArmState, Fingertip, Frame, SheetTarget, SoftBody
+from nodes.console.newest import Source
+
+Floats = NDArray[np.float64]
+
+WINDOW_S = 30.0
+SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "frame drawn")
+
+
+class History:
+    """Samples of the latencies, each in ms from the exposure that it goes back to."""
+
+    def __init__(self) -> None:
+        self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
+
+    def take(self, now_s: float, source: Source) -> None:
+        """Add a sample of now; what is older than the window is dropped."""
+        self._samples.append((now_s, latencies_ms(source)))
+        while self._samples and self._samples[0][0] < now_s - WINDOW_S:
+            self._samples.popleft()
+
+    def columns(self) -> tuple[Floats, ...]:
+        """Seconds before the newest sample (all <= 0), then each series (ms; NaN: nothing)."""
+        if not self._samples:
+            return (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES))
+        newest_s = self._samples[-1][0]
+        times = np.array([time_s - newest_s for time_s, _ in self._samples])
+        values = np.array([values for _, values in self._samples])
+        return (times, *values.T)
+
+    def newest(self) -> dict[str, float]:
+        """The last sample by series; NaN where nothing has come."""
+        values = self._samples[-1][1] if self._samples else (float("nan"),) * len(SERIES)
+        return dict(zip(SERIES, values, strict=True))
+
+
+def latencies_ms(source: Source) -> tuple[float, ...]:
+    """How long after its exposure (ms) each step's newest message was sent; NaN: none was.
+
+    For the arm: when the command was written that goes back to the exposure.
+    """
+    found = []
+    for name, kind in (
+        ("fingertip", Fingertip),
+        ("sheet_target", SheetTarget),
+        ("soft_body", SoftBody),
+    ):
+        entry = source.newest(name, kind)
+        found.append(
+            float("nan") if entry is None else 1e-6 * (entry[1].publish_ns - entry[1].source_ns)
+        )
+    arms = [source.newest(name, ArmState) for name in ("arm_left", "arm_right")]
+    sent = [
+        1e-6 * (arm[0].command_sent_ns - arm[0].target_source_ns)
+        for arm in arms
+        if arm is not None and arm[0].target_source_ns and arm[0].command_sent_ns
+    ]
+    found.append(max(sent, default=float("nan")))
+    frame = source.newest("frame", Frame)
+    late = float("nan") if frame is None else 1e-6 * (frame[1].publish_ns - frame[1].source_ns)
+    return (*found, late)

@@ -1,0 +1,163 @@
+"""A page in the browser: the whole apparatus in 3D, how the graph is, and a hand on it."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from functools import partial
+from ipaddress import ip_address
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from messages.base import Header, Message
+from messages.scene import Positive, Scene
+from messages.topics import Delivery, Topic, topic_named
+from messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
+from messages.wire import WireError
+from nodes.console.desk import Desk
+from nodes.console.finger import Finger
+from nodes.console.guard import Guard, read_token, start_server
+from nodes.console.newest import Newest
+from nodes.console.operator import Operator
+from nodes.console.scenes import first_scene
+from nodes.node import Input, Node, NodeParameters, Output, periodic
+
+SHOWN = {
+    *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),
+    *("frame", "twin/eye", "status", "estop", "display"),
+}
+"""Topics that it reads, as far as the graph has them."""
+
+
+class ConsoleParameters(NodeParameters):
+    """Where the page is, and how often it changes while somebody looks."""
+
+    address: str = Field(default="127.0.0.1", description="IP address that the page is served at")
+    page_port: int = Field(default=8080, ge=0, le=65535, description="0: any that is free")
+    token_file: Path | None = Field(
+        default=None, description="who looks must know what is in it; needed beyond loopback"
+    )
+    rate_hz: Positive = Field(default=25.0, description="of the 3D view")
+    tables_hz: Positive = Field(default=2.0, description="of tables and charts")
+    drives_finger: bool = Field(default=True, description="the mouse moves the twin's finger")
+    finger_speed_m_per_s: Positive = 0.15
+    bags: Path = Field(default=Path("runs"), description="folder whose bags can be replayed")
+    plan: Path = Field(default=Path("@run/plan.json"), description="holds the first scene")
+    scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
+
+    @field_validator("address")
+    @classmethod
+    def _is_an_address(cls, address: str) -> str:
+        try:
+            return str(ip_address(address))
+        except ValueError:
+            raise ValueError(f'"{address}" is no IP address; as in 127.0.0.1') from None
+
+    @model_validator(mode="after")
+    def _is_guarded(self) -> Self:
+        if self.token_file is None and not ip_address(self.address).is_loopback:
+            raise ValueError(
+                f"address {self.address} is beyond loopback: name a token_file, "
+                "or take 127.0.0.1 and come through ssh -L"
+            )
+        return self
+
+
+class Console(Node):
+    """Serves the page.  It takes what it draws at its own rate, and works only while one looks."""
+
+    takes_frames: ClassVar[bool] = True
+    opens_devices: ClassVar[bool] = True
+    parameters: ConsoleParameters
+    scene: Output[Scene]
+    display: Output[Display]
+    estop: Output[EStop]
+    recording: Output[Recording]
+    moment: Output[Moment]
+    twin__finger_path: Output[FingerPath]
+
+    @classmethod
+    def further_inputs(
+        cls, parameters: ConsoleParameters, written: Sequence[Topic]
+    ) -> Sequence[str]:
+        return [topic.name for topic in written if topic.name in SHOWN]
+
+    def __init__(
+        self, parameters: ConsoleParameters, *, topics: dict[str, str] | None = None, **rest: Any
+    ) -> None:
+        super().__init__(parameters, topics=topics, **rest)
+        for port, topic in (topics or {}).items():
+            if port.startswith("in/"):
+                self.inputs[port] = Input(topic_named(topic), self.clock)
+
+    async def setup(self) -> None:
+        given = self.parameters
+        token = None if given.token_file is None else read_token(given.token_file)
+        guard = Guard(given.address, token)
+        self._loop = asyncio.get_running_loop()
+        self._newest = Newest(self._refused)
+        self._server = start_server(given.address, given.page_port, guard, "flexsheet")
+        self.url = f"http://{given.address}:{self._server.get_port()}/"
+        scene = first_scene(given.plan)
+        finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
+        desk = Desk(
+            self._publish, scenes_folder=given.scenes, bags=given.bags, first=scene, finger=finger
+        )
+        self.operator = Operator(
+            self._server, self._newest, desk, self._ask, with_finger=given.drives_finger
+        )
+        self.scene.publish(scene)
+        self.note = f"{self.url}, nobody looks"
+
+    async def close(self) -> None:
+        await self.operator.desk.scenes.close()
+        await asyncio.to_thread(self._server.stop)
+
+    def deliver(self, port: str, message: Any, header: Header) -> None:
+        """Keep frames of what is drawn until they are drawn; what must all be read is read now."""
+        source = self.inputs[port]
+        source.counts.count(header, self.clock.now_ns())
+        superseded = self._newest.put(source.topic.name, message)
+        if source.topic.delivery is Delivery.LATEST:
+            source.counts.dropped += superseded
+        elif source.topic.message is not Skin and (
+            opened := self._newest.newest(source.topic.name, source.topic.message)
+        ):
+            self._guarded(self.operator.hear, opened[0], header, self.clock.now_ns() * 1e-9)
+
+    @periodic("rate_hz")
+    def draw(self) -> None:
+        """The 3D view, and what moves by itself."""
+        now_s = self.clock.now_ns() * 1e-9
+        looking = len(self._server.get_clients())
+        self.note = f"{self.url}, {looking or 'nobody'} look{'' if looking > 1 else 's'}"
+        self._guarded(self.operator.advance, now_s, looking > 0)
+
+    @periodic("tables_hz")
+    def tell(self) -> None:
+        """Tables and charts."""
+        if self._server.get_clients():
+            self._guarded(self.operator.tell, self.clock.now_ns() * 1e-9)
+
+    def _publish(self, message: Message) -> None:
+        output = next(one for one in self.outputs.values() if one.topic.message is type(message))
+        output.publish(message)
+
+    def _ask(self, what: str, *values: Any) -> None:
+        """Hand on what a viewer wants, from any thread."""
+        heed = partial(self._guarded, self.operator.heed, what, *values)
+        self._loop.call_soon_threadsafe(heed)
+
+    def _guarded(self, function: Any, *values: Any) -> None:
+        try:
+            function(*values)
+        except Exception as error:
+            self.report_error(function.__name__, error)
+            self.operator.fail(error)
+
+    def _refused(self, topic: Topic, error: WireError) -> None:
+        port = next(one for one in self.inputs.values() if one.topic is topic)
+        port.counts.rejected += 1
+        self.log.warning("input", problem=str(error))

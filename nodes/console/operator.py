@@ -1,0 +1,259 @@
+"""Between page and graph: what viewers ask goes to the desk, what the graph says to the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from messages.bag import BagError
+from messages.base import Header, Message
+from messages.scene import Scene
+from messages.types import (
+    ArmState,
+    Correction,
+    Display,
+    EStop,
+    Fingertip,
+    Frame,
+    Skin,
+    Status,
+    TwinEye,
+)
+from nodes.console import panels
+from nodes.console.desk import Desk
+from nodes.console.history import History
+from nodes.console.newest import Newest, Source
+from nodes.console.page import NO_BAG, Ask, Page
+from nodes.console.picture import picture_of
+from nodes.console.view import LAYERS
+
+Floats = NDArray[np.float64]
+
+WIDEST_PX = 340
+"""Of the small pictures."""
+
+BAGS_EVERY_S = 5.0
+LONGEST_STEP_S = 0.2
+"""After a pause the finger and the replay go on from where they were."""
+
+SIDES = ("left", "right")
+RECORDER = "recorder"
+NO_RECORDER = (
+    "there is no recorder in this graph that waits to be told: start it with --console, or give "
+    "its recorder the parameter waits: true"
+)
+
+
+class Operator:
+    """Runs on the node's own loop, but for the page's callbacks."""
+
+    def __init__(
+        self, server: viser.ViserServer, live: Newest, desk: Desk, ask: Ask, *, with_finger: bool
+    ) -> None:
+        self._live, self.desk = live, desk
+        self._page = Page(server, ask, with_finger=with_finger)
+        self._history = History()
+        self._statuses: dict[str, tuple[Status, float]] = {}
+        self._drawn_scene: Scene | None = None
+        self._drawn_skin: Skin | None = None
+        self._pictured: Frame | None = None
+        self._now_s = 0.0
+        self._bags_s = -BAGS_EVERY_S
+        self._take_up_scene()
+        self._asked: dict[str, Callable[..., None]] = {
+            "touch": desk.finger.touch,
+            "place": desk.finger.place,
+            "push": desk.finger.push,
+            "lift": desk.finger.lift,
+            "stop": desk.stop,
+            "release": desk.release,
+            "choose": self._choose,
+            "slide": self._slide,
+            "show_layer": self._show_layer,
+            "look": self._look,
+            "correct": self._correct,
+            "record": self._record,
+            "mark": self._mark,
+            "open_bag": self._open_bag,
+            "leave": self._leave,
+            "play": self._play,
+            "seek": desk.replay.seek,
+            "replay_rate": self._set_rate,
+        }
+
+    @property
+    def source(self) -> Source:
+        """What is shown: a bag, or else the running graph."""
+        return self.desk.replay.timeline or self._live
+
+    def heed(self, what: str, *values: Any) -> None:
+        """Do what a viewer wants; what cannot be done is said on the page."""
+        try:
+            self._asked[what](*values)
+        except (ValueError, BagError) as error:
+            self.fail(error)
+        else:
+            self._page.show_problem("")
+        self._show_state()
+
+    def fail(self, error: Exception) -> None:
+        """Say on the page that something could not be done."""
+        self._page.show_problem(str(error))
+
+    def hear(self, message: Message, header: Header, now_s: float) -> None:
+        """Take what must not be missed."""
+        if isinstance(message, Status):
+            self._statuses[message.node] = (message, now_s)
+        elif isinstance(message, EStop):
+            self.desk.stopped = message.reason if message.engaged else None
+        elif isinstance(message, Display):
+            self.desk.look.heed(message)
+        elif isinstance(message, TwinEye) and self.desk.look.got(message, now_s):
+            for name, image in (("seen", message.seen), ("proper", message.proper)):
+                self._page.show_picture(name, smaller(image))
+
+    def advance(self, now_s: float, looking: bool) -> None:
+        """Go on with what moves by itself, and draw it where somebody looks."""
+        step_s = min(now_s - self._now_s, LONGEST_STEP_S)
+        self._now_s, desk = now_s, self.desk
+        finger = self._live.newest("fingertip", Fingertip) if looking else None
+        seen = finger[0].position_world_m if finger is not None and finger[0].valid else None
+        desk.finger.advance(step_s, seen)
+        try:
+            if desk.scenes.settle(now_s):
+                self._take_up_scene()
+        except ValueError as error:
+            self.fail(error)
+        if looking:
+            desk.look.advance(now_s)
+            self._draw(step_s)
+
+    def _draw(self, step_s: float) -> None:
+        replay = self.desk.replay
+        replay.advance(step_s)
+        self._follow_scene()
+        self._follow_skin()
+        if self._drawn_scene is not None:
+            self._page.view.draw(picture_of(self._drawn_scene, self.source))
+        self._show_frame()
+        if replay.timeline is not None:
+            self._page.show_replay(self.desk)
+
+    def _follow_scene(self) -> None:
+        """Draw what the scene holds anew when it is another one."""
+        recorded = None
+        if self.desk.replay.timeline is not None:
+            recorded = self.source.newest("scene", Scene)
+        scene = self.desk.scenes.scene if recorded is None else recorded[0]
+        if scene is not self._drawn_scene:
+            self._drawn_scene, self._drawn_skin = scene, None
+            scenes = self.desk.scenes
+            self._page.show_scene(scene, scenes.names, scenes.sliders)
+
+    def _follow_skin(self) -> None:
+        skin = self.source.newest("skin", Skin)
+        if skin is not None and skin[0] is not self._drawn_skin:
+            self._drawn_skin = skin[0]
+            rest = np.asarray(skin[0].vertices_world_m, dtype=np.float64)
+            self._page.view.set_skin(rest, skin[0].triangles)
+
+    def _show_frame(self) -> None:
+        entry = self.source.newest("frame", Frame)
+        if entry is None or entry[0] is self._pictured or not entry[0].pixels:
+            return
+        self._pictured = entry[0]
+        self._page.show_picture("frame", smaller(entry[0].pixels[0]))
+
+    def tell(self, now_s: float) -> None:
+        """Tables, charts, banner."""
+        ages = {name: (status, now_s - at_s) for name, (status, at_s) in self._statuses.items()}
+        self._history.take(now_s, self._live)
+        tables = panels.topics_table(ages) + panels.nodes_table(ages)
+        self._page.show_graph(tables, self._history.columns())
+        self._show_state()
+        if now_s >= self._bags_s + BAGS_EVERY_S:
+            self._bags_s = now_s
+            self._page.show_bags(self.desk.replay.bags())
+
+    def _show_state(self) -> None:
+        desk, arms = self.desk, {}
+        for side in SIDES:
+            entry = self._live.newest(f"arm_{side}", ArmState)
+            if entry is not None:
+                arms[side] = entry[0]
+        stopped = desk.stopped
+        if stopped is None and any(arm.mode == "estop" for arm in arms.values()):
+            stopped = "the arms are still stopped"
+        timeline = desk.replay.timeline
+        where = "Live" if timeline is None else f"REPLAY of {timeline.path.name}"
+        shown = desk.scenes.scene if self._drawn_scene is None else self._drawn_scene
+        html = panels.banner(shown.name, arms, stopped, where)
+        self._page.show_state(html, stopped=stopped is not None, recording=desk.recording)
+
+    def _take_up_scene(self) -> None:
+        self.desk.scenes.make_aim(self.desk.finger, self._page.show_problem)
+
+    def _choose(self, name: str) -> None:
+        self.desk.scenes.choose(name)
+        self._take_up_scene()
+
+    def _slide(self, name: str, value: float) -> None:
+        self.desk.scenes.slide(self._now_s, **{name: value})
+
+    def _show_layer(self, layer: str, shown: bool) -> None:
+        if layer not in LAYERS:
+            raise ValueError(f'there is no layer "{layer}"; there are: {", ".join(LAYERS)}')
+        self._page.view.show_layer(layer, shown)
+
+    def _look(self, wanted: bool) -> None:
+        self.desk.look.wanted = wanted
+        self.desk.look.again()
+
+    def _correct(self, correction: Correction) -> None:
+        self.desk.look.correction = correction
+        self.desk.look.again()
+
+    def _recorder_waits(self) -> bool | None:
+        """Whether the graph's recorder waits to be told; None where there is none."""
+        entry = self._statuses.get(RECORDER)
+        return None if entry is None else entry[0].note.startswith(("waits", "recorded"))
+
+    def _record(self) -> None:
+        if self._recorder_waits() is None:
+            raise ValueError(NO_RECORDER)
+        self.desk.record(not self.desk.recording)
+
+    def _mark(self, label: str) -> None:
+        if self._recorder_waits() is None:
+            raise ValueError(NO_RECORDER)
+        if self._recorder_waits() and not self.desk.recording:
+            raise ValueError(
+                "nothing is recorded now, so there is nothing to mark: start recording"
+            )
+        self.desk.mark(label)
+
+    def _open_bag(self, name: str) -> None:
+        if name == NO_BAG:
+            raise ValueError("there is no bag to show yet: record one first")
+        self.desk.replay.open(name)
+        self._page.show_replay(self.desk, opened=True)
+
+    def _leave(self) -> None:
+        self.desk.replay.leave()
+        self._page.show_replay(self.desk, opened=True)
+
+    def _play(self) -> None:
+        self.desk.replay.playing = not self.desk.replay.playing
+
+    def _set_rate(self, rate: float) -> None:
+        self.desk.replay.rate = rate
+
+
+def smaller(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Every nth pixel of a picture, so that it is at most `WIDEST_PX` wide."""
+    step = -(-image.shape[1] // WIDEST_PX)
+    return np.ascontiguousarray(image[::step, ::step])

@@ -1,0 +1,108 @@
+"""A bag as the page shows it: at any moment, the newest message of each topic until then."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections import OrderedDict
+from pathlib import Path
+from typing import TypeVar
+
+from mcap.records import Message as Record
+
+from messages.bag import BagError, BagReader, Chunk, split_frames
+from messages.base import Header, Message
+from messages.topics import TOPICS
+from messages.types import Moment
+from messages.wire import WireError, decode
+from nodes.console.newest import checked
+
+M = TypeVar("M", bound=Message)
+
+CHUNKS_KEPT = 6
+
+
+class Timeline:
+    """A bag and a place in it; `seconds` counts from its beginning.
+
+    Raises BagError for a file that is no bag, or holds nothing that the page could show.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._reader = BagReader(path)
+        summary = self._reader.info()
+        self.duration_s, self._start_ns = summary.duration_s, summary.start_ns
+        self._readable = {one.name for one in summary.topics if one.readable and one.count}
+        if not self._readable & {"arm_left", "arm_right", "fingertip", "soft_body"}:
+            raise BagError(f"{path}: nothing in it that the page shows; it holds no arms, finger")
+        self._channels = {one.topic: one.id for one in self._reader.channels.values()}
+        self._places = {name: self._times(name) for name in self._readable}
+        self._chunks: OrderedDict[int, dict[tuple[int, int], Record]] = OrderedDict()
+        self._opened: dict[str, tuple[int, tuple[Message, Header]]] = {}
+        self.moments = self._find_moments()
+        self.seconds = 0.0
+
+    def newest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
+        """See `nodes.console.newest.Source`; at `seconds`."""
+        times, _ = self._places.get(name, ([], []))
+        i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
+        if i < 0:
+            return None
+        held = self._opened.get(name)
+        if held is None or held[0] != i:
+            held = (i, self._open(name, i))
+            self._opened[name] = held
+        return checked(held[1], kind)
+
+    def _times(self, name: str) -> tuple[list[int], list[Chunk]]:
+        """Log times of a topic's messages in order, and the chunk of each."""
+        entries = [
+            (time_ns, chunk.offset, chunk)
+            for chunk in self._reader.chunks
+            for time_ns in chunk.times_ns.get(self._channels[name], [])
+        ]
+        entries.sort(key=lambda entry: entry[:2])
+        return [entry[0] for entry in entries], [entry[2] for entry in entries]
+
+    def _open(self, name: str, i: int) -> tuple[Message, Header]:
+        times, chunks = self._places[name]
+        record = self._records(chunks[i]).get((self._channels[name], times[i]))
+        if record is None:
+            raise BagError(f'{self.path}: topic "{name}": no message where its index says')
+        try:
+            return decode(split_frames(record.data), TOPICS[name])
+        except WireError as error:
+            raise BagError(f'{self.path}: topic "{name}" at {times[i]} ns: {error}') from error
+
+    def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
+        """Messages of a chunk by channel and log time; the last few chunks are kept."""
+        held = self._chunks.get(chunk.offset)
+        if held is None:
+            with self.path.open("rb") as file:
+                records = self._reader.read_chunk(file, chunk)
+            held = {
+                (record.channel_id, record.log_time): record
+                for record in records
+                if isinstance(record, Record)
+            }
+            self._chunks[chunk.offset] = held
+            if len(self._chunks) > CHUNKS_KEPT:
+                self._chunks.popitem(last=False)
+        self._chunks.move_to_end(chunk.offset)
+        return held
+
+    def _find_moments(self) -> list[tuple[float, str]]:
+        """(seconds, label) of the moments that were marked."""
+        found = []
+        for i, time_ns in enumerate(self._places.get("moment", ([], []))[0]):
+            message, _ = self._open("moment", i)
+            if isinstance(message, Moment):
+                found.append(((time_ns - self._start_ns) * 1e-9, message.label))
+        return found
+
+
+def bags_in(folder: Path) -> list[str]:
+    """Names of the bags in a folder, the newest first."""
+    found = [path for path in folder.glob("**/*.mcap") if path.is_file()]
+    found.sort(key=lambda path: path.stat().st_mtime, reverse=True)
+    return [str(path.relative_to(folder)) for path in found]

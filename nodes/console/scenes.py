@@ -1,0 +1,126 @@
+"""Scenes to choose from, and what the page's sliders make of one."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
+from nodes.models.rigid import rotation_from_rpy
+
+Floats = NDArray[np.float64]
+Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
+
+
+class SceneChoiceError(ValueError):
+    """A scene that cannot be shown; the sentence says why."""
+
+
+def first_scene(plan_file: Path) -> Scene:
+    """The scene of the run's plan; SceneChoiceError where it has none."""
+    values = json.loads(plan_file.read_text())["scene"]
+    if values is None:
+        raise SceneChoiceError('the launch file names no scene: give it a "scene" for the console')
+    return Scene.model_validate(values)
+
+
+def scene_names(folder: Path) -> list[str]:
+    return sorted(path.stem for path in folder.glob("*.json"))
+
+
+def load(folder: Path, name: str) -> Scene:
+    """A scene of the run's folder by its name; SceneChoiceError says which there are."""
+    names = scene_names(folder)
+    if name not in names:
+        raise SceneChoiceError(f'there is no scene "{name}"; there are: {", ".join(names)}')
+    return Scene.model_validate_json((folder / f"{name}.json").read_text())
+
+
+def edited(
+    scene: Scene, *, young_modulus_pa: float, stretch_ratio: float, size_ratio: float
+) -> Scene:
+    """The scene with another stiffness, least stretch of the sheet, and size of its object.
+
+    The object grows away from the user: its foremost point stays where it is.  SceneChoiceError
+    for values that make no scene.
+    """
+    values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
+    solid, sheet = scene.object, scene.sheet
+    try:
+        geometry = scaled(solid.geometry, size_ratio)
+        pose = solid.world_from_object
+        rotation = rotation_from_rpy(pose.rpy_rad)
+        back_m = front_m(solid.geometry, rotation) * (size_ratio - 1.0)
+        position_m = pose.position_m - np.array([0.0, 0.0, back_m])
+        material = _with(solid.material, young_modulus_pa=young_modulus_pa)
+        pose = _with(pose, position_m=position_m)
+        values["object"] = _with(
+            solid, geometry=geometry, material=material, world_from_object=pose
+        )
+        most = max(sheet.max_stretch_ratio, stretch_ratio + 0.01)
+        values["sheet"] = _with(sheet, min_stretch_ratio=stretch_ratio, max_stretch_ratio=most)
+        return Scene(**values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(step) for step in first["loc"])
+        raise SceneChoiceError(f"{where}: {first['msg']}") from error
+
+
+def _with(part: Any, **changes: Any) -> Any:
+    """A copy of a message's part with some fields changed, checked as if it had just come."""
+    fields = {name: getattr(part, name) for name in type(part).model_fields}
+    return type(part)(**fields | changes)
+
+
+def scaled(geometry: Geometry, ratio: float) -> Geometry:
+    """The same shape, larger by `ratio` about its origin; a plane stays as it is."""
+    if not (np.isfinite(ratio) and ratio > 0.0):
+        raise SceneChoiceError(f"size: {ratio} times as large is no size")
+    changes: dict[str, Any]
+    match geometry:
+        case Cylinder():
+            changes = {"radius_m": ratio * geometry.radius_m, "length_m": geometry.length_m}
+        case Sphere():
+            changes = {"radius_m": ratio * geometry.radius_m}
+        case Ellipsoid():
+            changes = {"semi_axes_m": tuple(ratio * side for side in geometry.semi_axes_m)}
+        case RoundedBox():
+            changes = {
+                "size_m": tuple(ratio * side for side in geometry.size_m),
+                "edge_radius_m": ratio * geometry.edge_radius_m,
+            }
+        case Mesh():
+            changes = {
+                "vertices_m": ratio * geometry.vertices_m,
+                "smoothing_m": ratio * geometry.smoothing_m,
+            }
+        case Plane():
+            return geometry
+    return _with(geometry, **changes)  # type: ignore[no-any-return]  # of the same type
+
+
+def front_m(geometry: Geometry, world_from_object: Floats) -> float:
+    """How far a shape reaches towards the user (world z) from its origin, turned as (3, 3) says.
+
+    Of a cylinder the side counts, not the ends: they are not touched.
+    """
+    towards = world_from_object[2]
+    match geometry:
+        case Cylinder():
+            return geometry.radius_m * float(np.hypot(towards[1], towards[2]))
+        case Sphere():
+            return geometry.radius_m
+        case Ellipsoid():
+            return float(np.linalg.norm(np.array(geometry.semi_axes_m) * towards))
+        case RoundedBox():
+            core = 0.5 * np.array(geometry.size_m) - geometry.edge_radius_m
+            return float(core @ np.abs(towards)) + geometry.edge_radius_m
+        case Mesh():
+            return float((geometry.vertices_m @ towards).max())
+        case Plane():
+            return 0.0

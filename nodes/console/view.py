@@ -1,0 +1,334 @@
+"""The 3D view: what is drawn, in which colours, and how it is kept up to date."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from messages.scene import Lens, Pose, Scene
+from nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
+from nodes.console.picture import Picture, ray_vertices, rays, transform_of
+from nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
+from nodes.models.rigid import quaternion_from_rotation, transform
+
+Floats = NDArray[np.float64]
+Color = tuple[int, int, int]
+
+ARM: Color = (222, 226, 232)
+ARM_DARK: Color = (74, 85, 104)
+SHEET: Color = (247, 236, 214)
+SHEET_LINES: Color = (150, 123, 84)
+OBJECT: Color = (214, 97, 84)
+FINGER: Color = (236, 188, 160)
+FINGER_LOST: Color = (148, 148, 148)
+TO_EYE: Color = (196, 110, 0)
+FROM_PROJECTOR: Color = (0, 108, 148)
+DEVICE: Color = (71, 85, 105)
+
+LINES_EVERY = 5
+FINGER_LENGTH_M = 0.05
+FINGER_TILT_RAD = 0.6
+FLOOR_M = 0.02
+"""Below the arms' bases."""
+
+LAYERS = ("Arms", "Sheet", "Object", "Finger", "Rays", "Devices")
+
+Drag = Callable[[Floats, Floats], None]
+"""Gets a ray (origin and direction, world) from the viewer's eye through the mouse."""
+
+
+class View:
+    """The 3D scene of all viewers; `draw` sends what has changed."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server, self._scene = server, server.scene
+        self._shown = dict.fromkeys(LAYERS, True)
+        self._layers: dict[str, list[Any]] = {}
+        self._of_scene: Scene | None = None
+        self._skin_shape: tuple[int, ...] | None = None
+        self._finger_color = FINGER
+        self._scene.set_up_direction("+y")
+        # Without a graphics card shadows would take most of a frame's time.
+        self._scene.configure_default_lights(cast_shadow=False)
+        server.initial_camera.position = (0.42, 0.30, 0.95)
+        server.initial_camera.look_at = (0.0, -0.06, 0.0)
+        server.initial_camera.fov = 0.75
+
+    def show_layer(self, layer: str, shown: bool) -> None:
+        self._shown[layer] = shown
+        for handle in self._layers.get(layer, []):
+            handle.visible = shown
+
+    def set_scene(self, scene: Scene) -> None:
+        """Draw everything anew for a scene."""
+        self._scene.reset()
+        self._layers = {layer: [] for layer in LAYERS}
+        self._of_scene, self._skin_shape = scene, None
+        self._add_floor(scene)
+        self._links = {
+            side: self._add_arm(side, scene.sheet.height_m) for side in ("left", "right")
+        }
+        self._add_sheet(scene)
+        self._add_finger(scene.finger.radius_m)
+        self._add_devices(scene)
+        ends = np.zeros((1, 2, 3))
+        self._rays = [
+            self._add("Rays", self._lines("/rays/eye", ends, TO_EYE, 1.6)),
+            self._add("Rays", self._lines("/rays/projector", ends, FROM_PROJECTOR, 1.6)),
+        ]
+
+    def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
+        """Draw the object with this skin from now on."""
+        self._object = self._add(
+            "Object",
+            self._scene.add_mesh_simple("/object", _f32(rest), triangles, color=OBJECT),
+        )
+        self._skin_shape, self._ray_vertices = rest.shape, ray_vertices(rest)
+        self._make_touchable(self._object)
+
+    def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
+        """Call these when the mouse presses or drags on the sheet or the object, and lets go."""
+        self._touched, self._released = touched, released
+
+    def draw(self, picture: Picture) -> None:
+        """Move everything to where it is now."""
+        scene = self._of_scene
+        if scene is None:
+            return
+        with self._server.atomic():
+            for side, poses in picture.links.items():
+                for handle, pose in zip(self._links[side], poses, strict=False):
+                    _place(handle, pose)
+                _place(self._links[side][-1], picture.edges[side])
+            if picture.sheet is not None:
+                self._sheet.vertices = _f32(picture.sheet)
+                self._sheet_lines.points = _f32(line_segments(picture.sheet))
+            if picture.skin is not None and picture.skin.shape == self._skin_shape:
+                self._object.vertices = _f32(picture.skin)
+            if picture.finger is not None:
+                self._finger.position = picture.finger
+                color = FINGER if picture.finger_valid else FINGER_LOST
+                if self._finger_color != color:
+                    self._finger_color = self._finger.color = color
+            self._draw_rays(scene, picture)
+
+    def _draw_rays(self, scene: Scene, picture: Picture) -> None:
+        if picture.sheet is None or picture.skin is None or not self._shown["Rays"]:
+            return
+        if picture.skin.shape != self._skin_shape:
+            return
+        found = rays(scene, picture.sheet, picture.skin[self._ray_vertices])
+        for handle, segments in zip(self._rays, found, strict=True):
+            if len(segments):
+                handle.points = _f32(segments)
+
+    def _add(self, layer: str, handle: Any) -> Any:
+        handle.visible = self._shown[layer]
+        self._layers[layer].append(handle)
+        return handle
+
+    def _add_floor(self, scene: Scene) -> None:
+        lowest = min(
+            arm.world_from_base.position_m[1] for arm in (scene.arms.left, scene.arms.right)
+        )
+        self._scene.add_grid(
+            "/floor",
+            width=2.4,
+            height=2.4,
+            plane="xz",
+            cell_size=0.1,
+            section_size=0.6,
+            cell_color=(214, 218, 224),
+            section_color=(176, 184, 196),
+            position=(0.0, lowest - FLOOR_M, 0.0),
+        )
+
+    def _add_arm(self, side: str, height_m: float) -> list[Any]:
+        """Frames of the seven links, and at the end the clamp's, with their boxes."""
+        frames = [
+            self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
+            for link in range(7)
+        ]
+        for i, piece in enumerate(PIECES):
+            vertices, triangles = rounded_box(piece.size_m, piece.middle_m)
+            self._scene.add_mesh_simple(
+                f"/{side}/{piece.link}/{i}",
+                _f32(vertices),
+                triangles,
+                color=ARM_DARK if piece.dark else ARM,
+                flat_shading=True,
+            )
+        clamp = self._add("Arms", self._scene.add_frame(f"/{side}/clamp", show_axes=False))
+        across, along, through = CLAMP_SIZE_M
+        vertices, triangles = rounded_box((across, along * height_m, through), (0.0, 0.0, 0.0))
+        self._scene.add_mesh_simple(
+            f"/{side}/clamp/bar", _f32(vertices), triangles, color=ARM_DARK, flat_shading=True
+        )
+        return [*frames, clamp]
+
+    def _add_sheet(self, scene: Scene) -> None:
+        half = 0.5 * scene.sheet.width_m
+        points = sheet_points(
+            transform(np.eye(3), (-half, 0.0, 0.0)),
+            transform(np.eye(3), (half, 0.0, 0.0)),
+            height_m=scene.sheet.height_m,
+            fingertip=None,
+            finger_radius_m=scene.finger.radius_m,
+        )
+        assert points is not None  # the scene's sheet is wider than nothing
+        self._sheet = self._add(
+            "Sheet",
+            self._scene.add_mesh_simple(
+                "/sheet",
+                _f32(points),
+                sheet_triangles(),
+                color=SHEET,
+                opacity=0.5,
+                side="double",
+                cast_shadow=False,
+                receive_shadow=False,
+            ),
+        )
+        lines = self._lines("/sheet_lines", line_segments(points), SHEET_LINES, 1.0)
+        self._sheet_lines = self._add("Sheet", lines)
+        self._make_touchable(self._sheet)
+
+    def _add_finger(self, radius_m: float) -> None:
+        vertices, triangles = finger_mesh(radius_m)
+        self._finger = self._add(
+            "Finger",
+            self._scene.add_mesh_simple("/finger", _f32(vertices), triangles, color=FINGER),
+        )
+        self._finger.position = (0.0, 0.0, 0.08)
+        self._finger_color = FINGER
+
+    def _add_devices(self, scene: Scene) -> None:
+        camera, projector = scene.camera, scene.projector
+        left = transform_of(camera.world_from_left)
+        right = left @ np.linalg.inv(camera.right_from_left)
+        size = (camera.width_px, camera.height_px)
+        self._add_frustum("/devices/camera_left", camera.left, size, left, 0.05)
+        self._add_frustum("/devices/camera_right", camera.right, size, right, 0.05)
+        self._add_projector(projector.world_from_projector)
+        half = 0.5 * scene.eyes.interocular_m
+        for name, offset in (("left", -half), ("right", half)):
+            eye = self._scene.add_icosphere(
+                f"/devices/eye_{name}",
+                radius=0.011,
+                color=(250, 250, 250),
+                position=scene.eyes.centre_world_m + np.array([offset, 0.0, 0.0]),
+            )
+            pupil = self._scene.add_icosphere(
+                f"/devices/eye_{name}/pupil", radius=0.006, color=TO_EYE, position=(0, 0, -0.0065)
+            )
+            self._add("Devices", eye)
+            self._add("Devices", pupil)
+
+    def _add_frustum(
+        self, name: str, lens: Lens, size_px: tuple[int, int], pose: Floats, scale: float
+    ) -> None:
+        handle = self._scene.add_camera_frustum(
+            name,
+            fov=2.0 * float(np.arctan(0.5 * size_px[1] / lens.fy_px)),
+            aspect=size_px[0] / size_px[1],
+            scale=scale,
+            color=DEVICE,
+            wxyz=quaternion_from_rotation(pose[:3, :3]),
+            position=pose[:3, 3],
+        )
+        self._add("Devices", handle)
+
+    def _add_projector(self, pose: Pose) -> None:
+        place = transform_of(pose)
+        vertices, triangles = rounded_box((0.16, 0.07, 0.12), (0.0, 0.0, -0.07))
+        body = self._scene.add_mesh_simple(
+            "/devices/projector",
+            _f32(vertices),
+            triangles,
+            color=ARM_DARK,
+            flat_shading=True,
+            wxyz=quaternion_from_rotation(place[:3, :3]),
+            position=place[:3, 3],
+        )
+        lens = self._scene.add_icosphere(
+            "/devices/projector/lens", radius=0.02, color=FROM_PROJECTOR, position=(0, 0, -0.005)
+        )
+        self._add("Devices", body)
+        self._add("Devices", lens)
+
+    def _lines(self, name: str, segments: Floats, color: Color, width: float) -> Any:
+        return self._scene.add_line_segments(
+            name, _f32(segments), color, thickness=width, thickness_units="screen"
+        )
+
+    def _make_touchable(self, handle: Any) -> None:
+        # Coroutines run on the server's own loop, in the order of the mouse's moves.
+        async def dragged(event: Any) -> None:
+            if event.phase == "end":
+                self._released()
+                return
+            eye = np.array(event.client.camera.position)
+            self._touched(eye, np.array(event.end_position) - eye)
+
+        async def clicked(event: Any) -> None:
+            self._touched(np.array(event.ray_origin), np.array(event.ray_direction))
+            self._released()
+
+        handle.on_drag("left")(dragged)
+        handle.on_click(clicked)
+
+
+def line_segments(points: Floats) -> Floats:
+    """Segments (n, 2, 3) of every fifth row and column of the sheet's grid."""
+    grid = points.reshape(ROWS, COLUMNS, 3)
+    rows, columns = grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)
+    lines = np.concatenate([rows, columns]) if ROWS == COLUMNS else rows
+    return np.stack([lines[:, :-1], lines[:, 1:]], axis=2).reshape(-1, 2, 3)
+
+
+def finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
+    """A fingertip (n, 3) and its triangles, tip at the origin, pointing away from the user."""
+    rings, around = 8, 20
+    tilt = np.linspace(0.0, 0.5 * np.pi, rings)
+    radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m]])
+    heights = np.concatenate([radius_m * (1.0 - np.cos(tilt)), [FINGER_LENGTH_M]])
+    angle = np.linspace(0.0, 2.0 * np.pi, around, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    vertices = np.concatenate(
+        [
+            np.column_stack([r * circle, np.full(around, h)])
+            for r, h in zip(radii, heights, strict=True)
+        ]
+        + [np.array([[0.0, 0.0, FINGER_LENGTH_M + 0.4 * radius_m]])]
+    )
+    # Leant back about the middle of the tip, as a finger comes from below.
+    lean = np.array(
+        [
+            [1.0, 0.0, 0.0],
+            [0.0, np.cos(FINGER_TILT_RAD), -np.sin(FINGER_TILT_RAD)],
+            [0.0, np.sin(FINGER_TILT_RAD), np.cos(FINGER_TILT_RAD)],
+        ]
+    )
+    middle = np.array([0.0, 0.0, radius_m])
+    vertices = (vertices - middle) @ lean.T + middle
+    triangles = []
+    for ring in range(rings):
+        for i in range(around):
+            a, b = ring * around + i, ring * around + (i + 1) % around
+            triangles += [(a, b, b + around), (a, b + around, a + around)]
+    last, cap = rings * around, len(vertices) - 1
+    triangles += [(last + i, last + (i + 1) % around, cap) for i in range(around)]
+    return vertices, np.array(triangles, dtype=np.int32)
+
+
+def _place(handle: Any, pose: Floats) -> None:
+    handle.position = pose[:3, 3]
+    handle.wxyz = quaternion_from_rotation(pose[:3, :3])
+
+
+def _f32(values: Floats) -> NDArray[np.float32]:
+    return np.ascontiguousarray(values, dtype=np.float32)
