@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -142,13 +141,13 @@ class Console(Node):
             self._guarded(self.operator.tell, self.clock.now_ns() * 1e-9)
 
     def _publish(self, message: Message) -> None:
-        output = next(one for one in self.outputs.values() if one.topic.message is type(message))
-        output.publish(message)
+        next(out for out in self.outputs.values() if out.topic.message is type(message)).publish(
+            message
+        )
 
     def _ask(self, what: str, *values: Any) -> None:
         """Hand on what a viewer wants, from any thread."""
-        heed = partial(self._guarded, self.operator.heed, what, *values)
-        self._loop.call_soon_threadsafe(heed)
+        self._loop.call_soon_threadsafe(self._guarded, self.operator.heed, what, *values)
 
     def _guarded(self, function: Any, *values: Any) -> None:
         try:
@@ -158,6 +157,5 @@ class Console(Node):
             self.operator.fail(error)
 
     def _refused(self, topic: Topic, error: WireError) -> None:
-        port = next(one for one in self.inputs.values() if one.topic is topic)
-        port.counts.rejected += 1
+        self.inputs[f"in/{topic.name}"].counts.rejected += 1
         self.log.warning("input", problem=str(error))

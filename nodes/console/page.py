@@ -244,7 +244,7 @@ class Page:
             for handle in (self._play, self._time, self._rate, self._moments, self._live):
                 handle.visible = timeline is not None
             if timeline is not None:
-                self._time.max = max(timeline.duration_s, 0.1)
+                self._time.max = max(round(timeline.duration_s, 1), 0.1)
                 marked = [f"{seconds:.2f} s {label}" for seconds, label in timeline.moments]
                 self._moments.options = ("-", *marked)
         if timeline is not None:

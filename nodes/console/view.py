@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from messages.scene import Lens, Pose, Scene
+from messages.scene import Scene
 from nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
 from nodes.console.picture import Picture, ray_vertices, rays, transform_of
 from nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
@@ -27,7 +27,7 @@ FINGER: Color = (236, 188, 160)
 FINGER_LOST: Color = (148, 148, 148)
 TO_EYE: Color = (196, 110, 0)
 FROM_PROJECTOR: Color = (0, 108, 148)
-DEVICE: Color = (71, 85, 105)
+EYE: Color = (250, 250, 250)
 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
@@ -48,30 +48,37 @@ class View:
         self._server, self._scene = server, server.scene
         self._shown = dict.fromkeys(LAYERS, True)
         self._layers: dict[str, list[Any]] = {}
+        self._links: dict[str, list[Any]] = {}
+        self._placed: set[str] = set()
         self._of_scene: Scene | None = None
         self._skin_shape: tuple[int, ...] | None = None
         self._finger_color = FINGER
         self._scene.set_up_direction("+y")
         # Without a graphics card shadows would take most of a frame's time.
         self._scene.configure_default_lights(cast_shadow=False)
-        server.initial_camera.position = (0.42, 0.30, 0.95)
-        server.initial_camera.look_at = (0.0, -0.06, 0.0)
+        server.initial_camera.position = (0.5, 0.34, 1.3)
+        server.initial_camera.look_at = (0.0, -0.13, 0.0)
         server.initial_camera.fov = 0.75
 
     def show_layer(self, layer: str, shown: bool) -> None:
         self._shown[layer] = shown
         for handle in self._layers.get(layer, []):
             handle.visible = shown
+        for side, frames in self._links.items():
+            # Where an arm is must be known before it is drawn.
+            for handle in frames:
+                handle.visible = self._shown["Arms"] and side in self._placed
 
     def set_scene(self, scene: Scene) -> None:
         """Draw everything anew for a scene."""
         self._scene.reset()
         self._layers = {layer: [] for layer in LAYERS}
-        self._of_scene, self._skin_shape = scene, None
+        self._of_scene, self._skin_shape, self._placed = scene, None, set()
         self._add_floor(scene)
         self._links = {
             side: self._add_arm(side, scene.sheet.height_m) for side in ("left", "right")
         }
+        self.show_layer("Arms", self._shown["Arms"])
         self._add_sheet(scene)
         self._add_finger(scene.finger.radius_m)
         self._add_devices(scene)
@@ -101,6 +108,9 @@ class View:
             return
         with self._server.atomic():
             for side, poses in picture.links.items():
+                if side not in self._placed:
+                    self._placed.add(side)
+                    self.show_layer("Arms", self._shown["Arms"])
                 for handle, pose in zip(self._links[side], poses, strict=False):
                     _place(handle, pose)
                 _place(self._links[side][-1], picture.edges[side])
@@ -207,58 +217,55 @@ class View:
         self._finger_color = FINGER
 
     def _add_devices(self, scene: Scene) -> None:
-        camera, projector = scene.camera, scene.projector
+        """The stereo camera, the projector, and the user's eyes, as bodies with lenses."""
+        camera = scene.camera
         left = transform_of(camera.world_from_left)
-        right = left @ np.linalg.inv(camera.right_from_left)
-        size = (camera.width_px, camera.height_px)
-        self._add_frustum("/devices/camera_left", camera.left, size, left, 0.05)
-        self._add_frustum("/devices/camera_right", camera.right, size, right, 0.05)
-        self._add_projector(projector.world_from_projector)
+        baseline_m = -float(camera.right_from_left[0, 3])
+        self._add_device(
+            "/devices/camera",
+            left,
+            ((baseline_m + 0.05, 0.035, 0.045), (0.5 * baseline_m, 0.0, -0.024)),
+            [(0.0, 0.0, 0.0), (baseline_m, 0.0, 0.0)],
+            0.011,
+        )
+        self._add_device(
+            "/devices/projector",
+            transform_of(scene.projector.world_from_projector),
+            ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
+            [(0.0, 0.0, -0.005)],
+            0.02,
+        )
         half = 0.5 * scene.eyes.interocular_m
         for name, offset in (("left", -half), ("right", half)):
             eye = self._scene.add_icosphere(
                 f"/devices/eye_{name}",
                 radius=0.011,
-                color=(250, 250, 250),
+                color=EYE,
                 position=scene.eyes.centre_world_m + np.array([offset, 0.0, 0.0]),
             )
-            pupil = self._scene.add_icosphere(
+            self._add("Devices", eye)
+            self._scene.add_icosphere(
                 f"/devices/eye_{name}/pupil", radius=0.006, color=TO_EYE, position=(0, 0, -0.0065)
             )
-            self._add("Devices", eye)
-            self._add("Devices", pupil)
 
-    def _add_frustum(
-        self, name: str, lens: Lens, size_px: tuple[int, int], pose: Floats, scale: float
+    def _add_device(
+        self,
+        name: str,
+        pose: Floats,
+        box: tuple[tuple[float, float, float], tuple[float, float, float]],
+        lenses: list[tuple[float, float, float]],
+        lens_radius_m: float,
     ) -> None:
-        handle = self._scene.add_camera_frustum(
-            name,
-            fov=2.0 * float(np.arctan(0.5 * size_px[1] / lens.fy_px)),
-            aspect=size_px[0] / size_px[1],
-            scale=scale,
-            color=DEVICE,
-            wxyz=quaternion_from_rotation(pose[:3, :3]),
-            position=pose[:3, 3],
-        )
-        self._add("Devices", handle)
-
-    def _add_projector(self, pose: Pose) -> None:
-        place = transform_of(pose)
-        vertices, triangles = rounded_box((0.16, 0.07, 0.12), (0.0, 0.0, -0.07))
+        vertices, triangles = rounded_box(*box)
         body = self._scene.add_mesh_simple(
-            "/devices/projector",
-            _f32(vertices),
-            triangles,
-            color=ARM_DARK,
-            flat_shading=True,
-            wxyz=quaternion_from_rotation(place[:3, :3]),
-            position=place[:3, 3],
+            name, _f32(vertices), triangles, color=ARM_DARK, flat_shading=True
         )
-        lens = self._scene.add_icosphere(
-            "/devices/projector/lens", radius=0.02, color=FROM_PROJECTOR, position=(0, 0, -0.005)
-        )
+        _place(body, pose)
         self._add("Devices", body)
-        self._add("Devices", lens)
+        for i, lens in enumerate(lenses):
+            self._scene.add_icosphere(
+                f"{name}/lens_{i}", radius=lens_radius_m, color=FROM_PROJECTOR, position=lens
+            )
 
     def _lines(self, name: str, segments: Floats, color: Color, width: float) -> Any:
         return self._scene.add_line_segments(
