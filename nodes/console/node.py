@@ -141,9 +141,8 @@ class Console(Node):
             self._guarded(self.operator.tell, self.clock.now_ns() * 1e-9)
 
     def _publish(self, message: Message) -> None:
-        next(out for out in self.outputs.values() if out.topic.message is type(message)).publish(
-            message
-        )
+        kind = type(message)
+        next(out for out in self.outputs.values() if out.topic.message is kind).publish(message)
 
     def _ask(self, what: str, *values: Any) -> None:
         """Hand on what a viewer wants, from any thread."""

@@ -34,8 +34,8 @@ def _table(caption: str, head: Iterable[str], rows: Iterable[Iterable[str]]) -> 
         "<tr>" + "".join(f"{cell}{value}</td>" for value in row) + "</tr>" for row in rows
     )
     return (
-        f'<table style="width:94%;margin:0 10px 10px;border-collapse:collapse;font-size:12px;color:{TEXT};'
-        'font-variant-numeric:tabular-nums">'
+        '<table style="width:94%;margin:0 10px 10px;border-collapse:collapse;font-size:12px;'
+        f'color:{TEXT};font-variant-numeric:tabular-nums">'
         '<caption style="text-align:left;font-weight:700;padding:4px 0">'
         f"{escape(caption)}</caption>"
         f"<thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
