@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from difflib import get_close_matches
 from importlib import import_module
@@ -14,6 +13,9 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
+from launch.machine import machine_name
+from launch.supervisor import git_state
+from launch.svg import COLOURS, INK, drawn_for_pages, save_svg
 from messages.scene import Scene
 from nodes.methods import Family, Point, measure, pareto_front
 
@@ -35,6 +37,8 @@ FAMILIES: dict[str, str] = {
 """Families by their name on the command line; each node's folder describes its own."""
 
 REPEATS = 30
+ROOT = Path(__file__).resolve().parent.parent
+OVERVIEW = "README.md"
 TITLE_WIDTH = 95
 
 
@@ -95,7 +99,8 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
         "scene": scene.name,
         "tolerance": family.tolerance(scene),
         "along": family.along,
-        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        "machine": machine_name(),
+        "code": json.loads(git_state(ROOT)),
         "points": [asdict(point) for point in points],
         "front": pareto_front(points),
     }
@@ -113,12 +118,17 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
         [] if result["along"] is None else sorted({k for p in result["points"] for k in p["also"]})
     )
     panels = 1 if result["along"] is None else 2 + len(also)
-    figure = Figure(figsize=(8, 5.5) if panels == 1 else (7 * panels, 6.5), layout="constrained")
-    first, *others = figure.subplots(1, panels, squeeze=False)[0]
-    _draw_time(first, result)
-    for axes, name in zip(others, ["error", *also], strict=False):
-        _draw_along(axes, result, name)
-    figure.savefig(path, dpi=110 if panels == 1 else 90)
+    with drawn_for_pages():
+        columns = min(panels, 2)
+        rows = math.ceil(panels / columns)
+        figure = Figure(figsize=(8, 5.5) if rows == 1 else (14, 5.5 * rows), layout="constrained")
+        first, *others = figure.subplots(rows, columns, squeeze=False).flat
+        for unused in others[panels - 1 :]:
+            unused.remove()
+        _draw_time(first, result)
+        for axes, name in zip(others, ["error", *also], strict=False):
+            _draw_along(axes, result, name)
+        save_svg(figure, path)
 
 
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
@@ -136,7 +146,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
                     [point["median_s"] * 1e6 for point in shown],
                     [max(point["error"], least) for point in shown],
                     marker,
-                    color=f"C{index % 10}",
+                    color=COLOURS[index % len(COLOURS)],
                     alpha=0.7,
                     label=f"{method}{front if in_range else ' (out of its range)'}",
                 )
@@ -153,8 +163,8 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
             if all(step[1] < earlier[1] for earlier in steps[:i])
         ]
         if len(best) > 1:
-            axes.step(*zip(*best, strict=True), where="post", color="0.6", linewidth=0.8)
-    axes.axhline(result["tolerance"], linestyle="--", color="0.2", label="the scene's tolerance")
+            axes.step(*zip(*best, strict=True), where="post", color=INK, alpha=0.4, linewidth=0.8)
+    axes.axhline(result["tolerance"], linestyle="--", color=INK, label="the scene's tolerance")
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel("time per call, µs (median)")
@@ -180,7 +190,8 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     if doubts:
         at, doubt = zip(*doubts, strict=True)
         low = [0.0 if name == "error" else -each for each in doubt]
-        axes.fill_between(at, low, doubt, color="0.85", label="the reference's own doubt")
+        band = {"color": INK, "alpha": 0.12, "linewidth": 0}
+        axes.fill_between(at, low, doubt, **band, label="the reference's own doubt")
     methods = list(dict.fromkeys(point["method"] for point in points))
     for index, method in enumerate(methods):
         shown = [
@@ -191,16 +202,17 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
         if not shown:
             continue
         at, values, sure = zip(*sorted(shown), strict=True)
-        color = f"C{index % 10}"
+        color = COLOURS[index % len(COLOURS)]
         axes.plot(at, values, "-", color=color, alpha=0.6, label=method)
         for x, y, inside in zip(at, values, sure, strict=True):
-            axes.plot(x, y, "o", color=color, markerfacecolor=color if inside else "white")
+            axes.plot(x, y, "o", color=color, markerfacecolor=color if inside else "none")
     if name == "error":
-        axes.axhline(result["tolerance"], linestyle="--", color="0.2")
+        axes.axhline(result["tolerance"], linestyle="--", color=INK)
         axes.set_yscale("symlog", linthresh=result["tolerance"])
+        axes.set_ylim(bottom=0.0)
         axes.set_ylabel(f"error, {result['unit']}")
     else:
-        axes.axhline(0.0, color="0.2", linewidth=0.8)
+        axes.axhline(0.0, color=INK, linewidth=0.8)
         axes.set_ylabel(name.replace("_", " "))
     axes.set_xlabel(f"{along.replace('_', ' ')} (hollow: out of the method's range)")
     axes.grid(visible=True, alpha=0.2)
@@ -228,10 +240,88 @@ def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
     """Write the picture and the numbers of a chart; returns both paths."""
     folder.mkdir(parents=True, exist_ok=True)
-    picture, numbers = folder / f"{result['family']}.png", folder / f"{result['family']}.json"
+    picture, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
     draw_chart(result, picture)
     numbers.write_text(json.dumps(finite(result), indent=1) + "\n")
     return picture, numbers
+
+
+def kept_charts(folder: Path) -> list[dict[str, Any]]:
+    """The charts whose numbers lie in the folder, in the order of the table of families."""
+    kept = [folder / f"{name}.json" for name in FAMILIES]
+    return [_as_today(json.loads(path.read_text())) for path in kept if path.exists()]
+
+
+def _as_today(result: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of earlier code, with what they did not have yet."""
+    points = [{"also": {}, "doubts": {}, **point} for point in result["points"]]
+    return {"along": None, "code": None, **result, "points": points}
+
+
+def write_overview(folder: Path) -> Path:
+    """One page of all the charts that lie in the folder; returns its path."""
+    path = folder / OVERVIEW
+    path.write_text("\n".join(_overview_lines(kept_charts(folder))) + "\n", encoding="utf-8")
+    return path
+
+
+def _overview_lines(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+    yield "# Speed against accuracy\n"
+    yield (
+        "Every method of every family, timed and judged on one machine and one scene by "
+        "`flexsheet chart --output docs/charts`. *In range* are the cases that a method says it is "
+        "good for; the front has those that no other method beats in both. The numbers of each "
+        "picture stand beside it as JSON.\n"
+    )
+    for result in results:
+        name, unit = result["family"], result["unit"]
+        commit = (result.get("code") or {}).get("commit") or "unknown"
+        yield f"## {name}\n"
+        yield (
+            f"Against {result['reference']}; scene {result['scene']}, tolerance "
+            f"{result['tolerance']:.3g} {unit}. {result['machine']}; code {commit[:10]}. "
+            f"[Numbers]({name}.json).\n"
+        )
+        yield f"![{name}: time against error of each method]({name}.svg)\n"
+        yield f"| method | time, median | largest error in range, {unit} | cases in range | front |"
+        yield "|---|---|---|---|---|"
+        yield from map(_overview_row, methods_of(result["points"]))
+        yield ""
+
+
+def methods_of(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Per method: the slowest median, the largest error and the count of its cases in range."""
+    rows = []
+    front = pareto_front([Point(**point) for point in points if _judged(point)])
+    for method in dict.fromkeys(point["method"] for point in points):
+        mine = [point for point in points if point["method"] == method]
+        inside = [point for point in mine if point["in_range"] and _judged(point)]
+        rows.append(
+            {
+                "method": method,
+                "median_s": max(point["median_s"] for point in inside or mine),
+                "error": max((point["error"] for point in inside), default=None),
+                "cases": len(mine),
+                "inside": len(inside),
+                "front": method in front,
+            }
+        )
+    return rows
+
+
+def _overview_row(row: dict[str, Any]) -> str:
+    error = "–" if row["error"] is None else f"{row['error']:.3g}"
+    cases = f"{row['inside']} of {row['cases']}"
+    front = "yes" if row["front"] else ""
+    return f"| {row['method']} | {duration(row['median_s'])} | {error} | {cases} | {front} |"
+
+
+def duration(seconds: float) -> str:
+    """A duration for people: 12 µs, 3.4 ms, 1.2 s."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds * 1e9:.3g} ns"
 
 
 def finite(value: Any) -> Any:

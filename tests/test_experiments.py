@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +11,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
+from typer.testing import CliRunner
 
-from launch.charts import UnknownFamilyError, chart_result, family_named, finite, write_chart
+from launch.charts import (
+    FAMILIES,
+    UnknownFamilyError,
+    chart_result,
+    family_named,
+    finite,
+    write_chart,
+)
+from launch.cli import app
 from launch.experiments import ExperimentError, image, stroke
+from launch.svg import INK
 from messages.scene import Scene
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 
@@ -168,8 +179,35 @@ def test_a_chart_is_measured_drawn_and_written(tmp_path: Path) -> None:
     assert [point["error"] for point in result["points"]] == [0.0, 2.0]
     assert result["front"] == ["good"]
     picture, numbers = write_chart(result, tmp_path / "charts")
-    assert picture.stat().st_size > 1000
     assert '"depth_mm": 20' in numbers.read_text()
+    assert result["machine"]
+    drawn = picture.read_text()
+    assert f"stroke: {INK}" in drawn
+    assert "prefers-color-scheme: dark" in drawn
+    write_chart(result, tmp_path / "charts")
+    assert picture.read_text() == drawn, "the same numbers give the same picture"
+
+
+def test_charts_are_gathered_on_a_page_and_drawn_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(FAMILIES, "made-up", "nowhere")
+    family = make_family()
+    points = [measure(trial, repeats=3) for trial in family.trials(SCENE)]
+    result = chart_result(family, SCENE, points)
+    result["family"] = "made-up"
+    older = {name: value for name, value in result.items() if name not in ("along", "code")}
+    older["points"] = [{k: v for k, v in point.items() if k not in ("also", "doubts")}
+                       for point in result["points"]]  # fmt: skip
+    (tmp_path / "made-up.json").write_text(json.dumps(older))
+    outcome = CliRunner().invoke(app, ["chart", "--redraw", "--output", str(tmp_path)])
+    assert outcome.exit_code == 0, outcome.output
+    page = (tmp_path / "README.md").read_text()
+    assert "## made-up" in page
+    assert "| 0 | 1 of 2 | yes |" in page
+    assert (tmp_path / "made-up.svg").exists()
+    nothing = CliRunner().invoke(app, ["chart", "--redraw", "--output", str(tmp_path / "none")])
+    assert nothing.exit_code != 0
 
 
 def test_an_unknown_family_gets_a_suggestion() -> None:

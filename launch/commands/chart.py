@@ -29,12 +29,23 @@ def chart(
     output: Annotated[
         Path, typer.Option("--output", metavar="FOLDER", help="For pictures and numbers.")
     ] = Path("runs/charts"),
+    redraw: Annotated[
+        bool, typer.Option("--redraw", help="Measure nothing: draw the numbers in --output anew.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Chart speed against accuracy of a family's methods, on this machine and one scene."""
     from launch import charts
     from launch.plan import load_scene
 
+    if redraw:
+        results = charts.kept_charts(output)
+        if not results:
+            raise CommandError(f"--output {output}: holds no charts to draw anew", BAD_INPUT)
+        for result in results:
+            charts.write_chart(result, output)
+        words.print(f"charts: {charts.write_overview(output)}")
+        return
     scene = load_scene(scene_file)
     try:
         families = [charts.family_named(name) for name in ([family] if family else charts.FAMILIES)]
@@ -50,6 +61,7 @@ def chart(
         results.append(result)
         if not as_json:
             _print_points(result)
+    words.print(f"charts: {charts.write_overview(output)}")
     if as_json:
         print_json(results[0] if family else results)
 

@@ -1,0 +1,62 @@
+"""Pictures for pages that are light or dark: one SVG that follows what its reader prefers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import StringIO
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+INK, INK_IN_THE_DARK = "#1f2328", "#e6edf3"
+"""Of axes and words, on white and on black."""
+
+COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8c6bb1", "#7f7f7f")
+"""Told apart by people who see colours otherwise (Okabe and Ito), on white and on black."""
+
+_STYLE = {
+    "axes.edgecolor": INK,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.facecolor": "none",
+    "figure.facecolor": "none",
+    "grid.color": INK,
+    "hatch.color": INK,
+    "legend.edgecolor": INK,
+    "legend.facecolor": "none",
+    "legend.framealpha": 0.0,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    # The same picture has the same bytes.
+    "svg.hashsalt": "flexsheet",
+}
+
+_DARK = f"""<style>
+@media (prefers-color-scheme: dark) {{
+ [style*="stroke: {INK}"] {{ stroke: {INK_IN_THE_DARK} !important; }}
+ [style*="fill: {INK}"] {{ fill: {INK_IN_THE_DARK} !important; }}
+}}
+</style>
+"""
+
+
+@contextmanager
+def drawn_for_pages() -> Iterator[None]:
+    """Figures made inside have the colours that `save_svg` can turn for the dark."""
+    import matplotlib as mpl
+    from cycler import cycler
+
+    with mpl.rc_context({**_STYLE, "axes.prop_cycle": cycler(color=COLOURS)}):
+        yield
+
+
+def save_svg(figure: Figure, path: Path) -> None:
+    """Write the figure; its ground is transparent, its ink is light where the page is dark."""
+    drawn = StringIO()
+    figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
+    head, tag, rest = drawn.getvalue().partition("<defs>")
+    path.write_text(f"{head}{_DARK}{tag}{rest}", encoding="utf-8")
