@@ -163,6 +163,13 @@ def sound_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int32]) ->
     return len(moved)
 
 
+def six_shape_functions(a: float, b: float) -> tuple[float, ...]:
+    """`shape_functions` at one place: on so few numbers arrays are slow."""
+    c = 1.0 - a - b
+    corners = (c * (2.0 * c - 1.0), a * (2.0 * a - 1.0), b * (2.0 * b - 1.0))
+    return (*corners, 4.0 * c * a, 4.0 * a * b, 4.0 * b * c)
+
+
 def nearest_on_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
     """Distance (m) of a point (3,) from the edges of a triangle (3, 3), and the local coordinates
     (2,) of the place that is nearest."""
@@ -210,6 +217,9 @@ class TableSoftBody:
         self._sag = float(np.linalg.norm(self._corners[:, 3:] - middles, axis=2).max())
         sides = self._corners[:, 1:3] - self._corners[:, :1]
         self._inverse = np.linalg.inv(sides @ sides.transpose(0, 2, 1)) @ sides
+        # local coordinates of a point on each flat face: one product for all
+        self._across = self._inverse.reshape(-1, 3)
+        self._offset = (self._inverse @ self._corners[:, 0, :, None]).reshape(-1, 2)
         self._depths = curve_depths(linear_depth_m, deepest - END_SPAN_M, push_depth_m)
         self._linear = linear_depth_m
         self._curves = np.array(
@@ -236,9 +246,10 @@ class TableSoftBody:
         skipped = 1 if first == 0 else 0
         rows, shares = slice(first + skipped - 1, first + 3), over[skipped:].astype(np.float32)
         total = np.zeros(self._fields.shape[2], dtype=np.float32)
+        add, fields = self._add, self._fields
         for node, weight in zip(nodes.tolist(), (fade * weights).tolist(), strict=True):
             # adds up in place: what it takes is reading the table
-            self._add(weight, self._fields[node, rows].T, shares, 1.0, total, overwrite_y=1)
+            add(weight, fields[node, rows].T, shares, 1.0, total, 0, 1, 0, 1, 0, 1)
         return Response(
             displacement=total.reshape(-1, 3),
             force_n=weights
@@ -255,22 +266,21 @@ class TableSoftBody:
         how far (m) the point is off the touchable skin."""
         # squared distances, but for what is the same for all
         squared = self._centre_squares - self._centres @ (2.0 * surface)
-        tried = squared.argpartition(FACES_TRIED)[:FACES_TRIED]
-        corners, inverse = self._corners[tried], self._inverse[tried]
-        local = (inverse @ (surface - corners[:, 0])[:, :, None])[:, :, 0]
-        a, b = local[:, 0], local[:, 1]
-        least = np.minimum(np.minimum(a, b), 1.0 - a - b)
-        best = int(least.argmax())
-        if least[best] < 0.0:
+        tried = squared.argpartition(FACES_TRIED)[:FACES_TRIED].tolist()
+        every = (self._across @ surface).reshape(-1, 2) - self._offset
+        local = [(face, *every[face].tolist()) for face in tried]
+        best, a, b = max(local, key=lambda one: min(one[1], one[2], 1.0 - one[1] - one[2]))
+        if min(a, b, 1.0 - a - b) < 0.0:
             # off the skin, or over an edge that two flat faces leave between them
-            nearest = [nearest_on_edges(surface, face[:3]) for face in corners]
-            face = int(np.argmin([away for away, _ in nearest]))
-            off, inner = nearest[face]
-            return self._faces[tried[face]], shape_functions(inner), max(0.0, off - self._sag)
+            nearest = [nearest_on_edges(surface, self._corners[face, :3]) for face in tried]
+            number = int(np.argmin([away for away, _ in nearest]))
+            off, inner = nearest[number]
+            return self._faces[tried[number]], shape_functions(inner), max(0.0, off - self._sag)
         # faces are curved: from the flat one's coordinates one step leads to theirs
-        there = shape_functions(local[best]) @ corners[best]
-        inner = local[best] + inverse[best] @ (surface - there)
-        return self._faces[tried[best]], shape_functions(inner), 0.0
+        left = surface - np.array(six_shape_functions(a, b)) @ self._corners[best]
+        a_left, b_left = (self._inverse[best] @ left).tolist()
+        weights = np.array(six_shape_functions(a + a_left, b + b_left))
+        return self._faces[best], weights, 0.0
 
     def stiffness_n_per_m(self, surface: Floats) -> float:
         """Force over depth at `linear_depth_m`, at the touchable place nearest to `surface`."""
