@@ -13,14 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from messages.base import Header
 from messages.scene import Lens, Pose
-from messages.types import Correction, Display, Eye, Frame, StereoMode
+from messages.types import Correction, Display, Eye, Frame, SoftBody, StereoMode
+from nodes.renderer.dent_ahead import DentAhead
 from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.lead import Lead
 from nodes.renderer.lens import clip_lens
 from nodes.renderer.sheet_mesh import finer, flat_mesh
 from nodes.renderer.stage import Stage
-from tests.test_renderer import MS, Bench, load_scene
+from tests.test_renderer import MS, Bench, load_scene, skin_and_body
 
 Image = NDArray[np.uint8]
 
@@ -239,3 +241,37 @@ def test_light_is_foretold_to_the_refresh_that_the_picture_makes(
         begun = swapped + round((0.3 + phase) * period)
     # Off by a whole refresh only where drawing ends within the margin before one.
     assert abs(predicted - light) < 1000 or 0 <= predicted - light - period < 1000
+
+
+def answer(at_ms: int, displacement: float, **changes: object) -> tuple[SoftBody, Header]:
+    body = skin_and_body(displacement)[1].model_copy(update=changes)
+    return body, Header(1, at_ms * MS, at_ms * MS, "here", "fem_solver", 1)
+
+
+def test_the_dent_is_carried_on_to_the_light() -> None:
+    dent = DentAhead()
+    assert dent.at(1000 * MS, "here") == (None, 0)
+    for at_ms in (1000, 1016, 1033):
+        dent.take(*answer(at_ms, 1e-6 * at_ms, lead_s=0.005))
+    body, at_ns = dent.at(1060 * MS, "here")
+    assert body is not None
+    assert at_ns == 1060 * MS
+    assert np.allclose(body.displacement_world_m, 1.055e-3, atol=1e-8)  # of the exposure then
+    body, at_ns = dent.at(2000 * MS, "here")  # no farther than 60 ms
+    assert at_ns == 1098 * MS
+    for at_ms, clock_id in ((1038, "here"), (1010, "here"), (1060, "elsewhere")):
+        body, at_ns = dent.at(at_ms * MS, clock_id)
+        assert at_ns == 1038 * MS
+        assert body is not None
+        assert np.allclose(body.displacement_world_m, 1.033e-3, atol=1e-8)
+
+
+def test_a_dent_of_another_method_is_not_carried_on_from() -> None:
+    dent = DentAhead()
+    dent.take(*answer(1000, 0.0))
+    dent.take(*answer(1033, 1e-3, method="nonlinear_table"))
+    body, at_ns = dent.at(1060 * MS, "here")
+    assert body is not None
+    assert (at_ns, float(body.displacement_world_m.max())) == (1033 * MS, np.float32(1e-3))
+    dent.take(*answer(1020, 5e-4, method="nonlinear_table"))  # time went back: a replay
+    assert dent.at(1060 * MS, "here")[1] == 1020 * MS

@@ -77,6 +77,8 @@ class Renderer(Node):
         self._shown, self._since_pixels = display, 0
 
     def on_soft_body(self, soft_body: SoftBody, header: Header) -> None:
+        if self._painter is not None:
+            self._painter.answered(soft_body, header)
         self._draw_if_due()
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from messages.base import Header
 from messages.clock import Clock
 from messages.types import (
     ArmState,
@@ -19,6 +20,7 @@ from messages.types import (
 )
 from nodes.node import Input
 from nodes.renderer.belief import SheetBelief, finger_tip_at
+from nodes.renderer.dent_ahead import DentAhead
 from nodes.renderer.lead import Lead
 from nodes.renderer.output import believed, both_eyes, drawn_for, which_eye
 from nodes.renderer.stage import Stage
@@ -57,7 +59,10 @@ class Painter:
         self._screen, self._ports, self._lead, self._clock = screen, ports, lead, clock
         self._stale_s = stale_s
         self._belief = SheetBelief(stale_s=stale_s)
+        self._dent = DentAhead()
         self._number = 0
+        if ports.soft_body.message is not None and ports.soft_body.header is not None:
+            self.answered(ports.soft_body.message, ports.soft_body.header)
 
     def paint(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
         """Draw a frame and hand it to the screen; also the exposure (ns) that it goes back to.
@@ -67,7 +72,7 @@ class Painter:
         ports, stage = self._ports, self.stage
         predicted_to_ns = self._lead.light_ns(begun_ns)
         lead_s = (predicted_to_ns - self._clock.now_ns()) * 1e-9
-        source_ns = self._shape(begun_ns)
+        source_ns, shaped_for_ns = self._shape(begun_ns, predicted_to_ns)
         tracked = ports.eye.message if ports.eye.age_s() <= self._stale_s else None
         eyes, across, eye_note = believed(stage.scene.eyes, tracked)
         finger_tip = finger_tip_at(ports.fingertip, lead_s, stale_s=self._stale_s)
@@ -111,7 +116,7 @@ class Painter:
             drawn_ns=drawn_ns,
             light_ns=light_ns,
             late_frames=self.late,
-            shaped_for_ns=self._shaped_for_ns(),
+            shaped_for_ns=shaped_for_ns,
             fingertip_world_m=np.zeros((0, 3)) if finger_tip is None else finger_tip[None],
             pixels=() if picture is None else (picture,),
         )
@@ -129,23 +134,23 @@ class Painter:
             update={"swapped_ns": swapped_ns, "light_ns": light_ns, "late_frames": self.late}
         )
 
-    def _shape(self, now_ns: int) -> int:
-        """Deform the drawn object as the newest soft body says, however old that is.
+    def answered(self, body: SoftBody, header: Header) -> None:
+        """Take in an answer of the solver."""
+        self._dent.take(body, header)
 
-        Returns the exposure (ns) that the picture goes back to.
+    def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
+        """Deform the drawn object as the soft body will be; a silent one's is held, however old.
+
+        Returns the exposure (ns) that the picture goes back to, and the instant of the dent.
         """
         ports, stage = self._ports, self.stage
-        skin, body = ports.skin.message, ports.soft_body.message
+        skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._stale_s
         if skin is not None and stage.mesh_id != skin.mesh_id:
             stage.follow(skin)
-        stage.shape(body if body is not None and body.mesh_id == stage.mesh_id else None)
-        fresh = ports.soft_body.age_s() <= self._stale_s
+        body, shaped_for_ns = self._dent.at(light_ns if fresh else 0, self._clock.id)
+        if body is None or body.mesh_id != stage.mesh_id:
+            body, shaped_for_ns = None, 0
+        stage.shape(body)
         header = ports.soft_body.header if fresh else ports.fingertip.header
         recent = fresh or ports.fingertip.age_s() <= self._stale_s
-        return header.source_ns if recent and header is not None else now_ns
-
-    def _shaped_for_ns(self) -> int:
-        body, header = self._ports.soft_body.message, self._ports.soft_body.header
-        if body is None or header is None or body.mesh_id != self.stage.mesh_id:
-            return 0
-        return header.source_ns + round(body.lead_s * 1e9)
+        return (header.source_ns if recent and header is not None else now_ns), shaped_for_ns
