@@ -59,6 +59,14 @@ CLOCKS_REMEMBERED = 16
 _log = logging.getLogger("flexsheet.bus")
 
 
+HEARTBEATS = {zmq.HEARTBEAT_IVL: 1000, zmq.HEARTBEAT_TIMEOUT: 5000, zmq.HEARTBEAT_TTL: 5000}
+"""Publishers ask by tcp, and tell subscribers to expect it; within a host nobody vanishes unseen.
+
+A subscriber must not ask by itself: libzmq 4.3.5 aborts the process when its heartbeat comes due
+after a publisher has gone whose messages still fill the queue.  For the same reason no publisher
+asks where it need not: a reader that is busy for long answers nothing, and is then hung up on.
+"""
+
 HANDSHAKE_FAILED: dict[int, str] = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "refuses our key; is it the one in its launch file?",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not speak with our keys; does it run without any?",
@@ -146,8 +154,11 @@ class Publisher:
                 self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
             # What is bound before keys are set is open to this host, which ipc alone reaches.
             for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
-                if endpoint.startswith("tcp:") and self._keys is not None and self._domain:
-                    self._keys.serve(self._socket, self._domain)
+                if endpoint.startswith("tcp:"):
+                    for option, value in HEARTBEATS.items():
+                        self._socket.setsockopt(option, value)
+                    if self._keys is not None and self._domain is not None:
+                        self._keys.serve(self._socket, self._domain)
                 endpoints.append(_bind(self._socket, self.topic, endpoint, keys=self._keys))
         except BaseException:
             self._socket.close(linger=0)
@@ -604,14 +615,6 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
     else:
         # A publisher is sent subscriptions and handshakes: a stranger shall not fill the memory.
         options[zmq.MAXMSGSIZE] = SUBSCRIPTION_BYTES
-        # Publishers ask, and tell subscribers to expect it.  A subscriber must not ask by itself:
-        # libzmq 4.3.5 aborts the process when its heartbeat comes due after a publisher has gone
-        # whose messages still fill the queue.
-        options |= {
-            zmq.HEARTBEAT_IVL: 1000,
-            zmq.HEARTBEAT_TIMEOUT: 5000,
-            zmq.HEARTBEAT_TTL: 5000,
-        }
     for option, value in options.items():
         opened.setsockopt(option, value)
     return opened
