@@ -1,0 +1,333 @@
+"""The page in a browser: real clicks, drags and keys, judged by what the graph then did."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import shutil
+import socket
+import tempfile
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import websockets
+from playwright.async_api import Locator, Page, async_playwright, expect
+
+from launch import runs
+from launch.plan import load_plan
+from launch.runs import Run
+from launch.supervisor import RunningGraph, local_endpoints
+from messages.bag import BagReader
+from messages.base import Header, Message
+from messages.bus import Subscriber
+from messages.topics import topic_named
+from messages.types import EStop, FingerPath, Moment, Recording, TwinFinger
+from nodes.node import PortCounts
+
+CHROMIUM = Path("/usr/bin/chromium")
+DRAWN_WITHOUT_GPU = (
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+ROOT = Path(__file__).resolve().parent.parent
+DEADLINE_S = 40.0
+OBJECT_PX = (244, 162)
+"""Where the object's middle is, behind the sheet, in the page of 860 x 420 pixels."""
+TWO_FRAMES = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+"""The page finds out what lies under the mouse when it draws."""
+
+pytestmark = [
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(not CHROMIUM.exists(), reason="needs Chromium: apt install chromium"),
+]
+
+
+@dataclass
+class Heard:
+    """What the graph said, by topic, in order."""
+
+    messages: dict[str, list[Any]] = field(default_factory=dict)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def take(self, name: str, message: Message, header: Header) -> None:
+        self.messages.setdefault(name, []).append(message)
+        self.changed.set()
+
+    def last(self, name: str) -> Any:
+        return self.messages.get(name, [None])[-1]
+
+    async def until(self, condition: Callable[[], bool], what: str) -> None:
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                while not condition():
+                    self.changed.clear()
+                    await self.changed.wait()
+        except TimeoutError:
+            pytest.fail(f"the graph never said: {what}")
+
+
+@contextlib.asynccontextmanager
+async def hearing(graph: RunningGraph, *names: str) -> AsyncIterator[Heard]:
+    heard, subscribers = Heard(), []
+    for name in names:
+        subscriber = Subscriber(
+            topic_named(name),
+            local_endpoints(graph.run, graph.plan.endpoints_to_read(name)),
+            lambda message, header, name=name: heard.take(name, message, header),
+            PortCounts(),
+        )
+        subscriber.start()
+        subscribers.append(subscriber)
+    try:
+        yield heard
+    finally:
+        for subscriber in subscribers:
+            subscriber.close()
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+@dataclass
+class Session:
+    """What one visit to the page left."""
+
+    heard: Heard
+    bag: Path
+    exit_codes: dict[str, int]
+    restarts: dict[str, int]
+    notes: dict[str, str] = field(default_factory=dict)
+
+
+async def refused(port: int, **headers: str) -> str:
+    """What a connection to the page's socket with such headers is answered."""
+    try:
+        async with websockets.connect(
+            f"ws://127.0.0.1:{port}", additional_headers=headers, open_timeout=DEADLINE_S
+        ):
+            return "welcome"
+    except websockets.InvalidStatus as error:
+        return str(error.response.status_code)
+
+
+def box_beside(page: Page, label: str) -> Locator:
+    """The text box after a label; viser does not tie the two together."""
+    return page.locator(
+        f"xpath=//*[normalize-space(text())='{label}']/following::input[not(@type='hidden')][1]"
+    )
+
+
+async def slide(page: Page, label: str, value: str) -> None:
+    """Type into the number beside a slider, as a keyboard user would."""
+    box = box_beside(page, label)
+    await box.fill(value)
+    await box.press("Enter")
+
+
+async def visit(page: Page, session: Session, port: int) -> None:
+    """Do with the page what a person would."""
+    await page.goto(f"http://127.0.0.1:{port}/")
+    await expect(page.get_by_role("button", name="E-STOP")).to_be_visible()
+    await expect(page.get_by_role("combobox", name="Scene")).to_have_value("cylinder")
+    await expect(page.get_by_role("status")).to_contain_text("Waiting for the arms")
+    # viser's notice that there is no graphics card lies over the sheet.
+    notice = page.get_by_role("alert").filter(has_text="Software WebGL")
+    await notice.get_by_role("button").evaluate("button => button.click()")
+    await expect(notice).to_have_count(0)
+    await begin_recording(page, session.heard)
+    await touch(page, session.heard)
+    await change_the_scene(page, session.heard)
+    await stop_and_release(page, session.heard)
+    await page.get_by_role("tab", name="Graph").click()
+    await expect(page.get_by_role("table", name="Topics")).to_contain_text("twin/finger_path")
+    session.notes["nodes"] = await page.get_by_role("table", name="Nodes").inner_text()
+    await end_recording(page, session.heard)
+
+
+async def begin_recording(page: Page, heard: Heard) -> None:
+    await page.get_by_role("tab", name="Record").click()
+    await box_beside(page, "Moment").fill("before anything")
+    await expect(page.get_by_role("button", name="Mark this moment")).to_be_visible()
+    await page.get_by_role("button", name="Mark this moment").click()
+    await expect(page.get_by_role("alert").last).to_contain_text("start recording")
+    await page.get_by_role("button", name="Start recording").click()
+    await heard.until(lambda: heard.last("recording") == Recording(running=True), "recording")
+    await box_beside(page, "Moment").fill("first touch")
+    await page.get_by_role("button", name="Mark this moment").click()
+    await heard.until(lambda: heard.last("moment") is not None, "the moment")
+
+
+async def touch(page: Page, heard: Heard) -> None:
+    await page.get_by_role("tab", name="Touch").click()
+    assert "twin/finger_path" not in heard.messages
+    x, y = OBJECT_PX
+    await page.mouse.move(x, y)
+    await page.evaluate(TWO_FRAMES)
+    await page.mouse.down()
+    for step in range(1, 9):
+        await page.evaluate(TWO_FRAMES)
+        await page.mouse.move(x - 2 * step, y)
+    await heard.until(
+        lambda: len(heard.messages.get("twin/finger_path", [])) > 2, "a dragged finger"
+    )
+    await page.mouse.up()
+    await heard.until(lambda: height_m(heard) < -0.002, "a finger at the object")
+    await page.keyboard.press("l")
+    await heard.until(lambda: height_m(heard) > 0.025, "a lifted finger")
+    await slide(page, "Across, mm", "30")
+    await heard.until(lambda: across_m(heard.last("twin/finger")) > 0.029, "a finger that is led")
+
+
+async def change_the_scene(page: Page, heard: Heard) -> None:
+    scenes = len(heard.messages["scene"])
+    await slide(page, "Stiffness, kPa", "9")
+    await heard.until(lambda: len(heard.messages["scene"]) > scenes, "a stiffer object")
+    await page.get_by_role("combobox", name="Scene").click()
+    await page.get_by_role("option", name="sphere").click()
+    await heard.until(lambda: heard.last("scene").name == "sphere", "another scene")
+
+
+async def stop_and_release(page: Page, heard: Heard) -> None:
+    await page.get_by_role("button", name="E-STOP").click()
+    await heard.until(lambda: engaged(heard) == "pressed at the console", "an e-stop")
+    await expect(page.get_by_role("status")).to_contain_text("E-STOP is engaged")
+    await page.get_by_role("button", name="Release").click()
+    await heard.until(lambda: engaged(heard) is None, "a release")
+    await page.keyboard.press("Escape")
+    await heard.until(lambda: engaged(heard) == "Escape at the console", "an e-stop by its key")
+
+
+async def end_recording(page: Page, heard: Heard) -> None:
+    await page.get_by_role("tab", name="Record").click()
+    await page.get_by_role("button", name="Stop recording").click()
+    await heard.until(lambda: heard.last("recording") == Recording(running=False), "its end")
+    await expect(page.get_by_role("combobox", name="Bag")).to_have_value(re.compile(r".*mcap"))
+    await page.get_by_role("button", name="Show the bag").click()
+    await expect(page.get_by_role("alert").last).to_contain_text(
+        "nothing in it that the page shows"
+    )
+
+
+def height_m(heard: Heard) -> float:
+    """Of the fingertip over the side of the cylinder that the first scene shows."""
+    finger, solid = heard.last("twin/finger"), heard.messages["scene"][0].object
+    across = finger.position_world_m[1:] - solid.world_from_object.position_m[1:]
+    return float(np.linalg.norm(across)) - solid.geometry.radius_m
+
+
+def across_m(finger: TwinFinger) -> float:
+    return float(finger.position_world_m[0])
+
+
+def engaged(heard: Heard) -> str | None:
+    estop = heard.last("estop")
+    return estop.reason if isinstance(estop, EStop) and estop.engaged else None
+
+
+@pytest.fixture(scope="module")
+def session() -> Any:
+    """One visit for all tests: a browser takes its time to start."""
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(runs.ROOT_VARIABLE, str(folder / "runs"))
+        yield asyncio.run(run_session(folder))
+    shutil.rmtree(folder)
+
+
+async def run_session(folder: Path) -> Session:
+    file = folder / "graph.yaml"
+    scenes = folder / "scenes"
+    scenes.mkdir()
+    for name in ("cylinder", "sphere"):
+        shutil.copy(ROOT / "launch" / "scenes" / f"{name}.yaml", scenes)
+    (scenes / "broken.yaml").write_text("name: broken\n")
+    file.write_text(
+        "scene: scenes/cylinder.yaml\n"
+        "nodes:\n"
+        "  twin_finger: {type: twin_finger, nice: 10}\n"
+        f"  recorder: {{type: recorder, parameters: {{bag: {folder}/bags/a.mcap, waits: true}}}}\n"
+    )
+    port = free_port()
+    settings = [f"console.page_port={port}", f"console.bags={folder}/bags"]
+    plan = load_plan(file, console=True, settings=settings)
+    names = ("scene", "twin/finger_path", "twin/finger", "estop", "recording", "moment")
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(120)
+        async with hearing(graph, *names) as heard:
+            session = Session(heard, folder / "bags" / "a.mcap", {}, {})
+            session.notes["foreign"] = await refused(port, Origin="http://evil.example")
+            async with async_playwright() as play:
+                browser = await play.chromium.launch(
+                    executable_path=str(CHROMIUM), args=list(DRAWN_WITHOUT_GPU)
+                )
+                page = await browser.new_page(viewport={"width": 860, "height": 420})
+                page.set_default_timeout(1e3 * DEADLINE_S)
+                expect.set_options(timeout=1e3 * DEADLINE_S)
+                await visit(page, session, port)
+                await browser.close()
+        session.restarts = dict(graph.restarts)
+        session.notes["log"] = scenes_left_out(graph.run)
+    session.exit_codes = graph.exit_codes
+    return session
+
+
+def scenes_left_out(run: Run) -> str:
+    return (run.logs / "launch.log").read_text()
+
+
+def test_nothing_crashed_and_all_ended_well(session: Session) -> None:
+    assert set(session.exit_codes.values()) == {0}
+    assert not any(session.restarts.values())
+    assert "error" not in session.notes["nodes"], session.notes["nodes"]
+
+
+def test_a_page_of_another_site_gets_no_socket(session: Session) -> None:
+    assert session.notes["foreign"] == "403"
+
+
+def test_a_scene_that_is_no_scene_is_left_out_with_the_reason(session: Session) -> None:
+    assert "scene broken.yaml is left out" in session.notes["log"]
+
+
+def test_the_bag_holds_what_was_done_to_the_page(session: Session) -> None:
+    entries = list(BagReader(session.bag))
+    by_topic: dict[str, list[Any]] = {}
+    for topic, message, _, _ in entries:
+        by_topic.setdefault(topic, []).append(message)
+    assert [one.label for one in by_topic["moment"] if isinstance(one, Moment)] == ["first touch"]
+    stops = [(one.engaged, one.reason) for one in by_topic["estop"]]
+    assert stops == [
+        (True, "pressed at the console"),
+        (False, "reset at the console"),
+        (True, "Escape at the console"),
+    ]
+    scenes = by_topic["scene"]
+    assert scenes[0].object.material.young_modulus_pa == pytest.approx(4000.0)
+    assert scenes[1].object.material.young_modulus_pa == pytest.approx(9000.0)
+    assert scenes[-1].name == "sphere"
+
+
+def test_the_finger_was_led_over_the_object_and_no_faster_than_it_may(session: Session) -> None:
+    paths = [
+        one for one in session.heard.messages["twin/finger_path"] if isinstance(one, FingerPath)
+    ]
+    ways = np.array([path.positions_world_m[0] for path in paths])
+    steps = np.linalg.norm(np.diff(ways, axis=0), axis=1)
+    assert steps.max() < 0.15 * 0.2 + 0.01
+    fingers = [one for one in session.heard.messages["twin/finger"] if isinstance(one, TwinFinger)]
+    solid = session.heard.messages["scene"][0].object
+    places = np.array([finger.position_world_m for finger in fingers if finger.path_label])
+    away = np.linalg.norm((places - solid.world_from_object.position_m)[:, 1:], axis=1)
+    # Between the points of its path the twin's finger takes the chord.
+    assert 0.003 < solid.geometry.radius_m - away.min() < 0.008
