@@ -464,6 +464,7 @@ class Bridge:
             self.control.mode,
             self.control.all_faults,
             age_s,
+            self.control.ready,
         )
 
     def hear(self, measured_rad: Floats) -> None:
@@ -526,7 +527,7 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
     geometries = [ArmGeometry(scene, side) for side in SIDES]
     starts = [geometry.joints_for_sheet(home, START_GUESS_RAD) for geometry in geometries]
     bridges = [
-        Bridge(geometry, ArmControl(patience, largest_lag_rad=0.12))
+        Bridge(geometry, ArmControl(patience, largest_lag_rad=0.12, by_itself=True))
         for _ in range(PAIRS)
         for geometry in geometries
     ]

@@ -7,6 +7,7 @@ import sys
 import typer
 
 from launch.commands import (
+    arms,
     bag,
     calibrate,
     calibrate_arms,
@@ -20,6 +21,7 @@ from launch.commands import (
     launching,
     node,
     prepare,
+    service,
     topic,
     trying,
 )
@@ -38,6 +40,8 @@ app.add_typer(node.app, name="node")
 app.add_typer(topic.app, name="topic")
 app.add_typer(bag.app, name="bag")
 app.add_typer(keys.app, name="keys")
+app.add_typer(arms.app, name="arms")
+app.add_typer(service.app, name="service")
 calibrate_arms.register(calibrate.app)
 calibrate_projector.register(calibrate.app)
 calibrate_sheet.register(calibrate.app)

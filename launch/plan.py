@@ -53,6 +53,9 @@ MAIN = "main"
 LAUNCHER, TOOLS = "launch", "tools"
 """Writers that are no nodes: the launching process, and command-line tools and experiments."""
 
+LAUNCHERS_TOPICS = ("host", "estop")
+"""What the launcher of each host writes: how the host is, and an e-stop that it keeps."""
+
 RECORDER_NICE = 5
 """What it reads waits for it in queues; nothing else waits."""
 
@@ -110,6 +113,12 @@ class NodeSpec(Strict):
     )
     restart: RestartSpec = RestartSpec()
     start_deadline_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
+    liveness_s: float | None = Field(
+        default=15.0,
+        ge=2.0,
+        allow_inf_nan=False,
+        description="a node without a sign of life for so long hangs and is killed; null: never",
+    )
     nice: int = Field(
         default=0, ge=0, le=19, description="how much it gives way to others on a busy computer"
     )
@@ -184,6 +193,7 @@ class PlannedNode(Strict):
     outputs: tuple[PlannedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
+    liveness_s: float | None = Field(default=None, description="none in bags from before")
     nice: int = Field(default=0, description="bags from before there was one have none")
 
 
@@ -351,6 +361,11 @@ def load_keys(path: Path) -> dict[str, str]:
     if problems:
         raise BadInputError(problems)
     return {name: host.key for name, host in spec.hosts.items() if host.key is not None}
+
+
+def launcher_on(host: str) -> str:
+    """The launcher of a host, as a writer."""
+    return LAUNCHER if host == MAIN else f"{LAUNCHER}_{host}"
 
 
 def load_scene(path: Path) -> Scene:
@@ -529,7 +544,8 @@ def _members(spec: LaunchFile, document: Document, problems: list[Problem]) -> l
     members = []
     for name, node_spec in spec.nodes.items():
         members.append(_Member(name, node_spec, ("nodes", name)))
-        if name in (LAUNCHER, TOOLS, *map(clock_node, spec.hosts)):
+        taken = (TOOLS, *map(clock_node, spec.hosts))
+        if name in taken or name.partition("_")[0] == LAUNCHER:
             problems.append(
                 document.problem(("nodes", name), f'"{name}" is taken', "give another name")
             )
@@ -715,6 +731,8 @@ def _writers(
             )
         elif not TOPICS[name].many_writers:
             writers[name] = [(TOOLS, MAIN)]
+    for name, host in product(LAUNCHERS_TOPICS, spec.hosts):
+        writers.setdefault(name, []).append((launcher_on(host), host))
     for topic in TOPICS.values():
         if topic.many_writers and topic.open_to_tools:
             writers.setdefault(topic.name, []).append((TOOLS, MAIN))
@@ -886,6 +904,7 @@ def _planned(
         + member.unconnected_ports("output"),
         restart=member.spec.restart,
         start_deadline_s=member.spec.start_deadline_s,
+        liveness_s=member.spec.liveness_s,
         nice=member.spec.nice,
     )
 

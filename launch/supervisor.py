@@ -27,6 +27,7 @@ from typing import Any, Self
 
 from launch.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from launch.documents import BadInputError, Problem, read_document
+from launch.host import HostVoice
 from launch.keys import KeyWatch, make_rings, ring_file
 from launch.plan import (
     LAUNCHER,
@@ -45,12 +46,17 @@ from messages.bus import Publisher, Source
 from messages.clock import SystemClock
 from messages.security import KeyRing, SecurityError
 from messages.topics import topic_named
+from messages.types import NodeProcess
 from nodes.runner import NodeConfig, PortConfig
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 ENTRY = Path(__file__).resolve().parent.parent / "flexsheet.py"
 STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
+LIVENESS_TURN_S = 0.5
+LAST_WORDS_S = 0.5
+"""For a hanging node to write where it is."""
+
 LOG_READ_BYTES = 65_536
 
 Report = Callable[[str, str], None]
@@ -81,6 +87,7 @@ class Child:
         self._log = (run.logs / f"{config.name}.log").open("ab", buffering=0)
         self._output, output_write = os.pipe()
         self._ready_fd, ready_write = os.pipe()
+        self._signs = 0
         try:
             with_pipe = config.model_copy(update={"ready_fd": ready_write})
             config_file.write_text(with_pipe.model_dump_json())
@@ -105,7 +112,7 @@ class Child:
         os.set_blocking(self._output, False)
         os.set_blocking(self._ready_fd, False)
         self._loop.add_reader(self._output, self._read_output)
-        self._loop.add_reader(self._ready_fd, self._read_ready)
+        self._loop.add_reader(self._ready_fd, self._read_life)
         self._loop.add_reader(self._pidfd, self._reap)
 
     @property
@@ -125,10 +132,31 @@ class Child:
             self._process.wait()
             self._reap()
 
-    def _read_ready(self) -> None:
-        if os.read(self._ready_fd, 64) and not self.ready.done():
+    def _read_life(self) -> None:
+        signs = os.read(self._ready_fd, 4096)
+        self._signs += len(signs)
+        if signs and not self.ready.done():
             self.ready.set_result(None)
-        self._loop.remove_reader(self._ready_fd)
+        if not signs:
+            self._loop.remove_reader(self._ready_fd)
+
+    async def silent_for(self, seconds: float) -> None:
+        """Until it has given no sign of life for so long, though we have listened all the while.
+
+        What counts is our own turns, not the clock: a launcher that stood still itself (suspended,
+        starved) has heard nobody, and that is nobody's fault.
+        """
+        heard, silence_s = self._signs, 0.0
+        while silence_s < seconds:
+            await asyncio.sleep(LIVENESS_TURN_S)
+            silence_s += LIVENESS_TURN_S
+            if self._signs != heard:
+                heard, silence_s = self._signs, 0.0
+
+    def end_hanging(self) -> None:
+        """Make it say where it hangs (Python's fault handler does), then kill it."""
+        self.signal(signal.SIGABRT)
+        self._loop.call_later(LAST_WORDS_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
         """Copy a piece of output to the log and report its lines; False when none is left."""
@@ -179,12 +207,14 @@ class RunningGraph:
         self.nodes = plan.nodes_on(host)
         self.exit_codes: dict[str, int] = {}
         self.restarts: dict[str, int] = {node.name: 0 for node in self.nodes}
+        self.hangs: dict[str, int] = {node.name: 0 for node in self.nodes}
         self.failure: NodeFailedError | None = None
         self._run: Run | None = None
         self._children: dict[str, Child] = {}
         self._keepers: dict[str, asyncio.Task[None]] = {}
         self._ready = {node.name: asyncio.Event() for node in self.nodes}
         self._publishers: list[Publisher] = []
+        self._voices: dict[str, HostVoice] = {}
         self._rings: dict[str, KeyRing] = {}
         self._keys_watch: asyncio.Task[None] | None = None
         self._lifeline: tuple[int, int] | None = None
@@ -289,6 +319,8 @@ class RunningGraph:
             for publisher in self._publishers:
                 publisher.close()
             self._publishers.clear()
+            for voice in self._voices.values():
+                await voice.close()
             if self._lifeline is not None:
                 for fd in self._lifeline:
                     os.close(fd)
@@ -321,6 +353,8 @@ class RunningGraph:
         self._lifeline = os.pipe()
         if self._host in (None, MAIN):
             self._publish_scene()
+        for host in self.plan.hosts if self._host is None else [self._host]:
+            self._start_voice(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
         for node in self.nodes:
             self._keepers[node.name] = asyncio.create_task(self._keep(node), name=node.name)
@@ -352,6 +386,38 @@ class RunningGraph:
             ),
         )
 
+    def _start_voice(self, host: str) -> None:
+        git = json.loads((self.run.directory / "git.json").read_text())
+        voice = HostVoice(
+            self.plan,
+            host,
+            run_id=self.run.id,
+            code=f"{(git['commit'] or 'unknown')[:12]}{'+' if git['changed'] else ''}",
+            processes=partial(self._processes, host),
+            endpoints=partial(local_endpoints, self.run),
+            sources=partial(local_sources, self.run),
+            keys=self._rings.get(host),
+            on_problem=partial(self._report, LAUNCHER),
+        )
+        self._voices[host] = voice
+        voice.start()
+
+    def _processes(self, host: str) -> tuple[NodeProcess, ...]:
+        return tuple(
+            NodeProcess(
+                name=node.name,
+                state="ready"
+                if self._ready[node.name].is_set()
+                else "starting"
+                if node.name in self.pids
+                else "away",
+                restarts=self.restarts[node.name],
+                hangs=self.hangs[node.name],
+            )
+            for node in self.nodes
+            if node.host == host
+        )
+
     async def _watch_keys(self) -> None:
         """Pass on what changes about the keys in the launch file or in our own files of them."""
         watch = KeyWatch(self.plan, self.run, self._rings)
@@ -371,6 +437,8 @@ class RunningGraph:
                 if host == MAIN:
                     for publisher in self._publishers:
                         publisher.renew_keys(change)
+                if host in self._voices:
+                    self._voices[host].renew_keys(change)
 
     async def _keep(self, node: PlannedNode) -> None:
         """Run the node again and again, as its policy says; NodeFailedError when for good."""
@@ -414,13 +482,31 @@ class RunningGraph:
         elif child.ready.done():
             self._ready[node.name].set()
             self._report(LAUNCHER, f"{node.name} is ready, pid {child.pid}")
+        hangs = not late and await self._outlives(child, node.liveness_s)
         # The future must outlive this task's cancellation: `stop` waits for it too.
         code = await asyncio.shield(child.exited)
         self._ready[node.name].clear()
         self.exit_codes[node.name] = code
         if late:
             return f"was not ready within {node.start_deadline_s:g} s"
+        if hangs:
+            self.hangs[node.name] += 1
+            return f"hung: no sign of life for {node.liveness_s:g} s; its log shows where"
         return describe_exit(code)
+
+    async def _outlives(self, child: Child, liveness_s: float | None) -> bool:
+        """Whether the process hangs, and so has to be ended; False when it ends by itself."""
+        if liveness_s is None:
+            return False
+        silence = asyncio.ensure_future(child.silent_for(liveness_s))
+        try:
+            await asyncio.wait((silence, child.exited), return_when=asyncio.FIRST_COMPLETED)
+            hangs = silence.done() and not child.exited.done()
+        finally:
+            silence.cancel()
+        if hangs:
+            child.end_hanging()
+        return hangs
 
     def _spawn(self, node: PlannedNode) -> Child:
         assert self._lifeline is not None  # made before any keeper

@@ -15,7 +15,7 @@ from messages.bus import Handler, Problem, Publisher, Subscriber
 from messages.clock import SystemClock
 from messages.security import KeyRing
 from messages.topics import topic_named
-from messages.types import Status
+from messages.types import HostStatus, Status
 from nodes.node import PortCounts
 
 READER_RECONNECT_S = 1.0
@@ -51,7 +51,8 @@ def subscriber_to(
         on_problem=on_problem,
         unopened=unopened,
         keys=keys_of(plan, run),
-        plan=None if wanted.message is Status else plan.hash,
+        # Who does not run our plan must be seen most of all.
+        plan=None if wanted.message in (Status, HostStatus) else plan.hash,
     )
 
 

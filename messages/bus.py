@@ -206,6 +206,10 @@ class Publisher:
         except zmq.Again:
             return found
 
+    def forget(self) -> None:
+        """Keep nothing for late subscribers any more, until the next message."""
+        self._last = None
+
     def close(self) -> None:
         """Give the endpoints free; what was sent is still delivered for half a second."""
         if self._socket.closed:

@@ -136,6 +136,10 @@ class ArmState(Message):
     side: Side
     mode: ArmMode
     faults: tuple[str, ...]
+    ready: bool = Field(
+        default=False, description="it may move: it was told so, and nothing has gone wrong since"
+    )
+    reason: str = Field(default="", description="why it does not follow; empty otherwise")
     joints_rad: Vector6
     joints_commanded_rad: Vector6
     world_from_flange: Transform
@@ -263,6 +267,16 @@ class Moment(Message):
     label: str = Field(max_length=200)
 
 
+class Arming(Message):
+    """A person's word that the arms may move (or, false, shall stop and let the sheet go).
+
+    After whatever has stopped them they stay where they are until somebody says so again.
+    """
+
+    ready: bool
+    reason: str = ""
+
+
 class PortStatus(Part):
     """One input or output of a node over the last second and since its start."""
 
@@ -328,6 +342,33 @@ class Status(Message):
     clock_offsets: tuple[ClockOffset, ...] = Field(
         default=(), description="of the other clocks that it hears, as it knows them"
     )
+
+
+class NodeProcess(Part):
+    """A node as its launcher knows it."""
+
+    name: str
+    state: Literal["starting", "ready", "away"] = Field(
+        description="away: it has ended, and starts again unless it may not"
+    )
+    restarts: int = Field(ge=0)
+    hangs: int = Field(ge=0, description="restarts because it gave no sign of life")
+
+
+class HostStatus(Message):
+    """How a computer is, from its launcher, once a second."""
+
+    host: str
+    run: str = Field(description="the run's identity")
+    plan_hash: str
+    code: str = Field(description="commit of the code, with + where it was changed since")
+    python: str
+    uptime_s: NonNegative
+    load_ratio: NonNegative = Field(description="of the last minute, over the number of cores")
+    disk_free_bytes: int = Field(ge=0, description="where bags go, or in the working folder")
+    memory_free_bytes: int = Field(ge=0)
+    nodes: tuple[NodeProcess, ...]
+    missing_devices: tuple[str, ...] = Field(description="what its nodes name and is not there")
 
 
 PathJoin = Literal["rounded_lines", "spline"]

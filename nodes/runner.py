@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ from messages.bus import Objection, Publisher, Source, Subscriber
 from messages.clock import SystemClock
 from messages.security import KeyRing, SecurityError
 from messages.topics import Delivery, Topic, topic_named
-from messages.types import EStop, Status
+from messages.types import Arming, EStop, HostStatus, Status
 from nodes import node_class
 from nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
 
@@ -128,7 +129,9 @@ class Links:
                 unopened=node.takes_frames,
                 keys=self.keys,
                 # How others are must be seen most of all when they are not as they should be.
-                plan=None if node_input.topic.message is Status else self._config.plan_hash,
+                plan=None
+                if node_input.topic.message in (Status, HostStatus)
+                else self._config.plan_hash,
                 objection=self._objection(node_input.topic),
             )
             subscriber.start()
@@ -140,15 +143,16 @@ class Links:
 
     def _objection(self, topic: Topic) -> Objection | None:
         allowed = self._config.estop_resetters
-        if topic.message is not EStop or allowed is None:
+        if topic.message not in (EStop, Arming) or allowed is None:
             return None
 
-        def objection(estop: EStop, header: Header) -> str | None:
-            if estop.engaged or header.writer in allowed:
+        def objection(word: EStop | Arming, header: Header) -> str | None:
+            asks = not word.engaged if isinstance(word, EStop) else word.ready
+            if not asks or header.writer in allowed:
                 return None
             return (
-                f"{header.writer} may not reset an e-stop; the launch file says whose hosts may: "
-                "hosts.NAME.may_reset_estop"
+                f"{header.writer} may not reset an e-stop or let the arms move; the launch file "
+                "says whose hosts may: hosts.NAME.may_reset_estop"
             )
 
         return objection
@@ -205,12 +209,13 @@ async def run_keys(links: Links) -> None:
         links.renew_keys()
 
 
-async def run_status(node: Node, process: psutil.Process) -> None:
-    """Publish the node's status once a second."""
+async def run_status(node: Node, process: psutil.Process, sign_of_life: Callable[[], None]) -> None:
+    """Publish the node's status once a second, and tell the launcher that the loop still turns."""
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
         node.status.publish(status_of(node, "running", process))
+        sign_of_life()
 
 
 def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
@@ -266,14 +271,15 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
     try:
         links.open_inputs(node)
         tasks = [asyncio.create_task(run_timer(node, timer)) for timer in timers_of(class_)]
-        tasks.append(asyncio.create_task(run_status(node, process)))
+        life = Life(config.ready_fd)
+        tasks.append(asyncio.create_task(run_status(node, process, life.sign)))
         tasks.append(asyncio.create_task(stop.wait()))
         if links.keys is not None:
             tasks.append(asyncio.create_task(run_keys(links)))
         # What setup built lives on; without this the collector walks it in the middle of a cycle.
         gc.collect()
         gc.freeze()
-        report_ready(config)
+        life.sign()
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
@@ -299,11 +305,24 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
         _, pending = await asyncio.wait(pending, timeout=CANCEL_AGAIN_S)
 
 
-def report_ready(config: NodeConfig) -> None:
-    """Tell the launcher, through the pipe it gave, that the node is set up."""
-    if config.ready_fd is not None:
-        os.write(config.ready_fd, b"ready\n")
-        os.close(config.ready_fd)
+class Life:
+    """The pipe to the launcher: the first byte says that the node is set up, others that it lives.
+
+    fd: the pipe's end, None where nobody listens.  A launcher that does not read keeps no node
+    waiting.
+    """
+
+    def __init__(self, fd: int | None) -> None:
+        self._fd = fd
+        if fd is not None:
+            os.set_blocking(fd, False)
+
+    def sign(self) -> None:
+        if self._fd is not None:
+            # Full, the pipe holds enough signs; broken, the launcher is gone, and its lifeline
+            # ends this process.
+            with suppress(BlockingIOError, BrokenPipeError):
+                os.write(self._fd, b".")
 
 
 async def run_until_signal(config: NodeConfig) -> None:

@@ -52,9 +52,9 @@ class Arm:
     command: Command
 
     @classmethod
-    def holding(cls, side: Side, motion: SheetMotion = HOME) -> Arm:
+    def holding(cls, side: Side, motion: SheetMotion = HOME, *, by_itself: bool = True) -> Arm:
         geometry = ArmGeometry(SCENE, side)
-        control = ArmControl(PATIENCE, largest_lag_rad=0.12)
+        control = ArmControl(PATIENCE, largest_lag_rad=0.12, by_itself=by_itself)
         joints = geometry.joints_for_sheet(motion, GUESS)
         arm = cls(geometry, control, joints, Command("idle", joints))
         control.take_measurement(joints, ())
@@ -76,6 +76,7 @@ class Arm:
             self.control.mode,
             self.control.all_faults,
             age_s,
+            self.control.ready,
         )
 
     @property
@@ -83,8 +84,11 @@ class Arm:
         return self.geometry.world_from_edge(self.joints)
 
 
-def pair(motion: SheetMotion = HOME) -> tuple[Arm, Arm]:
-    arms = Arm.holding("left", motion), Arm.holding("right", motion)
+def pair(motion: SheetMotion = HOME, *, by_itself: bool = True) -> tuple[Arm, Arm]:
+    arms = (
+        Arm.holding("left", motion, by_itself=by_itself),
+        Arm.holding("right", motion, by_itself=by_itself),
+    )
     for arm in arms:
         arm.control.mode = "idle"
     return arms

@@ -116,7 +116,11 @@ async def running_rig(
     for side in ("left", "right"):
         other = "right" if side == "left" else "left"
         nodes[side] = ArmBridge(
-            ArmBridgeParameters(side=side, port=twin.servers[side].port, **bridge_parameters),
+            ArmBridgeParameters(
+                side=side,
+                port=twin.servers[side].port,
+                **{"arming": "by_itself", **bridge_parameters},
+            ),
             name=f"bridge_{side}",
             clock=rig.clock,
             send=rig.send,

@@ -28,7 +28,7 @@ from tests.test_arm_loop import until as until_within
 pytestmark = pytest.mark.alone
 
 until = partial(until_within, within_s=40.0)
-PATIENT = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
+PATIENT = {"arming": "by_itself", "timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
 PATIENT_TWIN = {"watchdog_s": 0.8}
 SIDES = ("left", "right")
 LONGEST_M = 0.24 * 1.09

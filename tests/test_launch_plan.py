@@ -40,7 +40,7 @@ def test_a_plan_knows_every_endpoint(tmp_path: Path) -> None:
     assert plan.nodes["listener"].inputs[0].endpoints == ("ipc://@run/beacon.twin.finger",)
     assert plan.nodes["beacon"].parameters["rate_hz"] == 20.0
     assert plan.nodes["beacon"].parameters["ready_after_s"] == 0.0
-    assert [writer.name for writer in plan.writers["estop"]] == ["listener", "tools"]
+    assert [writer.name for writer in plan.writers["estop"]] == ["listener", "launch", "tools"]
 
 
 def test_the_same_file_gives_the_same_hash_and_another_value_another(tmp_path: Path) -> None:
@@ -215,7 +215,7 @@ def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
     assert recorder.parameters["bag"] == str(tmp_path / "a.mcap")
     assert recorder.parameters["compress"] is False
     assert {port.topic for port in recorder.inputs} == {
-        "twin/finger", "estop", "status", "display", "twin/finger_path", "eye",
+        "twin/finger", "arming", "estop", "host", "status", "display", "twin/finger_path", "eye",
         "recording", "moment",
     }  # fmt: skip
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import psutil
 import pytest
+import zmq
 
 from launch import runs, supervisor
 from launch.documents import BadInputError
@@ -109,17 +110,19 @@ async def test_a_nice_node_gives_way_as_a_process_and_as_a_session(tmp_path: Pat
 
 
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:
-    descriptors, threads = set(os.listdir("/proc/self/fd")), threading.active_count()
+    # ZeroMQ's own descriptors come with the first socket and stay.
+    zmq.Context.instance().socket(zmq.PUB).close()
+    descriptors, threads = len(os.listdir("/proc/self/fd")), threading.active_count()
     plan = plan_of(tmp_path, beacon=beacon(), listener=LISTENER)
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(DEADLINE_S)
         assert graph.pids.keys() == {"beacon", "listener"}
         assert all(os.getsid(pid) == pid for pid in graph.pids.values())
         assert [run.id for run in runs.live_runs()] == [graph.run.id]
-        assert len(sockets_in(runs_root)) == 4
+        assert len(sockets_in(runs_root)) == 6
     assert graph.exit_codes == {"beacon": 0, "listener": 0}
     assert_nothing_left(runs_root)
-    assert set(os.listdir("/proc/self/fd")) == descriptors
+    wait_until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors, "ZeroMQ's descriptors")
     assert threading.active_count() == threads
     assert (graph.run.logs / "launch.log").read_text().startswith(f"run {graph.run.id}")
 
@@ -187,6 +190,41 @@ async def test_a_node_that_is_not_ready_in_time_is_ended(tmp_path: Path, runs_ro
             await asyncio.wait_for(graph.wait_ready(), DEADLINE_S)
         assert graph.pids == {}
     assert_nothing_left(runs_root)
+
+
+async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: Path) -> None:
+    """One stands still as a whole, the loop of the other does not turn; the third is well."""
+    quiet = {"topics": {"twin__finger": None}, "liveness_s": 2.0, "restart": {"delay_s": 0.01}}
+    plan = plan_of(
+        tmp_path,
+        stopped=beacon(**quiet),
+        stuck=beacon(**quiet, parameters={"deaf": True}),
+        beacon=beacon(liveness_s=2.0),
+    )
+    said: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        graph.kill("stopped", signal.SIGSTOP)
+        async with asyncio.timeout(DEADLINE_S):
+            for name in ("stopped", "stuck"):
+                await graph.wait_ready_again(name, 1)
+        assert graph.hangs["stopped"] == graph.hangs["stuck"] == 1
+        assert graph.restarts["beacon"] == graph.hangs["beacon"] == 0
+        assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
+    told = "hung: no sign of life for 2 s; its log shows where; starts again in 0.01 s"
+    assert f"stuck {told}" in said
+
+
+async def test_silence_that_the_launcher_itself_was_absent_for_is_no_hang(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        # Both are suspended, as when somebody stops a whole machine, for longer than it may be.
+        graph.kill("beacon", signal.SIGSTOP)
+        time.sleep(2.5)  # noqa: ASYNC251 - the loop shall stand still
+        graph.kill("beacon", signal.SIGCONT)
+        await asyncio.sleep(1.0)
+        assert graph.hangs == graph.restarts == {"beacon": 0}
 
 
 async def test_waiting_for_ready_has_a_deadline_of_its_own(tmp_path: Path) -> None:

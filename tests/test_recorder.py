@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import errno
 import json
+import os
+import random
 import shutil
 import subprocess
 import sys
@@ -24,9 +26,10 @@ from messages.base import Header
 from messages.clock import VirtualClock
 from messages.topics import TOPICS
 from messages.types import EStop
-from messages.wire import encode
+from messages.wire import encode, read_envelope
 from nodes.recorder.files import free_path
-from nodes.recorder.node import Recorder, RecorderParameters
+from nodes.recorder.node import TRY_AGAIN_NS, Recorder
+from nodes.recorder.parameters import RecorderParameters
 
 pytestmark = pytest.mark.alone
 
@@ -130,26 +133,110 @@ async def test_a_place_that_cannot_be_written_is_a_clear_error(tmp_path: Path) -
     await node.close()
 
 
-async def test_a_full_disk_is_said_and_what_is_lost_is_counted(
+async def test_a_disk_that_refuses_is_said_and_what_is_lost_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    node = recorder(VirtualClock(), bag=tmp_path / "a.mcap")
+    clock = VirtualClock()
+    node = recorder(clock, bag=tmp_path / "a.mcap", keep_free_bytes=0)
     await node.setup()
     node.deliver("in/estop", *estop_message(1))
 
     def refuse(*arguments: Any) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
+        raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(BagWriter, "write_frames", refuse)
     for number in (2, 3, 4):
         node.deliver("in/estop", *estop_message(number))
+        node.watch_disk()
     assert node.inputs["in/estop"].counts.dropped == 3
     assert node.errors == 1
     assert node.note.startswith("NOT RECORDING")
-    assert "No space left" in node.note
+    assert "Input/output error" in node.note
+    # It is asked again after a while, in vain, and then it has come back.
+    clock.move_to(clock.now_ns() + TRY_AGAIN_NS)
+    node.watch_disk()
+    assert node.errors == 2
     monkeypatch.undo()
+    clock.move_to(clock.now_ns() + TRY_AGAIN_NS)
+    node.watch_disk()
+    node.deliver("in/estop", *estop_message(5))
     await node.close()
     assert len(list(BagReader(tmp_path / "a.mcap"))) == 1
+    assert names_in(tmp_path) == ["a-2.mcap", "a.mcap"]
+    again = BagReader(tmp_path / "a-2.mcap")
+    assert again.metadata["recording"]["lost_messages"] == "3"
+    # Latched, the newest of what was lost meanwhile comes first.
+    assert [header.sequence for _, _, header, _ in again] == [4, 5]
+
+
+@pytest.fixture
+def small_disk() -> Iterator[Path]:
+    """A disk of 48 MiB of its own."""
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=48m", "tmpfs", str(folder)],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if mounted.returncode:
+        folder.rmdir()
+        pytest.skip(f"no disk can be mounted here: {mounted.stderr.strip()}")
+    yield folder
+    subprocess.run(["umount", str(folder)], check=True)
+    folder.rmdir()
+
+
+@pytest.mark.parametrize("keep_free_bytes", [8 << 20, 0])
+async def test_on_a_full_disk_the_bag_ends_readable_and_another_goes_on(
+    small_disk: Path, keep_free_bytes: int
+) -> None:
+    """Looked at in time it ends with its index; filled up from one moment to the next, without."""
+    clock = VirtualClock()
+    node = recorder(clock, bag=small_disk / "a.mcap", keep_free_bytes=keep_free_bytes)
+    await node.setup()
+    sent = 0
+
+    def send(count: int) -> None:
+        nonlocal sent
+        for _ in range(count):
+            sent += 1
+            clock.move_to(clock.now_ns() + 1000)
+            # Beyond recognition, so that nothing makes it small.
+            reason = random.Random(sent).randbytes(20_000).hex()
+            header = Header(sent, sent, sent, "clock", "hand", 7)
+            node.deliver("in/status", encode(EStop(engaged=True, reason=reason), header), header)
+
+    send(20)
+    left = os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_frsize
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(left - (4 << 20)))
+    if keep_free_bytes:
+        node.watch_disk()
+    send(300)
+    assert node.note.startswith("NOT RECORDING")
+    lost = node.inputs["in/status"].counts.dropped
+    assert 100 < lost <= 300
+    first = BagReader(small_disk / "a.mcap")
+    assert first.complete == bool(keep_free_bytes)
+    kept = [header.sequence for _, _, header in read_headers(first)]
+    assert kept == list(range(1, len(kept) + 1))
+    # A chunk may not have made it.
+    assert 320 - lost - 60 <= len(kept) <= 320 - lost
+    filler.unlink()
+    node.watch_disk()
+    assert node.note.startswith("NOT RECORDING"), "it is not asked again at once"
+    clock.move_to(clock.now_ns() + TRY_AGAIN_NS)
+    node.watch_disk()
+    send(20)
+    await node.close()
+    second = BagReader(small_disk / "a-2.mcap")
+    assert second.complete
+    assert [header.sequence for _, _, header in read_headers(second)] == list(range(321, 341))
+    assert second.metadata["recording"]["lost_messages"] == str(lost)
+
+
+def read_headers(reader: BagReader) -> Iterator[tuple[str, list[Any], Header]]:
+    for topic, frames, _ in reader.frames():
+        yield topic, frames, read_envelope(frames, TOPICS["estop"]).header
 
 
 async def test_killed_it_loses_at_most_the_last_second(tmp_path: Path) -> None:

@@ -211,7 +211,8 @@ async def _record(
     from launch.plan import MAIN, RUN_DIRECTORY
     from launch.supervisor import local_sources
     from messages.topics import TOPICS
-    from nodes.recorder.node import RUN_FILES, Recorder, RecorderParameters
+    from nodes.recorder.node import Recorder
+    from nodes.recorder.parameters import RUN_FILES, RecorderParameters
     from nodes.runner import NodeConfig, PortConfig, run_node
 
     parameters = RecorderParameters(

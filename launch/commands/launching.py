@@ -68,6 +68,7 @@ async def run_graph(
     when_ready: Callable[[], None] = lambda: None,
 ) -> int:
     """Run the plan's nodes until a signal, or `duration_s` after they are ready; the exit code."""
+    from launch.notify import keep_telling, tell
     from launch.supervisor import NodeFailedError, RunningGraph
 
     asked_to_stop = asyncio.Event()
@@ -84,6 +85,7 @@ async def run_graph(
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
             loop.add_signal_handler(number, on_signal)
     stop = asyncio.create_task(asked_to_stop.wait())
+    turning = asyncio.create_task(keep_telling())
     try:
         async with graph:
             ready = asyncio.create_task(graph.wait_ready())
@@ -92,6 +94,7 @@ async def run_graph(
                 await asyncio.wait((ready, end, stop), return_when=asyncio.FIRST_COMPLETED)
                 if ready.done():
                     ready.result()
+                    tell("READY=1")
                     words.print(f"[green]all {len(graph.nodes)} nodes are ready[/]; Ctrl-C ends")
                     when_ready()
                     await asyncio.wait(
@@ -100,6 +103,7 @@ async def run_graph(
                 if end.done():
                     end.result()
             finally:
+                tell("STOPPING=1")
                 ready.cancel()
                 end.cancel()
                 await asyncio.gather(ready, end, return_exceptions=True)
@@ -108,6 +112,7 @@ async def run_graph(
         return FAILED
     finally:
         stop.cancel()
+        turning.cancel()
     words.print("stopped")
     return 0
 

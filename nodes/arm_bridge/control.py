@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import ArmMode, ArmState, EStop
+from messages.types import Arming, ArmMode, ArmState, EStop
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, pace, slowed
 from nodes.arm_bridge.kinematics import UnreachableError
@@ -71,6 +71,15 @@ ESTOP = "e-stop: "
 JUMP_RAD = 0.35
 """Joints that would have to go further than this at once are on another branch of solutions."""
 
+LET_GO_AFTER_S = 0.5
+"""An arm without a target lets the sheet go after so long: a moment's gap is not worth it."""
+
+READY_TOGETHER_S = 1.0
+"""An arm that was told to be ready is no longer, if the other has not become so by then."""
+
+OLDEST_ARMING_S = 1.0
+"""An older word was held up on the way; who gave it may no longer mean it."""
+
 
 LOOK_AGAIN_S = 0.5
 """How long a barred way stays barred before it is looked at again, the target having moved on."""
@@ -94,6 +103,7 @@ class OtherArm:
     mode: ArmMode
     faults: tuple[str, ...]
     age_s: float
+    ready: bool
 
     @classmethod
     def from_state(cls, state: ArmState, age_s: float) -> OtherArm:
@@ -105,6 +115,7 @@ class OtherArm:
             state.mode,
             state.faults,
             age_s,
+            state.ready,
         )
 
     @property
@@ -141,10 +152,15 @@ class ArmControl:
 
     mode, faults and reason are for people and for the other arm: faults hold what is wrong with
     this arm (latched until `reset`, but for a lost connection), reason why it does not follow.
+    ready: whether it may move.  A person makes it so, and whatever hinders the motion (a target or
+    the other arm silent for long, a lost connection, a fault, a stop) ends it: when all is well
+    again the arm stays where it is.  With `by_itself` it is ready whenever nothing hinders it.
     question: the way of which it wants to know, by `take_way`, whether it is clear; None: of none.
     """
 
-    def __init__(self, patience: Patience, *, largest_lag_rad: float) -> None:
+    def __init__(
+        self, patience: Patience, *, largest_lag_rad: float, by_itself: bool = False
+    ) -> None:
         self.mode: ArmMode = "disconnected"
         self.faults: tuple[str, ...] = ()
         self.reason = "not connected yet"
@@ -153,6 +169,12 @@ class ArmControl:
         self.last_measured_rad: Floats | None = None
         self.commanded_rad = np.zeros(6)
         self.question: Way | None = None
+        self.ready = by_itself
+        self._by_itself = by_itself
+        self._hindrance: str | None = self.reason
+        self._unready_since = ""
+        self._stood_down: str | None = None
+        self._waited_s = 0.0
         self._clear_way: Way | None = None
         self._barred: tuple[str, float] | None = None
         self._together = False
@@ -204,6 +226,8 @@ class ArmControl:
         """The arm cannot be reached: forget all but a latched fault or e-stop."""
         self.measured_rad = None
         self.mode, self.reason = "disconnected", text
+        self._hinder(text)
+        self._has_pulled = False
         self._forget_motion()
 
     def take_measurement(self, joints_rad: Floats, arm_faults: tuple[str, ...]) -> None:
@@ -217,6 +241,8 @@ class ArmControl:
             self._start_at(joints_rad)
             self._clear_arm = True
             self.mode, self.reason = "stopping", "the arm's watchdog stopped it"
+            self._hinder(self.reason)
+            self._has_pulled = False
         elif arm_faults and not self.faults:
             self.faults = tuple(f"arm: {text}" for text in arm_faults)
 
@@ -258,6 +284,54 @@ class ArmControl:
             self._clear_arm = True
         return True
 
+    def take_arming(self, arming: Arming, age_s: float) -> str | None:
+        """A person's word that the arm may move, or shall no longer; returns why it is refused."""
+        if not arming.ready:
+            self._stood_down = f"stood down: {arming.reason}" if arming.reason else "stood down"
+            return None
+        if not age_s <= OLDEST_ARMING_S:
+            return f"the word is {age_s:.1f} s old"
+        if self._hindrance not in (None, self._stood_down):
+            return self._hindrance
+        if not self.at_rest:
+            return "the arm still moves"
+        self._stood_down = self._hindrance = None
+        self._make_ready()
+        return None
+
+    def _make_ready(self) -> None:
+        self.ready, self._waited_s = True, 0.0
+
+    def _hinder(self, why: str) -> None:
+        """Something keeps the arm from moving: it is ready no longer."""
+        self._hindrance = why
+        if self.ready:
+            self.ready, self._unready_since, self._waited_s = False, why, 0.0
+
+    def _look_for_hindrance(self, goal: Goal | None, other: OtherArm | None) -> None:
+        """Whether the arm is, and stays, ready."""
+        silent = other is None or not other.age_s <= self._patience.stop_after_s
+        stopped = self.estop_reason is not None or (other is not None and other.estopped)
+        why = self._stood_down
+        if self.estop_reason is not None:
+            why = f"{ESTOP}{self.estop_reason}"
+        elif self.faults:
+            why = self.faults[0]
+        elif other is None or silent:
+            why = "the other arm is silent"
+        elif other.trouble is not None:
+            why = other.trouble
+        elif goal is None or not goal.overdue_s <= self._patience.stop_after_s:
+            why = why or "no sheet target"
+        if why is not None:
+            self._hinder(why)
+        else:
+            self._hindrance = None
+            if self._by_itself:
+                self._make_ready()
+        # To let go is a motion too: it belongs to the stop, and never comes after a silence.
+        self._has_pulled = self._has_pulled and not (silent or stopped)
+
     def step(
         self,
         geometry: ArmGeometry,
@@ -279,6 +353,10 @@ class ArmControl:
         if other is not None and not other.is_somewhere:
             other = None
         self._watch(geometry, other, measured)
+        self._look_for_hindrance(goal, other)
+        if clock_trouble:
+            self._hinder(clock_trouble)
+            self._has_pulled = False
         if self.estop_reason is not None:
             return self._stop("estop", f"{ESTOP}{self.estop_reason}", geometry, step_s)
         if other is not None and other.estopped:
@@ -303,8 +381,9 @@ class ArmControl:
             return self._stop("idle", "the other arm is silent", geometry, step_s)
         if other.trouble is not None:
             return self._stop_and_relax("idle", other.trouble, geometry, other, step_s)
-        if goal is None or not goal.overdue_s <= self._patience.stop_after_s:
-            return self._stop("idle", "no sheet target", geometry, step_s)
+        if goal is None or not self.ready or not other.ready:
+            return self._stand(geometry, other, step_s)
+        self._waited_s = 0.0
         if self._relax_from is not None:
             return self._stop("idle", "after relaxing", geometry, step_s)
         if not _is_sound(goal.motion):
@@ -316,6 +395,25 @@ class ArmControl:
         if self._sheet is None:
             return self._set_out(geometry, goal, other, measured, step_s)
         return self._follow(goal, self._sheet, geometry, other, step_s)
+
+    def _stand(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
+        """Not ready: stop, let the sheet go if that is still to be done, and stay."""
+        self._waited_s += step_s
+        if self.ready:
+            return self._wait_for_other(geometry, step_s)
+        why = self._hindrance
+        if why is None:
+            why = f"not ready since: {self._unready_since}" if self._unready_since else "not ready"
+        if self._waited_s > LET_GO_AFTER_S:
+            return self._stop_and_relax("idle", why, geometry, other, step_s)
+        return self._stop("idle", why, geometry, step_s)
+
+    def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
+        """The other arm may not move: this one stops too; not yet begun, it waits a moment."""
+        began = self._sheet is not None or not self.at_rest
+        if not self._by_itself and (began or self._waited_s > READY_TOGETHER_S):
+            self._hinder("the other arm is not ready")
+        return self._stop("idle", "the other arm is not ready", geometry, step_s)
 
     def _follow(
         self,

@@ -5,39 +5,19 @@ from __future__ import annotations
 import asyncio
 from typing import ClassVar
 
-from pydantic import Field
-
 from messages.base import Header
-from messages.scene import NonNegative, Positive, Scene
-from messages.types import ArmState, EStop, SheetTarget, Side
+from messages.scene import Scene
+from messages.types import Arming, ArmState, EStop, SheetTarget, Side
 from nodes.arm_bridge.control import ArmControl, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, Timing, goal_of
 from nodes.arm_bridge.link import ArmLinkError, ArmSilentError
-from nodes.arm_bridge.link_drivers import Driver, link_for
+from nodes.arm_bridge.link_drivers import link_for
 from nodes.arm_bridge.pacing import Pace
+from nodes.arm_bridge.parameters import ArmBridgeParameters
 from nodes.arm_bridge.report import Exchanged, arm_state
 from nodes.arm_bridge.way import Lookout
-from nodes.node import Input, Node, NodeParameters, Output, periodic
-
-
-class ArmBridgeParameters(NodeParameters):
-    side: Side
-    host: str = "127.0.0.1"
-    port: int = Field(default=5020, ge=1, le=65535)
-    rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0)
-    driver: Driver = "modbus"
-    timeout_s: Positive | None = Field(default=None, description="null: the driver's own")
-    servo_lag_s: NonNegative = Field(
-        default=0.03, description="how far the arm trails a command that moves evenly"
-    )
-    target_period_s: Positive | None = Field(
-        default=None, description="older than that is late; null: the period of the scene's camera"
-    )
-    hold_after_s: Positive = 0.02
-    stop_after_s: Positive = 0.1
-    furthest_extrapolation_s: Positive = 0.06
-    largest_lag_rad: Positive = 0.12
+from nodes.node import Input, Node, Output, periodic
 
 
 class ArmBridge(Node):
@@ -49,13 +29,18 @@ class ArmBridge(Node):
     sheet_target: Input[SheetTarget]
     other_arm: Input[ArmState]
     estop: Input[EStop]
+    arming: Input[Arming]
     arm: Output[ArmState]
 
     async def setup(self) -> None:
         given = self.parameters
         self._link = link_for(given.driver, given.host, given.port, given.timeout_s)
         patience = Patience(given.hold_after_s, given.stop_after_s)
-        self._control = ArmControl(patience, largest_lag_rad=given.largest_lag_rad)
+        self._control = ArmControl(
+            patience,
+            largest_lag_rad=given.largest_lag_rad,
+            by_itself=given.arming == "by_itself",
+        )
         self._geometry: ArmGeometry | None = None
         self._newest, self._cycle_ns, self._failures = Exchanged(), 0, 0
         self._cycling = asyncio.Lock()
@@ -86,6 +71,10 @@ class ArmBridge(Node):
         doubt = self.estop.clock_trouble
         if refusal := self._control.take_estop(estop, header.source_ns, doubt):
             self.log.warning("reset refused", reason=refusal)
+
+    def on_arming(self, arming: Arming, header: Header) -> None:
+        if refusal := self._control.take_arming(arming, self.arming.age_s()):
+            self.log.warning("not made ready", reason=refusal)
 
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
         """A target is passed on when it comes: at the next beat it would be 7 ms older."""

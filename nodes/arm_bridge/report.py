@@ -46,6 +46,8 @@ def arm_state(
         side=geometry.side,
         mode=control.mode,
         faults=control.all_faults,
+        ready=control.ready,
+        reason=control.reason,
         joints_rad=measured,
         joints_commanded_rad=control.commanded_rad,
         world_from_flange=geometry.world_from_flange(measured),

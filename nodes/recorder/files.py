@@ -1,9 +1,15 @@
-"""Names of bag files."""
+"""Bag files: their names, what each begins with, and room for them."""
 
 from __future__ import annotations
 
+import mimetypes
+import os
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
+
+from messages.bag import BagError, BagWriter
 
 
 def free_path(path: Path) -> Path:
@@ -18,3 +24,25 @@ def free_path(path: Path) -> Path:
         if not candidate.exists():
             return candidate
     raise AssertionError("count() does not end")
+
+
+def free_bytes(folder: Path) -> int:
+    """What is left for us on the disk of a folder; OSError where it is gone."""
+    state = os.statvfs(folder)
+    return state.f_bavail * state.f_frsize
+
+
+def open_bag(
+    path: Path, recording: Mapping[str, str], *, compress: bool, attach: Iterable[Path]
+) -> BagWriter:
+    """A new bag at a free path, with the files to attach in it; raises BagError, OSError."""
+    bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
+    try:
+        for file in attach:
+            media_type = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
+            bag.add_attachment(file.name, file.read_bytes(), media_type)
+    except BaseException:
+        with suppress(BagError):
+            bag.close()
+        raise
+    return bag

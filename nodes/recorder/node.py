@@ -2,53 +2,31 @@
 
 from __future__ import annotations
 
-import mimetypes
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar
-
-from pydantic import Field
 
 from messages.bag import BagError, BagWriter
 from messages.base import Header
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import Recording
 from messages.wire import decode
-from nodes.node import Input, Node, NodeParameters
-from nodes.recorder.files import free_path
+from nodes.node import Input, Node, periodic
+from nodes.recorder.files import free_bytes, open_bag
+from nodes.recorder.parameters import RecorderParameters
 
-RUN_FILES = tuple(
-    Path("@run") / name for name in ("launch.yaml", "scene.yaml", "plan.json", "git.json")
-)
-
-
-class RecorderParameters(NodeParameters):
-    """Which topics go to which bag."""
-
-    bag: Path = Field(description="file to write; %Y%m%d-%H%M%S and the like become its start")
-    topics: tuple[str, ...] = Field(
-        default=(), description="empty: all that the table of topics says are logged"
-    )
-    also: tuple[str, ...] = Field(default=(), description="topics beside those, as stereo")
-    compress: bool | None = Field(
-        default=None,
-        description="null: unless pictures come, which take longer to compress than to write",
-    )
-    waits: bool = Field(
-        default=False,
-        description="record only while a `recording` message says so, to a bag for each time",
-    )
-    attach: tuple[Path, ...] = Field(
-        default=RUN_FILES, description="files that go into the bag; @run is the run's directory"
-    )
+TRY_AGAIN_NS = 5_000_000_000
+"""After a disk has refused, it is not asked again for so long."""
 
 
 class Recorder(Node):
     """Writes every message that arrives; an existing bag is never overwritten.
 
-    When the disk refuses, the graph goes on without a recording: what is not written is counted as
-    dropped, and the status says why.
+    When the disk is full or refuses, the graph goes on without a recording: the bag is ended, what
+    is not written is counted as dropped, the status says so; and when there is room again, another
+    bag goes on, with the last messages of all latched topics first.
     """
 
     parameters: RecorderParameters
@@ -71,8 +49,9 @@ class Recorder(Node):
             if port.startswith("in/"):
                 self.inputs[port] = Input(topic_named(topic), self.clock)
         self._bag: BagWriter | None = None
-        self._failed = False
+        self._path, self._wanted = Path(), False
         self._latched: dict[tuple[str, str], tuple[Any, Header]] = {}
+        self._lost, self._try_again_ns = 0, 0
 
     async def setup(self) -> None:
         if self.parameters.waits:
@@ -81,74 +60,103 @@ class Recorder(Node):
             self._open()
 
     def _open(self) -> None:
+        self._wanted, self._lost = True, 0
         # The one use of the time of day: it names the bag, and tells people when it was.
         now = datetime.now(UTC)
-        path = Path(now.astimezone().strftime(str(self.parameters.bag)))
+        self._path = Path(now.astimezone().strftime(str(self.parameters.bag)))
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise BagError(f"{path.parent}: cannot be made: {error.strerror}") from error
+            raise BagError(f"{self._path.parent}: cannot be made: {error.strerror}") from error
+        self._begin_bag()
+        self.watch_disk()
+
+    def _begin_bag(self, **more: str) -> None:
         recording = {
             "clock_id": self.clock.id,
             "started_ns": str(self.clock.now_ns()),
-            "started": now.isoformat(),
+            "started": datetime.now(UTC).isoformat(),
             "plan_hash": self.plan_hash,
+            **more,
         }
         compress = self.parameters.compress
         if compress is None:
             # The camera's pixels are what the table does not log by itself.
             compress = all(source.topic.logged for source in self.inputs.values())
-        self._bag = bag = BagWriter(free_path(path), {"recording": recording}, compress=compress)
-        self._failed = False
-        for file in self.parameters.attach:
-            media_type = mimetypes.guess_type(file.name)[0] or "application/octet-stream"
-            bag.add_attachment(file.name, file.read_bytes(), media_type)
+        self._bag = bag = open_bag(
+            self._path, recording, compress=compress, attach=self.parameters.attach
+        )
         for (port, _), (message, header) in self._latched.items():
             bag.write_frames(self.inputs[port].topic, message, header, self.clock.now_ns())
         bag.flush()
         self.note = f"records to {bag.path}"
-        self.log.info("recording", bag=str(bag.path), topics=self._topics())
+        topics = [source.topic.name for source in self.inputs.values()]
+        self.log.info("recording", bag=str(bag.path), topics=topics)
 
-    def _topics(self) -> list[str]:
-        return [source.topic.name for source in self.inputs.values()]
+    @periodic("watch_hz")
+    def watch_disk(self) -> None:
+        """End the bag while there is room for its index; begin another when there is room again."""
+        if not self._wanted:
+            return
+        free, keep = free_bytes(self._path.parent), self.parameters.keep_free_bytes
+        if self._bag is not None and free < keep:
+            self._end_bag(OSError(f"{free >> 20} MiB are free at {self._path.parent}"))
+        elif self._bag is None and free >= 2 * keep and self.clock.now_ns() >= self._try_again_ns:
+            lost, self._lost = self._lost, 0
+            try:
+                self._begin_bag(lost_messages=str(lost))
+            except (BagError, OSError) as error:
+                self._lost += lost
+                self._end_bag(error)
+
+    def _end_bag(self, why: Exception) -> None:
+        """Keep what is written; say why there is no more."""
+        bag, self._bag = self._bag, None
+        self._try_again_ns = self.clock.now_ns() + TRY_AGAIN_NS
+        where = f"; {bag.messages} messages are in {bag.path}" if bag and bag.messages else ""
+        self.note = f"NOT RECORDING: {why}{where}"
+        self.report_error("recording", why)
+        if bag is not None:
+            # What it says of a disk that refuses is known already; a cut bag can be read.
+            with suppress(BagError):
+                bag.close()
+            if bag.messages == 0:
+                bag.path.unlink(missing_ok=True)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
         """Write a message's frames; called instead of handlers, since frames are taken unopened."""
         source = self.inputs[port]
         now_ns = self.clock.now_ns()
         source.counts.count(header, now_ns)
-        if self.parameters.waits:
-            if source.topic.name == "recording":
-                self._heed(decode(message, Recording)[0])
-            elif source.topic.delivery is Delivery.LATCHED:
-                self._latched[port, header.writer] = (message, header)
-        if self._bag is None and self.parameters.waits:
-            return
-        if self._bag is None or self._failed:
+        if self.parameters.waits and source.topic.name == "recording":
+            self._heed(decode(message, Recording)[0])
+        elif source.topic.delivery is Delivery.LATCHED:
+            self._latched[port, header.writer] = (message, header)
+        if self._bag is not None:
+            try:
+                self._bag.write_frames(source.topic, message, header, now_ns)
+            except (BagError, OSError) as error:
+                self._end_bag(error)
+            else:
+                self.note = f"{self._bag.messages} messages in {self._bag.path}"
+                return
+        if self._wanted:
             source.counts.dropped += 1
-            return
-        try:
-            self._bag.write_frames(source.topic, message, header, now_ns)
-        except (BagError, OSError) as error:
-            self._failed = True
-            source.counts.dropped += 1
-            self.note = f"NOT RECORDING: {error}"
-            self.report_error("recording", error)
-        else:
-            self.note = f"{self._bag.messages} messages in {self._bag.path}"
+            self._lost += 1
 
     def _heed(self, told: Recording) -> None:
         """Begin a bag, or end the one that is being written; what cannot be is reported."""
         try:
-            if told.running and self._bag is None:
+            if told.running and not self._wanted:
                 self._open()
-            elif not told.running and self._bag is not None:
-                bag, self._bag = self._bag, None
+            elif not told.running:
+                self._wanted, bag, self._bag = False, self._bag, None
+                if bag is None:
+                    return
                 bag.close()
                 self.note = f"recorded {bag.messages} messages in {bag.path}"
         except (BagError, OSError) as error:
-            self.note = f"NOT RECORDING: {error}"
-            self.report_error("recording", error)
+            self._end_bag(error)
 
     async def close(self) -> None:
         if self._bag is not None:

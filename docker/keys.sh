@@ -1,0 +1,18 @@
+#!/bin/sh
+# Makes a key pair for each host that runs in a container and writes the public halves into the
+# launch file: docker/keys.sh LAUNCH_FILE [HOST...].  On three machines each makes its own instead
+# (docs/deploy.md): a secret key never leaves its computer.
+set -eu
+launch_file=$1
+shift
+[ $# -gt 0 ] || set -- main left right
+here=$(dirname "$0")
+for host in "$@"; do
+    mkdir -p -m 700 "$here/keys/$host"
+    if [ ! -e "$here/keys/$host/$host.secret" ]; then
+        FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys new "$host"
+    fi
+    FLEXSHEET_KEYS="$here/keys/$host" flexsheet keys install "$launch_file" "$host"
+done
+# In the containers flexsheet is user 1000.
+[ "$(id -u)" -ne 0 ] || chown -R 1000 "$here/keys"

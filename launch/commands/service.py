@@ -1,0 +1,57 @@
+"""`flexsheet service`: run one host of a launch file under systemd."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from launch.commands.output import BAD_INPUT, CommandError, words
+
+app = typer.Typer(no_args_is_help=True, help="One host of a launch file as a systemd service.")
+
+USER_PATTERN = "abcdefghijklmnopqrstuvwxyz0123456789_-"
+
+
+@app.command()
+def install(
+    *,
+    launch_file: Annotated[Path, typer.Argument(metavar="LAUNCH_FILE")],
+    host: Annotated[str, typer.Option(help="Which of its hosts this computer is.")],
+    user: Annotated[str, typer.Option(help="Who runs it; must exist.")] = "flexsheet",
+    root: Annotated[Path, typer.Option(help="Where the system lies.")] = Path("/"),
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print, write nothing.")] = False,
+) -> None:
+    """Write the unit flexsheet@.service and the host's environment; start nothing."""
+    from launch.plan import load_plan
+    from launch.service import files_of
+
+    plan = load_plan(launch_file)
+    if host not in plan.hosts:
+        raise CommandError(
+            f'{launch_file}: there is no host "{host}"; there are: {", ".join(plan.hosts)}',
+            BAD_INPUT,
+        )
+    if not user or set(user) - set(USER_PATTERN):
+        raise CommandError(f'--user "{user}" is no name of a user', BAD_INPUT)
+    for file in files_of(launch_file=launch_file, host=host, user=user, root=root):
+        if dry_run:
+            print(f"# {file.path}\n{file.text}")
+            continue
+        try:
+            file.path.parent.mkdir(parents=True, exist_ok=True)
+            file.path.write_text(file.text)
+            os.chmod(file.path, file.mode)
+        except OSError as error:
+            raise CommandError(
+                f"{file.path}: cannot be written: {error.strerror}; as root?"
+            ) from error
+        words.print(f"wrote {file.path}", markup=False)
+    if not dry_run:
+        words.print(
+            f"next: systemctl daemon-reload && systemctl enable --now flexsheet@{host}; "
+            f"its words: journalctl -fu flexsheet@{host}",
+            markup=False,
+        )

@@ -1,0 +1,43 @@
+"""The systemd unit of one host: its text, and where it and what belongs to it is put."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+TEMPLATE = Path(__file__).parent / "systemd" / "flexsheet@.service"
+SOFTWARE = Path(__file__).resolve().parent.parent
+
+
+@dataclass(frozen=True, slots=True)
+class Installed:
+    """A file to be written: where, with what, and the mode."""
+
+    path: Path
+    text: str
+    mode: int = 0o644
+
+
+def files_of(
+    *, launch_file: Path, host: str, user: str, root: Path, flexsheet: Path | None = None
+) -> Iterator[Installed]:
+    """The unit and the host's environment file, under `root` ("/" on a real computer).
+
+    flexsheet: the command; default: the one beside this Python.
+    """
+    command = flexsheet or Path(sys.executable).parent / "flexsheet"
+    unit = TEMPLATE.read_text()
+    for key, value in (
+        ("@SOFTWARE@", str(SOFTWARE)),
+        ("@USER@", user),
+        ("@FLEXSHEET@", str(command)),
+    ):
+        unit = unit.replace(key, value)
+    yield Installed(root / "etc/systemd/system/flexsheet@.service", unit)
+    yield Installed(
+        root / f"etc/flexsheet/{host}.env",
+        f"# What flexsheet@{host}.service runs; the file must be the same on all hosts.\n"
+        f"FLEXSHEET_LAUNCH_FILE={launch_file.resolve()}\n",
+    )

@@ -1,0 +1,36 @@
+"""What an arm's bridge is told by the launch file."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from messages.scene import NonNegative, Positive
+from messages.types import Side
+from nodes.arm_bridge.link_drivers import Driver
+from nodes.node import NodeParameters
+
+
+class ArmBridgeParameters(NodeParameters):
+    side: Side
+    host: str = "127.0.0.1"
+    port: int = Field(default=5020, ge=1, le=65535)
+    rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0)
+    driver: Driver = "modbus"
+    timeout_s: Positive | None = Field(default=None, description="null: the driver's own")
+    servo_lag_s: NonNegative = Field(
+        default=0.03, description="how far the arm trails a command that moves evenly"
+    )
+    target_period_s: Positive | None = Field(
+        default=None, description="older than that is late; null: the period of the scene's camera"
+    )
+    hold_after_s: Positive = 0.02
+    stop_after_s: Positive = 0.1
+    furthest_extrapolation_s: Positive = 0.06
+    largest_lag_rad: Positive = 0.12
+    arming: Literal["by_command", "by_itself"] = Field(
+        default="by_command",
+        description="whether a person must say that it may move (flexsheet arms ready), at first "
+        "and after each stop; by_itself is for simulated arms",
+    )

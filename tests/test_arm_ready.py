@@ -1,0 +1,251 @@
+"""An arm moves when a person has said that it may; after each stop, when he says so again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from ruamel.yaml import YAML
+
+from launch.plan import load_plan
+from messages.base import Header
+from messages.clock import VirtualClock
+from messages.types import Arming
+from nodes.arm_bridge.control import LET_GO_AFTER_S, OLDEST_ARMING_S, READY_TOGETHER_S
+from nodes.arm_bridge.goal import Goal
+from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
+from tests.test_arm_loop import SCENE_FILE
+
+GO, STAND_DOWN = Arming(ready=True), Arming(ready=False, reason="lunch")
+GOAL = on_time(sheet_at(stretch=1.06))
+NO_TARGET = replace(GOAL, overdue_s=0.2)
+SLACK_M = 0.24
+Arms = tuple[Arm, Arm]
+
+
+def unready() -> Arms:
+    return pair(sheet_at(stretch=1.06), by_itself=False)
+
+
+def say_go(arms: Arms) -> list[str | None]:
+    return [arm.control.take_arming(GO, 0.01) for arm in arms]
+
+
+def following() -> Arms:
+    arms = unready()
+    run(arms, GOAL, 3)
+    assert say_go(arms) == [None, None]
+    run(arms, GOAL, 60)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+    return arms
+
+
+def assert_stands(arms: Arms, goal: Goal | None = GOAL, cycles: int = 250) -> None:
+    places = [arm.joints.copy() for arm in arms]
+    run(arms, goal, cycles)
+    assert not any(arm.control.ready for arm in arms)
+    for arm, place in zip(arms, places, strict=True):
+        assert (arm.joints == place).all()
+
+
+def test_nothing_moves_before_somebody_says_so() -> None:
+    arms = unready()
+    assert_stands(arms, on_time(sheet_at(0.03)))
+    assert {arm.control.reason for arm in arms} == {"not ready"}
+    assert say_go(arms) == [None, None]
+    run(arms, on_time(sheet_at(0.03)), 500)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+    assert arms[0].edge[1, 3] == pytest.approx(0.03, abs=1e-4)
+
+
+def test_without_targets_both_stop_let_go_and_stay_when_they_come_again() -> None:
+    arms = following()
+    run(arms, NO_TARGET, 20)
+    assert {arm.control.mode for arm in arms} == {"idle"}
+    assert distance(arms) == pytest.approx(SLACK_M * 1.06, abs=1e-6)
+    run(arms, NO_TARGET, round(3.0 / STEP_S))
+    assert distance(arms) == pytest.approx(SLACK_M, abs=5e-4)
+    assert_stands(arms)
+    assert arms[0].control.reason == "not ready since: no sheet target"
+    assert say_go(arms) == [None, None]
+    run(arms, GOAL, 600)
+    assert distance(arms) == pytest.approx(SLACK_M * 1.06, abs=1e-6)
+
+
+def test_a_target_that_is_missing_for_a_moment_costs_no_tension_but_the_word() -> None:
+    arms = following()
+    run(arms, NO_TARGET, round(0.5 * LET_GO_AFTER_S / STEP_S))
+    run(arms, GOAL, 2)
+    assert distance(arms) == pytest.approx(SLACK_M * 1.06, abs=1e-6)
+    assert {arm.control.mode for arm in arms} == {"idle"}
+
+
+def test_when_the_other_arm_falls_silent_the_sheet_stays_as_it_is_for_good() -> None:
+    arms = following()
+    for _ in range(300):
+        for arm, other in (arms, arms[::-1]):
+            arm.cycle(GOAL, other.as_other(age_s=0.3))
+    assert {arm.control.reason for arm in arms} == {"the other arm is silent"}
+    # To let go now would be a motion on return.
+    assert_stands(arms)
+    assert distance(arms) == pytest.approx(SLACK_M * 1.06, abs=1e-6)
+    assert say_go(arms) == [None, None]
+    run(arms, GOAL, 100)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+
+
+def lose_arm(arm: Arm) -> None:
+    arm.control.lose_connection("no answer")
+
+
+def trip_watchdog(arm: Arm) -> None:
+    arm.control.take_measurement(arm.joints, ("watchdog: no command",))
+
+
+@pytest.mark.parametrize("trouble", [lose_arm, trip_watchdog])
+def test_an_arm_that_was_away_comes_back_standing(trouble: Callable[[Arm], None]) -> None:
+    arms = following()
+    trouble(arms[0])
+    arms[1].cycle(GOAL, arms[0].as_other())
+    run(arms, GOAL, 700)
+    assert_stands(arms)
+    # Both say why, to whoever stands before them.
+    assert all(arm.control.reason.startswith("not ready since: ") for arm in arms)
+    assert say_go(arms) == [None, None]
+    run(arms, GOAL, 400)
+    assert {arm.control.mode for arm in arms} == {"follow"}
+
+
+def test_clocks_in_doubt_take_the_word_back_too() -> None:
+    arms = following()
+    for arm, other in (arms, arms[::-1]):
+        arm.control.step(arm.geometry, GOAL, other.as_other(), STEP_S, "clocks: 9 ms apart")
+    assert arms[0].control.take_arming(GO, 0.0) == "clocks: 9 ms apart"
+    assert_stands(arms)
+    assert arms[1].control.reason == "not ready since: clocks: 9 ms apart"
+
+
+def test_a_reset_alone_moves_nothing() -> None:
+    for stop in ("fault", "estop"):
+        arms = following()
+        if stop == "fault":
+            arms[0].control.faults = ("drill",)
+        else:
+            for arm in arms:
+                arm.control.engage_estop("button")
+        run(arms, GOAL, 400)
+        assert say_go(arms) != [None, None]
+        assert all(arm.control.reset() for arm in arms)
+        assert_stands(arms)
+        assert say_go(arms) == [None, None]
+        run(arms, GOAL, 400)
+        assert {arm.control.mode for arm in arms} == {"follow"}
+
+
+def test_the_word_is_refused_where_it_cannot_be_meant() -> None:
+    arms = unready()
+    assert say_go(arms) == ["not connected yet", "not connected yet"]
+    run(arms, None, 3)
+    assert say_go(arms) == ["no sheet target", "no sheet target"]
+    run(arms, GOAL, 3)
+    assert arms[0].control.take_arming(GO, OLDEST_ARMING_S + 0.5) == "the word is 1.5 s old"
+    assert "nan" in str(arms[0].control.take_arming(GO, float("nan")))
+    assert_stands(arms)
+    arms, up = following(), np.array([0.0, 0.15, 0.0, 0.0, 0.0, 0.0])
+    for number in range(60):
+        shifted = sheet_at(0.15 * number * STEP_S, stretch=1.06)
+        run(arms, on_time(replace(shifted, twist_world=up)), 1)
+    run(arms, NO_TARGET, 1)
+    run(arms, GOAL, 1)
+    assert arms[0].control.take_arming(GO, 0.0) == "the arm still moves"
+
+
+def test_one_arm_alone_is_not_ready_for_long() -> None:
+    arms = unready()
+    run(arms, GOAL, 3)
+    assert arms[0].control.take_arming(GO, 0.0) is None
+    run(arms, GOAL, round(0.5 * READY_TOGETHER_S / STEP_S))
+    assert arms[0].control.ready
+    run(arms, GOAL, round(0.6 * READY_TOGETHER_S / STEP_S))
+    assert not arms[0].control.ready
+    # Told so now, the second must not find the first still waiting.
+    assert arms[1].control.take_arming(GO, 0.0) is None
+    run(arms, GOAL, 3)
+    assert {arm.control.mode for arm in arms} == {"idle"}
+
+
+def test_told_to_stand_down_both_stop_and_let_go() -> None:
+    for arms in (following(), pair(sheet_at(stretch=1.06))):
+        run(arms, GOAL, 60)
+        for arm in arms:
+            assert arm.control.take_arming(STAND_DOWN, 99.0) is None
+        run(arms, GOAL, 600)
+        assert distance(arms) == pytest.approx(SLACK_M, abs=5e-4)
+        assert_stands(arms)
+        assert arms[0].control.reason == "stood down: lunch"
+        assert say_go(arms) == [None, None]
+        run(arms, GOAL, 600)
+        assert {arm.control.mode for arm in arms} == {"follow"}
+
+
+EVENTS = ("no target", "silent", "lost", "watchdog", "estop", "reset", "fault", "go", "well")
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.sampled_from(EVENTS), min_size=1, max_size=12))
+def test_whatever_happens_an_arm_that_is_not_ready_begins_no_motion(events: list[str]) -> None:
+    """Once at rest and slack or cut off, it stays there until it is told to be ready."""
+    arms = following()
+    goal = on_time(HOME)
+    for event in events:
+        if event == "lost":
+            lose_arm(arms[0])
+        elif event == "watchdog":
+            trip_watchdog(arms[1])
+        elif event == "estop":
+            arms[0].control.engage_estop("button")
+        elif event == "reset":
+            arms[0].control.reset()
+        elif event == "fault":
+            arms[1].control.faults = ("drill",)
+        elif event == "go":
+            say_go(arms)
+        for _ in range(40):
+            for arm, other in (arms, arms[::-1]):
+                was_ready, resting, before = arm.control.ready, arm.control.at_rest, arm.joints
+                age_s = 0.3 if event == "silent" else 0.005
+                arm.cycle(NO_TARGET if event == "no target" else goal, other.as_other(age_s))
+                begins = resting and not (arm.joints == before).all()
+                if begins and not was_ready:
+                    assert arm.control.mode == "relax", (event, arm.control.mode)
+                    assert arm.control._has_pulled
+
+
+async def test_the_node_hears_the_word_and_says_what_it_is() -> None:
+    clock, said = VirtualClock(10**9, clock_id="here"), []
+    node = ArmBridge(
+        ArmBridgeParameters(side="left"),
+        name="bridge",
+        clock=clock,
+        send=lambda topic, message, header: said.append(message),
+        topics={"arm": "arm_left", "other_arm": "arm_right"},
+    )
+    await node.setup()
+    await node.step("arming", GO, Header(1, 10**9, 10**9, "here", "tools", 1))
+    assert not node._control.ready
+    await node.close()
+
+
+def test_real_arms_need_the_word_and_the_demos_do_not() -> None:
+    folder = SCENE_FILE.parent.parent
+    for name, expected in (("lab.yaml", "by_command"), ("demo.yaml", "by_itself")):
+        nodes = load_plan(folder / name).nodes.values()
+        found = {node.parameters["arming"] for node in nodes if node.type == "arm_bridge"}
+        assert found == {expected}
+    values = YAML(typ="safe").load(folder / "lab.yaml")
+    assert "arming" not in values["nodes"]["arm_left_bridge"]["parameters"]

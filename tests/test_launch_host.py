@@ -1,0 +1,126 @@
+"""What a launcher says of its host, and the e-stop that it keeps for who comes late."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch import runs
+from launch.host import devices_of
+from launch.plan import TOOLS, Plan, launcher_on, load_plan
+from launch.supervisor import RunningGraph
+from launch.tools import ToolsWriter, subscriber_to
+from messages.types import EStop, HostStatus
+
+DEADLINE_S = 30.0
+BEACON = {"type": "tests.launch_nodes:Beacon"}
+HOSTS = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+STOP, RESET = EStop(engaged=True, reason="hand in the sheet"), EStop(engaged=False, reason="")
+
+
+@pytest.fixture(autouse=True)
+def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(folder))
+    yield folder
+    shutil.rmtree(folder)
+
+
+def plan_of(folder: Path, nodes: dict[str, Any]) -> Plan:
+    path = folder / "graph.yaml"
+    path.write_text(json.dumps({"nodes": nodes, "hosts": HOSTS}))
+    return load_plan(path)
+
+
+async def until(condition: Callable[[], bool], what: str) -> None:
+    loop = asyncio.get_running_loop()
+    end_s = loop.time() + DEADLINE_S
+    while not condition():
+        assert loop.time() < end_s, what
+        await asyncio.sleep(0.02)
+
+
+async def heard_late(plan: Plan, graph: RunningGraph, seconds: float) -> list[tuple[str, EStop]]:
+    """The e-stops that somebody hears who comes only now."""
+    heard: list[tuple[str, EStop]] = []
+    subscriber = subscriber_to(
+        "estop", plan, graph.run,
+        lambda message, header: heard.append((header.writer, message)),
+        on_problem=pytest.fail,
+    )  # fmt: skip
+    subscriber.start()
+    await asyncio.sleep(seconds)
+    subscriber.close()
+    return heard
+
+
+async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, {"beacon": BEACON})
+    said: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+        await graph.wait_ready(DEADLINE_S)
+
+        async def say(estop: EStop, answer: str) -> None:
+            writer = ToolsWriter(plan, graph.run, ["estop"])
+            await asyncio.sleep(0.6)
+            writer.publish("estop", estop)
+            await until(lambda: sum(answer in line for line in said) == 2, answer)
+            writer.close()
+
+        await say(STOP, "kept until it is reset")
+        assert dict(await heard_late(plan, graph, 1.0)) == {
+            launcher_on(host): STOP for host in HOSTS
+        }
+        await say(RESET, "reset by tools")
+        assert await heard_late(plan, graph, 1.0) == []
+
+
+async def test_each_host_says_how_it_is_and_how_its_nodes_are(tmp_path: Path) -> None:
+    nodes = {
+        "beacon": BEACON | {"restart": {"delay_s": 0.01}},
+        "other": BEACON | {"host": "left", "topics": {"twin__finger": None}},
+    }
+    plan = plan_of(tmp_path, nodes)
+    newest: dict[str, HostStatus] = {}
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        graph.kill("beacon")
+        subscriber = subscriber_to(
+            "host", plan, graph.run,
+            lambda message, header: newest.update({message.host: message}),
+            on_problem=pytest.fail,
+        )  # fmt: skip
+        subscriber.start()
+        await until(
+            lambda: (
+                newest.keys() == HOSTS.keys()
+                and ("beacon", 1, "ready")
+                in {(one.name, one.restarts, one.state) for one in newest["main"].nodes}
+            ),
+            "both hosts, and the restart",
+        )
+        subscriber.close()
+    assert {status.plan_hash for status in newest.values()} == {plan.hash}
+    assert "other" in {node.name for node in newest["left"].nodes}
+    assert newest["main"].disk_free_bytes > 0
+
+
+def test_the_launchers_are_writers_of_their_own(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, {"beacon": BEACON})
+    assert [(one.name, one.host) for one in plan.writers["host"]] == [
+        ("launch", "main"), ("launch_left", "left"),
+    ]  # fmt: skip
+    assert {one.name for one in plan.writers["estop"]} == {"launch", "launch_left", TOOLS}
+
+
+def test_devices_are_found_wherever_parameters_name_them() -> None:
+    lab = load_plan(Path(__file__).resolve().parent.parent / "launch" / "lab.yaml")
+    assert devices_of(lab.nodes_on("main")) == ["/dev/video0", "/dev/video2"]
+    assert devices_of(lab.nodes_on("left")) == []
