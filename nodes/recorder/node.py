@@ -83,15 +83,13 @@ class Recorder(Node):
         if compress is None:
             # The camera's pixels are what the table does not log by itself.
             compress = all(source.topic.logged for source in self.inputs.values())
-        self._bag = bag = open_bag(
-            self._path, recording, compress=compress, attach=self.parameters.attach
-        )
+        files = self.parameters.attach
+        self._bag = bag = open_bag(self._path, recording, compress=compress, attach=files)
         for (port, _), (message, header) in self._latched.items():
             bag.write_frames(self.inputs[port].topic, message, header, self.clock.now_ns())
         bag.flush()
         self.note = f"records to {bag.path}"
-        topics = [source.topic.name for source in self.inputs.values()]
-        self.log.info("recording", bag=str(bag.path), topics=topics)
+        self.log.info("recording", bag=str(bag.path), inputs=len(self.inputs))
 
     @periodic("watch_hz")
     def watch_disk(self) -> None:
@@ -113,8 +111,7 @@ class Recorder(Node):
         """Keep what is written; say why there is no more."""
         bag, self._bag = self._bag, None
         self._try_again_ns = self.clock.now_ns() + TRY_AGAIN_NS
-        where = f"; {bag.messages} messages are in {bag.path}" if bag and bag.messages else ""
-        self.note = f"NOT RECORDING: {why}{where}"
+        self.note = f"NOT RECORDING: {why}"
         self.report_error("recording", why)
         if bag is not None:
             # What it says of a disk that refuses is known already; a cut bag can be read.
