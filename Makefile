@@ -44,6 +44,10 @@ bench: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 
+# Kills, cuts and spoils everything between three computers (network namespaces: root).
+faults: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
+
 # What docs/limits.md shows of the tracking: its tables and pictures.
 limits: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
