@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,9 +216,12 @@ class NeoHookeanBody:
         friction: Friction = "none",
         tolerance: float = TOLERANCE,
         smallest_share: float = SMALLEST_SHARE,
+        factored_in: type[np.floating[Any]] = np.float64,
     ) -> None:
         """faces (f, 6): six-node triangles that a finger can touch, node indices, outward.
         tolerance, smallest_share: as `TOLERANCE` and `SMALLEST_SHARE`.
+        factored_in: precision of the tangents' factors, which only say where to look next; forces
+        and energies are always of double precision.
 
         Errors as `NeoHookeanSolid`.
         """
@@ -230,6 +233,7 @@ class NeoHookeanBody:
         )
         self.fixed, self.friction = fixed, friction
         self.tolerance, self.smallest_share = tolerance, smallest_share
+        self.factored_in = factored_in
         self._order = Dissection(nodes, elements, fixed)
         self._hull = boundary_faces(elements)[:, SUBTRIANGLES].reshape(-1, 3)
 
@@ -363,7 +367,7 @@ class NeoHookeanBody:
             self.obstacle.add_tangents(matrices, positions, centre, held, turned=turned)
             self.solid.stiffen(matrices, stiffening)
             try:
-                return self._order.factor(matrices)
+                return self._order.factor(matrices.astype(self.factored_in, copy=False))
             except IndefiniteError:
                 continue
         raise StuckError("the stiffness cannot be made definite")

@@ -93,6 +93,7 @@ def solve_push(job: PushJob, stopped: Callable[[], bool] = lambda: False) -> Pus
         finger_radius_m=job.finger_radius_m,
         tolerance=TOLERANCE,
         smallest_share=SMALLEST_SHARE,
+        factored_in=np.float32,
     )
     hull = boundary_faces(job.elements)
     skin = np.unique(hull)
