@@ -190,8 +190,8 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     if doubts:
         at, doubt = zip(*doubts, strict=True)
         low = [0.0 if name == "error" else -each for each in doubt]
-        band = {"color": INK, "alpha": 0.12, "linewidth": 0}
-        axes.fill_between(at, low, doubt, **band, label="the reference's own doubt")
+        label = "the reference's own doubt"
+        axes.fill_between(at, low, doubt, color=INK, alpha=0.12, linewidth=0, label=label)
     methods = list(dict.fromkeys(point["method"] for point in points))
     for index, method in enumerate(methods):
         shown = [
