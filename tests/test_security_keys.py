@@ -159,6 +159,7 @@ ONE, TWO = new_key_pair()[0], new_key_pair()[0]
         (ONE, ONE, 'hosts.left.key: is the key of host "main" too; each host has its own'),
         (ONE, "secret", 'hosts.left.key: "secret" is no public key'),
     ],
+    ids=["one without", "two alike", "no key"],  # keys are drawn anew; names of tests must not be
 )
 def test_keys_that_do_not_do(tmp_path: Path, main: str, left: str | None, said: str) -> None:
     given = {"main": {**HOSTS["main"], "key": main}, "left": {**HOSTS["left"], "key": left}}
