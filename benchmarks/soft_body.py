@@ -4,7 +4,7 @@
 
 With --table, the nonlinear table of the demo's mesh instead: how long it takes to make (minutes, if
 the cache does not hold it), how far it and the linear method are, at places that it was not made
-from, from Newton solutions on meshes made as the table's, and the same slides.
+from, from Newton solutions on finer meshes, and the same slides.
 
 The fingertip goes 6 mm in each of three directions at constant depth, 0.02 mm a step.  Prints for
 every mesh and depth the force (beside Hertz's), its ripple, the largest jump of any skin node in a
@@ -40,6 +40,8 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cyl
 DEMO_SPACING_M = 0.0045
 JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
 """Station along the axis (m) and angle: places that no table is made from."""
+JUDGE_RATIO = 0.25
+"""Of the judge's mesh at the push, in finger radii: finer than the table's."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
 HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
@@ -117,6 +119,7 @@ def judge_push(
         site,
         poisson_ratio=best.spec.poisson_ratio,
         finger_radius_m=scene.finger.radius_m,
+        spacing_m=JUDGE_RATIO * scene.finger.radius_m,
     )
     solved = pushes.solve_push(job)
     nodes, weights = Hull(solved.rest, solved.faces).weights(best.rest)

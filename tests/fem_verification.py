@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,30 +20,24 @@ import pytest
 Record = Callable[[str, Any], None]
 """Pytest's fixture `record_property`."""
 KEY = "verified"
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    what: str
-    measured: str
-    tolerance: str
+"""Of what is recorded: (what, as measured, tolerance), plain text that crosses processes."""
 
 
 def at_most(record: Record, what: str, measured: float, limit: float) -> None:
     """Note an error; AssertionError unless it is within the limit."""
-    record(KEY, Finding(what, f"{measured:.2g}", f"at most {limit:g}"))
+    record(KEY, (what, f"{measured:.2g}", f"at most {limit:g}"))
     assert measured <= limit, f"{what}: {measured:.3g}, at most {limit:g}"
 
 
 def between(record: Record, what: str, measured: float, low: float, high: float) -> None:
     """Note a value; AssertionError unless it lies in the band."""
-    record(KEY, Finding(what, f"{measured:.4g}", f"{low:g} to {high:g}"))
+    record(KEY, (what, f"{measured:.4g}", f"{low:g} to {high:g}"))
     assert low <= measured <= high, f"{what}: {measured:.6g}, not in {low:g} to {high:g}"
 
 
 def near(record: Record, what: str, measured: float, wanted: float, relative: float) -> None:
     """Note a value beside the one that it should have."""
-    record(KEY, Finding(what, f"{measured:.5g}", f"{wanted:.5g} ± {100 * relative:.2g} %"))
+    record(KEY, (what, f"{measured:.5g}", f"{wanted:.5g} ± {100 * relative:.2g} %"))
     error = abs(measured / wanted - 1.0)
     assert error <= relative, f"{what}: {measured:.6g}, wanted {wanted:.6g}, off by {error:.3g}"
 
@@ -73,7 +66,8 @@ class _Table:
                 test = f"`{file}`: `{name}`"
                 source = self._sources[report.nodeid] if test != self._last else "″"
                 self._last = test
-                cells = (finding.what, source, finding.measured, finding.tolerance, test)
+                what, measured, tolerance = finding
+                cells = (what, source, measured, tolerance, test)
                 self.rows.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells))
 
 
