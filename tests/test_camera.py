@@ -152,7 +152,7 @@ async def test_the_twins_pictures_pass_with_their_time(scene: Scene) -> None:
             left=picture(1, 0),
             right=picture(1, 1),
         )
-        header = Header(1, 123_456, 130_000, "virtual", "twin", 1)
+        header = Header(1, 123_456, 130_000, bench.node.clock.id, "twin", 1)
         await bench.node.step("twin__stereo", pair, header)
         passed, passed_header = bench.sent[0]
         assert passed.left is pair.left

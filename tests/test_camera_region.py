@@ -179,7 +179,8 @@ async def test_the_twins_pairs_are_cut_to_the_fingers_regions() -> None:
     async with running(scene, source="twin", region="finger") as bench:
         left, right = finger_regions(scene)
         pair = StereoPair(device="t", exposure_s=0.0, dropped_frames=0, left=RAMP, right=RAMP)
-        await bench.node.step("twin__stereo", pair, Header(1, 5, 6, "virtual", "twin", 1))
+        header = Header(1, 5, 6, bench.node.clock.id, "twin", 1)
+        await bench.node.step("twin__stereo", pair, header)
         sent, header = bench.sent[0]
         assert header.source_ns == 5
         assert sent.exposure_s == 0.0
@@ -201,6 +202,7 @@ async def test_nothing_is_published_while_the_region_is_wrong() -> None:
     region = {"left": [0, 0, 64, 48], "right": [0, 0, 640, 480]}
     async with running(scene, source="twin", region=region) as bench:
         pair = StereoPair(device="t", exposure_s=0.0, dropped_frames=0, left=RAMP, right=RAMP)
-        await bench.node.step("twin__stereo", pair, Header(1, 5, 6, "virtual", "twin", 1))
+        header = Header(1, 5, 6, bench.node.clock.id, "twin", 1)
+        await bench.node.step("twin__stereo", pair, header)
         assert bench.sent == []
         assert "region.right" in bench.node.last_error

@@ -319,7 +319,7 @@ def test_verify_steps_a_node_and_compares(
 def test_verify_sees_another_output(flexsheet: Command, recorded: Path, tmp_path: Path) -> None:
     forged = tmp_path / "forged.mcap"
     reader = BagReader(recorded)
-    with BagWriter(forged) as writer:
+    with BagWriter(forged, reader.metadata) as writer:
         writer.add_attachment("plan.json", reader.attachment("plan.json"), "application/json")
         for topic, message, header, log_ns in reader:
             other = EStop(engaged=True, reason="eleven") if topic == "estop" else message

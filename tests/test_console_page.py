@@ -303,8 +303,10 @@ def test_a_scene_that_is_no_scene_is_left_out_with_the_reason(session: Session) 
 def test_the_bag_holds_what_was_done_to_the_page(session: Session) -> None:
     entries = list(BagReader(session.bag))
     by_topic: dict[str, list[Any]] = {}
-    for topic, message, _, _ in entries:
-        by_topic.setdefault(topic, []).append(message)
+    for topic, message, header, _ in entries:
+        # The launcher keeps an e-stop, and says it again for those who come late.
+        if topic != "estop" or header.writer == "console":
+            by_topic.setdefault(topic, []).append(message)
     assert [one.label for one in by_topic["moment"] if isinstance(one, Moment)] == ["first touch"]
     stops = [(one.engaged, one.reason) for one in by_topic["estop"]]
     assert stops == [
