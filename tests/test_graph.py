@@ -158,7 +158,12 @@ def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> N
         if begin_ns <= header.publish_ns <= end_ns:
             stamps.setdefault(topic, []).append(header.publish_ns)
     duration_s = (end_ns - begin_ns) * 1e-9
-    expected = {name: one.rate_hz for name, one in TOPICS.items() if one.logged and one.rate_hz}
+    written = load_plan(DEMO_FILE).writers
+    expected = {
+        name: one.rate_hz
+        for name, one in TOPICS.items()
+        if one.logged and one.rate_hz and name in written
+    }
     assert {"fingertip", "sheet_target", "arm_left", "twin/arms", "status"} <= set(expected)
     for name, rate in expected.items():
         # A busy machine may be late: half the least expected rate says that the path works.
