@@ -41,6 +41,8 @@ bench: setup
 	$(BIN)/python -m benchmarks.image_correction
 	$(BIN)/python -m benchmarks.recovery
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_size --output docs/charts
+	$(BIN)/python -m benchmarks.frame_cpu
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 
@@ -48,8 +50,9 @@ bench: setup
 faults: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
 
-# What docs/limits.md shows of the tracking: its tables and pictures.
+# What docs/limits.md and docs/limits-soft-body.md show: tables and pictures.
 limits: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
 docs: setup

@@ -243,6 +243,9 @@ class Frame(Message):
         default_factory=lambda: np.zeros((0, 3)),
         description="where the finger was taken to be at `predicted_to_ns`; none: not known",
     )
+    lost_share: NonNegative = Field(
+        default=0.0, description="of the sheet, folded so that it gets no light"
+    )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, one (mono or packed)"
     )

@@ -118,6 +118,7 @@ class Painter:
             late_frames=self.late,
             shaped_for_ns=shaped_for_ns,
             fingertip_world_m=np.zeros((0, 3)) if finger_tip is None else finger_tip[None],
+            lost_share=stage.lost_share,
             pixels=() if picture is None else (picture,),
         )
         return frame, source_ns
