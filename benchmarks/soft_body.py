@@ -40,7 +40,7 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cyl
 DEMO_SPACING_M = 0.0045
 JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
 """Station along the axis (m) and angle: places that no table is made from."""
-JUDGE_RATIO = 0.25
+JUDGE_RATIO = 0.3
 """Of the judge's mesh at the push, in finger radii: finer than the table's."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
