@@ -27,7 +27,8 @@ from typing import Any, TypeVar
 import uvloop
 
 from benchmarks import messaging
-from benchmarks.messaging import NODES_USE, PAYLOADS, Design, Sender, machine, percentile_us
+from benchmarks.messaging import NODES_USE, PAYLOADS, Design, Sender, percentile_us
+from launch.machine import machine_name
 from messages.base import Header
 from messages.bus import Publisher, Source, Subscriber
 from messages.security import KeyRing, new_key_pair, write_ring, write_secret
@@ -188,7 +189,7 @@ def main() -> None:
     finally:
         loop.close()
     report = {
-        "machine": machine(),
+        "machine": machine_name(),
         "load": [load, os.getloadavg()[0]],
         "rounds": options.rounds,
         "latency": rows,

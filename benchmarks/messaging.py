@@ -18,7 +18,6 @@ import gc
 import json
 import multiprocessing
 import os
-import platform
 import random
 import statistics
 import sys
@@ -40,6 +39,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from launch.machine import machine_name
 from messages.base import Header, Message
 from messages.bus import Publisher, Subscriber
 from messages.topics import TOPICS, Topic
@@ -395,15 +395,6 @@ def codec_costs() -> list[dict[str, Any]]:
     return rows
 
 
-def machine() -> str:
-    name = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        lines = [line for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        name = lines[0].partition(":")[2].strip() if lines else name
-    return f"{os.cpu_count()} cores {name}, Python {platform.python_version()}"
-
-
 LATENCY_HEADS = (
     "design",
     "",
@@ -521,7 +512,7 @@ def main() -> None:
     report = {
         "command": f"python -m benchmarks.messaging --transport {options.transport} "
         f"--rounds {rounds} --seconds {seconds:g} --markdown docs/messaging.md",
-        "machine": machine(),
+        "machine": machine_name(),
         "load": [load_before, os.getloadavg()[0]],
         "zmq": zmq.zmq_version(),
         "transport": options.transport,

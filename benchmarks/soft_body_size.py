@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -26,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from launch.machine import machine_name
 from launch.plan import load_scene
 from messages.scene import Scene, cylinder_of
 from nodes.fem_solver.body import spec_of
@@ -304,7 +304,7 @@ def main() -> None:
     folder.mkdir(parents=True, exist_ok=True)
     draw(by_size, by_contact, folder / "soft-body-size.png")
     content = {
-        "machine": f"{platform.machine()}, Python {platform.python_version()}",
+        "machine": machine_name(),
         "tables": "of made-up numbers and of the right size, at some of the places",
         "by_skin_nodes": [asdict(point) for point in by_size],
         "by_contact_nodes": [asdict(point) for point in by_contact],

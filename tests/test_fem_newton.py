@@ -24,7 +24,11 @@ MODULUS, NU, FINGER = 4000.0, 0.45, 0.007
 SIDE, HEIGHT = 0.03, 0.012
 
 
-def pad(friction: Friction = "none", divisions: tuple[int, int, int] = (5, 5, 2)) -> NeoHookeanBody:
+def pad(
+    friction: Friction = "none",
+    divisions: tuple[int, int, int] = (5, 5, 2),
+    factored_in: type[np.float32 | np.float64] = np.float64,
+) -> NeoHookeanBody:
     """A block of 30 x 30 x 12 mm, glued to the ground, its top at z = 0."""
     nodes, elements = box(divisions, (SIDE, SIDE, HEIGHT))
     nodes = nodes - [0.5 * SIDE, 0.5 * SIDE, HEIGHT]
@@ -38,6 +42,7 @@ def pad(friction: Friction = "none", divisions: tuple[int, int, int] = (5, 5, 2)
         poisson_ratio=NU,
         finger_radius_m=FINGER,
         friction=friction,
+        factored_in=factored_in,
     )
 
 
@@ -116,6 +121,21 @@ def test_the_answer_is_smooth_in_the_fingers_place(body: NeoHookeanBody) -> None
     assert np.linalg.norm(moves, axis=2).max() < 2.0 * step
     assert np.abs(np.diff(forces[:, 2])).max() < 0.01 * forces[:, 2].mean()
     assert np.abs(np.diff(forces[:, 2], 2)).max() < 0.002 * forces[:, 2].mean()
+
+
+def test_factors_of_single_precision_lead_to_the_same_balance(
+    body: NeoHookeanBody, pressed: Solved
+) -> None:
+    """They only say where to look next: the balance is that of forces in double precision."""
+    coarse = pad(factored_in=np.float32)
+    quick = press(coarse, centre(0.0), pressed.centre)[-1]
+    assert quick.reached
+    largest = np.abs(pressed.displacement).max()
+    assert np.abs(quick.displacement - pressed.displacement).max() < 1e-6 * largest
+    assert np.allclose(quick.force_n, pressed.force_n, rtol=1e-6, atol=1e-9)
+    stiffness = body.solid.tangents(pressed.displacement)
+    factors = body._order.factor(stiffness.astype(np.float32))
+    assert {pivot.dtype for pivot in factors.pivots} == {np.dtype(np.float32)}
 
 
 def test_a_sticking_finger_drags_the_skin_and_a_smooth_one_does_not() -> None:
