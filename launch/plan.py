@@ -30,19 +30,11 @@ from launch.documents import (
 )
 from launch.meshes import scene_of
 from messages.bus import Source
-from messages.calibration import (
-    CalibrationFileError,
-    CalibrationMismatchError,
-    load_calibration,
-    refuse_other_camera,
-)
+from messages.calibration import load_calibration, refuse_other_camera
+from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 from messages.scene import Scene
 from messages.security import is_key
-from messages.sheet_calibration import (
-    SheetCalibrationError,
-    load_sheet_calibration,
-    refuse_other_sheet,
-)
+from messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
 from messages.topics import TOPICS, Topic
 from nodes import NODES, UnknownNodeError, node_class
 from nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
@@ -809,7 +801,7 @@ def _check_calibrations(
         path = Path(_absolute(calibration, _base(document, key)))
         try:
             check(path)
-        except (CalibrationFileError, CalibrationMismatchError, SheetCalibrationError) as error:
+        except (CalibrationFileError, CalibrationMismatchError) as error:
             said = str(error) if str(path) in str(error) else f"{path}: {error}"
             problems.append(document.problem(key, said))
 

@@ -48,8 +48,9 @@ _DARK = f"""<style>
 def drawn_for_pages() -> Iterator[None]:
     """Figures made inside have the colours that `save_svg` can turn for the dark."""
     import matplotlib as mpl
+    from matplotlib.rcsetup import cycler
 
-    style = _STYLE | {"axes.prop_cycle": mpl.cycler(color=COLOURS)}
+    style = _STYLE | {"axes.prop_cycle": cycler(color=COLOURS)}
     with mpl.rc_context(style):
         yield
 

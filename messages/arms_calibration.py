@@ -1,19 +1,14 @@
-"""The arms' calibration file: what `flexsheet calibrate arms` writes; where the bases stand.
-
-It is YAML, so that people can read it, with every number in full precision.
-"""
+"""The arms' calibration file: what `flexsheet calibrate arms` writes; where the bases stand."""
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from pydantic import Field
 
-from messages.calibration import Board, CalibrationFileError, Covariance
+from messages.calibration import Board, Covariance
+from messages.calibration_file import read_calibration, write_calibration
 from messages.scene import NonNegative, Part, Pose
 
 ARMS_CALIBRATION_VERSION = 1
@@ -71,46 +66,12 @@ class ArmsCalibration(Part):
 
 
 def save_arms_calibration(calibration: ArmsCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the file, replacing an older one only when the new one is complete.
-
-    comment: a line more for its head, as the command that made it.
-    """
-    yaml = YAML()
-    yaml.default_flow_style = None
-    yaml.width = 4096
-    text = io.StringIO()
-    text.write(f"# Where the arms of scene {calibration.scene} stand, {calibration.date}.\n")
-    if comment:
-        text.write(f"# {comment}\n")
-    yaml.dump(calibration.model_dump(mode="json"), text)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text.getvalue())
-    partial.replace(path)
+    title = f"Where the arms of scene {calibration.scene} stand, {calibration.date}."
+    write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_arms_calibration(path: Path) -> ArmsCalibration:
-    """Read the file; raises CalibrationFileError for one that is absent, foreign or incomplete."""
-    remedy = "`flexsheet calibrate arms` writes one"
-    try:
-        content: Any = YAML(typ="safe").load(path.read_text())
-    except OSError as error:
-        raise CalibrationFileError(f"{path}: cannot be read: {error.strerror}; {remedy}") from error
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise CalibrationFileError(f"{path}: not YAML: {error}") from error
-    if not isinstance(content, dict) or "version" not in content:
-        raise CalibrationFileError(
-            f'{path}: no key "version": not a calibration of the arms; {remedy}'
-        )
-    if content["version"] != ARMS_CALIBRATION_VERSION:
-        raise CalibrationFileError(
-            f"{path}: version: {content['version']!r}, this program reads "
-            f"{ARMS_CALIBRATION_VERSION}; calibrate anew"
-        )
-    try:
-        return ArmsCalibration.model_validate(content)
-    except ValidationError as error:
-        problems = "; ".join(
-            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
-            for problem in error.errors()
-        )
-        raise CalibrationFileError(f"{path}: {problems}") from error
+    command = "flexsheet calibrate arms"
+    return read_calibration(
+        ArmsCalibration, path, version=ARMS_CALIBRATION_VERSION, command=command
+    )

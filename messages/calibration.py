@@ -1,34 +1,25 @@
-"""The stereo calibration file: what `flexsheet calibrate stereo` writes and the triangulator reads.
-
-It is YAML, so that people can read it, with every number in full precision.
-"""
+"""The stereo calibration: what `flexsheet calibrate stereo` writes and the triangulator reads."""
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from pydantic import Field
 
 from messages.arrays import ArraySpec, Transform
+from messages.calibration_file import (
+    CalibrationMismatchError,
+    read_calibration,
+    write_calibration,
+)
 from messages.scene import Lens, NonNegative, Part, Positive, StereoCamera
 
 CALIBRATION_VERSION = 2
 
 Covariance = Annotated[NDArray[np.float64], ArraySpec("<f8", ("numbers", "numbers"))]
-
-
-class CalibrationFileError(ValueError):
-    """A calibration file that cannot be used; the message names file, key and remedy."""
-
-
-class CalibrationMismatchError(ValueError):
-    """A calibration of another device or picture size than the scene's camera."""
 
 
 class Board(Part):
@@ -119,49 +110,10 @@ def refuse_other_camera(calibration: StereoCalibration, camera: StereoCamera) ->
 
 
 def save_calibration(calibration: StereoCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the file, replacing an older one only when the new one is complete.
-
-    comment: a line more for its head, as the command that made it.
-    """
-    yaml = YAML()
-    yaml.default_flow_style = None
-    yaml.width = 4096  # a row of the covariance a line
-    text = io.StringIO()
-    text.write(f"# Stereo calibration of {calibration.device}, {calibration.date}.\n")
-    if comment:
-        text.write(f"# {comment}\n")
-    yaml.dump(calibration.model_dump(mode="json"), text)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text.getvalue())
-    partial.replace(path)
+    title = f"Stereo calibration of {calibration.device}, {calibration.date}."
+    write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_calibration(path: Path) -> StereoCalibration:
-    """Read the file; raises CalibrationFileError for one that is absent, foreign or incomplete."""
-    try:
-        content: Any = YAML(typ="safe").load(path.read_text())
-    except OSError as error:
-        raise CalibrationFileError(
-            f"{path}: cannot be read: {error.strerror}; name a file that "
-            "`flexsheet calibrate stereo` wrote"
-        ) from error
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise CalibrationFileError(f"{path}: not YAML: {error}") from error
-    if not isinstance(content, dict) or "version" not in content:
-        raise CalibrationFileError(
-            f'{path}: no key "version": not a calibration file; `flexsheet calibrate stereo` '
-            "writes one"
-        )
-    if content["version"] != CALIBRATION_VERSION:
-        raise CalibrationFileError(
-            f"{path}: version: {content['version']!r}, this program reads {CALIBRATION_VERSION}; "
-            "calibrate anew with `flexsheet calibrate stereo`"
-        )
-    try:
-        return StereoCalibration.model_validate(content)
-    except ValidationError as error:
-        problems = "; ".join(
-            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
-            for problem in error.errors()
-        )
-        raise CalibrationFileError(f"{path}: {problems}") from error
+    command = "flexsheet calibrate stereo"
+    return read_calibration(StereoCalibration, path, version=CALIBRATION_VERSION, command=command)

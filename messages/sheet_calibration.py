@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from pydantic import Field
 
 from messages.arrays import ArraySpec
+from messages.calibration_file import (
+    CalibrationMismatchError,
+    read_calibration,
+    write_calibration,
+)
 from messages.scene import NonNegative, Part, Positive, SheetSpec
 
 SHEET_CALIBRATION_VERSION = 1
@@ -22,10 +24,6 @@ Entries = Annotated[NDArray[np.float64], ArraySpec("<f8", ("stretches", "depths"
 
 NOMINAL_RATIO = 0.02
 """Nominal sizes of calibration and scene may differ by this much."""
-
-
-class SheetCalibrationError(ValueError):
-    """A sheet's calibration file that cannot be used; names file, key and remedy."""
 
 
 class Fitted(Part):
@@ -78,63 +76,26 @@ class SheetCalibration(Part):
 
 
 def refuse_other_sheet(calibration: SheetCalibration, sheet: SheetSpec) -> None:
-    """Raises SheetCalibrationError unless the calibration is of a sheet of the scene's sizes."""
+    """Raises CalibrationMismatchError unless the calibration is of a sheet of the scene's sizes."""
     sizes = (
         ("width_m", calibration.nominal_width_m, sheet.width_m),
         ("height_m", calibration.height_m, sheet.height_m),
     )
     for key, measured, wanted in sizes:
         if abs(measured - wanted) > NOMINAL_RATIO * wanted:
-            raise SheetCalibrationError(
+            raise CalibrationMismatchError(
                 f"calibration is of a sheet with {key} {measured:g}, the scene's sheet.{key} is "
                 f"{wanted:g}: name the right file, or calibrate this sheet"
             )
 
 
 def save_sheet_calibration(calibration: SheetCalibration, path: Path, *, comment: str = "") -> None:
-    """Write the file, replacing an older one only when the new one is complete.
-
-    comment: a line more for its head, as the command that made it.
-    """
-    yaml = YAML()
-    yaml.default_flow_style = None
-    yaml.width = 4096
-    text = io.StringIO()
-    text.write(f"# Calibration of a sheet, {calibration.date}.\n")
-    if comment:
-        text.write(f"# {comment}\n")
-    yaml.dump(calibration.model_dump(mode="json"), text)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text.getvalue())
-    partial.replace(path)
+    title = f"Calibration of a sheet, {calibration.date}."
+    write_calibration(calibration, path, title=title, comment=comment)
 
 
 def load_sheet_calibration(path: Path) -> SheetCalibration:
-    """Read the file; SheetCalibrationError for one that is absent, foreign or incomplete."""
-    try:
-        content: Any = YAML(typ="safe").load(path.read_text())
-    except OSError as error:
-        raise SheetCalibrationError(
-            f"{path}: cannot be read: {error.strerror}; name a file that "
-            "`flexsheet calibrate sheet` wrote"
-        ) from error
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise SheetCalibrationError(f"{path}: not YAML: {error}") from error
-    if not isinstance(content, dict) or "modulus_thickness_n_per_m" not in content:
-        raise SheetCalibrationError(
-            f'{path}: no key "modulus_thickness_n_per_m": not a sheet\'s calibration; '
-            "`flexsheet calibrate sheet` writes one"
-        )
-    if content.get("version") != SHEET_CALIBRATION_VERSION:
-        raise SheetCalibrationError(
-            f"{path}: version: {content.get('version')!r}, this program reads "
-            f"{SHEET_CALIBRATION_VERSION}; calibrate anew with `flexsheet calibrate sheet`"
-        )
-    try:
-        return SheetCalibration.model_validate(content)
-    except ValidationError as error:
-        problems = "; ".join(
-            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
-            for problem in error.errors()
-        )
-        raise SheetCalibrationError(f"{path}: {problems}") from error
+    command = "flexsheet calibrate sheet"
+    return read_calibration(
+        SheetCalibration, path, version=SHEET_CALIBRATION_VERSION, command=command
+    )

@@ -13,13 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.calibration import (
-    Board,
-    CalibrationFileError,
-    StereoCalibration,
-    load_calibration,
-    save_calibration,
-)
+from messages.calibration import Board, StereoCalibration, load_calibration, save_calibration
+from messages.calibration_file import CalibrationFileError
 from messages.scene import Lens
 from nodes.camera.calibration import calibrate_stereo
 from nodes.camera.check import check_stereo, cross_check, rigid_fit_residuals

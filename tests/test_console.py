@@ -50,6 +50,7 @@ from nodes.console.sheet import COLUMNS, ROWS, film, hit_by_ray, sheet_points
 from nodes.console.view import finger_mesh, line_segments
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.recorder.node import Recorder, RecorderParameters
+from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 from tests.plans import scene_with
 
@@ -74,25 +75,6 @@ def sheet(fingertip: Floats | None = None) -> Floats:
     points = sheet_points(*edges(), height_m=HEIGHT_M, fingertip=fingertip, finger_radius_m=0.007)
     assert points is not None
     return points
-
-
-def arm_state(side: str, mode: str = "follow", **changes: Any) -> ArmState:
-    values: dict[str, Any] = {
-        "side": side,
-        "mode": mode,
-        "faults": (),
-        "joints_rad": np.array([0.1, 0.4, 1.5, 0.2, -0.3, 0.5]),
-        "joints_commanded_rad": np.zeros(6),
-        "world_from_flange": np.eye(4),
-        "world_from_flange_commanded": np.eye(4),
-        "command_age_s": None,
-        "target_source_ns": 0,
-        "command_sent_ns": 0,
-        "edge_distance_m": None,
-        "edge_force_n": None,
-        "cycle_s": 0.001,
-    }
-    return ArmState(**values | changes)
 
 
 class Shelf:
@@ -471,7 +453,7 @@ def test_tables_say_in_words_what_is_wrong() -> None:
 def test_the_banner_shouts_what_matters_most() -> None:
     follow = {"left": arm_state("left", edge_force_n=5.1), "right": arm_state("right")}
     assert "5.1 N" in panels.banner("cylinder", follow, None, "Live")
-    fault = {"left": arm_state("left", "fault", faults=("joint 3",))}
+    fault = {"left": arm_state("left", mode="fault", faults=("joint 3",))}
     assert "left arm: fault (joint 3)" in panels.banner("cylinder", fault, None, "Live")
     assert "E-STOP is engaged: why" in panels.banner("cylinder", fault, "why", "Live")
     assert "Waiting" in panels.banner("cylinder", {}, None, "Live")

@@ -21,6 +21,7 @@ from messages.base import Header, Message
 from messages.topics import TOPICS
 from messages.types import ArmState, EStop, Skin, SoftBody, StereoPair
 from nodes.models.rigid import transform
+from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 
 pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: pip install -e '.[dev]'")
@@ -34,23 +35,9 @@ DENT = np.array([[0, 0, -0.5], [0, 0, 0], [0, 0, 0]], np.float32)
 LEFT = np.arange(12, dtype=np.uint8).reshape(3, 4)
 
 
-def arm(side: Any, x_m: float) -> ArmState:
+def arm(side: str, x_m: float) -> ArmState:
     flange = transform(np.eye(3), np.array([x_m, 0.0, 0.0]))
-    return ArmState(
-        side=side,
-        mode="follow",
-        faults=(),
-        joints_rad=np.zeros(6),
-        joints_commanded_rad=np.zeros(6),
-        world_from_flange=flange,
-        world_from_flange_commanded=flange,
-        command_age_s=None,
-        target_source_ns=0,
-        command_sent_ns=0,
-        edge_distance_m=0.24,
-        edge_force_n=None,
-        cycle_s=0.005,
-    )
+    return arm_state(side, world_from_flange=flange, edge_distance_m=0.24)
 
 
 RECORDED: tuple[tuple[str, Message], ...] = (

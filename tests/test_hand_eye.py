@@ -29,7 +29,8 @@ from launch.arm_places import (
 )
 from launch.plan import load_scene
 from messages.arms_calibration import load_arms_calibration
-from messages.calibration import Board, CalibrationFileError
+from messages.calibration import Board
+from messages.calibration_file import CalibrationFileError
 from messages.types import Side
 from nodes.arm_bridge.hand_eye import (
     BaseFit,

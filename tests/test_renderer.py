@@ -14,7 +14,7 @@ from messages.base import Header, Message
 from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
-from messages.types import ArmState, Display, Frame, SheetTarget, Skin, SoftBody
+from messages.types import Display, Frame, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses, flange_pose
 from nodes.renderer import gl
@@ -25,6 +25,7 @@ from nodes.renderer.output import pack
 from nodes.renderer.sheet import sheet_between
 from nodes.renderer.stage import Stage, transform_of
 from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
+from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 
 ROOT = Path(__file__).parents[1]
@@ -322,29 +323,12 @@ class Bench:
         for side, edge in zip(("left", "right"), edges, strict=True):
             spec = getattr(self.scene.arms, side)
             flange = flange_pose(edge, transform_of(spec.flange_from_edge))
-            await self.step(f"arm_{side}", arm_state(side, flange), age_ms=age_ms)
+            state = arm_state(side, world_from_flange=flange, world_from_flange_commanded=flange)
+            await self.step(f"arm_{side}", state, age_ms=age_ms)
 
     async def finger(self, *tip: float, age_ms: float = 4.0, valid: bool = True) -> None:
         message = fingertip(np.array(tip), reason="ok" if valid else "no_mark")
         await self.step("fingertip", message, age_ms=age_ms)
-
-
-def arm_state(side: str, world_from_flange: np.ndarray) -> ArmState:
-    return ArmState(
-        side=side,
-        mode="follow",
-        faults=(),
-        joints_rad=np.zeros(6),
-        joints_commanded_rad=np.zeros(6),
-        world_from_flange=world_from_flange,
-        world_from_flange_commanded=world_from_flange,
-        command_age_s=None,
-        target_source_ns=0,
-        command_sent_ns=0,
-        edge_distance_m=None,
-        edge_force_n=None,
-        cycle_s=0.0,
-    )
 
 
 def skin_and_body(displacement: float) -> tuple[Skin, SoftBody]:
@@ -402,6 +386,17 @@ async def test_frame_follows_the_soft_body_and_carries_its_exposure(bench: Bench
     await bench.step("soft_body", body)
     await bench.finger(0.0, 0.0, 0.1)
     assert len(bench.sent) == 2
+
+
+async def test_a_frame_says_how_much_of_the_sheet_gets_no_light(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a folded sheet, whose share the stage finds (tests/test_renderer_failures.py)."""
+    monkeypatch.setattr("nodes.renderer.stage.lost_share", lambda mesh, eye, projector: 0.25)
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4))
+    await bench.finger(0.0, 0.0, 0.1)
+    assert bench.sent[0][0].lost_share == 0.25
 
 
 async def test_without_solver_the_fingertip_draws_and_the_rate_is_limited(bench: Bench) -> None:

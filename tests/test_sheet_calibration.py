@@ -19,9 +19,9 @@ from launch.documents import BadInputError
 from launch.plan import load_scene
 from launch.sheet_rows import read_rows, twin_rows
 from launch.twin_sheet import twin_force
+from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 from messages.sheet_calibration import (
     SheetCalibration,
-    SheetCalibrationError,
     load_sheet_calibration,
     save_sheet_calibration,
 )
@@ -276,23 +276,25 @@ def test_a_file_that_does_not_fit_is_refused(
 ) -> None:
     file = tmp_path / "sheet.yaml"
     file.write_text(json.dumps({**twin_calibration.model_dump(mode="json"), **change}))
-    with pytest.raises(SheetCalibrationError, match=words):
+    with pytest.raises(CalibrationFileError, match=words):
         load_sheet_calibration(file)
 
 
-@pytest.mark.parametrize("content", ["- 1\n", "a: 1\n", "a: [\n"])
+@pytest.mark.parametrize("content", ["- 1\n", "a: 1\n", "a: [\n", "version: 1\nscene: lab\n"])
 def test_a_foreign_file_is_refused(tmp_path: Path, content: str) -> None:
     file = tmp_path / "sheet.yaml"
     file.write_text(content)
-    with pytest.raises(SheetCalibrationError, match=r"not YAML|not a sheet"):
+    with pytest.raises(
+        CalibrationFileError, match=r"not YAML|not a calibration|`flexsheet calibrate sheet`"
+    ):
         load_sheet_calibration(file)
-    with pytest.raises(SheetCalibrationError, match="cannot be read"):
+    with pytest.raises(CalibrationFileError, match="cannot be read"):
         load_sheet_calibration(tmp_path / "none.yaml")
 
 
 def test_another_sheets_calibration_is_refused(twin_calibration: SheetCalibration) -> None:
     other = SCENE.sheet.model_copy(update={"width_m": 0.3})
-    with pytest.raises(SheetCalibrationError, match=r"width_m 0\.24, the scene"):
+    with pytest.raises(CalibrationMismatchError, match=r"width_m 0\.24, the scene"):
         law_for(other, twin_calibration)
 
 

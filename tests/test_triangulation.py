@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
-from messages.calibration import Board, CalibrationMismatchError, StereoCalibration
+from messages.calibration import Board, StereoCalibration
+from messages.calibration_file import CalibrationMismatchError
 from messages.scene import Scene
 from nodes.methods import measure as measure_trial
 from nodes.models import camera, rigid

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from messages.base import Header, Message
-from messages.calibration import Board, CalibrationFileError, StereoCalibration, save_calibration
+from messages.calibration import Board, StereoCalibration, save_calibration
+from messages.calibration_file import CalibrationFileError
 from messages.clock import VirtualClock
 from messages.scene import Scene, StereoCamera
 from messages.topics import Topic

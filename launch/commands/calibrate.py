@@ -219,7 +219,8 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Measure a board of known size with a calibration, on pictures that did not make it."""
-    from messages.calibration import CalibrationFileError, load_calibration
+    from messages.calibration import load_calibration
+    from messages.calibration_file import CalibrationFileError
     from nodes.camera.check import check_stereo
     from nodes.camera.corners import CalibrationError
 

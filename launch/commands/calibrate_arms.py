@@ -136,7 +136,7 @@ def write_scene(
     """Copy a scene with the bases of a calibration of the arms; all else stays as it is."""
     from launch.plan import load_scene
     from messages.arms_calibration import load_arms_calibration
-    from messages.calibration import CalibrationFileError
+    from messages.calibration_file import CalibrationFileError
 
     _refuse_overwriting(output, "-o")
     load_scene(scene_file)
@@ -236,12 +236,8 @@ def _refuse_overwriting(path: Path, option: str) -> None:
 
 
 def _optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
-    from messages.calibration import (
-        CalibrationFileError,
-        CalibrationMismatchError,
-        load_calibration,
-        refuse_other_camera,
-    )
+    from messages.calibration import load_calibration, refuse_other_camera
+    from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 
     if path is None:
         return None

@@ -159,12 +159,8 @@ def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterato
 
 def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     """The scene's camera with the optics of a calibration file."""
-    from messages.calibration import (
-        CalibrationFileError,
-        CalibrationMismatchError,
-        load_calibration,
-        refuse_other_camera,
-    )
+    from messages.calibration import load_calibration, refuse_other_camera
+    from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 
     if calibration is None:
         return scene.camera

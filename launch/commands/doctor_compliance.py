@@ -38,8 +38,9 @@ def compliance(
     """
     from launch.compliance import compliance_result, front_curve
     from launch.plan import load_scene
+    from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
     from messages.scene import UnfitGeometryError
-    from messages.sheet_calibration import SheetCalibrationError, load_sheet_calibration
+    from messages.sheet_calibration import load_sheet_calibration
     from nodes.planner.compliance import ObjectCurve
     from nodes.planner.sheet_force import law_for
 
@@ -50,7 +51,7 @@ def compliance(
         )
         with words.status("working out the soft body"):
             curve = ObjectCurve.from_rows(front_curve(scene))
-    except (SheetCalibrationError, UnfitGeometryError) as error:
+    except (CalibrationFileError, CalibrationMismatchError, UnfitGeometryError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
     result = compliance_result(scene, law, curve)
     if as_json:

@@ -40,7 +40,7 @@ def rubber_of(sheet: SheetSpec) -> Rubber:
 def law_for(sheet: SheetSpec, calibration: SheetCalibration | None = None) -> SheetLaw:
     """The law to plan with: as calibrated, else the scaled law of the scene's sheet.
 
-    SheetCalibrationError for a calibration of a sheet of other sizes.
+    CalibrationMismatchError for a calibration of a sheet of other sizes.
     """
     rubber = rubber_of(sheet)
     if calibration is None:

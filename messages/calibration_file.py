@@ -1,0 +1,76 @@
+"""How calibrations are kept: as YAML that people can read, with every number in full precision."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from messages.scene import Part
+
+Calibration = TypeVar("Calibration", bound=Part)
+
+
+class CalibrationFileError(ValueError):
+    """A calibration file that cannot be used; the message names file, key and remedy."""
+
+
+class CalibrationMismatchError(ValueError):
+    """A calibration of something else than the scene's: another camera, another sheet."""
+
+
+def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:
+    """Write the file, replacing an older one only when the new one is complete.
+
+    title: the first line of its head.  comment: one line more, as the command that made it.
+    """
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 4096  # a row of a matrix a line
+    text = io.StringIO()
+    text.write(f"# {title}\n")
+    if comment:
+        text.write(f"# {comment}\n")
+    yaml.dump(calibration.model_dump(mode="json"), text)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(text.getvalue())
+    partial.replace(path)
+
+
+def read_calibration(
+    kind: type[Calibration], path: Path, *, version: int, command: str
+) -> Calibration:
+    """Read a calibration of one kind, as its command wrote it.
+
+    Raises CalibrationFileError for a file that is absent, foreign, of another version or
+    incomplete.
+    """
+    try:
+        content: Any = YAML(typ="safe").load(path.read_text())
+    except OSError as error:
+        raise CalibrationFileError(
+            f"{path}: cannot be read: {error.strerror}; name a file that `{command}` wrote"
+        ) from error
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise CalibrationFileError(f"{path}: not YAML: {error}") from error
+    if not isinstance(content, dict) or "version" not in content:
+        raise CalibrationFileError(
+            f'{path}: no key "version": not a calibration; `{command}` writes one'
+        )
+    if content["version"] != version:
+        raise CalibrationFileError(
+            f"{path}: version: {content['version']!r}, this program reads {version}; "
+            f"calibrate anew with `{command}`"
+        )
+    try:
+        return kind.model_validate(content)
+    except ValidationError as error:
+        problems = "; ".join(
+            f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
+            for problem in error.errors()
+        )
+        raise CalibrationFileError(f"{path}: not what `{command}` writes: {problems}") from error
