@@ -1,96 +1,112 @@
-"""The `flexsheet` command.  Subcommands live in `launch.commands`; this file only gathers them."""
+"""The `flexsheet` command.
+
+A command is a line of `COMMANDS`; its module in `launch.commands` is imported when it is called, so
+that nobody waits for the others.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator, Mapping
+from functools import cache
+from importlib import import_module
+from typing import Any
 
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command
 
-from launch.commands import (
-    arms,
-    bag,
-    calibrate,
-    calibrate_arms,
-    calibrate_projector,
-    calibrate_sheet,
-    chart,
-    doctor,
-    doctor_compliance,
-    experiment,
-    keys,
-    launching,
-    node,
-    prepare,
-    service,
-    topic,
-    trying,
-)
-from launch.commands.output import BAD_INPUT, FAILED, CommandError, words
+from launch.commands.output import CommandError, examples, words
+
+COMMANDS: dict[str, tuple[str, ...]] = {
+    "launch": ("launching",),
+    "node": ("node",),
+    "topic": ("topic",),
+    "bag": ("bag",),
+    "arms": ("arms",),
+    "experiment": ("experiment",),
+    "demo": ("demo",),
+    "try": ("trying",),
+    "chart": ("chart",),
+    "calibrate": ("calibrate", "calibrate_arms", "calibrate_projector", "calibrate_sheet"),
+    "prepare": ("prepare",),
+    "keys": ("keys",),
+    "service": ("service",),
+    "doctor": ("doctor", "doctor_compliance"),
+}
+"""Modules of `launch.commands` by name of command, in the order of `--help`.
+
+The first one has the typer app `app`, of one command or of many; the others have `register(app)`
+and add to it.
+"""
+
+
+@cache
+def load_command(name: str) -> Any:
+    """The click command of a name in `COMMANDS`."""
+    first, *further = (import_module(f"launch.commands.{module}") for module in COMMANDS[name])
+    for module in further:
+        module.register(first.app)
+    command = get_command(first.app)
+    command.name = name
+    return command
+
+
+class CommandTable(Mapping[str, Any]):
+    """The commands of `COMMANDS`, each imported when it is looked up."""
+
+    def __getitem__(self, name: str) -> Any:
+        return load_command(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(COMMANDS)
+
+    def __len__(self) -> int:
+        return len(COMMANDS)
+
+
+class CommandGroup(TyperGroup):
+    """A typer group whose commands are those of the table."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.commands = CommandTable()  # type: ignore[assignment]  # nobody adds to it
+
 
 app = typer.Typer(
     name="flexsheet",
+    cls=CommandGroup,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
-    help="An encountered-type visual haptic display with a flexible sheet.",
+    epilog=examples("flexsheet try", "flexsheet launch launch/demo.yaml", "flexsheet topic list"),
 )
-app.command()(launching.launch)
-app.command()(prepare.prepare)
-app.add_typer(node.app, name="node")
-app.add_typer(topic.app, name="topic")
-app.add_typer(bag.app, name="bag")
-app.add_typer(keys.app, name="keys")
-app.add_typer(arms.app, name="arms")
-app.add_typer(service.app, name="service")
-calibrate_arms.register(calibrate.app)
-calibrate_projector.register(calibrate.app)
-calibrate_sheet.register(calibrate.app)
-app.add_typer(calibrate.app, name="calibrate")
-app.add_typer(experiment.app, name="experiment")
-app.command()(experiment.demo)
-app.command("try")(trying.try_it)
-app.command()(chart.chart)
-doctor_compliance.register(doctor.app)
-app.add_typer(doctor.app, name="doctor")
+
+
+@app.callback()
+def flexsheet() -> None:
+    """An encountered-type visual haptic display with a flexible sheet."""
 
 
 def main() -> None:
     """Run the command line; what people can put right is said in a sentence, without a trace."""
     try:
-        app()
+        app(prog_name="flexsheet")
     except Exception as error:
-        code = _exit_code(error)
+        code = exit_code(error)
         if code is None:
             raise
         words.print(f"flexsheet: {error}", markup=False)
         sys.exit(code)
 
 
-def _exit_code(error: Exception) -> int | None:
+def exit_code(error: Exception) -> int | None:
     """The exit code of an error that is the user's to put right; None for an error of ours."""
-    # Imported only now: a command that goes well should not wait for these.
-    from launch.documents import BadInputError
-    from launch.experiments import ExperimentError
-    from launch.export import ExportError
-    from launch.runs import RunDirectoryError
-    from launch.supervisor import NodeFailedError
-    from messages.bag import BagError
-    from messages.bus import BusError
-    from messages.security import SecurityError
-
     if isinstance(error, CommandError):
         return error.code
-    if isinstance(error, BadInputError):
+    # Imported only now: a command that goes well should not wait for these.
+    from launch.commands.failures import BAD_INPUTS, FAILURES
+    from launch.commands.output import BAD_INPUT, FAILED
+
+    if isinstance(error, BAD_INPUTS):
         return BAD_INPUT
-    failures = (
-        BusError
-        | SecurityError
-        | RunDirectoryError
-        | BagError
-        | ExperimentError
-        | ExportError
-        | NodeFailedError
-    )
-    if isinstance(error, failures):
-        return FAILED
-    return None
+    return FAILED if isinstance(error, FAILURES) else None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
-from launch.commands.output import FAILED, print_json, print_table, words
+from launch.commands.output import FAILED, examples, print_json, print_table, words
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from messages.base import Message
     from messages.types import ArmState
 
-app = typer.Typer(no_args_is_help=True, help="The arms of the graph that runs: ready, stop, reset.")
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="The arms of the graph that runs: ready, stop, reset.",
+)
 
 TOPICS = ("arm_left", "arm_right")
 ANSWER_S = 3.0
@@ -25,13 +29,13 @@ FRESH_S, TURN_S = 0.5, 0.02
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for whoever reads it.")]
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet arms status", "flexsheet arms status --json"))
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
     """How the arms are; exit code 1 when one says nothing."""
     raise typer.Exit(run_interruptible(_say(run, None, lambda arms: len(arms) == 2, as_json)))
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet arms ready"))
 def ready(run: RunOption = None, as_json: JsonOption = False) -> None:
     """Let the arms move.  Look first that nobody is near them.
 
@@ -45,7 +49,10 @@ def ready(run: RunOption = None, as_json: JsonOption = False) -> None:
     raise typer.Exit(run_interruptible(_say(run, ("arming", Arming(ready=True)), done, as_json)))
 
 
-@app.command("stand-down")
+@app.command(
+    "stand-down",
+    epilog=examples("flexsheet arms stand-down --reason 'end of the session'"),
+)
 def stand_down(
     reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
@@ -60,7 +67,7 @@ def stand_down(
     raise typer.Exit(run_interruptible(_say(run, ("arming", message), done, as_json)))
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet arms stop"))
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
@@ -75,7 +82,7 @@ def stop(
     raise typer.Exit(run_interruptible(_say(run, ("estop", message), done, as_json)))
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet arms reset --reason 'looked at, all clear'"))
 def reset(
     reason: ReasonOption = "flexsheet arms reset",
     run: RunOption = None,

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -17,9 +15,11 @@ from launch.commands.output import (
     FAILED,
     OTHER_THAN_LIVE,
     CommandError,
+    examples,
     print_fields,
     print_json,
     print_table,
+    progress_bar,
     words,
 )
 
@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from launch.replay import Verification
     from launch.runs import Run
 
-app = typer.Typer(no_args_is_help=True, help="Bags: recordings of topics (MCAP files).")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="Bags: recordings of topics (MCAP files)."
+)
 
 BagArgument = Annotated[Path, typer.Argument(metavar="BAG", help="Bag file.")]
 TopicsOption = Annotated[
@@ -36,7 +38,12 @@ TopicsOption = Annotated[
 ]
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet bag record session.mcap",
+        "flexsheet bag record fingers.mcap --topic fingertip --duration 10",
+    )
+)
 def record(
     bag: BagArgument,
     topics: TopicsOption = None,
@@ -44,16 +51,25 @@ def record(
         float | None, typer.Option(metavar="SECONDS", help="Stop by itself.")
     ] = None,
     run: RunOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Record the graph that runs, until Ctrl-C; without --topic all that is logged by default."""
     plan, found = running_graph(run)
     if bag.exists():
         raise CommandError(f"{bag}: exists already; a bag is never written over", BAD_INPUT)
     run_interruptible(_record(bag, topics or [], plan, found, duration))
-    words.print(f"recorded {bag}", markup=False)
+    if as_json:
+        print_json({"bag": str(bag)})
+    else:
+        words.print(f"recorded {bag}", markup=False)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet bag play session.mcap --rate 0.5",
+        "flexsheet bag play session.mcap --topic twin/finger_path --into graph.yaml",
+    )
+)
 def play(
     *,
     bag: BagArgument,
@@ -66,13 +82,14 @@ def play(
         typer.Option(metavar="FILE", help="Start this launch file for the time of playing."),
     ] = None,
     run: RunOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Play a bag into a graph: the topics that its launch file leaves to tools (from_tools)."""
-    how = Playing(bag, tuple(topics or ()), rate, start, loop)
+    how = Playing(bag, tuple(topics or ()), rate, start, loop, as_json)
     raise typer.Exit(run_interruptible(_play(how, into, run)))
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet bag info session.mcap"))
 def info(bag: BagArgument, as_json: JsonOption = False) -> None:
     """What a bag holds; a bag that was cut off by a crash is read as far as it goes."""
     from messages.bag import info as bag_info
@@ -102,7 +119,7 @@ def info(bag: BagArgument, as_json: JsonOption = False) -> None:
     )
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet bag recover cut.mcap whole.mcap"))
 def recover(
     bag: BagArgument,
     output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="Bag to write.")],
@@ -119,7 +136,12 @@ def recover(
         print_fields([*asdict(report).items(), ("output", output)])
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet bag export session.mcap for-foxglove.mcap",
+        "flexsheet bag export session.mcap small.mcap --topic fingertip --topic sheet_target",
+    )
+)
 def export(
     bag: BagArgument,
     output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="MCAP file to write.")],
@@ -129,7 +151,7 @@ def export(
     """Write what a bag holds for other tools: Foxglove and rerun open the file."""
     from launch.export import export as export_bag
 
-    with _progress(f"exporting {bag.name}") as progress:
+    with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
     for topic in result.unreadable:
         words.print(f"not exported: {topic} (its type has changed since)", markup=False)
@@ -139,7 +161,12 @@ def export(
     print_table(("channel", "messages"), sorted(result.messages.items()))
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet bag verify planner session.mcap",
+        "flexsheet bag verify triangulator session.mcap --tolerance 1e-9 --json",
+    )
+)
 def verify(
     node: Annotated[str, typer.Argument(help="Name of the node in the bag's launch file.")],
     bag: BagArgument,
@@ -262,6 +289,7 @@ class Playing:
     rate: float
     start_s: float
     loop: bool
+    as_json: bool
 
 
 async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> int:
@@ -290,7 +318,7 @@ async def _play_into(how: Playing, plan: Plan, run: Run) -> int:
         raise CommandError(f"{how.bag}: nothing in it can be played into {plan.launch_file}")
     sent = 0
     while True:
-        with _progress(f"playing {how.bag.name}") as progress:
+        with progress_bar(f"playing {how.bag.name}") as progress:
             sent += await play_bag(
                 how.bag,
                 plan,
@@ -302,14 +330,8 @@ async def _play_into(how: Playing, plan: Plan, run: Run) -> int:
             )
         if not how.loop:
             break
-    words.print(f"played {sent} messages on {', '.join(selection.topics)}", markup=False)
+    if how.as_json:
+        print_json({"bag": str(how.bag), "messages": sent, "topics": list(selection.topics)})
+    else:
+        words.print(f"played {sent} messages on {', '.join(selection.topics)}", markup=False)
     return 0
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[float, float], None]]:
-    from rich.progress import Progress
-
-    with Progress(console=words, transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda played, total: bar.update(task, completed=played, total=total)

@@ -16,6 +16,7 @@ from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    examples,
     print_fields,
     print_json,
     print_table,
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from messages.calibration import Board, StereoCalibration
     from messages.scene import Scene
 
-app = typer.Typer(no_args_is_help=True, help="Calibration from pictures.")
+app = typer.Typer(add_completion=False, no_args_is_help=True, help="Calibration from pictures.")
 
 LeftOption = Annotated[str, typer.Option(metavar="GLOB", help="Left pictures, in name order.")]
 RightOption = Annotated[str, typer.Option(metavar="GLOB", help="Right pictures, in name order.")]
@@ -44,7 +45,14 @@ DictionaryOption = Annotated[
 FOUR_BITS = "DICT_4X4_50"
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate stereo --left 'left*.jpg' --right 'right*.jpg' --board 9x6 "
+        "--square-mm 25 -o stereo.yaml",
+        "flexsheet calibrate stereo --twin launch/scenes/cylinder.yaml --board 9x6 "
+        "--square-mm 25 -o stereo.yaml",
+    )
+)
 def stereo(
     *,
     board: BoardOption,
@@ -206,7 +214,12 @@ def _tell(calibration: StereoCalibration, output: Path, page: Path | None, as_js
             words.print(f"left out: {pair.left}: {pair.reason}", markup=False)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet calibrate check --calibration stereo.yaml --left 'left*.jpg' --right "
+        "'right*.jpg' --board 9x6 --square-mm 25"
+    )
+)
 def check(
     *,
     calibration: Annotated[Path, typer.Option(help="Calibration file.")],
@@ -247,7 +260,13 @@ def check(
         print_fields((name, _figure(value)) for name, value in result.items() if value != again)
 
 
-@app.command("cross-check")
+@app.command(
+    "cross-check",
+    epilog=examples(
+        "flexsheet calibrate cross-check --left 'left*.jpg' --right 'right*.jpg' --board 9x6 "
+        "--square-mm 25"
+    ),
+)
 def cross_check(
     *,
     left: LeftOption,
@@ -292,7 +311,13 @@ def cross_check(
     )
 
 
-@app.command("board")
+@app.command(
+    "board",
+    epilog=examples(
+        "flexsheet calibrate board --board 9x6 --square-mm 25 -o board.svg",
+        "flexsheet calibrate board --board 9x6 --square-mm 25 --marker-mm 18 -o board.svg",
+    ),
+)
 def print_board(
     *,
     board: BoardOption,
@@ -377,7 +402,7 @@ def _progress(what: str) -> Iterator[Callable[[int, int, str], None]]:
     """A progress bar on stderr, as the function that the calibration calls."""
     from rich.progress import Progress
 
-    with Progress(console=words, transient=True) as bar:
+    with Progress(console=words.console, transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total, now: bar.update(
             task, completed=done, total=total, description=now

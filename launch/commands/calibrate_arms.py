@@ -26,6 +26,7 @@ from launch.commands.graph import JsonOption, RunOption, run_interruptible
 from launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    examples,
     print_fields,
     print_json,
     words,
@@ -55,9 +56,26 @@ SIDES: tuple[Side, Side] = ("left", "right")
 
 def register(app: typer.Typer) -> None:
     """Add the commands to `flexsheet calibrate`."""
-    app.command("arms")(arms)
-    app.command("arms-capture")(capture)
-    app.command("arms-scene")(write_scene)
+    app.command(
+        "arms",
+        epilog=examples(
+            "flexsheet calibrate arms --scene lab.yaml --left-arm places-left --right-arm "
+            "places-right --board 9x6 --square-mm 10 -o arms.yaml",
+            "flexsheet calibrate arms --scene launch/scenes/cylinder.yaml --twin --board 9x6 "
+            "--square-mm 10 -o arms.yaml",
+        ),
+    )(arms)
+    app.command(
+        "arms-capture",
+        epilog=examples(
+            "flexsheet calibrate arms-capture --arm left --scene lab.yaml --board 9x6 "
+            "--square-mm 10 -o places-left"
+        ),
+    )(capture)
+    app.command(
+        "arms-scene",
+        epilog=examples("flexsheet calibrate arms-scene arms.yaml lab.yaml -o lab-measured.yaml"),
+    )(write_scene)
 
 
 def arms(
@@ -132,6 +150,7 @@ def write_scene(
     calibration: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="Of the arms.")],
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene to copy.")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")],
+    as_json: JsonOption = False,
 ) -> None:
     """Copy a scene with the bases of a calibration of the arms; all else stays as it is."""
     from launch.plan import load_scene
@@ -144,7 +163,10 @@ def write_scene(
         _write_copy(scene_file, load_arms_calibration(calibration), output)
     except CalibrationFileError as error:
         raise CommandError(str(error), BAD_INPUT) from error
-    words.print(f"scene: {output}", markup=False)
+    if as_json:
+        print_json({"scene": str(output)})
+    else:
+        words.print(f"scene: {output}", markup=False)
 
 
 def capture(
@@ -161,6 +183,7 @@ def capture(
     marker_mm: MarkerOption = None,
     dictionary: DictionaryOption = FOUR_BITS,
     run: RunOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Take places from the graph that runs, from the topics of the arm and `stereo`.
 
@@ -183,7 +206,10 @@ def capture(
     taker = PlaceTaker(output, described, rig_of(scene, _optics(calibration, scene)))
     size = (scene.camera.width_px, scene.camera.height_px)
     run_interruptible(_watch(f"arm_{side}", taker, size, places, run))
-    words.print(f"{taker.taken} places in {output}", markup=False)
+    if as_json:
+        print_json({"folder": str(output), "places": taker.taken})
+    else:
+        words.print(f"{taker.taken} places in {output}", markup=False)
 
 
 async def _watch(

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, words
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    examples,
+    print_fields,
+    print_json,
+    words,
+)
 
 if TYPE_CHECKING:
     from messages.scene import Projector, Scene, StereoCamera
@@ -23,7 +30,15 @@ VOLUME_HALF_M = 0.1
 
 def register(app: typer.Typer) -> None:
     """Adds the command to `flexsheet calibrate`."""
-    app.command("projector")(projector)
+    app.command(
+        "projector",
+        epilog=examples(
+            "flexsheet calibrate projector --scene lab.yaml --write-patterns patterns",
+            "flexsheet calibrate projector --scene lab.yaml --pictures poses -o lab-measured.yaml",
+            "flexsheet calibrate projector --scene lab.yaml --corners '599,499 199,499 199,99 "
+            "599,99' --rectangle-mm 200x200",
+        ),
+    )(projector)
 
 
 def projector(
@@ -75,7 +90,10 @@ def projector(
     scene = load_scene(scene_file)
     size = scene.projector.width_px, scene.projector.height_px
     if write_patterns is not None:
-        _write_patterns(gray_code.patterns(*size), write_patterns)
+        shown = gray_code.patterns(*size)
+        _write_patterns(shown, write_patterns)
+        if as_json:
+            print_json({"folder": str(write_patterns), "patterns": len(shown)})
         return
     if (pictures is not None) + (corners is not None) + twin != 1:
         raise CommandError(
@@ -152,7 +170,7 @@ def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterato
 
     shown = patterns(scene.projector.width_px, scene.projector.height_px)
     lit = LitSheet(scene, true_camera(scene.camera), true, seed=seed)
-    held = track(sheet_poses(poses), "taking pictures", console=words, transient=True)
+    held = track(sheet_poses(poses), "taking pictures", console=words.console, transient=True)
     for world_from_sheet in held:
         yield lit.pair(shown, world_from_sheet)
 

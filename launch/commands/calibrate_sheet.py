@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, words
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    examples,
+    print_fields,
+    print_json,
+    words,
+)
 
 if TYPE_CHECKING:
     from messages.scene import Scene
@@ -22,7 +29,13 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
 def register(app: typer.Typer) -> None:
     """Adds the command to `flexsheet calibrate`."""
-    app.command("sheet")(sheet)
+    app.command(
+        "sheet",
+        epilog=examples(
+            "flexsheet calibrate sheet --rows pushes.csv --scene lab.yaml -o sheet.yaml",
+            "flexsheet calibrate sheet --twin launch/scenes/cylinder.yaml -o sheet.yaml",
+        ),
+    )(sheet)
 
 
 def sheet(
@@ -156,7 +169,7 @@ def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[Pu
 
     from launch.sheet_rows import twin_rows
 
-    with Progress(console=words, transient=True) as bar:
+    with Progress(console=words.console, transient=True) as bar:
         task = bar.add_task("pushing the twin's sheet", total=None)
         return twin_rows(
             scene,

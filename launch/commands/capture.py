@@ -130,7 +130,7 @@ def _shown(capture: Capture) -> Iterator[Any]:
         return
     from rich.live import Live
 
-    with Live(coverage_view(capture, "waiting for pictures"), console=words) as live:
+    with Live(coverage_view(capture, "waiting for pictures"), console=words.console) as live:
         yield lambda hint, taken: live.update(coverage_view(capture, hint))
 
 

@@ -11,15 +11,25 @@ from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
     CommandError,
+    examples,
     print_json,
     print_table,
     progress_words,
     words,
 )
 
+app = typer.Typer(add_completion=False)
+
 SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet chart tracking",
+        "flexsheet chart kinematics --scene lab.yaml --json",
+        "flexsheet chart --output docs/charts --redraw",
+    )
+)
 def chart(
     *,
     family: Annotated[str | None, typer.Argument(help="Method family; without it, all.")] = None,
@@ -45,6 +55,8 @@ def chart(
         for result in results:
             charts.write_chart(result, output)
         words.print(f"charts: {charts.write_overview(output)}")
+        if as_json:
+            print_json(results)
         return
     scene = load_scene(scene_file)
     try:

@@ -13,6 +13,7 @@ from launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
+    examples,
     print_fields,
     print_json,
     print_table,
@@ -21,8 +22,10 @@ from launch.commands.output import (
 )
 
 app = typer.Typer(
+    add_completion=False,
     invoke_without_command=True,
     help="Check this machine, or with `scene` whether the arms reach a scene's working range.",
+    epilog=examples("flexsheet doctor", "flexsheet doctor --sweep", "flexsheet doctor --json"),
 )
 
 
@@ -62,7 +65,10 @@ def doctor(
         raise typer.Exit(FAILED)
 
 
-@app.command("scene")
+@app.command(
+    "scene",
+    epilog=examples("flexsheet doctor scene launch/scenes/cylinder.yaml -o reach.png"),
+)
 def check_scene(
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to check.")],
     output: Annotated[

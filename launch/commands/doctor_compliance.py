@@ -12,6 +12,7 @@ from launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
+    examples,
     print_fields,
     print_json,
     print_table,
@@ -21,7 +22,10 @@ from launch.commands.output import (
 
 def register(app: typer.Typer) -> None:
     """Adds the command to `flexsheet doctor`."""
-    app.command("compliance")(compliance)
+    app.command(
+        "compliance",
+        epilog=examples("flexsheet doctor compliance launch/scenes/cylinder.yaml"),
+    )(compliance)
 
 
 def compliance(

@@ -1,4 +1,4 @@
-"""`flexsheet experiment` and `flexsheet demo`: the paper's experiments, run on the graph."""
+"""`flexsheet experiment`: the paper's experiments, run on the graph."""
 
 from __future__ import annotations
 
@@ -8,13 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import print_json, print_table, progress_words, words
+from launch.commands.output import examples, print_json, print_table, progress_words, words
 
 if TYPE_CHECKING:
     from launch.experiments.image import Series
     from launch.experiments.run import Procedure, Progress
 
-app = typer.Typer(no_args_is_help=True, help="The paper's experiments, through the running graph.")
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="The paper's experiments, through the running graph.",
+)
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 
@@ -40,7 +44,8 @@ MapOption = Annotated[
 ]
 
 
-def _folder(output: Path | None, name: str) -> Path:
+def result_folder(output: Path | None, name: str) -> Path:
+
     from launch.experiments.run import new_folder
 
     if output is None:
@@ -62,7 +67,12 @@ def _record(
     progress("reading the bag")
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet experiment stroke --seconds 30",
+        "flexsheet experiment stroke --set triangulator.method=none --json",
+    )
+)
 def stroke(
     *,
     seconds: Annotated[float, typer.Option(min=1.0, max=600.0, help="Moving time.")] = 10.0,
@@ -75,7 +85,7 @@ def stroke(
     from launch.experiments import stroke as experiment
     from launch.experiments.run import stroke_procedure
 
-    bag = _folder(output, "stroke") / "stroke.mcap"
+    bag = result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
         procedure = stroke_procedure([seconds], progress)
         _record(launch_file, settings, bag, procedure, progress)
@@ -89,7 +99,7 @@ def stroke(
         words.print(f"bag: {bag}")
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet experiment tilt --map tilt.png"))
 def tilt(
     *,
     map_file: MapOption = None,
@@ -101,11 +111,15 @@ def tilt(
     """Errors of the picture on an inclined sheet (section VI-B, Fig. 11)."""
     from launch.experiments.image import TILT
 
-    bag = _folder(output, "tilt") / "tilt.mcap"
+    bag = result_folder(output, "tilt") / "tilt.mcap"
     _photograph(TILT, bag, launch_file, settings, map_file=map_file, as_json=as_json)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet experiment push", "flexsheet experiment push --at 50 --tilt 20 --json"
+    )
+)
 def push(
     *,
     at_mm: Annotated[
@@ -131,11 +145,11 @@ def push(
     from launch.experiments.run import settings_of_type
 
     settings = [*settings_of_type(launch_file, "planner", "presents=stretch"), *(settings or ())]
-    bag, series = _folder(output, "push") / "push.mcap", pushed_at(at_mm, tilt_deg)
+    bag, series = result_folder(output, "push") / "push.mcap", pushed_at(at_mm, tilt_deg)
     _photograph(series, bag, launch_file, settings, map_file=map_file, as_json=as_json)
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet experiment compliance --output runs/soft"))
 def compliance(
     *,
     launch_file: LaunchOption = DEMO_FILE,
@@ -147,7 +161,7 @@ def compliance(
     from launch.experiments import compliance as experiment
     from launch.experiments.pictures import draw_compliance
 
-    folder = _folder(output, "compliance")
+    folder = result_folder(output, "compliance")
     bag, picture = folder / "compliance.mcap", folder / "compliance.png"
     with progress_words() as progress:
         procedure = experiment.compliance_procedure(progress)
@@ -216,7 +230,7 @@ def _print_rows(
         words.print(f"map: {map_file}")
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet experiment gestures --names tap,stop"))
 def gestures(
     *,
     names: Annotated[
@@ -232,7 +246,7 @@ def gestures(
     from launch.experiments import gestures as experiment
 
     wanted = experiment.chosen(names)
-    bag = _folder(output, "gestures") / "gestures.mcap"
+    bag = result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.gestures_procedure(wanted, progress)
         _record(launch_file, settings, bag, procedure, progress)
@@ -282,32 +296,3 @@ def print_strokes(results: list[dict[str, Any]]) -> None:
                 row.append(f"{ours['mean']:.3f} ± {ours['std']:.3f}")
         rows.append(row)
     print_table(columns, rows)
-
-
-def demo(
-    *,
-    launch_file: LaunchOption = DEMO_FILE,
-    settings: SettingsOption = None,
-    finger_path: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME_OR_FILE",
-            help="A gesture by name, or a recorded finger (CSV with t_s,x_mm,y_mm,z_mm), instead "
-            "of the strokes.",
-        ),
-    ] = None,
-    output: OutputOption = None,
-) -> None:
-    """Run the whole system on this machine: stroke, tilt and push the sheet; then pictures."""
-    from launch.experiments.demo import run_demo
-    from launch.experiments.gestures import finger_path as path_of
-
-    path = None if finger_path is None else path_of(launch_file, finger_path)
-    folder = _folder(output, "demo")
-    with progress_words() as progress:
-        result = run_demo(launch_file, settings or (), folder, progress, path=path)
-    if result.strokes:
-        print_strokes(result.strokes)
-    words.print(f"bag: {result.bag}")
-    for picture in result.pictures:
-        words.print(f"picture: {picture}")

@@ -8,14 +8,24 @@ from typing import Annotated
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import BAD_INPUT, FAILED, CommandError, print_json, print_table, words
+from launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    examples,
+    print_json,
+    print_table,
+    words,
+)
 
-app = typer.Typer(no_args_is_help=True, help="Keys between hosts: one pair per host.")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="Keys between hosts: one pair per host."
+)
 
 HostArgument = Annotated[str, typer.Argument(metavar="HOST", help="Its name in the launch file.")]
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet keys new arm_left"))
 def new(
     host: HostArgument,
     replace: Annotated[
@@ -50,7 +60,7 @@ def new(
         print(public)
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet keys show", "flexsheet keys show arm_left"))
 def show(
     host: Annotated[str | None, typer.Argument(metavar="HOST", help="Without it: all.")] = None,
     as_json: JsonOption = False,
@@ -83,13 +93,18 @@ def show(
         raise typer.Exit(FAILED)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet keys install lab.yaml arm_left 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'"
+    )
+)
 def install(
     file: Annotated[Path, typer.Argument(metavar="LAUNCH_FILE", help="The same on every host.")],
     host: HostArgument,
     key: Annotated[
         str | None, typer.Argument(metavar="KEY", help="Without it: the one made here.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Put a host's public key into a launch file.
 
@@ -105,4 +120,7 @@ def install(
         except SecurityError as error:
             raise CommandError(str(error)) from error
     install_key(file, host, key)
-    words.print(f"{file}: hosts.{host}.key is {key}", markup=False)
+    if as_json:
+        print_json({"launch_file": str(file), "host": host, "public": key})
+    else:
+        words.print(f"{file}: hosts.{host}.key is {key}", markup=False)

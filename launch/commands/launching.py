@@ -7,19 +7,37 @@ import json
 import signal
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import FAILED, print_json, print_table, words
+from launch.commands.output import (
+    FAILED,
+    examples,
+    print_json,
+    print_json_line,
+    print_table,
+    words,
+)
 
 if TYPE_CHECKING:
     from launch.plan import Plan
+    from launch.runs import Run
+
+app = typer.Typer(add_completion=False)
 
 LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet launch launch/demo.yaml",
+        "flexsheet launch launch/demo.yaml --console --record session.mcap",
+        "flexsheet launch lab.yaml --host arm_left",
+        "flexsheet launch launch/demo.yaml --set planner.lead_s=0.02 --dry-run",
+    )
+)
 def launch(
     *,
     file: Annotated[Path, typer.Argument(help="Launch file.")],
@@ -46,6 +64,8 @@ def launch(
 ) -> None:
     """Start the nodes of a launch file and keep them running until Ctrl-C.
 
+    With --json the plan is printed, or once all nodes are ready one line about the run.
+
     Exit codes: 0 stopped as asked, 1 a node failed for good, 2 the input is wrong.
     """
     from launch.plan import load_plan
@@ -57,7 +77,18 @@ def launch(
         else:
             _print_plan(plan, host)
         return
-    raise typer.Exit(asyncio.run(run_graph(plan, host, duration)))
+
+    def ready(run: Run) -> None:
+        if as_json:
+            print_json_line(about_run(plan, run, host))
+
+    raise typer.Exit(asyncio.run(run_graph(plan, host, duration, when_ready=ready)))
+
+
+def about_run(plan: Plan, run: Run, host: str | None) -> dict[str, Any]:
+    """What a script wants to know of a graph that is ready."""
+    nodes = [node.name for node in plan.nodes_on(host)]
+    return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes}
 
 
 async def run_graph(
@@ -65,7 +96,7 @@ async def run_graph(
     host: str | None,
     duration_s: float | None,
     *,
-    when_ready: Callable[[], None] = lambda: None,
+    when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
     """Run the plan's nodes until a signal, or `duration_s` after they are ready; the exit code."""
     from launch.notify import keep_telling, tell
@@ -96,7 +127,7 @@ async def run_graph(
                     ready.result()
                     tell("READY=1")
                     words.print(f"[green]all {len(graph.nodes)} nodes are ready[/]; Ctrl-C ends")
-                    when_ready()
+                    when_ready(graph.run)
                     await asyncio.wait(
                         (end, stop), timeout=duration_s, return_when=asyncio.FIRST_COMPLETED
                     )

@@ -7,12 +7,26 @@ from typing import Annotated, Any
 import typer
 
 from launch.commands.graph import JsonOption, running_graph
-from launch.commands.output import BAD_INPUT, CommandError, print_fields, print_json, print_table
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    examples,
+    print_fields,
+    print_json,
+    print_table,
+)
 
-app = typer.Typer(no_args_is_help=True, help="Nodes: which there are, what they take and give.")
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="Nodes: which there are, what they take and give.",
+)
 
 
-@app.command("list")
+@app.command(
+    "list",
+    epilog=examples("flexsheet node list"),
+)
 def list_nodes(as_json: JsonOption = False) -> None:
     """The node types that a launch file can name, and the nodes of the graph that runs."""
     from launch.runs import live_runs
@@ -38,7 +52,12 @@ def list_nodes(as_json: JsonOption = False) -> None:
         )
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet node describe planner",
+        "flexsheet node describe my_package.my_node:MyNode --json",
+    )
+)
 def describe(
     node: Annotated[str, typer.Argument(help='Type of node, or "module:Class".')],
     as_json: JsonOption = False,

@@ -6,13 +6,12 @@ import json
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-from rich.table import Table
-
-words = Console(stderr=True, highlight=False, soft_wrap=True)
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.status import Status
 
 FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
 
@@ -23,6 +22,38 @@ class CommandError(Exception):
     def __init__(self, text: str, code: int = FAILED) -> None:
         super().__init__(text)
         self.code = code
+
+
+class Words:
+    """What is said to people, on stderr; rich is imported with the first word.
+
+    Colours and bars are for terminals, and colours only where NO_COLOR is not set.
+    """
+
+    @cached_property
+    def console(self) -> Console:
+        from rich.console import Console
+
+        return Console(stderr=True, highlight=False, soft_wrap=True)
+
+    @property
+    def is_terminal(self) -> bool:
+        return self.console.is_terminal
+
+    def print(self, text: str, *, markup: bool = True, style: str | None = None) -> None:
+        self.console.print(text, markup=markup, style=style)
+
+    def status(self, text: str) -> Status:
+        """Shows what is being done until it is done; nothing where it is no terminal."""
+        return self.console.status(text)
+
+
+words = Words()
+
+
+def examples(*lines: str) -> str:
+    """Calls of a command, as its help shows them at the end."""
+    return "\n".join(["[bold]Examples[/]", *(line.replace("[", r"\[") for line in lines)])
 
 
 def print_json(data: Any) -> None:
@@ -37,6 +68,9 @@ def print_json_line(data: Any) -> None:
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """A table on stdout; as wide as it needs to be where stdout is no terminal."""
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
         table.add_column(column, overflow="fold")
@@ -62,7 +96,19 @@ def progress_words() -> Iterator[Callable[[str], None]]:
     if not words.is_terminal:
         yield lambda text: words.print(text, markup=False)
         return
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
     columns = (SpinnerColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=words) as bar:
+    with Progress(*columns, console=words.console) as bar:
         task = bar.add_task("", total=None)
         yield lambda text: bar.update(task, description=text)
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[float, float], None]]:
+    """A bar on stderr that is told (done, total); nothing where it is no terminal."""
+    from rich.progress import Progress
+
+    with Progress(console=words.console, transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -7,9 +7,18 @@ from typing import Annotated
 
 import typer
 
-from launch.commands.output import progress_words, words
+from launch.commands.graph import JsonOption
+from launch.commands.output import examples, print_json, progress_words, words
+
+app = typer.Typer(add_completion=False)
 
 
+@app.command(
+    epilog=examples(
+        "flexsheet prepare launch/scenes/cylinder.yaml",
+        "flexsheet prepare launch/scenes/cylinder.yaml --skin-spacing 0.005",
+    )
+)
 def prepare(
     scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file.")],
     cache: Annotated[
@@ -32,6 +41,7 @@ def prepare(
             "table; default: this machine's processors.",
         ),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Work out how a scene's sheet dents, once; experiments and the demo do so by themselves."""
     from launch.plan import load_scene
@@ -41,8 +51,13 @@ def prepare(
         raise typer.BadParameter("is for the table of --skin-spacing", param_hint="--scheduler")
     scene = load_scene(scene_file)
     with progress_words() as progress:
-        path = prepare_dents(scene, cache, progress)
-        words.print(f"dent shapes: {path}")
+        files = {"dent_shapes": prepare_dents(scene, cache, progress)}
         if skin_spacing_m is not None:
-            path = prepare_soft_body(scene, skin_spacing_m, cache, scheduler, progress)
-            words.print(f"soft body: {path}")
+            files["soft_body"] = prepare_soft_body(
+                scene, skin_spacing_m, cache, scheduler, progress
+            )
+    if as_json:
+        print_json({name: str(file) for name, file in files.items()})
+        return
+    for name, file in files.items():
+        words.print(f"{name.replace('_', ' ')}: {file}", markup=False)

@@ -8,14 +8,25 @@ from typing import Annotated
 
 import typer
 
-from launch.commands.output import BAD_INPUT, CommandError, words
+from launch.commands.graph import JsonOption
+from launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
 
-app = typer.Typer(no_args_is_help=True, help="One host of a launch file as a systemd service.")
+app = typer.Typer(add_completion=False, no_args_is_help=True)
 
 USER_PATTERN = "abcdefghijklmnopqrstuvwxyz0123456789_-"
 
 
-@app.command()
+@app.callback()
+def service() -> None:
+    """One host of a launch file as a systemd service."""
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet service install /etc/flexsheet/lab.yaml --host arm_left --dry-run",
+        "sudo flexsheet service install /etc/flexsheet/lab.yaml --host arm_left",
+    )
+)
 def install(
     *,
     launch_file: Annotated[Path, typer.Argument(metavar="LAUNCH_FILE")],
@@ -23,6 +34,7 @@ def install(
     user: Annotated[str, typer.Option(help="Who runs it; must exist.")] = "flexsheet",
     root: Annotated[Path, typer.Option(help="Where the system lies.")] = Path("/"),
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print, write nothing.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write the unit flexsheet@.service and the host's environment; start nothing."""
     from launch.plan import load_plan
@@ -36,9 +48,13 @@ def install(
         )
     if not user or set(user) - set(USER_PATTERN):
         raise CommandError(f'--user "{user}" is no name of a user', BAD_INPUT)
-    for file in files_of(launch_file=launch_file, host=host, user=user, root=root):
+    files = files_of(launch_file=launch_file, host=host, user=user, root=root)
+    if as_json:
+        print_json([{"path": str(file.path), "text": file.text} for file in files])
+    for file in files:
         if dry_run:
-            print(f"# {file.path}\n{file.text}")
+            if not as_json:
+                print(f"# {file.path}\n{file.text}")
             continue
         try:
             file.path.parent.mkdir(parents=True, exist_ok=True)

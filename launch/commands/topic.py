@@ -18,6 +18,7 @@ from launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
+    examples,
     print_fields,
     print_json,
     print_json_line,
@@ -26,18 +27,25 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from messages.base import Header, Message
     from messages.bus import Handler, Subscriber
     from messages.topics import Topic
 
-app = typer.Typer(no_args_is_help=True, help="Topics: the table, and what is on them now.")
+app = typer.Typer(
+    add_completion=False, no_args_is_help=True, help="Topics: the table, and what is on them now."
+)
 
 TopicArgument = Annotated[str, typer.Argument(help="Name of the topic, as twin/finger.")]
 SHORT_ARRAY = 36
 """Arrays of more elements than a 6x6 matrix are abbreviated."""
 
 
-@app.command("list")
+@app.command(
+    "list",
+    epilog=examples("flexsheet topic list", "flexsheet topic list --json"),
+)
 def list_topics(as_json: JsonOption = False) -> None:
     """The one table of topics."""
     from messages.topics import TOPICS
@@ -62,7 +70,7 @@ def list_topics(as_json: JsonOption = False) -> None:
         )
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet topic info fingertip"))
 def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = False) -> None:
     """Type and fields of a topic, and who writes and reads it in the graph that runs."""
     found = _topic(topic)
@@ -96,7 +104,12 @@ def info(topic: TopicArgument, run: RunOption = None, as_json: JsonOption = Fals
     print_table(("field", "what"), fields.items())
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet topic echo fingertip",
+        "flexsheet topic echo sheet_target --once --field stretch_ratio --json",
+    )
+)
 def echo(
     *,
     topic: TopicArgument,
@@ -126,7 +139,7 @@ def echo(
     raise typer.Exit(run_interruptible(_read(found, run, show, wanted, timeout)))
 
 
-@app.command()
+@app.command(epilog=examples("flexsheet topic hz stereo --duration 10"))
 def hz(
     topic: TopicArgument,
     duration: Annotated[float, typer.Option(help="Measure for so many seconds.", min=0.1)] = 5.0,
@@ -160,13 +173,20 @@ def hz(
         raise typer.Exit(FAILED)
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "flexsheet topic pub display '{correction: two_pass, stereo: mono}'",
+        "flexsheet topic pub estop @stop.yaml --count 3",
+    )
+)
 def pub(
+    *,
     topic: TopicArgument,
     message: Annotated[str, typer.Argument(help="The message in YAML or JSON, or @FILE.")],
     rate: Annotated[float | None, typer.Option(help="Send again at this rate, Hz.")] = None,
     count: Annotated[int | None, typer.Option(help="Send so many times.", min=1)] = None,
     run: RunOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Publish into the graph that runs: to topics that many may write, and those of from_tools.
 
@@ -175,7 +195,19 @@ def pub(
     found = _topic(topic)
     built = _parse_message(found, message)
     times = count if count is not None else (None if rate else 1)
-    code = run_interruptible(_publish(found, built, run, rate or 1.0, times))
+    sent = 0
+
+    def told(count: int) -> None:
+        nonlocal sent
+        sent = count
+
+    code = run_interruptible(
+        _publish(found, built, run=run, rate_hz=rate or 1.0, times=times, told=told)
+    )
+    if as_json:
+        print_json({"topic": topic, "sent": sent})
+    else:
+        words.print(f'sent {sent} on "{topic}"', markup=False)
     raise typer.Exit(code)
 
 
@@ -377,7 +409,13 @@ def _parse_message(topic: Topic, text: str) -> Message:
 
 
 async def _publish(
-    topic: Topic, message: Message, run: Path | None, rate_hz: float, times: int | None
+    topic: Topic,
+    message: Message,
+    *,
+    run: Path | None,
+    rate_hz: float,
+    times: int | None,
+    told: Callable[[int], None],
 ) -> int:
     from launch.tools import READER_RECONNECT_S, ToolsWriter
 
@@ -391,9 +429,9 @@ async def _publish(
                 await asyncio.sleep(1.0 / rate_hz)
             writer.publish(topic.name, message)
             sent += 1
+            told(sent)
         # Latched messages reach readers that are only now connecting.
         await asyncio.sleep(READER_RECONNECT_S / 2)
     finally:
         writer.close()
-    words.print(f'sent {sent} on "{topic.name}"')
     return 0

@@ -6,16 +6,23 @@ import asyncio
 import os
 import webbrowser
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from launch.commands.launching import run_graph
-from launch.commands.output import progress_words, words
+from launch.commands.graph import JsonOption
+from launch.commands.launching import about_run, run_graph
+from launch.commands.output import examples, print_json_line, progress_words, words
+
+if TYPE_CHECKING:
+    from launch.runs import Run
+
+app = typer.Typer(add_completion=False)
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 
 
+@app.command(epilog=examples("flexsheet try", "flexsheet try --port 9000 --no-browser"))
 def try_it(
     *,
     launch_file: Annotated[
@@ -30,6 +37,7 @@ def try_it(
     duration: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Stop by itself, counted from ready.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Touch a virtual object in the browser: no hardware is needed.
 
@@ -46,7 +54,9 @@ def try_it(
     given = plan.nodes["console"].parameters
     url = f"http://{given['address']}:{given['page_port']}/"
 
-    def ready() -> None:
+    def ready(run: Run) -> None:
+        if as_json:
+            print_json_line({"page": url, **about_run(plan, run, None)})
         words.print(f"[bold]open {url}[/] and drag on the sheet")
         if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)

@@ -1,0 +1,62 @@
+"""`flexsheet demo`: the whole system once on this machine."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from launch.commands.experiment import (
+    DEMO_FILE,
+    LaunchOption,
+    OutputOption,
+    SettingsOption,
+    print_strokes,
+    result_folder,
+)
+from launch.commands.graph import JsonOption
+from launch.commands.output import examples, print_json, progress_words, words
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command(
+    epilog=examples("flexsheet demo", "flexsheet demo --finger-path tap --output runs/tap --json")
+)
+def demo(
+    *,
+    launch_file: LaunchOption = DEMO_FILE,
+    settings: SettingsOption = None,
+    finger_path: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME_OR_FILE",
+            help="A gesture by name, or a recorded finger (CSV with t_s,x_mm,y_mm,z_mm), instead "
+            "of the strokes.",
+        ),
+    ] = None,
+    output: OutputOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the whole system on this machine: stroke, tilt and push the sheet; then pictures."""
+    from launch.experiments.demo import run_demo
+    from launch.experiments.gestures import finger_path as path_of
+
+    path = None if finger_path is None else path_of(launch_file, finger_path)
+    folder = result_folder(output, "demo")
+    with progress_words() as progress:
+        result = run_demo(launch_file, settings or (), folder, progress, path=path)
+    if as_json:
+        print_json(
+            {
+                "strokes": result.strokes,
+                "bag": str(result.bag),
+                "pictures": [str(picture) for picture in result.pictures],
+            }
+        )
+        return
+    if result.strokes:
+        print_strokes(result.strokes)
+    words.print(f"bag: {result.bag}")
+    for picture in result.pictures:
+        words.print(f"picture: {picture}")
