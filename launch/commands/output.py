@@ -50,10 +50,18 @@ class Words:
 
 words = Words()
 
+EXAMPLES = "[bold]Examples[/]"
+
 
 def examples(*lines: str) -> str:
     """Calls of a command, as its help shows them at the end."""
-    return "\n".join(["[bold]Examples[/]", *(line.replace("[", r"\[") for line in lines)])
+    return "\n".join([EXAMPLES, *(line.replace("[", r"\[") for line in lines)])
+
+
+def examples_in(epilog: str | None) -> list[str]:
+    """The calls that `examples` has put there."""
+    heading, *lines = (epilog or "").split("\n")
+    return [line.replace(r"\[", "[") for line in lines] if heading == EXAMPLES else []
 
 
 def print_json(data: Any) -> None:

@@ -29,7 +29,9 @@ def service() -> None:
 )
 def install(
     *,
-    launch_file: Annotated[Path, typer.Argument(metavar="LAUNCH_FILE")],
+    launch_file: Annotated[
+        Path, typer.Argument(metavar="LAUNCH_FILE", help="The same on every host.")
+    ],
     host: Annotated[str, typer.Option(help="Which of its hosts this computer is.")],
     user: Annotated[str, typer.Option(help="Who runs it; must exist.")] = "flexsheet",
     root: Annotated[Path, typer.Option(help="Where the system lies.")] = Path("/"),
