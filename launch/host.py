@@ -16,7 +16,8 @@ from typing import Any
 
 import psutil
 
-from launch.plan import Plan, PlannedNode, launcher_on
+from launch.plan import launcher_on
+from launch.planned import Plan, PlannedNode
 from messages.base import Header, Message
 from messages.bus import Publisher, Source, Subscriber
 from messages.clock import SystemClock

@@ -15,8 +15,9 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
 from launch.documents import BadInputError, Problem, did_you_mean, read_document
-from launch.plan import Plan, load_keys
-from launch.runs import Run
+from launch.plan import load_keys
+from launch.planned import Plan
+from launch.runs import Run, ring_file
 from messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
 
 KEYS_VARIABLE = "FLEXSHEET_KEYS"
@@ -33,11 +34,6 @@ def directory() -> Path:
 
 def secret_file(host: str) -> Path:
     return directory() / f"{host}.secret"
-
-
-def ring_file(run: Run, host: str) -> Path:
-    """What processes of `host` in a run read their keys from."""
-    return run.directory / f"keys-{host}.json"
 
 
 def make_rings(plan: Plan, run: Run, host: str | None) -> dict[str, KeyRing]:

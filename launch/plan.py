@@ -13,9 +13,9 @@ import json
 from collections.abc import Iterable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 from ruamel.yaml.error import YAMLError
 
 from launch.documents import (
@@ -29,7 +29,18 @@ from launch.documents import (
     validate,
 )
 from launch.meshes import scene_of
-from messages.bus import Source
+from launch.planned import (
+    LAUNCHER,
+    MAIN,
+    RUN_DIRECTORY,
+    TOOLS,
+    Plan,
+    PlannedNode,
+    PlannedPort,
+    RestartSpec,
+    Strict,
+    Writer,
+)
 from messages.calibration import load_calibration, refuse_other_camera
 from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 from messages.scene import Scene
@@ -38,12 +49,6 @@ from messages.sheet_calibration import load_sheet_calibration, refuse_other_shee
 from messages.topics import TOPICS, Topic
 from nodes import NODES, UnknownNodeError, node_class
 from nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
-
-MAIN = "main"
-"""The host of the launcher's own topics, of the recorder and of the command-line tools."""
-
-LAUNCHER, TOOLS = "launch", "tools"
-"""Writers that are no nodes: the launching process, and command-line tools and experiments."""
 
 LAUNCHERS_TOPICS = ("host", "estop")
 """What the launcher of each host writes: how the host is, and an e-stop that it keeps."""
@@ -57,17 +62,10 @@ CONSOLE_NICE = 10
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
 """Where a recorder that waits for the console puts its bags, from where the command was given."""
 
-RUN_DIRECTORY = "@run"
-"""Stands for the run's directory in endpoints and parameters; known only when the run starts."""
-
 FIRST_PORT, PORTS = 20_000, 10_000
 """TCP ports lie below the range that Linux gives to outgoing connections (32768 and up)."""
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
-
-
-class Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class HostSpec(Strict):
@@ -80,26 +78,12 @@ class HostSpec(Strict):
     )
 
 
-class RestartSpec(Strict):
-    """What happens when a node's process ends by itself.
-
-    The delay doubles from `delay_s` with each restart inside the window, up to `max_delay_s`; after
-    `max_restarts` in `window_s` the node has failed for good and the whole run ends.
-    """
-
-    policy: Literal["never", "on_failure", "always"] = "on_failure"
-    delay_s: float = Field(default=0.2, ge=0, allow_inf_nan=False)
-    max_delay_s: float = Field(default=5.0, gt=0, allow_inf_nan=False)
-    max_restarts: int = Field(default=5, ge=0)
-    window_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
-
-
 class NodeSpec(Strict):
     """One node as the launch file has it."""
 
     type: str = Field(description='a name of the table of nodes, or "module:Class"')
     host: str = MAIN
-    parameters: dict[str, Any] = {}
+    parameters: dict[str, Any] = Field(default={})
     topics: dict[str, str | None] = Field(
         default={}, description="port: topic, where they differ; null leaves a port unconnected"
     )
@@ -132,7 +116,7 @@ class LaunchFile(Strict):
     """A launch file's keys."""
 
     scene: str | None = Field(default=None, description="scene file, relative to this one")
-    hosts: dict[Name, HostSpec] = {MAIN: HostSpec(address="127.0.0.1")}
+    hosts: dict[Name, HostSpec] = Field(default={MAIN: HostSpec(address="127.0.0.1")})
     nodes: dict[Name, NodeSpec]
     from_tools: list[str] = Field(
         default=[], description="topics that a tool writes into the graph, as `bag play` does"
@@ -141,104 +125,6 @@ class LaunchFile(Strict):
     record: dict[str, Any] | None = Field(
         default=None, description="parameters of a recorder on the main host"
     )
-
-
-class Writer(Strict):
-    """One writer of a topic and what it binds: ipc for its own host, tcp for the others."""
-
-    name: str
-    host: str
-    ipc: str
-    tcp: str | None
-
-    @property
-    def endpoints(self) -> tuple[str, ...]:
-        return (self.ipc,) if self.tcp is None else (self.ipc, self.tcp)
-
-    def endpoint_for(self, host: str) -> str:
-        if host == self.host or self.tcp is None:
-            return self.ipc
-        return self.tcp
-
-    def source_for(self, host: str) -> Source:
-        """Where a subscriber on `host` connects to, and whose words alone it takes there."""
-        far = host != self.host and self.tcp is not None
-        return Source(self.endpoint_for(host), self.name, self.host if far else None)
-
-
-class PlannedPort(Strict):
-    """A port, its topic, and the endpoints: bound for an output, connected to for an input."""
-
-    port: str
-    topic: str
-    endpoints: tuple[str, ...]
-
-
-class PlannedNode(Strict):
-    """All that is needed to start one node."""
-
-    name: str
-    type: str
-    host: str
-    parameters: dict[str, Any]
-    inputs: tuple[PlannedPort, ...]
-    outputs: tuple[PlannedPort, ...]
-    restart: RestartSpec
-    start_deadline_s: float
-    liveness_s: float | None = Field(default=None, description="none in bags from before")
-    nice: int = Field(default=0, description="bags from before there was one have none")
-
-
-class Plan(Strict):
-    """A resolved launch file."""
-
-    launch_file: str
-    launch_text: str
-    scene_file: str | None
-    scene_text: str
-    scene: dict[str, Any] | None
-    hosts: dict[str, str] = Field(description="address by name")
-    nodes: dict[str, PlannedNode]
-    writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
-    keys: dict[str, str] = Field(default={}, description="public key by host; no part of the hash")
-    estop_resetters: tuple[str, ...] = Field(default=(MAIN,), description="hosts that may")
-    hash: str
-
-    def writer(self, topic: str, name: str) -> Writer | None:
-        """The writer `name` of `topic`; None when it may not write it."""
-        return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
-
-    def endpoints_to_read(self, topic: str, host: str = MAIN) -> tuple[str, ...]:
-        """Where a subscriber of `topic` on `host` connects to."""
-        return tuple(writer.endpoint_for(host) for writer in self.writers.get(topic, ()))
-
-    def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
-        """The same, with who may write there."""
-        return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
-
-    def may_reset_estop(self) -> tuple[str, ...]:
-        """Writers of e-stops whose hosts may reset one."""
-        return tuple(
-            writer.name
-            for writer in self.writers.get("estop", ())
-            if writer.host in self.estop_resetters
-        )
-
-    def nodes_on(self, host: str | None) -> list[PlannedNode]:
-        """The nodes of one host, or of all."""
-        return [node for node in self.nodes.values() if host is None or node.host == host]
-
-    def ports_of_its_own(self, host: str | None) -> list[tuple[str, int]]:
-        """(node, TCP port) that nodes listen on by themselves: parameters named `..._port`."""
-        return [
-            (node.name, value)
-            for node in self.nodes_on(host)
-            for name, value in node.parameters.items()
-            if name.endswith("_port") and isinstance(value, int) and value > 0
-        ]
-
-    def scene_message(self) -> Scene | None:
-        return None if self.scene is None else Scene.model_validate(self.scene)
 
 
 _PARAMETERS_THEMSELVES: tuple[Key, ...] = (("record",), ("clocks",))

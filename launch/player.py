@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from launch.plan import Plan
+from launch.planned import Plan
 from launch.runs import Run
 from launch.tools import READER_RECONNECT_S, ToolsWriter, topics_for_tools
 from messages.bag import BagError, BagReader

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from launch.plan import Plan
+from launch.planned import Plan
 from messages.scene import Scene
 from nodes.cache import default_cache_dir
 from nodes.models.sheet.membrane import NoEquilibriumError

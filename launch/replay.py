@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from launch.documents import did_you_mean
-from launch.plan import Plan, PlannedNode
+from launch.planned import Plan, PlannedNode
 from messages.bag import BagError, BagReader
 from messages.base import Header, Message
 from messages.clock import VirtualClock

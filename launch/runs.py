@@ -62,6 +62,11 @@ class Run:
                 entry.unlink(missing_ok=True)
 
 
+def ring_file(run: Run, host: str) -> Path:
+    """What processes of `host` in a run read their keys from."""
+    return run.directory / f"keys-{host}.json"
+
+
 def root() -> Path:
     """The directory of this user's runs; short, since a socket's path has 107 bytes at most."""
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")

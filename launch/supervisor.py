@@ -18,8 +18,7 @@ import signal
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -28,21 +27,25 @@ from typing import Any, Self
 from launch.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from launch.documents import BadInputError, Problem, read_document
 from launch.host import HostVoice
-from launch.keys import KeyWatch, make_rings, ring_file
+from launch.keys import KeyWatch, make_rings
 from launch.plan import (
+    clock_node,
+    is_loopback,
+    load_scene,
+)
+from launch.planned import (
     LAUNCHER,
     MAIN,
     RUN_DIRECTORY,
     Plan,
     PlannedNode,
     PlannedPort,
-    clock_node,
-    is_loopback,
-    load_scene,
+    local_endpoints,
+    local_sources,
 )
-from launch.runs import RUN_VARIABLE, Run, create_run, is_free, sweep
+from launch.runs import RUN_VARIABLE, Run, create_run, is_free, ring_file, sweep
 from messages.base import Header
-from messages.bus import Publisher, Source
+from messages.bus import Publisher
 from messages.clock import SystemClock
 from messages.security import KeyRing, SecurityError
 from messages.topics import topic_named
@@ -622,19 +625,6 @@ def _clocks_port(plan: Plan, host: str, run: Run) -> PortConfig | None:
         return None
     endpoints = local_sources(run, [writer.source_for(host)])
     return PortConfig(port="clocks", topic="clocks", endpoints=endpoints)
-
-
-def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """Endpoints of a plan with the run's directory filled in."""
-    return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
-
-
-def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Sources of a plan with the run's directory filled in."""
-    return tuple(
-        replace(one, endpoint=one.endpoint.replace(RUN_DIRECTORY, str(run.directory)))
-        for one in sources
-    )
 
 
 def describe_exit(code: int) -> str | None:

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
-from launch import documents
-from launch.documents import BadInputError
-from launch.keys import ring_file
-from launch.plan import MAIN, TOOLS, Plan
-from launch.runs import Run
-from launch.supervisor import local_endpoints, local_sources
+from launch.planned import MAIN, TOOLS, Plan, local_endpoints, local_sources
+from launch.runs import Run, ring_file
 from messages.base import Header, Message
 from messages.bus import Handler, Problem, Publisher, Subscriber
 from messages.clock import SystemClock
 from messages.security import KeyRing
 from messages.topics import topic_named
 from messages.types import HostStatus, Status
-from nodes.node import PortCounts
 
 READER_RECONNECT_S = 1.0
 """Readers look for a writer that was not there at most every half second."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """What a tool's subscriber has lost or refused."""
+
+    dropped: int = 0
+    gaps: int = 0
+    rejected: int = 0
 
 
 def topics_for_tools(plan: Plan) -> list[str]:
@@ -47,7 +52,7 @@ def subscriber_to(
         wanted,
         local_sources(run, plan.sources_to_read(topic)),
         on_message,
-        PortCounts(),
+        Counts(),
         on_problem=on_problem,
         unopened=unopened,
         keys=keys_of(plan, run),
@@ -72,11 +77,13 @@ class ToolsWriter:
             for name in topics:
                 writer = plan.writer(name, TOOLS)
                 if writer is None:
+                    from launch.documents import BadInputError, Problem
+
                     owners = ", ".join(one.name for one in plan.writers.get(name, ()))
                     what = f"is written by {owners}" if owners else "is not part of the graph"
                     raise BadInputError(
                         [
-                            documents.Problem(
+                            Problem(
                                 plan.launch_file,
                                 ("from_tools",),
                                 f'topic "{name}" {what}',

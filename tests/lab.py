@@ -21,7 +21,8 @@ from typing import Any, Self
 import pytest
 from ruamel.yaml import YAML
 
-from launch.plan import Plan, load_plan
+from launch.plan import load_plan
+from launch.planned import Plan
 from launch.runs import ROOT_VARIABLE
 from messages.base import Header, Message
 from messages.bus import Subscriber

@@ -20,8 +20,9 @@ from playwright.async_api import Locator, Page, async_playwright, expect
 
 from launch import runs
 from launch.plan import load_plan
+from launch.planned import local_endpoints
 from launch.runs import Run
-from launch.supervisor import RunningGraph, local_endpoints
+from launch.supervisor import RunningGraph
 from messages.bag import BagReader
 from messages.base import Header, Message
 from messages.bus import Subscriber

@@ -14,7 +14,8 @@ import pytest
 
 from launch import runs
 from launch.host import devices_of
-from launch.plan import TOOLS, Plan, launcher_on, load_plan
+from launch.plan import launcher_on, load_plan
+from launch.planned import TOOLS, Plan
 from launch.supervisor import RunningGraph
 from launch.tools import ToolsWriter, subscriber_to
 from messages.types import EStop, HostStatus

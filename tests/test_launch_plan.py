@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from launch.documents import BadInputError, parse_value
-from launch.plan import FIRST_PORT, PORTS, Plan, _ports, load_plan
+from launch.plan import FIRST_PORT, PORTS, _ports, load_plan
+from launch.planned import Plan
 
 ROOT = Path(__file__).resolve().parent.parent
 BEACON = "tests.launch_nodes:Beacon"

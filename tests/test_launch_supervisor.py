@@ -24,7 +24,8 @@ import zmq
 
 from launch import runs, supervisor
 from launch.documents import BadInputError
-from launch.plan import Plan, load_plan
+from launch.plan import load_plan
+from launch.planned import Plan
 from launch.supervisor import NodeFailedError, RunningGraph
 from messages.bag import BagReader
 

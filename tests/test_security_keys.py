@@ -15,7 +15,8 @@ import pytest
 from launch import runs
 from launch.documents import BadInputError
 from launch.keys import KEYS_VARIABLE, install
-from launch.plan import Plan, load_plan
+from launch.plan import load_plan
+from launch.planned import Plan
 from launch.supervisor import RunningGraph
 from launch.tools import subscriber_to
 from messages.security import (

@@ -24,7 +24,7 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.plan import Plan
+    from launch.planned import Plan
     from launch.replay import Verification
     from launch.runs import Run
 
@@ -234,9 +234,8 @@ async def _record(
     bag: Path, topics: list[str], plan: Plan, run: Run, duration_s: float | None
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
-    from launch.keys import ring_file
-    from launch.plan import MAIN, RUN_DIRECTORY
-    from launch.supervisor import local_sources
+    from launch.planned import MAIN, RUN_DIRECTORY, local_sources
+    from launch.runs import ring_file
     from messages.topics import TOPICS
     from nodes.recorder.node import Recorder
     from nodes.recorder.parameters import RUN_FILES, RecorderParameters

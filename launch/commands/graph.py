@@ -13,7 +13,7 @@ import typer
 from launch.commands.output import BAD_INPUT, CommandError
 
 if TYPE_CHECKING:
-    from launch.plan import Plan
+    from launch.planned import Plan
     from launch.runs import Run
 
 RunOption = Annotated[
@@ -25,7 +25,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 def running_graph(directory: Path | None) -> tuple[Plan, Run]:
     """The Plan and the Run of the graph in `directory`, or of the newest that is alive."""
-    from launch.plan import Plan
+    from launch.planned import Plan
     from launch.runs import Run, live_runs
 
     if directory is not None:

@@ -22,7 +22,7 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.plan import Plan
+    from launch.planned import Plan
     from launch.runs import Run
 
 app = typer.Typer(add_completion=False)

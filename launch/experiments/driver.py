@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 
 from launch.experiments import ExperimentError
-from launch.plan import TOOLS, Plan
+from launch.planned import TOOLS, Plan
 from launch.runs import Run
 from launch.tools import ToolsWriter, subscriber_to
 from messages.base import Header, Message

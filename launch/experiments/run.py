@@ -11,7 +11,8 @@ from typing import Any
 
 from launch.experiments import ExperimentError, image, stroke
 from launch.experiments.driver import Driver
-from launch.plan import Plan, load_plan
+from launch.plan import load_plan
+from launch.planned import Plan
 from launch.prepare import prepare_plan
 from launch.supervisor import RunningGraph
 from messages.scene import Scene
