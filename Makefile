@@ -3,19 +3,40 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DEV_STAMP := $(VENV)/.installed-dev
+INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
+LOCK := build/pip-tools
 
-.PHONY: setup demo try test lint bench limits docs clean
+.PHONY: setup demo try test lint bench faults limits docs lock clean
 
+# What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
 	@$(BIN)/python -m launch.system
 
-$(STAMP): requirements.lock pyproject.toml
+$(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "Python 3.11 or newer is needed; say which: make PYTHON=python3.11 ..." >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r requirements.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
+
+$(STAMP): requirements.lock pyproject.toml | $(BIN)/python
+	$(INSTALL) --require-hashes -r requirements.lock
+	$(INSTALL) --no-deps --no-build-isolation -e .
 	@touch $@
+
+$(DEV_STAMP): requirements-dev.lock $(STAMP)
+	$(INSTALL) --require-hashes -r requirements-dev.lock
+	@touch $@
+
+# Both locks anew, after a change of pyproject.toml; what is pinned stays where it may.
+lock:
+	$(PYTHON) -m venv $(LOCK)
+	$(LOCK)/bin/pip install --quiet --disable-pip-version-check pip-tools
+	$(call compile,--extra export,requirements.lock)
+	$(call compile,--extra export --extra dev,requirements-dev.lock)
+
+compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) --all-build-deps \
+	--strip-extras --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
+	--no-emit-find-links -o $(2) pyproject.toml
 
 demo: setup
 	$(BIN)/flexsheet demo
@@ -24,19 +45,19 @@ demo: setup
 try: setup
 	$(BIN)/flexsheet try
 
-lint: $(STAMP)
+lint: $(DEV_STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
 # Threads of BLAS would only spin against the processes that tests start.  Tests that keep time with
 # other processes have the machine for themselves; the others share its cores.
-test: setup lint
+test: setup $(DEV_STAMP) lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m "not alone" --numprocesses auto --dist worksteal
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m alone
 
 # Longer than the tests: what docs/messaging.md, docs/image-correction.md and docs/results.md hold.
-bench: setup
+bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.messaging
 	$(BIN)/python -m benchmarks.image_correction
 	$(BIN)/python -m benchmarks.recovery
@@ -47,16 +68,19 @@ bench: setup
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
 
 # Kills, cuts and spoils everything between three computers (network namespaces: root).
-faults: setup
+faults: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
 
 # What docs/limits.md and docs/limits-soft-body.md show: tables and pictures.
-limits: setup
+limits: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
 docs: setup
 	$(BIN)/python -m messages.reference > docs/messages.md
+	$(BIN)/python -m launch.cli_reference > docs/cli.md
+	$(BIN)/python -m launch.parameters_reference > docs/parameters.md
+	$(BIN)/python -m launch.errors_reference > docs/errors.md
 	$(BIN)/flexsheet chart --output docs/charts
 
 clean:

@@ -33,6 +33,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "keys": ("keys",),
     "service": ("service",),
     "doctor": ("doctor", "doctor_compliance"),
+    "explain": ("explain",),
 }
 """Modules of `launch.commands` by name of command, in the order of `--help`.
 

@@ -16,8 +16,10 @@ import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import psutil
+if TYPE_CHECKING:
+    import psutil
 
 RUN_VARIABLE = "FLEXSHEET_RUN"
 """Environment variable that tags every process of a run."""
@@ -113,6 +115,8 @@ def launcher_is_alive(run_id: str) -> bool:
 
 def orphans() -> list[psutil.Process]:
     """Processes of this user that are tagged with the run of a launcher that is gone."""
+    import psutil
+
     found = []
     for process in psutil.process_iter():
         try:
@@ -131,6 +135,8 @@ def orphans() -> list[psutil.Process]:
 
 def sweep() -> list[int]:
     """End orphans and tidy up the directories of dead runs; returns the pids that were ended."""
+    import psutil
+
     found = orphans()
     _signal(found, signal.SIGTERM)
     _, alive = psutil.wait_procs(found, timeout=ORPHAN_GRACE_S)
@@ -158,6 +164,8 @@ def is_free(address: str, port: int) -> bool:
 
 
 def _signal(processes: Iterable[psutil.Process], number: int) -> None:
+    import psutil
+
     for process in processes:
         try:
             process.send_signal(number)

@@ -54,12 +54,12 @@ Arrays never hold NaN or infinity.
 def reference() -> str:
     """The whole page."""
     types = list(dict.fromkeys(topic.message for topic in TOPICS.values()))
-    parts = list(dict.fromkeys(part for kind in types for part in _parts_of(kind)))
+    parts = list(dict.fromkeys(part for kind in types for part in parts_of(kind)))
     sections = [INTRODUCTION + "\n" + _topic_table(), HEADER_INTRODUCTION + "\n" + _header_table()]
     sections.append(TYPES_INTRODUCTION)
-    sections += [_type_section(kind) for kind in types]
+    sections += [type_section(kind) for kind in types]
     sections.append("## Parts\n\nGroups of fields within the types above.\n")
-    sections += [_type_section(kind) for kind in parts]
+    sections += [type_section(kind) for kind in parts]
     return "\n".join(sections)
 
 
@@ -103,16 +103,18 @@ def _header_table() -> str:
     return _table(("field", "type", "what"), rows)
 
 
-def _type_section(kind: type[BaseModel]) -> str:
+def type_section(kind: type[BaseModel]) -> str:
+    """A type's name, docstring and fields."""
     rows = [
-        (f"`{name}`", _field_type(field), _field_notes(field))
+        (f"`{name}`", field_type(field), _field_notes(field))
         for name, field in kind.model_fields.items()
     ]
     text = inspect.cleandoc(kind.__doc__ or "")
     return f"### {kind.__name__}\n\n{text}\n\n{_table(('field', 'type', 'notes'), rows)}"
 
 
-def _field_type(field: FieldInfo) -> str:
+def field_type(field: FieldInfo) -> str:
+    """A field's type as a reader of the page would say it."""
     for extra in field.metadata:
         if isinstance(extra, ArraySpec):
             return _array(extra)
@@ -176,13 +178,13 @@ def _constraint(extra: Any) -> str:
             return ""
 
 
-def _parts_of(annotation: Any) -> Iterator[type[BaseModel]]:
+def parts_of(annotation: Any) -> Iterator[type[BaseModel]]:
     """All models within a type, outer ones first, without the type itself."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         for field in annotation.model_fields.values():
             for inner in _models_in(field.annotation):
                 yield inner
-                yield from _parts_of(inner)
+                yield from parts_of(inner)
 
 
 def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:

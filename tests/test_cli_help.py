@@ -2,28 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import os
 import shlex
-from collections.abc import Iterator
-from typing import Any
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
 
 import pytest
 from typer.main import get_command
 
 from launch import cli
+from launch.cli_reference import commands
+from launch.commands import complete
 from launch.commands.output import examples_in
+from launch.errors_reference import explained, undocumented
 
-
-def commands(group: Any = None, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """All commands that do something, by what is typed."""
-    group = group or get_command(cli.app)
-    for name, command in group.commands.items():
-        path = (*words, name)
-        if hasattr(command, "commands"):
-            if command.invoke_without_command:
-                yield " ".join(path), command
-            yield from commands(command, path)
-        else:
-            yield " ".join(path), command
+ROOT = Path(__file__).resolve().parent.parent
 
 
 COMMANDS = dict(commands())
@@ -70,3 +66,118 @@ def test_a_command_can_print_json_and_only_the_first_one_installs_completion(nam
     options = {option for parameter in COMMANDS[name].params for option in parameter.opts}
     assert "--json" in options
     assert "--install-completion" not in options
+
+
+@pytest.mark.parametrize("page", ["cli", "errors", "parameters"])
+def test_the_generated_pages_are_up_to_date(page: str) -> None:
+    written = (ROOT / "docs" / f"{page}.md").read_text()
+    made = import_module(f"launch.{page}_reference").reference()
+    assert written == made, f"python -m launch.{page}_reference > docs/{page}.md"
+
+
+def test_every_kind_of_error_has_a_remedy_and_no_remedy_is_of_nothing() -> None:
+    assert undocumented() == []
+
+
+@pytest.mark.parametrize(
+    ("message", "page"),
+    [
+        ("no graph is running; start one with: flexsheet launch FILE", "command-line"),
+        ('unknown topic "fingr"; did you mean "finger"?', "topics-and-messages"),
+        ("a.mcap: exists already; a bag is never written over", "bags"),
+        ("saturated", "fingertip"),
+    ],
+)
+def test_a_message_is_explained(message: str, page: str) -> None:
+    first = explained(message)[0]
+    assert first["page"] == f"docs/errors.md#{page}"
+    assert first["what to do"]
+    assert explained("no such words were ever said") == []
+
+
+def test_looking_into_a_graph_loads_little() -> None:
+    """What `topic echo` needs until it is subscribed: no YAML, no linear algebra, no supervisor."""
+    code = (
+        "import json, sys\n"
+        "import launch.cli, launch.commands.topic, launch.tools\n"
+        "print(json.dumps(sorted(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True)
+    heavy = {
+        "cv2", "scipy", "matplotlib", "mcap", "moderngl", "pymodbus", "rich", "ruamel.yaml",
+        "structlog", "psutil", "launch.plan", "launch.supervisor", "nodes.node", "uvloop",
+    }  # fmt: skip
+    assert heavy & set(json.loads(done.stdout)) == set()
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        ("flexsheet topic echo finger", "fingertip"),
+        ("flexsheet node describe pla", "planner"),
+        ("flexsheet chart kin", "kinematics"),
+        ("flexsheet bag ver", "verify"),
+        ("flexsheet topic echo --on", "--once"),
+    ],
+)
+def test_the_shell_completes(
+    words: str, offered: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("_FLEXSHEET_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    with pytest.raises(SystemExit):
+        cli.main()
+    assert offered in capsys.readouterr().out.split()
+
+
+def test_files_are_offered_by_their_suffix(tmp_path: Path) -> None:
+    for name in ("one.mcap", "two.txt"):
+        (tmp_path / name).touch()
+    (tmp_path / "old").mkdir()
+    assert complete.bags(f"{tmp_path}/o") == [f"{tmp_path}/one.mcap", f"{tmp_path}/old/"]
+    assert complete.bags(f"{tmp_path}/t") == []
+    assert complete.bags(f"{tmp_path}/none/x") == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["topc"], "topic"),
+        (["bag", "verfy"], "verify"),
+        (["topic", "echo", "x", "--onc"], "--once"),
+    ],
+)
+def test_a_slip_is_answered_with_what_was_meant(
+    arguments: list[str],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["flexsheet", *arguments])
+    with pytest.raises(SystemExit) as end:
+        cli.main()
+    out, err = capsys.readouterr()
+    assert (end.value.code, out) == (2, "")
+    assert said in err
+
+
+def test_colours_are_for_terminals_and_no_color_takes_them_away() -> None:
+    """The same words in a pseudo-terminal with NO_COLOR, without it, and into a pipe."""
+    code = "from launch.commands.output import words; words.print('[red]so[/]')"
+
+    def said(terminal: bool, **more: str) -> bytes:
+        ours, theirs = os.openpty() if terminal else os.pipe()
+        environment = {**os.environ, "TERM": "xterm", **more}
+        environment.pop("NO_COLOR", None) if "NO_COLOR" not in more else None
+        subprocess.run(
+            [sys.executable, "-c", code], cwd=ROOT, stderr=theirs, env=environment, check=True
+        )
+        os.close(theirs)
+        text = os.read(ours, 1000)
+        os.close(ours)
+        return text
+
+    assert b"\x1b[31m" in said(True)
+    assert b"\x1b" not in said(True, NO_COLOR="1")
+    assert b"\x1b" not in said(False)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
 from launch.commands.output import (
     BAD_INPUT,
@@ -32,9 +33,14 @@ app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Bags: recordings of topics (MCAP files)."
 )
 
-BagArgument = Annotated[Path, typer.Argument(metavar="BAG", help="Bag file.")]
+BagArgument = Annotated[
+    Path, typer.Argument(metavar="BAG", help="Bag file.", autocompletion=complete.bags)
+]
 TopicsOption = Annotated[
-    list[str] | None, typer.Option("--topic", help="Only this topic; may be given again.")
+    list[str] | None,
+    typer.Option(
+        "--topic", help="Only this topic; may be given again.", autocompletion=complete.topics
+    ),
 ]
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
@@ -32,7 +33,10 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 )
 def chart(
     *,
-    family: Annotated[str | None, typer.Argument(help="Method family; without it, all.")] = None,
+    family: Annotated[
+        str | None,
+        typer.Argument(help="Method family; without it, all.", autocompletion=complete.families),
+    ] = None,
     scene_file: Annotated[
         Path, typer.Option("--scene", metavar="FILE", help="Scene to measure on.")
     ] = SCENE_FILE,

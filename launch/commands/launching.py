@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import (
     FAILED,
@@ -40,7 +41,7 @@ LEVEL_STYLES = {"warning": "yellow", "error": "red", "critical": "red"}
 )
 def launch(
     *,
-    file: Annotated[Path, typer.Argument(help="Launch file.")],
+    file: Annotated[Path, typer.Argument(help="Launch file.", autocompletion=complete.yaml_files)],
     host: Annotated[
         str | None, typer.Option(help="Start only this host's nodes; all of them without it.")
     ] = None,

@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption, running_graph
 from launch.commands.output import (
     BAD_INPUT,
@@ -59,7 +60,10 @@ def list_nodes(as_json: JsonOption = False) -> None:
     )
 )
 def describe(
-    node: Annotated[str, typer.Argument(help='Type of node, or "module:Class".')],
+    node: Annotated[
+        str,
+        typer.Argument(help='Type of node, or "module:Class".', autocompletion=complete.node_types),
+    ],
     as_json: JsonOption = False,
 ) -> None:
     """Ports, timers and parameters of a type of node."""

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import (
     JsonOption,
     RunOption,
@@ -16,7 +17,6 @@ from launch.commands.graph import (
 )
 from launch.commands.output import (
     BAD_INPUT,
-    FAILED,
     CommandError,
     examples,
     print_fields,
@@ -37,7 +37,9 @@ app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Topics: the table, and what is on them now."
 )
 
-TopicArgument = Annotated[str, typer.Argument(help="Name of the topic, as twin/finger.")]
+TopicArgument = Annotated[
+    str, typer.Argument(help="Name of the topic, as twin/finger.", autocompletion=complete.topics)
+]
 SHORT_ARRAY = 36
 """Arrays of more elements than a 6x6 matrix are abbreviated."""
 
@@ -169,8 +171,7 @@ def hz(
             ],
         )
     if not rows:
-        words.print(f'nothing came on "{topic}" in {duration:g} s')
-        raise typer.Exit(FAILED)
+        raise silence(topic, duration)
 
 
 @app.command(
@@ -209,6 +210,13 @@ def pub(
     else:
         words.print(f'sent {sent} on "{topic}"', markup=False)
     raise typer.Exit(code)
+
+
+def silence(topic: str, duration_s: float) -> CommandError:
+    return CommandError(
+        f'nothing came on "{topic}" in {duration_s:g} s; see that its writer runs: '
+        "flexsheet topic echo status"
+    )
 
 
 def rates(headers: list[Header]) -> list[dict[str, Any]]:
@@ -343,8 +351,7 @@ async def _read(
             show(message, header)
             shown += 1
     except TimeoutError:
-        words.print(f'nothing came on "{topic.name}" in {timeout_s:g} s')
-        return FAILED
+        raise silence(topic.name, timeout_s or 0.0) from None
     finally:
         subscriber.close()
     return 0
