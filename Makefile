@@ -7,7 +7,7 @@ DEV_STAMP := $(VENV)/.installed-dev
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
 LOCK := build/pip-tools
 
-.PHONY: setup demo try test lint bench faults limits docs lock clean
+.PHONY: setup demo try test lint bench faults limits pages docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
@@ -76,11 +76,14 @@ limits: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
-docs: setup
+# What is written from the code; after a change of a message, parameter, command or error.
+pages: setup
 	$(BIN)/python -m messages.reference > docs/messages.md
 	$(BIN)/python -m launch.cli_reference > docs/cli.md
 	$(BIN)/python -m launch.parameters_reference > docs/parameters.md
 	$(BIN)/python -m launch.errors_reference > docs/errors.md
+
+docs: pages
 	$(BIN)/flexsheet chart --output docs/charts
 
 clean:
