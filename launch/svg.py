@@ -55,9 +55,14 @@ def drawn_for_pages() -> Iterator[None]:
         yield
 
 
-def save_svg(figure: Figure, path: Path) -> None:
-    """Write the figure; its ground is transparent, its ink is light where the page is dark."""
+def svg_of(figure: Figure) -> str:
+    """The figure as SVG; its ground is transparent, its ink is light where the page is dark."""
     drawn = StringIO()
     figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
     head, tag, rest = drawn.getvalue().partition("<defs>")
-    path.write_text(f"{head}{_DARK}{tag}{rest}", encoding="utf-8")
+    return f"{head}{_DARK}{tag}{rest}"
+
+
+def save_svg(figure: Figure, path: Path) -> None:
+    """Write `svg_of` the figure."""
+    path.write_text(svg_of(figure), encoding="utf-8")

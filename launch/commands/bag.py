@@ -1,4 +1,4 @@
-"""`flexsheet bag`: record, play, look into, save and verify bags."""
+"""`flexsheet bag`: record, play, look into, save, verify and report on bags."""
 
 from __future__ import annotations
 
@@ -199,6 +199,40 @@ def verify(
         raise typer.Exit(FAILED)
     if not result.as_live:
         raise typer.Exit(OTHER_THAN_LIVE)
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet bag report session.mcap",
+        "flexsheet bag report session.mcap -o session.html",
+        "flexsheet bag report session.mcap --json",
+    )
+)
+def report(
+    bag: BagArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="FILE.html", help="Page; else beside the bag."),
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write one page about a session: what was wrong first, then charts, tables and pictures.
+
+    The page needs no network.  With --json the numbers are printed, and a page is written only
+    where one is named.  A bag that was cut off is read as far as it goes.
+    """
+    from launch.report.write import default_output
+    from launch.report.write import report as report_on
+
+    page = output if as_json else output or default_output(bag)
+    with progress_bar(f"reading {bag.name}") as progress:
+        result = report_on(bag, page, progress)
+    if as_json:
+        print_json(result)
+        return
+    for finding in result["findings"]:
+        words.print(f"{finding['gravity']}: {finding['text']}", markup=False)
+    print(page)
 
 
 def _print_verification(result: Verification) -> None:

@@ -13,6 +13,7 @@ from scipy.interpolate import make_smoothing_spline
 from launch.experiments import ExperimentError
 from launch.experiments.lag import lag_s
 from messages.bag import BagReader
+from messages.base import Header, Message
 from messages.scene import ArmSpec, Scene, cylinder_of
 from messages.types import (
     ArmState,
@@ -198,6 +199,25 @@ def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
     return [*events, ("light", frame.light_ns)] if frame.light_ns else events
 
 
+def events_of(message: Message, header: Header) -> list[tuple[str, int, int]]:
+    """What of the way from exposure to light a message tells: (event, exposure ns, when ns)."""
+    exposure_ns = header.source_ns
+    match message:
+        case Fingertip() if message.valid:
+            return [("fingertip", exposure_ns, header.publish_ns)]
+        case SheetTarget():
+            return [("sheet target", exposure_ns, header.publish_ns)]
+        case SoftBody():
+            return [("soft body", exposure_ns, header.publish_ns)]
+        case ArmState() if message.target_source_ns and message.command_sent_ns:
+            event = f"{message.side} arm command"
+            return [(event, message.target_source_ns, message.command_sent_ns)]
+        case Frame():
+            events = frame_events(message, header.publish_ns)
+            return [(event, exposure_ns, at_ns) for event, at_ns in events]
+    return []
+
+
 def _windows_ns(times_by_label: dict[str, list[tuple[int, float]]]) -> dict[str, tuple[int, int]]:
     """When each path began and when it was last heard of, from (stamp, time on the path)."""
     return {
@@ -224,11 +244,12 @@ def read_recording(bag: Path) -> Recording:
 
     losses: dict[tuple[str, int, str], int] = {}
     for _, message, header, _ in BagReader(bag):
+        for event in events_of(message, header):
+            delay(*event)
         match message:
             case Scene():
                 scene = message
             case Fingertip() if message.valid:
-                delay("fingertip", header.source_ns, header.publish_ns)
                 fingertip.append((header.source_ns, message.position_world_m))
                 measured.append((header.source_ns, message.measured_world_m))
             case TwinFinger():
@@ -238,20 +259,11 @@ def read_recording(bag: Path) -> Recording:
                 )
             case ArmState():
                 flanges[message.side].append((header.source_ns, message.world_from_flange))
-                if message.target_source_ns and message.command_sent_ns:
-                    event = f"{message.side} arm command"
-                    delay(event, message.target_source_ns, message.command_sent_ns)
             case TwinArms():
                 flanges["true_left"].append((header.source_ns, message.world_from_flange_left))
                 flanges["true_right"].append((header.source_ns, message.world_from_flange_right))
-            case SheetTarget():
-                delay("sheet target", header.source_ns, header.publish_ns)
-            case SoftBody():
-                delay("soft body", header.source_ns, header.publish_ns)
             case Frame():
                 pictures.take(message)
-                for event, at_ns in frame_events(message, header.publish_ns):
-                    delay(event, header.source_ns, at_ns)
             case Status():
                 for port in message.inputs:
                     # Each start of a node counts anew; its last word is what it lost in all.
@@ -312,17 +324,22 @@ def presented(
 
 
 def sheet_errors(
-    scene: Scene, finger: Track, edges: tuple[Track, Track], times_ns: NDArray[np.int64]
+    scene: Scene,
+    finger: Track,
+    edges: tuple[Track, Track],
+    times_ns: NDArray[np.int64],
+    retreat_m: Floats | float = 0.0,
 ) -> tuple[Floats, Floats]:
     """Delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`.
 
     D is the cylinder's point nearest to the finger: the sheet presents the undeformed surface, so
-    how deep the finger pushes is not an error of its.
+    how deep the finger pushes is not an error of its.  retreat_m (n,): how far below that surface
+    the sheet is meant to be, where it yields as the object would.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.at(times_ns))
     angles = np.arctan2(points[:, 1], points[:, 2])
-    radius = cylinder_of(scene).radius_m
+    radius = cylinder_of(scene).radius_m - retreat_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
     presented_points, presented_angles = presented(edges, world_from_object, times_ns, points[:, 0])
     delta_theta = (angles - presented_angles + np.pi) % (2 * np.pi) - np.pi

@@ -1,0 +1,181 @@
+"""What was wrong in a session, in sentences; each says where on the page to read on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Gravity = Literal["bad", "doubtful"]
+
+SLOW_SHARE = 0.5
+"""Of the least rate that the table of topics expects, as on the console's page."""
+
+UNSEEN_SHARE = 0.05
+"""Of the time: with the finger lost for longer, that is said."""
+
+FULL_SHARE = 1.0
+"""Of a limit."""
+
+ROUNDING = 1.02
+"""What the measuring of speeds and forces may be off."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """gravity: bad, something failed; doubtful, to be looked at.  section: of the page, by id."""
+
+    gravity: Gravity
+    text: str
+    section: str
+
+
+CHECKED = (
+    "the bag's end, its types and the state of the code; e-stops, faults and modes of the arms; "
+    "joint speed, tool speed and edge force against their limits; nodes' errors and restarts; "
+    "each topic's rate, silences, losses and refusals; latency, sheet position and the soft body's "
+    "range against the scene's tolerances; the finger's being seen; late frames"
+)
+
+
+def findings_of(numbers: dict[str, Any]) -> list[Finding]:
+    """All of them, the bad ones first."""
+    found = [
+        *_of_the_bag(numbers),
+        *_of_the_arms(numbers),
+        *_of_the_nodes(numbers),
+        *_of_the_topics(numbers),
+        *_of_tolerances(numbers),
+        *_of_the_finger(numbers),
+    ]
+    return sorted(found, key=lambda one: one.gravity != "bad")
+
+
+def _of_the_bag(numbers: dict[str, Any]) -> Iterator[Finding]:
+    bag = numbers["bag"]
+    if not bag["complete"]:
+        yield Finding(
+            "bad", f"The bag is not whole ({bag['problem']}); this is what can be read.", "bag"
+        )
+    if lost := int(bag["recording"].get("lost_messages", 0)):
+        yield Finding(
+            "bad", f"The recorder lost {lost} messages before this bag (a full disk).", "bag"
+        )
+    for name, topic in numbers["topics"].items():
+        if topic["readable"] is False:
+            text = f"{name} cannot be read: {topic['type']} has changed since the recording."
+            yield Finding("doubtful", text, "topics")
+    if numbers["git"].get("changed"):
+        text = "The code had been changed since its commit: this run cannot be repeated exactly."
+        yield Finding("doubtful", text, "bag")
+    for name, host in numbers["hosts"].items():
+        if host["missing_devices"]:
+            devices = ", ".join(host["missing_devices"])
+            yield Finding("bad", f"{name}: its nodes name devices that are not there: {devices}.",
+                          "bag")  # fmt: skip
+
+
+def _of_the_arms(numbers: dict[str, Any]) -> Iterator[Finding]:
+    counts, first = numbers["events"]["counts"], numbers["events"]["first"]
+    for kind, what in (("estop", "E-stop"), ("fault", "Arm's fault"), ("arm", "Arm not at work")):
+        if kind in counts:
+            event = next(one for one in first if one["kind"] == kind)
+            times = "once" if counts[kind] == 1 else f"{counts[kind]} times"
+            text = f"{what}, {times}; first at {event['seconds']:.2f} s: {event['text']}."
+            yield Finding("bad", text, "timeline")
+    scene = numbers["scene"] or {}
+    for side, arm in numbers["arms"].items():
+        shares = [share for share in arm["joint_speed_share"] if share is not None]
+        if shares and max(shares) > ROUNDING * FULL_SHARE:
+            joint = arm["joint_speed_share"].index(max(shares)) + 1
+            text = f"{side} arm: joint {joint} went at {max(shares):.0%} of its greatest speed."
+            yield Finding("bad", text, "arms")
+        for key, limit, scale, unit, what in (
+            ("tool_speed_mm_per_s", "max_tool_speed_m_per_s", 1e3, "mm/s", "its tool went at"),
+            ("edge_force_n", "max_edge_force_n", 1.0, "N", "its edge was pulled with"),
+        ):
+            most = arm[key]
+            if most is not None and limit in scene and most > ROUNDING * scale * scene[limit]:
+                allowed = scale * scene[limit]
+                text = f"{side} arm: {what} {most:.3g} {unit}; {allowed:.3g} {unit} are allowed."
+                yield Finding("bad", text, "arms")
+
+
+def _of_the_nodes(numbers: dict[str, Any]) -> Iterator[Finding]:
+    for name, node in numbers["nodes"].items():
+        if node["errors"]:
+            count = "an error" if node["errors"] == 1 else f"{node['errors']} errors"
+            yield Finding("bad", f"{name} had {count}; the last: {node['last_error']}.", "nodes")
+        if node["starts"] > 1:
+            yield Finding("bad", f"{name} was started {node['starts']} times.", "nodes")
+        if node["degraded"] and not node["errors"]:
+            text = f"{name} called itself degraded {node['degraded']} times: {node['last_error']}"
+            yield Finding("doubtful", f"{text.rstrip(' :')}.", "nodes")
+
+
+def _of_the_topics(numbers: dict[str, Any]) -> Iterator[Finding]:
+    for name, topic in numbers["topics"].items():
+        expected, rate = topic["expected_hz"], topic["rate_hz"]
+        if topic["refused"]:
+            text = f"{name}: {topic['refused']} messages were refused by their readers."
+            yield Finding("bad", text, "topics")
+        if topic["lost"]:
+            text = f"{name}: {topic['lost']} messages were lost on the way to readers."
+            yield Finding("doubtful", text, "topics")
+        if topic["missing"]:
+            text = f"{name}: {topic['missing']} messages never reached the recorder."
+            yield Finding("doubtful", text, "topics")
+        if expected and rate and topic["messages"] > 10 and rate < SLOW_SHARE * expected[0]:
+            text = f"{name} came at {rate:.3g} Hz; at least {expected[0]:.3g} Hz are expected."
+            yield Finding("doubtful", text, "topics")
+        if topic["silences"]:
+            times = "once" if topic["silences"] == 1 else f"{topic['silences']} times"
+            text = f"{name} fell silent {times}, for {topic['longest_silence_s']:.2f} s at most."
+            yield Finding("doubtful", text, "topics")
+
+
+def _of_tolerances(numbers: dict[str, Any]) -> Iterator[Finding]:
+    if numbers["scene"] is None:
+        return
+    tolerances = numbers["scene"]["tolerances"]
+    allowed_ms = 1e3 * tolerances["latency_s"]
+    for side in ("left", "right"):
+        event = f"{side} arm command"
+        p99 = numbers["latency_ms"].get(event, {}).get("p99")
+        if p99 is not None and p99 > allowed_ms:
+            text = (
+                f"Exposure to {event}: {p99:.1f} ms (99 %); the scene allows {allowed_ms:.3g} ms."
+            )
+            yield Finding("doubtful", text, "latency")
+    contact = numbers["sheet"]["contact"]
+    for key, what in (("true_delta_d_mm", "true"), ("delta_d_mm", "measured")):
+        errors = contact[key]
+        most_mm = 1e3 * tolerances["sheet_position_m"]
+        if errors is not None:
+            if errors["mean"] > most_mm:
+                text = (
+                    f"In contact the sheet was {errors['mean']:.3g} mm off the {what} finger "
+                    f"in the mean; the scene allows {most_mm:.3g} mm."
+                )
+                yield Finding("doubtful", text, "sheet")
+            break
+    body = numbers["soft_body"]
+    if body["out_of_range"]:
+        share = body["out_of_range"] / sum(body["methods"].values())
+        text = f"The soft body's method was out of its range in {share:.1%} of its answers."
+        yield Finding("doubtful", text, "nodes")
+
+
+def _of_the_finger(numbers: dict[str, Any]) -> Iterator[Finding]:
+    reasons = numbers["finger"]["reasons"]
+    total = sum(reasons.values())
+    missed = {reason: count for reason, count in reasons.items() if reason != "ok"}
+    if total and sum(missed.values()) > UNSEEN_SHARE * total:
+        worst = max(missed, key=lambda reason: missed[reason])
+        share = sum(missed.values()) / total
+        text = f"In {share:.1%} of the pictures there was no valid finger, mostly: {worst}."
+        yield Finding("doubtful", text, "sheet")
+    frames = numbers["frames"]
+    if frames["late"]:
+        text = f"{frames['late']} of {frames['count']} frames were late by more than half a frame."
+        yield Finding("doubtful", text, "latency")

@@ -1,0 +1,184 @@
+"""What is kept of a measured quantity over time: per stretch of time, never per message.
+
+A bag of an hour and one of a day so take the same memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import log10
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+SHORTEST_S, LONGEST_S, CELLS_PER_DECADE = 1e-5, 1e2, 100
+"""Of durations that are told apart; a cell of a `Spread` is 2.3 % wide."""
+
+CELLS = 7 * CELLS_PER_DECADE
+LONGEST_STEP_S = 0.5
+"""A state that nobody confirmed for longer is not taken to have lasted."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """The bag's time in equal stretches."""
+
+    start_ns: int
+    duration_s: float
+    count: int
+
+    def index(self, at_ns: int) -> int:
+        """The stretch of a moment; moments outside belong to the first or the last one."""
+        share = (at_ns - self.start_ns) * 1e-9 / max(self.duration_s, 1e-9)
+        return min(max(int(share * self.count), 0), self.count - 1)
+
+    def seconds(self) -> Floats:
+        """The middles (count,) of the stretches, s since the bag began."""
+        middles = np.arange(self.count, dtype=np.float64) + 0.5
+        return np.asarray(middles * (self.duration_s / self.count))
+
+
+class Range:
+    """Least and greatest value of each stretch; NaN where there was none."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.least = np.full(grid.count, np.nan)
+        self.most = np.full(grid.count, np.nan)
+
+    def take(self, index: int, value: float) -> None:
+        # NaN fails every comparison.
+        if not value >= self.least[index]:
+            self.least[index] = value
+        if not value <= self.most[index]:
+            self.most[index] = value
+
+    def overall(self) -> tuple[float, float] | None:
+        """Least and greatest of all; None where nothing came."""
+        if np.isnan(self.most).all():
+            return None
+        return float(np.nanmin(self.least)), float(np.nanmax(self.most))
+
+
+class Spread:
+    """How durations are distributed in each stretch, as counts in cells of equal ratio."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.counts: NDArray[np.int32] = np.zeros((grid.count, CELLS), np.int32)
+        self.longest_s = 0.0
+
+    def take(self, index: int, duration_s: float) -> None:
+        """Add a duration; below `SHORTEST_S` (or negative) it counts as that."""
+        self.longest_s = max(self.longest_s, duration_s)
+        cell = CELLS_PER_DECADE * log10(max(duration_s, SHORTEST_S) / SHORTEST_S)
+        self.counts[index, min(int(cell), CELLS - 1)] += 1
+
+    @property
+    def count(self) -> int:
+        return int(self.counts.sum())
+
+    def quantile_s(self, share: float) -> float | None:
+        """Of all durations together, to 2.3 %; None where there are none."""
+        found = _quantiles(self.counts.sum(axis=0, keepdims=True), share)[0]
+        return None if np.isnan(found) else float(min(found, self.longest_s))
+
+    def quantiles_s(self, share: float) -> Floats:
+        """Of each stretch, (count,); NaN where there was nothing."""
+        return _quantiles(self.counts, share)
+
+
+def _quantiles(counts: NDArray[np.int32], share: float) -> Floats:
+    """Quantiles (n,) of rows (n, CELLS) of counts."""
+    sums = np.cumsum(counts, axis=1)
+    wanted = share * sums[:, -1:]
+    cell = np.argmax(sums >= np.maximum(wanted, 1), axis=1)
+    before = np.take_along_axis(sums - counts, cell[:, None], axis=1)[:, 0]
+    inside = np.take_along_axis(counts, cell[:, None], axis=1)[:, 0]
+    part = np.clip((wanted[:, 0] - before) / np.maximum(inside, 1), 0.0, 1.0)
+    found = SHORTEST_S * 10.0 ** ((cell + part) / CELLS_PER_DECADE)
+    return np.where(sums[:, -1] > 0, found, np.nan)
+
+
+class Places:
+    """The newest point of each stretch, (count, 3); NaN where there was none."""
+
+    def __init__(self, grid: Grid) -> None:
+        self.points = np.full((grid.count, 3), np.nan)
+
+    def take(self, index: int, point: Floats) -> None:
+        self.points[index] = point
+
+
+class States:
+    """A thing that is in one state at a time: the gravest of each stretch, and how long in each.
+
+    order: the states that are known, from the least to the most important to see.
+    """
+
+    NOTHING = -1
+
+    def __init__(self, grid: Grid, order: Sequence[str]) -> None:
+        self.names = list(order)
+        self.codes: NDArray[np.int8] = np.full(grid.count, self.NOTHING, np.int8)
+        self.seconds = dict.fromkeys(self.names, 0.0)
+        self.changes = 0
+        self.state: str | None = None
+        self._since_ns = 0
+
+    def take(self, index: int, at_ns: int, state: str) -> bool:
+        """Be in that state at `at_ns`; says whether it was another one before."""
+        if state not in self.seconds:
+            self.names.append(state)
+            self.seconds[state] = 0.0
+        if self.state is not None:
+            passed_s = (at_ns - self._since_ns) * 1e-9
+            self.seconds[self.state] += min(max(passed_s, 0.0), LONGEST_STEP_S)
+        changed = self.state is not None and self.state != state
+        self.changes += changed
+        self.state, self._since_ns = state, at_ns
+        self.codes[index] = max(int(self.codes[index]), self.names.index(state))
+        return changed
+
+
+@dataclass(slots=True)
+class Moments:
+    """Mean, standard deviation and maximum of values that are not kept."""
+
+    count: int = 0
+    total: float = 0.0
+    squares: float = 0.0
+    most: float = 0.0
+
+    def take(self, values: Floats) -> None:
+        if len(values):
+            self.count += len(values)
+            self.total += float(values.sum())
+            self.squares += float((values**2).sum())
+            self.most = max(self.most, float(values.max()))
+
+    def summary(self, scale: float) -> dict[str, float] | None:
+        """The three, times `scale`; None where there was no value."""
+        if not self.count:
+            return None
+        mean = self.total / self.count
+        variance = max(self.squares / self.count - mean**2, 0.0)
+        return {"mean": scale * mean, "std": scale * variance**0.5, "max": scale * self.most}
+
+
+@dataclass(slots=True)
+class Events:
+    """What happened, in order, at most `limit` of each kind; all are counted."""
+
+    limit: int = 100
+    held: list[tuple[float, str, str]] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+
+    def add(self, seconds: float, kind: str, text: str) -> None:
+        self.counts[kind] = self.counts.get(kind, 0) + 1
+        if self.counts[kind] <= self.limit:
+            self.held.append((seconds, kind, text))
+
+    def of(self, kind: str) -> list[tuple[float, str]]:
+        return [(seconds, text) for seconds, its, text in self.held if its == kind]

@@ -1,0 +1,340 @@
+"""`bag report`: what it says of a session is so, whatever the session lacks."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import sys
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from launch.cli import main
+from launch.experiments.stroke import read_recording, stroke_errors, summary
+from launch.report.album import Album
+from launch.report.charts import stretches_of
+from launch.report.findings import findings_of
+from launch.report.page import COLOURS, MARK, SECTIONS, page_of
+from launch.report.series import Events, Grid, Moments, Range, Spread, States
+from launch.report.session import read_session
+from launch.report.strokes import seconds_of
+from launch.report.write import report, result_of
+from messages.bag import BagError, BagWriter
+from tests import sessions
+
+LONELY = ("scene", "fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "status",
+          "twin/finger", "stereo", "twin/eye", "frame", "moment", "estop")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return sessions.write_session(tmp_path_factory.mktemp("bags") / "a.mcap")
+
+
+@pytest.fixture(scope="module")
+def numbers(bag: Path) -> dict[str, Any]:
+    return result_of(read_session(bag))
+
+
+@pytest.fixture(scope="module")
+def page(bag: Path) -> str:
+    return page_of(read_session(bag))
+
+
+# What is kept.
+
+
+@given(st.lists(st.floats(2e-5, 50.0), min_size=1, max_size=200), st.floats(0.01, 1.0))
+def test_a_spread_knows_quantiles_to_a_cell(durations: list[float], share: float) -> None:
+    spread = Spread(Grid(0, 1.0, 2))
+    for duration in durations:
+        spread.take(1, duration)
+    found = spread.quantile_s(share)
+    exact = float(np.quantile(durations, share, method="inverted_cdf"))
+    assert found == pytest.approx(exact, rel=0.024)
+    assert np.isnan(spread.quantiles_s(share)[0])
+    assert spread.longest_s == max(durations)
+
+
+def test_nothing_has_no_quantile_and_no_summary() -> None:
+    grid = Grid(0, 1.0, 3)
+    assert Spread(grid).quantile_s(0.5) is None
+    assert Range(grid).overall() is None
+    assert Moments().summary(1.0) is None
+
+
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=50))
+def test_moments_are_numpys(values: list[float]) -> None:
+    moments = Moments()
+    for one in values:
+        moments.take(np.abs([one]))
+    found, wanted = moments.summary(2.0), summary(np.abs(values), 2.0)
+    assert found is not None
+    for key in ("mean", "max"):
+        assert found[key] == pytest.approx(wanted[key])
+    assert found["std"] == pytest.approx(wanted["std"], abs=1e-3)
+
+
+def test_what_is_kept_does_not_grow_with_what_came() -> None:
+    album, events = Album(4, [(50.0, "x")]), Events(limit=5)
+    image = np.zeros((2, 2), np.uint8)
+    for i in range(100):
+        album.take(float(i), str(i), (("left", image),))
+        events.add(float(i), "gap", "")
+    events.add(3.0, "estop", "late, but of another kind")
+    shots = album.shots()
+    assert [shot.seconds for shot in shots if shot.marked] == [50.0]
+    assert 3 <= len(shots) <= 6
+    spread = np.diff([shot.seconds for shot in shots if not shot.marked])
+    assert spread.max() <= 2 * spread.min(), "all over the session"
+    assert album.seen == 100
+    assert len(events.held) == 6
+    assert events.counts == {"gap": 100, "estop": 1}
+
+
+def test_states_last_until_another_and_gaps_stay_white() -> None:
+    grid = Grid(0, 10.0, 10)
+    states = States(grid, ("wait", "contact"))
+    for second, state in ((0, "wait"), (1, "wait"), (2, "contact"), (7, "contact")):
+        states.take(second, second * 10**9, state)
+    assert states.changes == 1
+    assert list(stretches_of(states, grid)) == [
+        ("wait", 0.0, 2.0),
+        ("contact", 2.0, 3.0),
+        ("contact", 7.0, 8.0),
+    ]
+    assert list(stretches_of(states, grid, lasting=True)) == [
+        ("wait", 0.0, 2.0),
+        ("contact", 2.0, 10.0),
+    ]
+    # What nobody confirmed is not counted beyond half a second.
+    assert states.seconds == {"wait": 1.0, "contact": 0.5}
+
+
+def test_labels_of_strokes_are_told_from_others() -> None:
+    assert seconds_of("stroke 10 s") == 10.0
+    assert seconds_of("stroke 2.5 s") == 2.5
+    for other in ("", "stroke", "stroke ten s", "push 30 mm", "stroke 10 mm", "a stroke 10 s"):
+        assert seconds_of(other) is None
+
+
+# What is told.
+
+
+def test_the_strokes_errors_are_those_of_the_experiment(bag: Path, numbers: dict[str, Any]) -> None:
+    (stroke,) = numbers["sheet"]["strokes"]
+    errors = stroke_errors(read_recording(bag), sessions.STROKE_S)
+    for key, values, scale in (
+        ("delta_d_mm", errors.delta_d_m, 1e3),
+        ("delta_theta_deg", errors.delta_theta_rad, np.degrees(1.0)),
+        ("true_delta_d_mm", errors.true_delta_d_m, 1e3),
+        ("true_delta_theta_deg", errors.true_delta_theta_rad, np.degrees(1.0)),
+    ):
+        assert stroke[key] == pytest.approx(summary(values, scale), abs=1e-6), key
+    # The offset along the normal, and the arc that the turn is, at right angles.
+    radius_m = sessions.SCENE.object.geometry.radius_m  # type: ignore[union-attr]
+    expected_mm = 1e3 * np.hypot(sessions.OFF_M, radius_m * sessions.TURNED_RAD)
+    assert stroke["true_delta_d_mm"]["mean"] == pytest.approx(expected_mm, rel=0.01)
+    turned = np.degrees(sessions.TURNED_RAD)
+    assert numbers["sheet"]["contact"]["true_delta_theta_deg"]["mean"] == pytest.approx(turned)
+
+
+def test_latencies_speeds_and_forces(numbers: dict[str, Any]) -> None:
+    assert numbers["latency_ms"]["fingertip"]["p50"] == pytest.approx(8.0, rel=0.03)
+    assert numbers["latency_ms"]["left arm command"]["p99"] == pytest.approx(5.0, rel=0.03)
+    assert numbers["latency_ms"]["frame drawn"]["p50"] == pytest.approx(28.0, rel=0.03)
+    right = numbers["arms"]["right"]
+    assert right["joint_speed_share"][1] == pytest.approx(3.3 / np.radians(90.0), rel=1e-6)
+    assert numbers["arms"]["left"]["edge_force_n"] == 25.0
+    assert numbers["arms"]["left"]["modes_s"]["fault"] == pytest.approx(0.98, abs=0.03)
+
+
+def test_topics_know_what_is_missing(numbers: dict[str, Any]) -> None:
+    topic = numbers["topics"]["fingertip"]
+    assert topic["missing"] == 39
+    assert topic["silences"] == 1
+    assert topic["longest_silence_s"] == pytest.approx(0.8, abs=0.03)
+    assert (topic["skipped"], topic["lost"], topic["refused"]) == (5, 2, 1)
+    assert numbers["topics"]["sheet_target"]["missing"] == 0
+
+
+def test_what_was_wrong_is_said_and_the_worst_first(numbers: dict[str, Any]) -> None:
+    found = findings_of(numbers)
+    said = " ".join(one.text for one in found)
+    for part in (
+        "had been changed",
+        "E-stop, once; first at 2.10 s: e-stop engaged by console: a person.",
+        "left arm: joint 3 is hot",
+        "right arm: joint 2 went at 210% of its greatest speed.",
+        "left arm: its edge was pulled with 25 N; 20 N are allowed.",
+        "planner had 3 errors; the last: on_fingertip: bang.",
+        "fingertip: 1 messages were refused",
+        "fingertip fell silent once",
+        "out of its range in 10.0% of its answers",
+    ):
+        assert part in said, part
+    gravities = [one.gravity for one in found]
+    assert gravities == sorted(gravities)
+    assert {one.section for one in found} <= SECTIONS.keys()
+
+
+def test_the_numbers_are_json(numbers: dict[str, Any]) -> None:
+    assert json.loads(json.dumps(numbers, allow_nan=False)) == json.loads(json.dumps(numbers))
+
+
+# The page.
+
+
+class Reader(HTMLParser):
+    """What of a page can be checked: tags, headings, pictures, what is fetched."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.headings: list[int] = []
+        self.images: list[dict[str, str | None]] = []
+        self.fetched: list[str] = []
+        self.ids: list[str] = []
+        self.links: list[str] = []
+        self.open: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        given = dict(attrs)
+        if re.fullmatch("h[1-6]", tag):
+            self.headings.append(int(tag[1]))
+        if tag == "img":
+            self.images.append(given)
+        self.fetched += [
+            value
+            for name, value in attrs
+            if name in ("src", "href") and value and not value.startswith(("data:", "#"))
+        ]
+        if tag == "a":
+            self.links.append((given.get("href") or "").removeprefix("#"))
+        if given.get("id"):
+            self.ids.append(str(given["id"]))
+        if tag not in ("img", "meta", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+
+def test_the_page_stands_alone_and_can_be_read_without_eyes(page: str) -> None:
+    reader = Reader()
+    reader.feed(page)
+    assert reader.open == []
+    assert not reader.fetched, "nothing is fetched"
+    assert "@import" not in page
+    assert "<script" not in page
+    assert '<html lang="en">' in page
+    assert reader.headings[0] == 1
+    assert all(after - before <= 1 for before, after in pairwise(reader.headings))
+    assert reader.images
+    assert all(len(image.get("alt") or "") > 10 for image in reader.images)
+    assert len(reader.ids) == len(set(reader.ids))
+    assert set(reader.links) <= set(reader.ids)
+
+
+def test_words_from_the_bag_are_words(page: str) -> None:
+    assert "<b>first touch</b>" not in page
+    assert "&lt;b&gt;first touch&lt;/b&gt;" in page
+
+
+def test_pictures_are_the_sessions(page: str) -> None:
+    images = re.findall(r'alt="([^"]*)" src="data:image/jpeg;base64,([^"]*)"', page)
+    left = [(text, data) for text, data in images if "left camera" in text]
+    levels = []
+    for _, data in left:
+        buffer = np.frombuffer(base64.b64decode(data), np.uint8)
+        levels.append(round(float(cv2.imdecode(buffer, cv2.IMREAD_GRAYSCALE).mean()), -1))
+    assert levels == [0, 10, 20]
+    assert sum("what it should see" in text for text, _ in images) == 3
+    assert sum("projector" in text for text, _ in images) == 3
+    # The first shot after the moment at 1.5 s is the one of 2.2 s.
+    assert re.search(r"2\.21 s\.[^<]*<strong>Moment: &lt;b&gt;first touch", page)
+
+
+def luminance(color: str) -> float:
+    parts = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+@pytest.mark.parametrize("scheme", COLOURS)
+def test_text_stands_out_as_much_as_wcag_aa_asks(scheme: str) -> None:
+    colours = COLOURS[scheme]
+    for ground in ("ground", "panel"):
+        for ink in ("text", "quiet", "link", "bad", "doubtful", "good"):
+            low, high = sorted(luminance(colours[name]) for name in (ground, ink))
+            assert (high + 0.05) / (low + 0.05) >= 4.5, (ground, ink)
+
+
+# Bags that lack something.
+
+
+@pytest.mark.parametrize(
+    "leave_out", [*((name,) for name in LONELY), LONELY], ids=lambda names: "+".join(names)[:20]
+)
+def test_a_bag_may_lack_any_topic(
+    tmp_path: Path, leave_out: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The charts are drawn once, elsewhere: here only from what they are drawn.
+    path = sessions.write_session(tmp_path / "a.mcap", leave_out=leave_out)
+    session = read_session(path)
+    monkeypatch.setattr("launch.report.page.charts_of", lambda session: {})
+    text = page_of(session)
+    assert all(f'id="{key}"' in text for key in SECTIONS)
+    json.dumps(result_of(session), allow_nan=False)
+
+
+def test_an_empty_bag_is_reported_as_that(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    BagWriter(path).close()
+    text = page_of(read_session(path))
+    assert "No arm was recorded." in text
+    assert "Nothing was found" in text
+
+
+def test_a_cut_bag_is_read_as_far_as_it_goes(bag: Path, tmp_path: Path) -> None:
+    data = bag.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) - 400])
+    found = result_of(read_session(cut))
+    assert found["findings"][0]["text"].startswith("The bag is not whole (cut after")
+    assert found["bag"]["messages"] > 100
+
+
+def test_a_bag_of_the_first_release_can_be_reported_on() -> None:
+    old = Path(__file__).parent / "recorded" / "first-release.mcap"
+    assert result_of(read_session(old))["bag"]["messages"] > 0
+
+
+# The command.
+
+
+def test_the_command_writes_beside_the_bag_and_over_reports_only(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "b.mcap"
+    copy.write_bytes(bag.read_bytes())
+    monkeypatch.setattr("launch.report.page.charts_of", lambda session: {})
+    for _ in range(2):
+        report(copy, copy.with_suffix(".html"), lambda done, whole: None)
+    assert MARK in copy.with_suffix(".html").read_text()
+    letter = tmp_path / "letter.html"
+    letter.write_text("dear")
+    with pytest.raises(BagError, match="is no report, so it is not written over"):
+        report(copy, letter, lambda done, whole: None)
+    monkeypatch.setattr(sys, "argv", ["flexsheet", "bag", "report", str(copy), "--json"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code in (0, None)
+    assert json.loads(capsys.readouterr().out)["bag"]["messages"] > 100
