@@ -1,0 +1,683 @@
+"""Does anything grow, leak or drift while the whole graph is used for long?
+
+    python -m benchmarks.soak [--minutes 60] [--set NODE.PARAMETER=VALUE] [--output FOLDER]
+
+Starts `launch/demo.yaml`, strokes and pushes all the while, and records what is logged.  Reports
+
+- per process: how fast its memory grows (its proportional share and what it has resident; the
+  median of the slopes between all pairs of samples, after a warm-up), descriptors, threads,
+  processor time, restarts and hangs;
+- per topic and reader: messages, those superseded or overflown, lost on the way, refused;
+- per window of five minutes: exposure to arm command, to fingertip and to frame, how much of the
+  time the arms followed, how much of the cameras' pictures gave a fingertip;
+- findings: what of that grew or went wrong.
+
+Each window is a bag of its own, by the topic `recording`: it is read when it is complete and then
+removed, the newest excepted, so that the disk holds two windows at most.  Ctrl-C ends it in order,
+with a report of what there is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, field
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from numpy.typing import NDArray
+from scipy.stats import theilslopes
+
+from launch.experiments import image
+from launch.experiments.driver import Driver
+from launch.experiments.gestures import gesture_path
+from launch.experiments.run import DEMO_FILE, new_folder
+from launch.machine import machine_name
+from launch.plan import load_plan
+from launch.prepare import prepare_plan
+from launch.supervisor import NodeFailedError, RunningGraph
+from launch.tools import ToolsWriter, subscriber_to
+from messages.bag import BagError, BagReader, info
+from messages.base import Header
+from messages.scene import Scene
+from messages.topics import TOPICS, Delivery
+from messages.types import ArmState, FingerPath, Fingertip, Frame, Recording, Status
+
+Floats = NDArray[np.float64]
+
+SAMPLE_S = 10.0
+WARM_UP_S = 600.0
+WARM_UP_SHARE = 0.25
+"""Of a run that is shorter than four warm-ups."""
+
+SHORTEST_FIT_S = 900.0
+"""Over less time than that, caches that fill look like leaks."""
+
+READER_NICE = 15
+
+GROWTH_B_PER_H = 2 << 20
+"""Surely more than this is a finding: 0.3 GB in a week."""
+
+LEAST_GROWTH_B = 1 << 20
+DRIFT_RATIO = 1.2
+"""Of the last third's median latency over the first third's."""
+
+LEAST_DRIFT_MS = 1.0
+LAUNCHER = "launcher"
+MIB = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """What a process takes at one time."""
+
+    time_s: float
+    pid: int
+    pss: int
+    rss: int
+    descriptors: int
+    threads: int
+    cpu_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class MachineSample:
+    """What all processors have done, and our processes of it; and how much the logs hold."""
+
+    time_s: float
+    busy_s: float
+    graph_s: float
+    logs_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Slope:
+    """How fast something grows, by the hour: the estimate and its 95 % interval."""
+
+    per_h: float
+    low_per_h: float
+    high_per_h: float
+
+
+@dataclass
+class PortTotal:
+    """What a reader's counters came to, over all starts of its process."""
+
+    messages: int = 0
+    dropped: int = 0
+    gaps: int = 0
+    rejected: int = 0
+
+
+@dataclass
+class Heard:
+    """What the nodes' status messages said since the graph was up."""
+
+    ports: dict[tuple[str, str], PortTotal] = field(default_factory=lambda: defaultdict(PortTotal))
+    errors: Counter[str] = field(default_factory=Counter)
+    last_error: dict[str, str] = field(default_factory=dict)
+    degraded: Counter[str] = field(default_factory=Counter)
+    _before: dict[str, Status] = field(default_factory=dict)
+
+    def take(self, status: Status, header: Header) -> None:
+        """Add what has happened since the node's last status; a new process begins from 0."""
+        before = self._before.get(status.node)
+        self._before[status.node] = status
+        if before is None:
+            return
+        same = before.pid == status.pid
+        known = {port.topic: port for port in before.inputs} if same else {}
+        for port in status.inputs:
+            total = self.ports[status.node, port.topic]
+            old = known.get(port.topic)
+            for name in ("messages", "dropped", "gaps", "rejected"):
+                grown = getattr(port, name) - (getattr(old, name) if old else 0)
+                setattr(total, name, getattr(total, name) + grown)
+        errors = status.errors - (before.errors if same else 0)
+        if errors > 0:
+            self.errors[status.node] += errors
+        if status.last_error and status.last_error != (before.last_error if same else ""):
+            self.last_error[status.node] = status.last_error
+        self.degraded[status.node] += status.state == "degraded"
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """What one bag says; delays in ms from the middle of the exposure, percentiles 50 and 99."""
+
+    begin_ns: int
+    seconds: float
+    megabytes: float
+    messages: int
+    to_fingertip_ms: tuple[float, float] | None
+    to_arm_ms: tuple[float, float] | None
+    to_frame_ms: tuple[float, float] | None
+    valid_share: float
+    follow_share: float
+    stops: dict[str, int]
+    faults: tuple[str, ...]
+
+
+def read_window(bag: Path) -> Window:
+    """The figures of a window's bag."""
+    first: dict[tuple[str, int], float] = {}
+    valid: Counter[bool] = Counter()
+    modes: Counter[str] = Counter()
+    stops: Counter[str] = Counter()
+    faults: set[str] = set()
+    last_mode: dict[str, str] = {}
+
+    def delay(event: str, source_ns: int, event_ns: int) -> None:
+        first.setdefault((event, source_ns), (event_ns - source_ns) * 1e-6)
+
+    for _, message, header, _ in BagReader(bag, ["arm_left", "arm_right", "fingertip", "frame"]):
+        match message:
+            case Fingertip():
+                valid[message.valid] += 1
+                delay("fingertip", header.source_ns, header.publish_ns)
+            case Frame():
+                delay("frame", header.source_ns, message.drawn_ns or header.publish_ns)
+            case ArmState():
+                modes[message.mode] += 1
+                faults.update(message.faults)
+                before, last_mode[message.side] = last_mode.get(message.side), message.mode
+                if before == "follow" and message.mode != "follow":
+                    stops[f"{message.side} arm: {message.mode}, {message.reason}"] += 1
+                if message.target_source_ns and message.command_sent_ns:
+                    delay(message.side, message.target_source_ns, message.command_sent_ns)
+            case _:
+                pass
+    events: dict[str, list[float]] = defaultdict(list)
+    for (event, _), value in first.items():
+        events["arm" if event in ("left", "right") else event].append(value)
+
+    def percentiles(event: str) -> tuple[float, float] | None:
+        if not events[event]:
+            return None
+        low, high = np.percentile(events[event], (50.0, 99.0))
+        return float(low), float(high)
+
+    whole = info(bag)
+    return Window(
+        begin_ns=whole.start_ns,
+        seconds=whole.duration_s,
+        megabytes=whole.size_bytes * 1e-6,
+        messages=whole.count,
+        to_fingertip_ms=percentiles("fingertip"),
+        to_arm_ms=percentiles("arm"),
+        to_frame_ms=percentiles("frame"),
+        valid_share=valid[True] / max(valid.total(), 1),
+        follow_share=modes["follow"] / max(modes.total(), 1),
+        stops=dict(stops.most_common()),
+        faults=tuple(sorted(faults)),
+    )
+
+
+def paths(scene: Scene) -> Iterator[FingerPath]:
+    """Strokes and pushes, for ever; each label once."""
+    for number in count(1):
+        for name in ("stroke-10", "stroke-push", "tap", "circle"):
+            path = gesture_path(name, scene)
+            yield path.model_copy(update={"label": f"{number} {path.label}"})
+        for depth_mm in (10.0, 30.0, 50.0, 5.0):
+            path = image.PUSH.path(scene, depth_mm)
+            yield path.model_copy(update={"label": f"{number} {path.label}"})
+
+
+class Soak:
+    """One run of the graph: its samples, its windows, and what the nodes said.
+
+    seconds: of stroking and pushing.  window_s: of each bag.  folder: for bags and report.
+    """
+
+    def __init__(
+        self, seconds: float, window_s: float, folder: Path, settings: Sequence[str]
+    ) -> None:
+        self.seconds, self.window_s, self.folder = seconds, window_s, folder
+        self.samples: dict[str, list[Sample]] = defaultdict(list)
+        self.machine: list[MachineSample] = []
+        self.heard = Heard()
+        self.windows: list[Window] = []
+        self.problems: list[str] = []
+        self.paths_followed = 0
+        self.began_s = self.lasted_s = 0.0
+        bag = folder / "soak-%Y%m%d-%H%M%S.mcap"
+        self.plan = load_plan(DEMO_FILE, record=bag, settings=["recorder.waits=true", *settings])
+        self.graph = RunningGraph(self.plan)
+        self._processes: dict[int, psutil.Process] = {}
+        self._cpu_s: dict[int, float] = {}
+
+    async def run(self) -> None:
+        """Use the graph for so long; what ends it early is told in `problems`."""
+        scene = self.plan.scene_message()
+        assert scene is not None  # the demo has one
+        prepare_plan(self.plan, say)
+        try:
+            async with self.graph:
+                await self.graph.wait_ready()
+                async with Driver(self.plan, self.graph.run) as driver:
+                    await driver.wait_until_up()
+                    await self._use(driver, scene)
+        except asyncio.CancelledError:
+            self.problems.append(f"interrupted after {self.lasted_s / 60.0:.1f} minutes")
+        except Exception as error:
+            # Whatever ended the graph is a result; the figures up to then are worth having.
+            self.problems.append(f"{type(error).__name__}: {error}")
+        await self._read_bags(all_of_them=True)
+
+    async def _use(self, driver: Driver, scene: Scene) -> None:
+        status = subscriber_to(
+            "status", self.plan, self.graph.run, self.heard.take, on_problem=self.problems.append
+        )
+        writer = ToolsWriter(self.plan, self.graph.run, ["recording"])
+        status.start()
+        self.began_s = time.monotonic()
+        writer.publish("recording", Recording(running=True))
+        say(f"{self.seconds / 60.0:g} minutes begin")
+        tasks = [
+            asyncio.create_task(self._stroke(driver, scene)),
+            asyncio.create_task(self._sample()),
+            asyncio.create_task(self._record(writer)),
+            asyncio.create_task(self.graph.wait()),
+        ]
+        try:
+            done, _ = await asyncio.wait(
+                tasks, timeout=self.seconds, return_when=asyncio.FIRST_COMPLETED
+            )
+            for task in done:
+                task.result()
+                raise NodeFailedError("the nodes have ended")
+        finally:
+            self.lasted_s = time.monotonic() - self.began_s
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            self._take_samples()
+            writer.publish("recording", Recording(running=False))
+            status.close()
+            writer.close()
+
+    async def _stroke(self, driver: Driver, scene: Scene) -> None:
+        for path in paths(scene):
+            await driver.follow(path)
+            self.paths_followed += 1
+
+    async def _sample(self) -> None:
+        while True:
+            self._take_samples()
+            await asyncio.sleep(SAMPLE_S)
+
+    def _take_samples(self) -> None:
+        time_s = time.monotonic() - self.began_s
+        for name, pid in {**self.graph.pids, LAUNCHER: os.getpid()}.items():
+            try:
+                process = self._processes.setdefault(pid, psutil.Process(pid))
+                memory, times = process.memory_full_info(), process.cpu_times()
+                sample = Sample(
+                    time_s=time_s,
+                    pid=pid,
+                    pss=memory.pss,
+                    rss=memory.rss,
+                    descriptors=process.num_fds(),
+                    threads=process.num_threads(),
+                    cpu_s=times.user + times.system,
+                )
+            except psutil.Error:
+                continue  # killed just now: the launcher counts its restart
+            self.samples[name].append(sample)
+            self._cpu_s[pid] = sample.cpu_s
+        times = psutil.cpu_times()
+        self.machine.append(
+            MachineSample(
+                time_s=time_s,
+                busy_s=sum(times) - times.idle - times.iowait,
+                graph_s=sum(self._cpu_s.values()),
+                logs_bytes=sum(one.stat().st_size for one in self.graph.run.logs.iterdir()),
+            )
+        )
+
+    async def _record(self, writer: ToolsWriter) -> None:
+        for number in count(1):
+            # Reading a bag takes a part of the next window.
+            await asyncio.sleep(self.began_s + number * self.window_s - time.monotonic())
+            writer.publish("recording", Recording(running=False))
+            writer.publish("recording", Recording(running=True))
+            await self._read_bags()
+            newest = self.windows[-1].to_arm_ms if self.windows else None
+            say(f"{(time.monotonic() - self.began_s) / 60.0:.0f} minutes: to arm {newest} ms")
+
+    async def _read_bags(self, *, all_of_them: bool = False) -> None:
+        """Read the bags that are complete, in a process that gives way, and remove them.
+
+        The newest is being written, until the end; then it is kept.
+        """
+        bags = sorted(self.folder.glob("soak-*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
+        context = multiprocessing.get_context("spawn")
+        for bag in bags if all_of_them else bags[:-1]:
+            with ProcessPoolExecutor(1, mp_context=context, initializer=give_way) as pool:
+                work = asyncio.get_running_loop().run_in_executor(pool, read_window, bag)
+                try:
+                    self.windows.append(await work)
+                except BagError as error:
+                    self.problems.append(str(error))
+            if bag is not bags[-1]:
+                bag.unlink()
+
+
+def give_way() -> None:
+    """Of the process that reads bags while the graph is being measured."""
+    os.nice(READER_NICE)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def slope(times_s: Floats, values: Floats) -> Slope | None:
+    """Theil and Sen's: the median of the slopes between all pairs; None over too short a time."""
+    if times_s[-1] - times_s[0] < SHORTEST_FIT_S:
+        return None
+    found = theilslopes(values, times_s / 3600.0)
+    return Slope(float(found.slope), float(found.low_slope), float(found.high_slope))
+
+
+def warm_up_s(lived_s: float) -> float:
+    return min(WARM_UP_S, WARM_UP_SHARE * lived_s)
+
+
+def process_report(samples: Sequence[Sample]) -> dict[str, Any]:
+    """What became of a process; of one that was started anew, of its newest start."""
+    pid = samples[-1].pid
+    ours = [one for one in samples if one.pid == pid]
+    settled_from_s = ours[0].time_s + warm_up_s(ours[-1].time_s - ours[0].time_s)
+    settled = [one for one in ours if one.time_s >= settled_from_s]
+    times = np.array([one.time_s for one in settled])
+    lived_s = ours[-1].time_s - ours[0].time_s
+
+    def grown(name: str) -> dict[str, Any]:
+        values = np.array([getattr(one, name) for one in settled], dtype=np.float64)
+        found = slope(times, values)
+        return {
+            "start": int(getattr(ours[0], name)),
+            "settled": float(np.median(values[: max(len(values) // 4, 1)])),
+            "end": float(np.median(values[-max(len(values) // 4, 1) :])),
+            "most": int(max(getattr(one, name) for one in ours)),
+            "slope_per_h": None if found is None else asdict(found),
+        }
+
+    return {
+        "starts": len({one.pid for one in samples}),
+        "pss": grown("pss"),
+        "rss": grown("rss"),
+        "descriptors": grown("descriptors"),
+        "threads": grown("threads"),
+        "processor_share": (ours[-1].cpu_s - ours[0].cpu_s) / lived_s if lived_s else None,
+    }
+
+
+def report_of(soak: Soak) -> dict[str, Any]:
+    """Everything, with its findings."""
+    processes = {name: process_report(samples) for name, samples in soak.samples.items() if samples}
+    windows = [window_report(soak, window) for window in soak.windows]
+    ports = [
+        {"node": node, "topic": topic, "delivery": TOPICS[topic].delivery.value, **asdict(total)}
+        for (node, topic), total in sorted(soak.heard.ports.items())
+    ]
+    result = {
+        "machine": machine_name(),
+        "minutes": soak.lasted_s / 60.0,
+        "paths_followed": soak.paths_followed,
+        "processes": processes,
+        "ports": ports,
+        "windows": windows,
+        "restarts": {name: number for name, number in soak.graph.restarts.items() if number},
+        "hangs": {name: number for name, number in soak.graph.hangs.items() if number},
+        "errors": dict(soak.heard.errors),
+        "last_errors": soak.heard.last_error,
+        "logs_bytes_per_h": logs_growth(soak.machine),
+        "series": {name: thinned(samples) for name, samples in soak.samples.items()},
+    }
+    return {**result, "findings": [*soak.problems, *findings(result)]}
+
+
+def window_report(soak: Soak, window: Window) -> dict[str, Any]:
+    begin_s = window.begin_ns * 1e-9 - soak.began_s
+    inside = [
+        one for one in soak.machine if begin_s - SAMPLE_S <= one.time_s <= begin_s + window.seconds
+    ]
+    busy = graph = None
+    if len(inside) > 1:
+        seconds = (inside[-1].time_s - inside[0].time_s) * (os.cpu_count() or 1)
+        busy = (inside[-1].busy_s - inside[0].busy_s) / seconds
+        graph = (inside[-1].graph_s - inside[0].graph_s) / seconds
+    return {**asdict(window), "begin_s": begin_s, "machine_busy": busy, "graph_busy": graph}
+
+
+def logs_growth(machine: Sequence[MachineSample]) -> float | None:
+    if len(machine) < 2 or machine[-1].time_s <= machine[0].time_s:
+        return None
+    grown = machine[-1].logs_bytes - machine[0].logs_bytes
+    return 3600.0 * grown / (machine[-1].time_s - machine[0].time_s)
+
+
+def thinned(samples: Sequence[Sample]) -> list[dict[str, Any]]:
+    """One a minute, for whoever wants to draw it."""
+    return [asdict(one) for one in samples[:: round(60.0 / SAMPLE_S)]]
+
+
+def findings(result: dict[str, Any]) -> list[str]:
+    """What grew, drifted or went wrong, a sentence each."""
+    found = []
+    for name, process in result["processes"].items():
+        memory = process["pss"]
+        rate = memory["slope_per_h"]
+        grown = memory["end"] - memory["settled"]
+        if rate and rate["low_per_h"] > GROWTH_B_PER_H and grown > LEAST_GROWTH_B:
+            found.append(
+                f"{name}: memory grows by {rate['per_h'] / MIB:.1f} MiB/h "
+                f"(at least {rate['low_per_h'] / MIB:.1f})"
+            )
+        for what in ("descriptors", "threads"):
+            if rate and process[what]["end"] > process[what]["settled"]:
+                found.append(
+                    f"{name}: {what} grew from {process[what]['settled']:g} "
+                    f"to {process[what]['end']:g}"
+                )
+    for word in ("restarts", "hangs"):
+        found += [f"{name}: {number} {word}" for name, number in result[word].items()]
+    for name, number in result["errors"].items():
+        found.append(f"{name}: {number} errors")
+    for port in result["ports"]:
+        lost = port["gaps"] + port["dropped"]
+        if port["rejected"] or (lost and port["delivery"] != Delivery.LATEST):
+            found.append(
+                f"{port['node']}, topic {port['topic']}: {lost} of {port['messages']} lost, "
+                f"{port['rejected']} refused"
+            )
+    for name, text in result["last_errors"].items():
+        found.append(f"{name}: {text}")
+    for window in result["windows"]:
+        found += [f"an arm had a fault: {fault}" for fault in window["faults"]]
+    return [*found, *drifts(result["windows"])]
+
+
+def drifts(windows: Sequence[dict[str, Any]]) -> list[str]:
+    """Latencies of the last third of the windows against those of the first."""
+    found = []
+    third = len(windows) // 3
+    for what in ("to_fingertip_ms", "to_arm_ms", "to_frame_ms"):
+        medians = [window[what][0] for window in windows if window[what]]
+        if third < 2 or len(medians) < len(windows):
+            continue
+        early, late = np.median(medians[:third]), np.median(medians[-third:])
+        if late > DRIFT_RATIO * early and late - early > LEAST_DRIFT_MS:
+            found.append(
+                f"exposure {what[:-3].replace('_', ' ')}: {early:.1f} ms became {late:.1f}"
+            )
+    return found
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join(f"| {' | '.join(row)} |" for row in lines)
+
+
+def in_words(result: dict[str, Any]) -> str:
+    """The report for people, in Markdown."""
+
+    def mib(value: float) -> str:
+        return f"{value / MIB:.1f}"
+
+    def growth(process: dict[str, Any], name: str) -> str:
+        rate = process[name]["slope_per_h"]
+        if rate is None:
+            return "–"
+        low, high = rate["low_per_h"] / MIB, rate["high_per_h"] / MIB
+        return f"{rate['per_h'] / MIB:+.2f} ({low:+.2f} to {high:+.2f})"
+
+    def both(pair: tuple[float, float] | None) -> str:
+        return "–" if pair is None else f"{pair[0]:.1f} / {pair[1]:.1f}"
+
+    def share(value: float | None) -> str:
+        return "–" if value is None else f"{100.0 * value:.1f} %"
+
+    def steady(process: dict[str, Any], name: str) -> str:
+        return f"{process[name]['settled']:g} → {process[name]['end']:g}"
+
+    processes = [
+        [
+            name,
+            mib(one["pss"]["start"]),
+            mib(one["pss"]["end"]),
+            growth(one, "pss"),
+            growth(one, "rss"),
+            steady(one, "descriptors"),
+            steady(one, "threads"),
+            share(one["processor_share"]),
+            str(one["starts"] - 1),
+        ]
+        for name, one in result["processes"].items()
+    ]
+    windows = [
+        [
+            f"{one['begin_s'] / 60.0:.0f}",
+            both(one["to_fingertip_ms"]),
+            both(one["to_arm_ms"]),
+            both(one["to_frame_ms"]),
+            share(one["valid_share"]),
+            share(one["follow_share"]),
+            str(sum(one["stops"].values())),
+            f"{one['megabytes']:.0f}",
+            share(one["graph_busy"]),
+            share(one["machine_busy"]),
+        ]
+        for one in result["windows"]
+    ]
+    ports = [
+        [
+            one["node"],
+            one["topic"],
+            one["delivery"],
+            str(one["messages"]),
+            str(one["dropped"]),
+            str(one["gaps"]),
+            str(one["rejected"]),
+        ]
+        for one in result["ports"]
+        if one["dropped"] or one["gaps"] or one["rejected"]
+    ]
+    stops: Counter[str] = Counter()
+    for one in result["windows"]:
+        stops.update(one["stops"])
+    logs = result["logs_bytes_per_h"]
+    parts = [
+        f"{result['machine']}; {result['minutes']:.1f} minutes, "
+        f"{result['paths_followed']} strokes, pushes and other paths",
+        table(
+            [
+                "process",
+                "PSS at first, MiB",
+                "at last",
+                "slope of PSS, MiB/h (95 %)",
+                "of RSS",
+                "descriptors",
+                "threads",
+                "processor",
+                "restarts",
+            ],
+            processes,
+        ),
+        table(
+            [
+                "minute",
+                "to fingertip, ms p50 / p99",
+                "to arm",
+                "to frame",
+                "valid",
+                "both follow",
+                "stops",
+                "bag, MB",
+                "graph's share of the cores",
+                "all work",
+            ],
+            windows,
+        ),
+        table(["reader", "topic", "delivery", "taken", "superseded", "lost", "refused"], ports)
+        if ports
+        else "no message was superseded, lost or refused",
+        "\n".join(f"- {number} × {reason}" for reason, number in stops.most_common(10))
+        or "the arms never stopped following",
+        "" if logs is None else f"logs grow by {logs / 1024:.0f} KiB/h",
+        "findings: " + ("none" if not result["findings"] else ""),
+        "\n".join(f"- {one}" for one in result["findings"]),
+    ]
+    return "\n\n".join(part for part in parts if part)
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+async def until_interrupted(soak: Soak) -> None:
+    """Run it; the first SIGINT or SIGTERM ends it in order."""
+    task = asyncio.create_task(soak.run())
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, task.cancel)
+    await task
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("--minutes", type=float, default=60.0)
+    parser.add_argument("--window-minutes", type=float, default=5.0)
+    parser.add_argument("--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE")
+    parser.add_argument("--output", type=Path, help="a new folder; default runs/TIME-soak")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    if given.output is None:
+        folder = new_folder("soak")
+    else:
+        folder = given.output
+        folder.mkdir(parents=True)
+    soak = Soak(60.0 * given.minutes, 60.0 * given.window_minutes, folder.resolve(), given.set)
+    asyncio.run(until_interrupted(soak))
+    result = report_of(soak)
+    (folder / "soak.json").write_text(json.dumps(result, indent=1))
+    (folder / "soak.md").write_text(in_words(result) + "\n")
+    print(json.dumps(result) if given.json else in_words(result))
+    say(f"report and newest bag are in {folder}")
+    return 1 if result["findings"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
