@@ -7,7 +7,7 @@ DEV_STAMP := $(VENV)/.installed-dev
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
 LOCK := build/pip-tools
 
-.PHONY: setup demo try test lint bench faults limits pages docs lock clean
+.PHONY: setup demo try test lint bench faults soak fuzz limits pages docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
@@ -70,6 +70,15 @@ bench: setup $(DEV_STAMP)
 # Kills, cuts and spoils everything between three computers (network namespaces: root).
 faults: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
+
+# An hour of strokes and pushes: what grows, drifts or is lost (docs/soak.md).
+soak: setup
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soak
+
+# Five minutes for each of what reads bytes from outside; what it needs more is installed first.
+fuzz: setup
+	$(INSTALL) --no-build-isolation -e '.[fuzz]'
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fuzz
 
 # What docs/limits.md and docs/limits-soft-body.md show: tables and pictures.
 limits: setup $(DEV_STAMP)

@@ -6,6 +6,7 @@ wrong with it is reported at once as `Problem`s.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -24,6 +25,18 @@ from ruamel.yaml.scalarint import ScalarInt
 from ruamel.yaml.scalarstring import ScalarString
 
 M = TypeVar("M", bound=BaseModel)
+TEXT_MAX = 1 << 20
+DEPTH_MAX = 50
+VALUES_MAX = 20_000
+BRACKETS = re.compile(r"[\[\]{}]")
+SCALARS: tuple[tuple[type, type], ...] = (
+    (ScalarBoolean, bool),
+    (ScalarFloat, float),
+    (ScalarInt, int),
+    (ScalarString, str),
+)
+"""The parser's own kinds of values, which remember how they were written."""
+
 Key = tuple[str | int, ...]
 """Where a value sits in a document: ("nodes", "planner", "parameters", "lead_s")."""
 
@@ -88,8 +101,30 @@ class Document:
 
 
 def parse_value(text: str) -> Any:
-    """A value as YAML reads it: "3" is a number, "[1, 2]" a list, "yes" a string."""
-    return plain(YAML(typ="rt", pure=True).load(text))
+    """A value as YAML reads it: "3" is a number, "[1, 2]" a list, "yes" a string.
+
+    Raises YAMLError.
+    """
+    return plain(_tree(text))
+
+
+def _tree(text: str) -> Any:
+    """The YAML tree of a text, with its comments; raises YAMLError and nothing else."""
+    depth = 0
+    for bracket in BRACKETS.finditer(text):
+        # The parser's time goes with the square of it and more, so it is counted here.
+        depth = depth + 1 if bracket[0] in "[{" else max(depth - 1, 0)
+        if depth > DEPTH_MAX:
+            raise YAMLError(f"more than {DEPTH_MAX} brackets are open at once")
+    try:
+        return YAML(typ="rt", pure=True).load(text)
+    except YAMLError:
+        raise
+    except RecursionError as error:
+        raise YAMLError("values within values within values, too deep") from error
+    # Days and numbers that are none, and odd tags, make the parser raise what it likes.
+    except Exception as error:
+        raise YAMLError(f"holds a value that cannot be read: {error}"[:500]) from error
 
 
 def read_document(path: Path) -> Document:
@@ -103,8 +138,12 @@ def read_document(path: Path) -> Document:
         ) from error
     except UnicodeDecodeError as error:
         raise BadInputError([Problem(str(path), (), f"is not UTF-8 text: {error}")]) from error
+    if len(text) > TEXT_MAX:
+        what = f"has {len(text)} characters, at most {TEXT_MAX} are read"
+        raise BadInputError([Problem(str(path), (), what)])
     try:
-        tree = YAML(typ="rt", pure=True).load(text)
+        tree = _tree(text)
+        values = plain(tree)
     except DuplicateKeyError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 0
         what = (error.problem or "duplicate key").split("\n")[0]
@@ -120,24 +159,42 @@ def read_document(path: Path) -> Document:
     if not isinstance(tree, CommentedMap):
         kind = "empty" if tree is None else f"a {type(tree).__name__}"
         raise BadInputError([Problem(str(path), (), f"is {kind}", "it must hold keys and values")])
-    return Document(path, plain(tree), text, dict(_lines(tree, ())))
+    return Document(path, values, text, dict(_lines(tree, ())))
 
 
-def plain(value: Any) -> Any:
-    """A YAML tree without its comments and quoting, as Python's own types."""
-    if isinstance(value, Mapping):
-        return {plain(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [plain(item) for item in value]
-    if isinstance(value, ScalarBoolean):
-        return bool(value)
-    if isinstance(value, ScalarFloat):
-        return float(value)
-    if isinstance(value, ScalarInt):
-        return int(value)
-    if isinstance(value, ScalarString):
-        return str(value)
-    return value
+def plain(tree: Any) -> Any:
+    """A YAML tree without its comments and quoting, as Python's own types.
+
+    Raises YAMLError for keys that are more than a word or a number, and where aliases stand for
+    more values than anybody writes.
+    """
+    left = VALUES_MAX
+
+    def convert(value: Any) -> Any:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise YAMLError(
+                f"more than {VALUES_MAX} values, those that aliases (*) repeat included"
+            )
+        if isinstance(value, Mapping):
+            return {key(name): convert(item) for name, item in value.items()}
+        if isinstance(value, list):
+            return [convert(item) for item in value]
+        for kind, own in SCALARS:
+            if isinstance(value, kind):
+                return own(value)
+        return value
+
+    def key(name: Any) -> Any:
+        if name is None or isinstance(name, str | int | float):
+            return convert(name)
+        raise YAMLError(f"a key is a {type(name).__name__}, not a word or a number")
+
+    try:
+        return convert(tree)
+    except RecursionError as error:
+        raise YAMLError("a value holds itself, or is nested too deeply") from error
 
 
 def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:

@@ -38,6 +38,9 @@ SUFFIXES = (".obj", ".stl")
 MOST_BYTES = 64 << 20
 SMALLEST_M, LARGEST_M = 0.005, 1.0
 """Objects that a hand can be shown; what is outside has its unit wrong."""
+LARGEST_UNITS = 1e9
+"""Of a coordinate in the file, whatever its unit: beyond it numbers of the mesh run over."""
+
 MOST_CUTTING = 0.01
 """Pairs of triangles that cut through one another, over all triangles: more is no flaw of a rim but
 another object.  Fewer are bridged by the smooth surface."""
@@ -139,10 +142,24 @@ def _read(path: Path) -> Any:
     import trimesh
 
     try:
-        return trimesh.load_mesh(path, process=False, skip_materials=True)
+        mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
     # A file of any content makes it raise errors of many kinds.
     except Exception as error:
         raise MeshError(f"is no mesh that can be read: {error}") from error
+    faces = np.asarray(getattr(mesh, "faces", ()))
+    if len(faces):
+        _refuse_odd(np.asarray(mesh.vertices), faces)
+    return mesh
+
+
+def _refuse_odd(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
+    """Arrays that are no mesh, which the library lets through; MeshError."""
+    if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
+        raise MeshError("its faces are no triangles of points in space")
+    if not (np.abs(vertices) < LARGEST_UNITS).all():
+        raise MeshError(f"a vertex is NaN or infinite, or further away than {LARGEST_UNITS:g}")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise MeshError("a triangle names a vertex that is not there")
 
 
 def _repaired(
@@ -156,8 +173,6 @@ def _repaired(
         raise MeshError(
             f"{len(mesh.faces)} triangles, at most {MOST_TRIANGLES} are taken; decimate the mesh"
         )
-    if not np.isfinite(mesh.vertices).all():
-        raise MeshError("a vertex is NaN or infinite")
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     for what, keep in (
         ("degenerate", ~degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces))),

@@ -31,6 +31,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import IO, Any
 
+import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -46,7 +47,8 @@ PROFILE = "flexsheet"
 CHUNK_BYTES = 1 << 20
 FLUSH_PERIOD_S = 1.0
 SUMMARY_RECORD_BYTES_MAX = 64 << 20
-CHUNK_BYTES_MAX = 1 << 30
+CHUNK_BYTES_MAX = 256 << 20
+"""Of a chunk unpacked; a writer closes one after 1 MiB, or with the message that goes beyond."""
 
 _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQ")
@@ -544,8 +546,7 @@ class BagReader:
         body = _read_at(file, chunk.offset, chunk.length)
         try:
             parsed = mcap_records.Chunk.read(ReadDataStream(BytesIO(body)))
-            if parsed.uncompressed_size > CHUNK_BYTES_MAX:
-                raise ValueError(f"claims {parsed.uncompressed_size} bytes")
+            parsed.data, parsed.compression = _unpacked(parsed), ""
             return breakup_chunk(parsed, validate_crc=True)
         # Decompression and parsing of damaged bytes raise what they like.
         except Exception as error:
@@ -576,7 +577,7 @@ class BagReader:
         try:
             recorded, fingerprint = json.loads(schema.data), channel.metadata["fingerprint"]
             bytes.fromhex(fingerprint)
-        except (ValueError, KeyError):
+        except (ValueError, KeyError, RecursionError):
             return None  # damaged
         return migration_for(topic.message, fingerprint, recorded)
 
@@ -690,6 +691,27 @@ def recover(path_in: Path | str, path_out: Path | str) -> RecoverReport:
 def _read_at(file: IO[bytes], offset: int, length: int) -> bytes:
     file.seek(offset)
     return file.read(length)
+
+
+def _unpacked(chunk: mcap_records.Chunk) -> bytes:
+    """A chunk's records; ValueError where they are more than the chunk claims, or than is allowed.
+
+    A few bytes of a packed chunk can stand for any number: no more is unpacked than is claimed.
+    """
+    claimed = chunk.uncompressed_size
+    if claimed > CHUNK_BYTES_MAX:
+        raise ValueError(f"claims {claimed} bytes, at most {CHUNK_BYTES_MAX} are allowed")
+    match chunk.compression:
+        case "":
+            data = chunk.data
+        case "zstd":
+            with zstandard.ZstdDecompressor().stream_reader(chunk.data) as packed:
+                data = packed.read(claimed + 1)
+        case other:
+            raise ValueError(f"is packed by {other[:40]!r}; bags are by zstd, or not at all")
+    if len(data) != claimed:
+        raise ValueError(f"claims {claimed} bytes unpacked, which it is not")
+    return data
 
 
 def _parse_attachment(body: bytes) -> mcap_records.Attachment:

@@ -42,44 +42,58 @@ def migration_for(
 def fits(recorded: Schema, today: Schema) -> bool:
     """Whether everything that the recorded schema allows is valid by today's."""
     try:
-        return _fits(recorded, today, recorded.get("$defs", {}), today.get("$defs", {}))
-    except (KeyError, TypeError, AttributeError):
-        return False  # damaged: no JSON Schema at all
+        return _Comparison(recorded.get("$defs", {}), today.get("$defs", {})).fits(recorded, today)
+    except (KeyError, TypeError, AttributeError, RecursionError):
+        return False  # damaged: no JSON Schema at all, or one without an end
 
 
 def _as_it_is(fields: Fields) -> Fields:
     return fields
 
 
-def _fits(old: Any, new: Any, old_parts: Schema, new_parts: Schema) -> bool:
-    old, new = _resolved(old, old_parts), _resolved(new, new_parts)
-    if not (isinstance(old, Mapping) and isinstance(new, Mapping)):
-        return bool(old == new)
+class _Comparison:
+    """Of two schemas with their parts; each pair is looked at once, however often it is named."""
 
-    def within(one: Any, other: Any) -> bool:
-        return _fits(one, other, old_parts, new_parts)
+    def __init__(self, old_parts: Schema, new_parts: Schema) -> None:
+        self._old_parts, self._new_parts = old_parts, new_parts
+        self._known: dict[tuple[int, int], bool] = {}
 
-    was, now = _options(old), _options(new)
-    if was or now:
-        return all(any(within(one, other) for other in now or [new]) for one in was or [old])
-    old_fields, new_fields = old.get("properties", {}), new.get("properties", {})
-    old_items, new_items = old.get("prefixItems", []), new.get("prefixItems", [])
-    return (
-        _rest(old) == _rest(new)
-        and _values(old) <= _values(new)
-        and set(new.get("required", ())) <= old_fields.keys()
-        and old_fields.keys() <= new_fields.keys()
-        and all(within(field, new_fields[name]) for name, field in old_fields.items())
-        and within(old.get("items"), new.get("items"))
-        and len(old_items) == len(new_items)
-        and all(map(within, old_items, new_items))
-    )
+    def fits(self, old: Any, new: Any) -> bool:
+        old, new = _resolved(old, self._old_parts), _resolved(new, self._new_parts)
+        if not (isinstance(old, Mapping) and isinstance(new, Mapping)):
+            return bool(old == new)
+        pair = id(old), id(new)
+        if pair not in self._known:
+            # What is met again within itself has no end, and is no message's.
+            self._known[pair] = False
+            self._known[pair] = self._fit(old, new)
+        return self._known[pair]
+
+    def _fit(self, old: Schema, new: Schema) -> bool:
+        was, now = _options(old), _options(new)
+        if was or now:
+            return all(any(self.fits(one, other) for other in now or [new]) for one in was or [old])
+        old_fields, new_fields = old.get("properties", {}), new.get("properties", {})
+        old_items, new_items = old.get("prefixItems", []), new.get("prefixItems", [])
+        return (
+            _rest(old) == _rest(new)
+            and _values(old) <= _values(new)
+            and set(new.get("required", ())) <= old_fields.keys()
+            and old_fields.keys() <= new_fields.keys()
+            and all(self.fits(field, new_fields[name]) for name, field in old_fields.items())
+            and self.fits(old.get("items"), new.get("items"))
+            and len(old_items) == len(new_items)
+            and all(map(self.fits, old_items, new_items))
+        )
 
 
 def _resolved(schema: Any, parts: Schema) -> Any:
-    while isinstance(schema, Mapping) and "$ref" in schema:
+    """What a chain of references leads to; TypeError for one that leads to itself."""
+    for _ in range(len(parts) + 1):
+        if not (isinstance(schema, Mapping) and "$ref" in schema):
+            return schema
         schema = parts[str(schema["$ref"]).rpartition("/")[2]]
-    return schema
+    raise TypeError("a reference that leads to itself")
 
 
 def _options(schema: Schema) -> list[Any]:

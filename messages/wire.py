@@ -48,6 +48,13 @@ DTYPES = tuple(
 )
 INLINE_BYTES = 1024
 NAME_LENGTH = 200
+HEADER_BYTES_MAX = 1 << 20
+"""Of the header frame: larger arrays are frames of their own.  Its smallest values, a byte each,
+take up to 64 times as much as objects."""
+
+ELEMENTS_MAX = 4096
+"""Of an array or a map in the header.  An array that only claims to be long takes its room before
+its elements are looked for, and may be the first element of another one."""
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
 _INLINE, _FRAME = 1, 2
@@ -129,6 +136,8 @@ def encode(
         raise WireError("field", f"{type(message).__name__} cannot be encoded: {error}") from error
     if max_bytes is not None:
         _check_size(frames, max_bytes, type(message).__name__)
+    if len(frames[0]) > HEADER_BYTES_MAX:
+        raise _too_much_header(frames)
     return frames
 
 
@@ -173,9 +182,10 @@ def read_envelope(
         )
     plan = unpacked[9] if len(unpacked) == 11 else ""
     fields = unpacked[-1]
-    if name != codec.name:
+    # An array may stand anywhere, and is neither equal nor unequal to anything.
+    if type(name) is not str or name != codec.name:
         raise WireError("type", f"carries {_shown(name)}, wanted {codec.name}")
-    if carried != wanted:
+    if type(carried) is not bytes or carried != wanted:
         raise WireError(
             "fingerprint",
             f"{codec.name} of another version: fingerprint {_shown(carried)}, "
@@ -239,7 +249,15 @@ def _unpack(frames: Sequence[Any]) -> Any:
     try:
         # A zmq.Frame is no buffer to msgpack; its bytes are.
         first = frames[0] if isinstance(frames[0], bytes | memoryview) else frames[0].buffer
-        unpacked = msgpack.unpackb(first, ext_hook=unpack, use_list=False)
+        if len(first) > HEADER_BYTES_MAX:
+            raise _too_much_header(frames)
+        unpacked = msgpack.unpackb(
+            first,
+            ext_hook=unpack,
+            use_list=False,
+            max_array_len=ELEMENTS_MAX,
+            max_map_len=ELEMENTS_MAX,
+        )
     except WireError:
         raise
     # Foreign bytes make msgpack raise ValueError, TypeError, struct.error and more.
@@ -249,6 +267,12 @@ def _unpack(frames: Sequence[Any]) -> Any:
     if used != len(frames) - 1:
         raise WireError("frames", f"got {len(frames)} frames, the header speaks of {used + 1}")
     return unpacked
+
+
+def _too_much_header(frames: Sequence[Any]) -> WireError:
+    return WireError(
+        "size", f"a header of {len(frames[0])} bytes, at most {HEADER_BYTES_MAX} are allowed"
+    )
 
 
 def _wrong_size(got: int, wanted: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> WireError:
@@ -295,5 +319,14 @@ def _describe(error: ValidationError, name: str) -> str:
 
 
 def _shown(value: object) -> str:
-    """A foreign value, cut short for a sentence."""
-    return repr(value.hex() if isinstance(value, bytes) else value)[:60]
+    """A foreign value, cut short for a sentence; of one that holds others its kind alone.
+
+    What is nested deeply has no repr.
+    """
+    if isinstance(value, bytes):
+        return repr(value[:60].hex())[:60]
+    if isinstance(value, str):
+        return repr(value[:60])[:60]
+    if value is None or isinstance(value, int | float):
+        return repr(value)
+    return f"a {type(value).__name__}"

@@ -1,0 +1,141 @@
+"""Looks for bytes from outside that do what they must not: `make fuzz`, or
+
+    python -m benchmarks.fuzz [TARGET ...] [--seconds 300] [--corpus FOLDER]
+
+Each target (`benchmarks.fuzz_targets`) runs in a process of its own for so long, guided by what the
+inputs reach in our code and in the readers below it (atheris: the extra `fuzz`); inputs begin with
+valid examples and are changed by what knows their structure.  What is found lies in the corpus'
+folder as `TARGET/crash-...`; `python -m benchmarks.fuzz TARGET --again FILE` runs it once more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import re
+import subprocess
+import sys
+import warnings
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+MEMORY_MIB = 2048
+LONGEST_S = 20
+FOUND = ("crash", "oom", "timeout")
+"""How atheris names the files of what it finds."""
+
+LONGEST_BYTES = 1 << 20
+TARGETS = ("wire", "bag", "launch", "scene", "mesh", "modbus", "mxt")
+MODULES = {
+    "wire": ("messages.wire", "messages.bus", "messages.arrays"),
+    "bag": ("messages.bag", "messages.migrations", "messages.wire"),
+    "launch": ("launch.documents", "launch.plan"),
+    "scene": ("launch.documents", "launch.meshes", "launch.textures", "messages.scene"),
+    "mesh": ("launch.meshes", "nodes.models.shapes.triangles"),
+    "modbus": ("nodes.arm_bridge.modbus", "nodes.twin.arms", "pymodbus"),
+    "mxt": ("nodes.arm_bridge.mxt", "nodes.twin.mxt_controller"),
+}
+"""Whose branches are to be reached, by the target."""
+
+
+def hunt(name: str, corpus: Path, seconds: float) -> None:
+    """Run one target in this process; atheris ends it."""
+    import atheris
+
+    with atheris.instrument_imports(include=list(MODULES[name])):
+        for module in MODULES[name]:
+            import_module(module)
+        from benchmarks.fuzz_targets import TARGETS as targets
+        from benchmarks.fuzz_targets import import_nodes
+    import_nodes()
+    target = targets[name]
+    warnings.simplefilter("ignore")
+    for number, seed in enumerate(target.seeds()):
+        target.check(seed)
+        (corpus / f"seed-{number}").write_bytes(seed)
+
+    def mutate(data: bytes, most_bytes: int, seed: int) -> bytes:
+        chance = random.Random(seed)
+        if chance.random() < 0.2:
+            return bytes(atheris.Mutate(data, most_bytes))
+        for _ in range(chance.choice((1, 1, 2, 4))):
+            data = target.mutate(data, chance)
+        return data[:most_bytes]
+
+    def run(data: bytes) -> None:
+        target.check(data)
+
+    arguments = [
+        sys.argv[0],
+        str(corpus),
+        f"-max_total_time={seconds:.0f}",
+        f"-artifact_prefix={corpus}/",
+        f"-rss_limit_mb={MEMORY_MIB}",
+        f"-timeout={LONGEST_S}",
+        f"-max_len={LONGEST_BYTES}",
+        "-print_final_stats=1",
+        "-verbosity=1",
+    ]
+    atheris.Setup(arguments, run, custom_mutator=mutate)
+    atheris.Fuzz()
+
+
+def hunted(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
+    """One target in a process of its own, and what its end says."""
+    folder = corpus / name
+    folder.mkdir(parents=True, exist_ok=True)
+    log = folder / "log.txt"
+    with log.open("wb") as written:
+        command = [sys.executable, "-m", "benchmarks.fuzz", name, "--here"]
+        command += ["--corpus", str(corpus), "--seconds", str(seconds)]
+        code = subprocess.run(command, stdout=written, stderr=written, check=False).returncode
+    text = log.read_text(errors="replace")
+    runs = re.findall(r"^#(\d+)\s", text, re.MULTILINE)
+    reached = re.findall(r"cov: (\d+)", text)
+    found = sorted(
+        str(one) for kind in ("crash", "oom", "timeout") for one in folder.glob(f"{kind}-*")
+    )
+    return {
+        "target": name,
+        "runs": int(runs[-1]) if runs else 0,
+        "reached": [int(reached[0]), int(reached[-1])] if reached else None,
+        "exit_code": code,
+        "found": found,
+        "log": str(log),
+    }
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
+    parser.add_argument("targets", nargs="*", metavar="TARGET", help=", ".join(TARGETS))
+    parser.add_argument("--seconds", type=float, default=300.0, help="for each target")
+    parser.add_argument("--corpus", type=Path, default=Path("runs/fuzz"))
+    parser.add_argument("--again", type=Path, metavar="FILE", help="run one input of the target")
+    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    for name in given.targets:
+        if name not in TARGETS:
+            parser.error(f'no target "{name}"; there are: {", ".join(TARGETS)}')
+    if given.again is not None:
+        from benchmarks.fuzz_targets import TARGETS as targets
+
+        (name,) = given.targets
+        print("taken" if targets[name].check(given.again.read_bytes()) else "refused")
+        return 0
+    corpus = given.corpus.resolve()
+    if given.here:
+        (name,) = given.targets
+        hunt(name, corpus / name, given.seconds)
+        return 0
+    bad = False
+    for name in given.targets or TARGETS:
+        result = hunted(name, corpus, given.seconds)
+        print(json.dumps(result), flush=True)
+        bad |= bool(result["found"]) or result["exit_code"] != 0
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,249 @@
+"""What fuzzing has found, each kept as a test: see `make fuzz`."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tracemalloc
+import zlib
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+import zstandard
+from ruamel.yaml.error import YAMLError
+
+from benchmarks.fuzz_targets import MAGIC, Record, example, joined, records_of
+from launch.documents import BadInputError, parse_value, read_document
+from launch.meshes import read_mesh
+from messages import wire
+from messages.bag import BagError, BagReader, BagWriter
+from messages.base import Header
+from messages.bus import Subscriber
+from messages.migrations import fits
+from messages.topics import TOPICS
+from messages.types import EStop, Fingertip
+from messages.wire import WireError, decode, encode
+from nodes.models.shapes import MeshError
+from nodes.node import PortCounts
+
+HEADER = Header(1, 10, 20, "clock", "planner", 1, "plan")
+FINGERTIP = TOPICS["fingertip"]
+
+
+def header_frame(**changes: Any) -> list[Any]:
+    """The header of a fingertip, some of its eleven elements replaced."""
+    places = {"protocol": 0, "name": 1, "fingerprint": 2, "sequence": 3, "writer": 7, "fields": -1}
+    elements = list(msgpack.unpackb(encode(example(Fingertip), HEADER)[0], use_list=False))
+    for name, value in changes.items():
+        elements[places[name]] = value
+    return elements
+
+
+ARRAY = msgpack.ExtType(1, struct.pack("<BBxxI", 9, 1, 2) + bytes(8))
+"""Two float32, where a name belongs."""
+
+
+@pytest.mark.parametrize("place", ["protocol", "name", "fingerprint", "sequence", "writer"])
+def test_an_array_where_a_name_belongs_is_refused_and_ends_no_reader(place: str) -> None:
+    """An array is neither equal nor unequal to a name, and asking raised ValueError."""
+    problems: list[str] = []
+    counts = PortCounts()
+    subscriber = Subscriber(FINGERTIP, [], print, counts, on_problem=problems.append)
+    frame = msgpack.packb(header_frame(**{place: ARRAY}))
+    assert subscriber.accept([frame], None) is None
+    assert counts.rejected == len(problems) == 1
+
+
+@pytest.mark.parametrize("place", ["protocol", "name", "sequence", "writer", "fields"])
+def test_lists_nested_to_the_parsers_limit_are_refused_in_a_sentence(place: str) -> None:
+    """Their text is not made: it would need more depth than Python has."""
+    deep = b"\x91" * 1000 + b"\x90"
+    mark = "here"
+    packed = msgpack.packb(header_frame(**{place: mark})).replace(msgpack.packb(mark), deep)
+    with pytest.raises(WireError) as refused:
+        decode([packed], FINGERTIP)
+    assert len(str(refused.value)) < 300
+
+
+def test_lists_that_only_claim_to_be_long_take_no_memory() -> None:
+    """Each takes its room before its elements are looked for: 8 GB for a message of a megabyte."""
+    claim = b"\xdd" + struct.pack(">I", 60_000)
+    bomb = claim * 1000 + bytes(100_000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(WireError):
+            decode([bomb], FINGERTIP)
+        assert tracemalloc.get_traced_memory()[1] < 40 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_header_of_many_small_values_is_refused_before_it_is_read() -> None:
+    """A byte of the wire may be 64 of memory, and a picture's topic lets 64 MiB in."""
+    large = bytes(wire.HEADER_BYTES_MAX + 1)
+    with pytest.raises(WireError, match="header of"):
+        decode([large], TOPICS["frame"])
+    with pytest.raises(WireError, match="header of"):
+        encode(EStop(engaged=True, reason="x" * wire.HEADER_BYTES_MAX), HEADER)
+
+
+def small_bag(path: Path, *, compress: bool = True) -> list[Record]:
+    with BagWriter(path, compress=compress) as bag:
+        bag.write(TOPICS["estop"], EStop(engaged=True, reason="x"), HEADER, 1)
+    return records_of(path.read_bytes()[len(MAGIC) :])
+
+
+def rewritten(path: Path, records: list[Record]) -> Path:
+    path.write_bytes(MAGIC + joined(records) + MAGIC)
+    return path
+
+
+def with_schema(records: list[Record], text: bytes) -> list[Record]:
+    """The records with another JSON Schema, and a fingerprint that is not today's."""
+    changed = []
+    for opcode, body in records:
+        start, at = body.find(b"{"), body.find(b"fingerprint") + len(b"fingerprint") + 4
+        if opcode == 3:
+            changed.append((opcode, body[: start - 4] + struct.pack("<I", len(text)) + text))
+        elif opcode == 4:
+            changed.append((opcode, body[:at] + b"0" * 16 + body[at + 16 :]))
+        elif opcode != 6:  # what is in the chunk would say the schema again
+            changed.append((opcode, body))
+    return changed
+
+
+LOOP = {"$defs": {"A": {"$ref": "#/$defs/B"}, "B": {"$ref": "#/$defs/A"}}}
+REFERENCE = {"$ref": "#/$defs/A"}
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        b"[" * 100_000,
+        b'{"a":' * 100_000,
+        json.dumps({**LOOP, "properties": {"reason": REFERENCE}}).encode(),
+        json.dumps({**LOOP, **REFERENCE}).encode(),
+    ],
+)
+def test_a_schema_without_an_end_is_no_schema(tmp_path: Path, schema: bytes) -> None:
+    """Nested deeper than Python is, or leading to itself: that hung."""
+    records = with_schema(small_bag(tmp_path / "a.mcap"), schema)
+    bag = rewritten(tmp_path / "b.mcap", records)
+    reader = BagReader(bag)
+    assert [one.readable for one in reader.info().topics] == [False]
+    with pytest.raises(BagError, match="estop"):
+        list(reader)
+
+
+def test_a_schema_that_names_its_parts_again_and_again_is_compared_once() -> None:
+    """Three ways in each of forty steps are more than anybody can wait for."""
+    parts: dict[str, Any] = {"p40": {"type": "string"}}
+    for number in range(40):
+        reference = {"$ref": f"#/$defs/p{number + 1}"}
+        parts[f"p{number}"] = {"anyOf": [reference, reference, reference]}
+    recorded = {"$defs": parts, "anyOf": [{"$ref": "#/$defs/p0"}]}
+    assert fits(recorded, {"type": "string"})
+    assert not fits(recorded, {"type": "integer"})
+    itself = {"$defs": {"A": {"anyOf": [REFERENCE, REFERENCE]}}, **REFERENCE}
+    assert not fits(itself, {"type": "string"})
+
+
+@pytest.mark.parametrize("claimed", [1 << 40, 1 << 20, 10])
+def test_a_chunk_is_unpacked_no_further_than_it_claims(tmp_path: Path, claimed: int) -> None:
+    """A file of 2 MB could ask for as much memory as there is."""
+    records = small_bag(tmp_path / "a.mcap")
+    packer = zstandard.ZstdCompressor().compressobj()
+    packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(300)) + packer.flush()
+    head = struct.pack("<QQQI", 1, 1, claimed, 0) + struct.pack("<I", 4) + b"zstd"
+    chunk = head + struct.pack("<Q", len(packed)) + packed
+    bag = rewritten(tmp_path / "b.mcap", [(op, chunk if op == 6 else body) for op, body in records])
+    tracemalloc.start()
+    try:
+        with pytest.raises(BagError, match="claims"):
+            list(BagReader(bag))
+        assert tracemalloc.get_traced_memory()[1] < 8 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_chunk_packed_otherwise_is_named(tmp_path: Path) -> None:
+    records = small_bag(tmp_path / "a.mcap", compress=False)
+    changed = [
+        (op, body[:28] + struct.pack("<I", 3) + b"lz4" + body[32:] if op == 6 else body)
+        for op, body in records
+    ]
+    with pytest.raises(BagError, match="'lz4'"):
+        list(BagReader(rewritten(tmp_path / "b.mcap", changed)))
+
+
+ODD_YAML = {
+    "a day that is none": "a: 2026-13-45",
+    "a time that is none": "a: 2026-02-30T25:61:61Z",
+    "a number too long": "a: " + "9" * 5000,
+    "no number": "a: !!int x",
+    "no truth": "a: !!bool x",
+    "a version of the future": "a: 1\n%YAML 9.9\n\nb: 2",
+    "a map as a key": "? {a: b}\n: c",
+    "a list as a key": "? [a]\n: c",
+    "brackets": "a: " + "[" * 3000,
+    "braces": "{a: " * 3000,
+    "dashes": "- " * 3000,
+    "aliases of aliases": "\n".join(
+        f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9) if n else 'x'}]" for n in range(14)
+    ),
+}
+
+
+@pytest.mark.parametrize("text", ODD_YAML.values(), ids=ODD_YAML)
+def test_odd_yaml_is_a_problem_with_its_file(tmp_path: Path, text: str) -> None:
+    """Each was another exception, a hang or an explosion."""
+    file = tmp_path / "a.yaml"
+    file.write_text(text)
+    with pytest.raises(BadInputError, match=r"a\.yaml"):
+        read_document(file)
+    with pytest.raises(YAMLError):
+        parse_value(text)
+
+
+def test_a_file_too_large_to_be_written_by_hand_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text("a: 1\n" * 300_000)
+    with pytest.raises(BadInputError, match="at most"):
+        read_document(file)
+
+
+@pytest.mark.parametrize(
+    "tag", ["!!python/object/apply:os.system ['true']", "!!python/name:os.system"]
+)
+def test_tags_of_python_are_nothing_but_text(tmp_path: Path, tag: str) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text(f"a: {tag}")
+    assert "system" not in str(type(read_document(file).values["a"]))
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n", "further"),
+        ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n", "NaN"),
+    ],
+)
+def test_an_impossible_mesh_is_refused_in_words(tmp_path: Path, text: str, said: str) -> None:
+    """Numbers that no integer holds ran over within the library."""
+    file = tmp_path / "a.obj"
+    file.write_text(text)
+    with pytest.raises(MeshError, match=said), np.errstate(all="ignore"):
+        read_mesh(file, 0.1, None)
+
+
+def test_check_sums_of_a_rewritten_bag_are_looked_at(tmp_path: Path) -> None:
+    """What the tests above rewrite would be read if it were sound."""
+    records = small_bag(tmp_path / "a.mcap", compress=False)
+    assert len(list(BagReader(rewritten(tmp_path / "b.mcap", records)))) == 1
+    changed = [(op, body[:-1] + b"\xff" if op == 6 else body) for op, body in records]
+    with pytest.raises(BagError, match="crc"):
+        list(BagReader(rewritten(tmp_path / "c.mcap", changed)))
+    assert zlib.crc32(b"") == 0
