@@ -32,7 +32,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "prepare": ("prepare",),
     "keys": ("keys",),
     "service": ("service",),
-    "doctor": ("doctor", "doctor_compliance"),
+    "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
     "explain": ("explain",),
 }
 """Modules of `launch.commands` by name of command, in the order of `--help`.

@@ -2,7 +2,8 @@
 
 An e-stop is said by whoever sees the danger, and he may be gone when a bridge is started anew: a
 tool, a node that has crashed.  Each launcher therefore repeats the last one to its host's nodes, as
-a writer of its own, until one who may resets it.
+a writer of its own, until one who may resets it.  Where arms wait for a person's word it is written
+down too, for the case that all launchers end.
 """
 
 from __future__ import annotations
@@ -11,19 +12,23 @@ import asyncio
 import os
 import sys
 from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import psutil
+import zmq
 
-from launch.plan import launcher_on
+from launch.estop_file import EStopFile
+from launch.plan import clock_node, launcher_on
 from launch.planned import Plan, PlannedNode
 from messages.base import Header, Message
-from messages.bus import Publisher, Source, Subscriber
+from messages.bus import Handler, Publisher, Source, Subscriber
 from messages.clock import SystemClock
+from messages.clock_table import ClockTable
 from messages.security import KeyChange, KeyRing
 from messages.topics import topic_named
-from messages.types import EStop, HostStatus, NodeProcess
+from messages.types import EStop, HostKey, HostStatus, NodeProcess
 from nodes.node import PortCounts
 
 PERIOD_S = 1.0
@@ -71,60 +76,107 @@ class HostVoice:
                     keys=keys,
                     on_refused=on_problem,
                 )
-        self._heard: Subscriber | None = None
+        self._clock_table = ClockTable(self._clock.id)
+        self._heard: list[Subscriber] = []
         self._task: asyncio.Task[None] | None = None
         self._kept: EStop | None = None
+        self._engaged_ns = 0
+        self._file = EStopFile(host) if waits_for_a_person(plan) else None
         nodes = plan.nodes_on(host)
         self._devices, self._folder = devices_of(nodes), folder_of(nodes)
 
     def start(self) -> None:
         """Begin to listen and to speak; needs a running loop."""
+        remembered = None if self._file is None else self._file.read()
+        if remembered is not None:
+            self._on_problem(
+                f"e-stop from before this start: {remembered.reason}; the arms stand until it is "
+                "reset: flexsheet arms reset"
+            )
+            self._engage(remembered, self._clock.now_ns())
         others = [
             source
             for source in self._plan.sources_to_read("estop", self._host)
             if source.writer != self._name
         ]
-        self._heard = Subscriber(
-            topic_named("estop"),
-            self._sources(others),
-            self._keep,
+        self._hear("estop", others, self._keep)
+        measured = self._plan.writer("clocks", clock_node(self._host))
+        if measured is not None:
+            source = measured.source_for(self._host)
+            self._hear("clocks", [source], lambda clocks, _: self._clock_table.update(clocks))
+        self._task = asyncio.create_task(self._speak(), name=f"host {self._host}")
+
+    def _hear(self, topic: str, sources: list[Source], handler: Handler) -> None:
+        subscriber = Subscriber(
+            topic_named(topic),
+            self._sources(sources),
+            handler,
             PortCounts(),
             on_problem=self._on_problem,
             keys=self._keys,
             plan=self._plan.hash,
         )
-        self._heard.start()
-        self._task = asyncio.create_task(self._speak(), name=f"host {self._host}")
+        subscriber.start()
+        self._heard.append(subscriber)
 
     def renew_keys(self, change: KeyChange) -> None:
         """Take over keys that have been read anew."""
         for publisher in self.publishers.values():
             publisher.renew_keys(change)
-        if self._heard is not None:
-            self._heard.renew_keys(change)
+        for subscriber in self._heard:
+            subscriber.renew_keys(change)
 
     async def close(self) -> None:
         """Fall silent; may be called twice."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
-        if self._heard is not None:
-            self._heard.close()
+        for subscriber in self._heard:
+            subscriber.close()
         for publisher in self.publishers.values():
             publisher.close()
 
     def _keep(self, estop: EStop, header: Header) -> None:
+        now_ns = self._clock.now_ns()
+        _, header, clock_trouble = self._clock_table.localised(estop, header, now_ns)
         if estop.engaged:
             if self._kept is not None and header.writer in self._launchers:
                 return
-            if self._kept is None:
+            before = self._kept
+            if before is None:
                 self._on_problem(f"e-stop of {header.writer}, kept until it is reset")
-            self._kept = estop
-            self._publish("estop", estop)
+            self._engage(estop, now_ns if clock_trouble else header.source_ns)
+            if before is None or before.reason != estop.reason:
+                self._write_down(estop)
         elif header.writer in self._plan.may_reset_estop() and self._kept is not None:
+            # A late reader is given each writer's last word: a reset may be older than the stop.
+            if header.source_ns < self._engaged_ns:
+                return
+            if clock_trouble:
+                self._on_problem(f"e-stop not reset: by {header.writer}, {clock_trouble}")
+                return
             self._on_problem(f"e-stop reset by {header.writer}")
             self._kept = None
             self.publishers["estop"].forget()
+            self._write_down(None)
+
+    def _engage(self, estop: EStop, at_ns: int) -> None:
+        self._kept, self._engaged_ns = estop, max(self._engaged_ns, at_ns)
+        self._publish("estop", estop)
+
+    def _write_down(self, estop: EStop | None) -> None:
+        if self._file is None:
+            return
+        try:
+            if estop is None:
+                self._file.remove()
+            else:
+                self._file.write(estop)
+        except OSError as error:
+            self._on_problem(
+                f"e-stop: {self._file.path} cannot be written ({error.strerror}); should all "
+                "launchers end, the next start does not know of this"
+            )
 
     def _publish(self, topic: str, message: Message) -> None:
         if topic not in self.publishers:
@@ -154,14 +206,37 @@ class HostVoice:
             run=self._run_id,
             plan_hash=self._plan.hash,
             code=self._code,
-            python=".".join(map(str, sys.version_info[:3])),
+            python=python_version(),
             uptime_s=(self._clock.now_ns() - self._epoch) * 1e-9,
             load_ratio=os.getloadavg()[0] / (os.cpu_count() or 1),
             disk_free_bytes=disk.f_bavail * disk.f_frsize,
             memory_free_bytes=psutil.virtual_memory().available,
             nodes=self._processes(),
             missing_devices=tuple(one for one in self._devices if not os.path.exists(one)),
+            software=software(),
+            keys=()
+            if self._keys is None
+            else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
+            estop=None if self._kept is None else self._kept.reason,
         )
+
+
+def waits_for_a_person(plan: Plan) -> bool:
+    """Whether arms move at a person's word only; those that go by themselves are simulated."""
+    return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
+
+
+def python_version() -> str:
+    return ".".join(map(str, sys.version_info[:3]))
+
+
+def software() -> str:
+    """Versions of what all hosts should have alike."""
+    try:
+        own = version("flexsheet")
+    except PackageNotFoundError:
+        own = "not installed"
+    return f"flexsheet {own}, pyzmq {zmq.pyzmq_version()}, libzmq {zmq.zmq_version()}"
 
 
 def devices_of(nodes: list[PlannedNode]) -> list[str]:

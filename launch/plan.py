@@ -40,6 +40,7 @@ from launch.planned import (
     RestartSpec,
     Strict,
     Writer,
+    tools_on,
 )
 from messages.calibration import load_calibration, refuse_other_camera
 from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
@@ -49,6 +50,9 @@ from messages.sheet_calibration import load_sheet_calibration, refuse_other_shee
 from messages.topics import TOPICS, Topic
 from nodes import NODES, UnknownNodeError, node_class
 from nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
+
+SAID_FROM_ANYWHERE = ("estop",)
+"""What tools on the other hosts may write too: a stop, by whoever stands beside the arm."""
 
 LAUNCHERS_TOPICS = ("host", "estop")
 """What the launcher of each host writes: how the host is, and an e-stop that it keeps."""
@@ -193,7 +197,7 @@ def load_plan(
         raise BadInputError(problems)
 
     addresses = {name: host.address for name, host in spec.hosts.items()}
-    endpoints = _endpoints(members, writers, addresses)
+    endpoints = _endpoints(writers, addresses)
     nodes = {
         member.name: _planned(member, endpoints, document, resolve_paths=True) for member in members
     }
@@ -422,7 +426,7 @@ def _members(spec: LaunchFile, document: Document, problems: list[Problem]) -> l
     members = []
     for name, node_spec in spec.nodes.items():
         members.append(_Member(name, node_spec, ("nodes", name)))
-        taken = (TOOLS, *map(clock_node, spec.hosts))
+        taken = (*map(tools_on, spec.hosts), *map(clock_node, spec.hosts), TOOLS)
         if name in taken or name.partition("_")[0] == LAUNCHER:
             problems.append(
                 document.problem(("nodes", name), f'"{name}" is taken', "give another name")
@@ -614,6 +618,9 @@ def _writers(
     for topic in TOPICS.values():
         if topic.many_writers and topic.open_to_tools:
             writers.setdefault(topic.name, []).append((TOOLS, MAIN))
+    for name, host in product(SAID_FROM_ANYWHERE, spec.hosts):
+        if host != MAIN:
+            writers.setdefault(name, []).append((tools_on(host), host))
     return writers
 
 
@@ -693,23 +700,19 @@ def _check_calibrations(
 
 
 def _endpoints(
-    members: list[_Member], writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
+    writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
 ) -> dict[str, tuple[Writer, ...]]:
-    """The endpoints of every writer: ipc for its host, tcp when another host reads the topic.
+    """The endpoints of every writer: ipc for its host, tcp where there are others.
 
-    The main host counts as a reader of everything, for the tools there.
+    Each topic can be read on each host, for the tools there; nothing is sent to who does not ask.
     """
-    reading_hosts: dict[str, set[str]] = {topic: {MAIN} for topic in writers}
-    for member in members:
-        for _, topic in member.topics("input"):
-            reading_hosts[topic.name].add(member.spec.host)
-    remote = sorted(
+    far = sorted(
         (host, writer, topic)
         for topic, entries in writers.items()
         for writer, host in entries
-        if reading_hosts[topic] - {host}
+        if addresses.keys() - {host}
     )
-    ports = _ports(remote)
+    ports = _ports(far)
     return {
         topic: tuple(
             Writer(

@@ -142,6 +142,11 @@ class Plan(Strict):
         return None if self.scene is None else Scene.model_validate(self.scene)
 
 
+def tools_on(host: str) -> str:
+    """The command-line tools of a host, as a writer."""
+    return TOOLS if host == MAIN else f"{TOOLS}_{host}"
+
+
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
     """Endpoints of a plan with the run's directory filled in."""
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)

@@ -30,6 +30,7 @@ ROOT_VARIABLE = "FLEXSHEET_RUNS"
 FINISHED_RUNS_KEPT = 10
 ORPHAN_GRACE_S = 3.5
 
+HOST_FILE = "host"
 _LAUNCHER_FILE = "launcher.json"
 _count = itertools.count(1)
 
@@ -52,6 +53,14 @@ class Run:
     @property
     def plan_file(self) -> Path:
         return self.directory / "plan.json"
+
+    @property
+    def host(self) -> str | None:
+        """The host whose nodes it has; None: all hosts of its plan."""
+        try:
+            return (self.directory / HOST_FILE).read_text()
+        except FileNotFoundError:
+            return None
 
     def is_alive(self) -> bool:
         """Whether its launcher still runs it."""

@@ -43,7 +43,7 @@ from launch.planned import (
     local_endpoints,
     local_sources,
 )
-from launch.runs import RUN_VARIABLE, Run, create_run, is_free, ring_file, sweep
+from launch.runs import HOST_FILE, RUN_VARIABLE, Run, create_run, is_free, ring_file, sweep
 from messages.base import Header
 from messages.bus import Publisher
 from messages.clock import SystemClock
@@ -536,6 +536,8 @@ class RunningGraph:
         (directory / "launch.yaml").write_text(self.plan.launch_text)
         (directory / "scene.yaml").write_text(self.plan.scene_text)
         (directory / "git.json").write_text(git_state(ENTRY.parent))
+        if self._host is not None:
+            (directory / HOST_FILE).write_text(self._host)
         if any(port.topic == "scene" for node in self.nodes for port in node.outputs):
             self._write_scenes(directory / "scenes")
         # Last and at once: tools that look for a graph read this file.

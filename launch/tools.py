@@ -1,11 +1,16 @@
-"""Writing into a graph from outside of it, as the writer "tools" that every plan foresees."""
+"""Reading a graph and writing into it from outside, on any of its hosts.
+
+Each plan foresees the tools as writers: those of the main host write what no node does, those of
+the other hosts e-stops alone.  They speak with the keys of the host where they run.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from launch.planned import MAIN, TOOLS, Plan, local_endpoints, local_sources
+from launch.planned import MAIN, Plan, local_endpoints, local_sources, tools_on
 from launch.runs import Run, ring_file
 from messages.base import Header, Message
 from messages.bus import Handler, Problem, Publisher, Subscriber
@@ -13,6 +18,9 @@ from messages.clock import SystemClock
 from messages.security import KeyRing
 from messages.topics import topic_named
 from messages.types import HostStatus, Status
+
+if TYPE_CHECKING:
+    from launch.documents import BadInputError
 
 READER_RECONNECT_S = 1.0
 """Readers look for a writer that was not there at most every half second."""
@@ -27,14 +35,19 @@ class Counts:
     rejected: int = 0
 
 
-def topics_for_tools(plan: Plan) -> list[str]:
-    """Topics that a tool may write in this plan."""
-    return [topic for topic in plan.writers if plan.writer(topic, TOOLS) is not None]
+def host_of(run: Run) -> str:
+    """The host whose tools we are."""
+    return run.host or MAIN
+
+
+def topics_for_tools(plan: Plan, host: str = MAIN) -> list[str]:
+    """Topics that a tool on a host may write in this plan."""
+    return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
 
 def keys_of(plan: Plan, run: Run) -> KeyRing | None:
-    """The keys of the main host, where tools are; None where the plan has none."""
-    return KeyRing(ring_file(run, MAIN)) if plan.keys else None
+    """The keys of the host where we are; None where the plan has none."""
+    return KeyRing(ring_file(run, host_of(run))) if plan.keys else None
 
 
 def subscriber_to(
@@ -50,7 +63,7 @@ def subscriber_to(
     wanted = topic_named(topic)
     return Subscriber(
         wanted,
-        local_sources(run, plan.sources_to_read(topic)),
+        local_sources(run, plan.sources_to_read(topic, host_of(run))),
         on_message,
         Counts(),
         on_problem=on_problem,
@@ -73,25 +86,12 @@ class ToolsWriter:
         keys = keys_of(plan, run)
         self._sequences: dict[str, int] = {}
         self._publishers: dict[str, Publisher] = {}
+        self._name, host = tools_on(host_of(run)), host_of(run)
         try:
             for name in topics:
-                writer = plan.writer(name, TOOLS)
+                writer = plan.writer(name, self._name)
                 if writer is None:
-                    from launch.documents import BadInputError, Problem
-
-                    owners = ", ".join(one.name for one in plan.writers.get(name, ()))
-                    what = f"is written by {owners}" if owners else "is not part of the graph"
-                    raise BadInputError(
-                        [
-                            Problem(
-                                plan.launch_file,
-                                ("from_tools",),
-                                f'topic "{name}" {what}',
-                                f'list it in "from_tools"; open are: '
-                                f"{', '.join(topics_for_tools(plan))}",
-                            )
-                        ]
-                    )
+                    raise _refusal(plan, name, host)
                 endpoints = local_endpoints(run, writer.endpoints)
                 self._publishers[name] = Publisher(topic_named(name), endpoints, keys=keys)
         except BaseException:
@@ -109,7 +109,7 @@ class ToolsWriter:
                 source_ns=now_ns if source_ns is None else source_ns,
                 publish_ns=now_ns,
                 clock_id=self._clock.id,
-                writer=TOOLS,
+                writer=self._name,
                 epoch=self._epoch,
                 plan=self._plan,
             ),
@@ -118,3 +118,21 @@ class ToolsWriter:
     def close(self) -> None:
         for publisher in self._publishers.values():
             publisher.close()
+
+
+def _refusal(plan: Plan, topic: str, host: str) -> BadInputError:
+    """Why tools on a host do not write a topic, and who may."""
+    from launch import documents
+
+    may = ", ".join(topics_for_tools(plan, host))
+    if topic in topics_for_tools(plan):
+        key: tuple[str, ...] = ("hosts", host)
+        what = f'topic "{topic}" is not for tools on this computer, host "{host}"'
+        remedy = f'say it on host "{MAIN}" ({plan.hosts[MAIN]}); from here: {may}'
+    else:
+        key = ("from_tools",)
+        owners = ", ".join(one.name for one in plan.writers.get(topic, ()))
+        what = f'topic "{topic}" '
+        what += f"is written by {owners}" if owners else "is not part of the graph"
+        remedy = f'list it in "from_tools"; open are: {may}'
+    return documents.BadInputError([documents.Problem(plan.launch_file, key, what, remedy)])

@@ -358,6 +358,13 @@ class NodeProcess(Part):
     hangs: int = Field(ge=0, description="restarts because it gave no sign of life")
 
 
+class HostKey(Part):
+    """A host's public key, as another one knows it."""
+
+    host: str
+    key: str
+
+
 class HostStatus(Message):
     """How a computer is, from its launcher, once a second."""
 
@@ -372,6 +379,9 @@ class HostStatus(Message):
     memory_free_bytes: int = Field(ge=0)
     nodes: tuple[NodeProcess, ...]
     missing_devices: tuple[str, ...] = Field(description="what its nodes name and is not there")
+    software: str = Field(default="", description="versions of what the hosts must agree about")
+    keys: tuple[HostKey, ...] = Field(default=(), description="which hosts it lets in")
+    estop: str | None = Field(default=None, description="reason of the e-stop that it keeps")
 
 
 PathJoin = Literal["rounded_lines", "spline"]

@@ -21,6 +21,8 @@ from typing import Any, Self
 import pytest
 from ruamel.yaml import YAML
 
+from launch.estop_file import STATE_VARIABLE
+from launch.keys import KEYS_VARIABLE
 from launch.plan import load_plan
 from launch.planned import Plan
 from launch.runs import ROOT_VARIABLE
@@ -149,7 +151,8 @@ class Lab:
         return {
             **os.environ,
             ROOT_VARIABLE: str(self.folder / host / "r"),
-            "FLEXSHEET_KEYS": str(self.folder / host / "keys"),
+            KEYS_VARIABLE: str(self.folder / host / "keys"),
+            STATE_VARIABLE: str(self.folder / host / "state"),
         }
 
     def command(self, host: str, *arguments: str) -> list[str]:

@@ -118,7 +118,9 @@ def test_the_launchers_are_writers_of_their_own(tmp_path: Path) -> None:
     assert [(one.name, one.host) for one in plan.writers["host"]] == [
         ("launch", "main"), ("launch_left", "left"),
     ]  # fmt: skip
-    assert {one.name for one in plan.writers["estop"]} == {"launch", "launch_left", TOOLS}
+    assert {one.name for one in plan.writers["estop"]} == {
+        "launch", "launch_left", TOOLS, "tools_left",
+    }  # fmt: skip
 
 
 def test_devices_are_found_wherever_parameters_name_them() -> None:

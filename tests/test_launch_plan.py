@@ -80,9 +80,12 @@ nodes:
     assert writer.tcp.startswith("tcp://127.0.0.2:")
     assert plan.nodes["near"].inputs[0].endpoints == (writer.ipc,)
     assert plan.nodes["far"].inputs[0].endpoints == (writer.tcp,)
-    far = plan.writer("estop", "far")
-    assert far is not None
-    assert far.tcp is None
+    # Nobody elsewhere reads it but a person with a tool.
+    status = plan.writer("status", "near")
+    assert status is not None
+    assert status.endpoint_for("main") == status.tcp
+    alone = load_plan(write(tmp_path, GRAPH))
+    assert {one.tcp for writers in alone.writers.values() for one in writers} == {None}
 
 
 def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:

@@ -9,11 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
-from launch.commands.output import FAILED, examples, print_json, print_table, words
+from launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    examples,
+    print_json,
+    print_table,
+    words,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from launch.planned import Plan
     from messages.base import Message
     from messages.types import ArmState
 
@@ -109,9 +118,10 @@ async def _say(
 
     It is said once only: a person means now, not when the network is back.
     """
-    from launch.tools import READER_RECONNECT_S, ToolsWriter, subscriber_to
+    from launch.tools import READER_RECONNECT_S, ToolsWriter, host_of, subscriber_to
 
     plan, run = running_graph(run_directory)
+    _refuse_reset_from_elsewhere(plan, host_of(run), word)
     loop = asyncio.get_running_loop()
     arms: dict[str, ArmState] = {}
     came_s: dict[str, float] = {}
@@ -151,6 +161,20 @@ async def _say(
     if not good:
         words.print("[red]not so[/]: see the reasons; each bridge's log says what it refused")
     return 0 if good else FAILED
+
+
+def _refuse_reset_from_elsewhere(plan: Plan, host: str, word: tuple[str, Message] | None) -> None:
+    from launch.planned import tools_on
+    from messages.types import EStop
+
+    if word is None or not isinstance(word[1], EStop) or word[1].engaged:
+        return
+    if tools_on(host) not in plan.may_reset_estop():
+        raise CommandError(
+            f'host "{host}" may not reset an e-stop; do it on {", ".join(plan.estop_resetters)}, '
+            f"or let it: hosts.{host}.may_reset_estop in {plan.launch_file}",
+            BAD_INPUT,
+        )
 
 
 def _show(arms: dict[str, ArmState], as_json: bool) -> None:

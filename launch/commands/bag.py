@@ -274,8 +274,9 @@ async def _record(
     bag: Path, topics: list[str], plan: Plan, run: Run, duration_s: float | None
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
-    from launch.planned import MAIN, RUN_DIRECTORY, local_sources
+    from launch.planned import RUN_DIRECTORY, local_sources
     from launch.runs import ring_file
+    from launch.tools import host_of
     from messages.topics import TOPICS
     from nodes.recorder.node import Recorder
     from nodes.recorder.parameters import RUN_FILES, RecorderParameters
@@ -299,13 +300,13 @@ async def _record(
             PortConfig(
                 port=f"in/{name}",
                 topic=name,
-                endpoints=local_sources(run, plan.sources_to_read(name)),
+                endpoints=local_sources(run, plan.sources_to_read(name, host_of(run))),
             )
             for name in wanted
         ),
         outputs=(),
         plan_hash=plan.hash,
-        keys_file=ring_file(run, MAIN) if plan.keys else None,
+        keys_file=ring_file(run, host_of(run)) if plan.keys else None,
         run_dir=str(run.directory),
     )
     stop = asyncio.Event()

@@ -1,0 +1,145 @@
+"""`flexsheet doctor hosts`: are all computers of a launch file fit; if not, what is to be done."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch.commands.graph import JsonOption, running_graph
+from launch.commands.output import (
+    BAD_INPUT,
+    FAILED,
+    CommandError,
+    print_json,
+    print_table,
+    words,
+)
+
+if TYPE_CHECKING:
+    from launch.doctor_hosts import HostFinding
+    from launch.planned import Plan
+    from launch.runs import Run
+
+PATIENCE_S = 4.0
+
+
+def register(app: typer.Typer) -> None:
+    """Adds the command to `flexsheet doctor`."""
+    app.command("hosts")(hosts)
+
+
+def hosts(
+    launch_file: Annotated[
+        Path | None,
+        typer.Argument(metavar="LAUNCH_FILE", help="Without it: that of the graph that runs here."),
+    ] = None,
+    host: Annotated[
+        str | None,
+        typer.Option(help="Which of its hosts this computer is; default: by its address."),
+    ] = None,
+    patience: Annotated[
+        float, typer.Option(metavar="SECONDS", help="How long to wait for answers.", min=1.5)
+    ] = PATIENCE_S,
+    as_json: JsonOption = False,
+) -> None:
+    """Ask all hosts of a launch file; exit code 1 when something must be put right.
+
+    Also before anything runs: then it says what this computer sees of itself and of the network.
+    """
+    plan, run = _graph(launch_file)
+    here = host_here(plan, run, host)
+    if run is not None and run.host not in (None, here):
+        run = None
+    with words.status("asking all hosts"):
+        findings = asyncio.run(examine(plan, here, run, patience))
+    if as_json:
+        print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
+    else:
+        words.print(f"{plan.launch_file}, plan {plan.hash}, asked from {here}", markup=False)
+        print_findings(findings)
+    if any(one.state == "failed" for one in findings):
+        raise typer.Exit(FAILED)
+
+
+def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
+    """The plan, and the graph of that launch file that runs here."""
+    from launch.plan import load_plan
+
+    if launch_file is None:
+        return running_graph(None)
+    plan = load_plan(launch_file)
+    try:
+        running, run = running_graph(None)
+    except CommandError:
+        return plan, None
+    same = Path(running.launch_file).resolve() == launch_file.resolve()
+    return plan, run if same or running.hash == plan.hash else None
+
+
+def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
+    """Which host of the plan this computer is; CommandError where that cannot be told."""
+    from launch.doctor_hosts import own_addresses
+    from launch.documents import did_you_mean
+    from launch.planned import MAIN
+    from launch.tools import host_of
+
+    if wanted is not None:
+        if wanted not in plan.hosts:
+            raise CommandError(
+                f"--host {wanted}: there is no such host; {did_you_mean(wanted, list(plan.hosts))}",
+                BAD_INPUT,
+            )
+        return wanted
+    if run is not None:
+        return host_of(run)
+    own = own_addresses()
+    found = [name for name, address in plan.hosts.items() if address in own]
+    if MAIN in found or len(found) == 1:
+        return MAIN if MAIN in found else found[0]
+    raise CommandError(
+        f"this computer has none of the addresses in {plan.launch_file} "
+        f"({', '.join(plan.hosts.values())}); say which host it is: --host NAME",
+        BAD_INPUT,
+    )
+
+
+async def examine(plan: Plan, here: str, run: Run | None, patience_s: float) -> list[HostFinding]:
+    """All findings: what this computer sees, and what the others say."""
+    import tempfile
+
+    from launch.doctor_hosts import before_start, judge, own_key_problem
+    from launch.keys import secret_file
+    from launch.visits import visit_all
+    from messages.security import KeyRing, write_ring
+
+    key_problem = await asyncio.to_thread(own_key_problem, plan, here)
+    with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
+        keys = None
+        if plan.keys and key_problem is None:
+            file = Path(folder) / "ring.json"
+            write_ring(file, host=here, secret_file=secret_file(here), public=plan.keys)
+            keys = KeyRing(file)
+        visits = await visit_all(plan, here=here, keys=keys, run=run, patience_s=patience_s)
+    findings = judge(plan, here, visits)
+    if visits[here].status is None:
+        seen = await asyncio.to_thread(lambda: list(before_start(plan, here, key_problem)))
+        first = next((i for i, one in enumerate(findings) if one.host == here), 0)
+        last = first + sum(one.host == here for one in findings)
+        findings[last:last] = seen
+    return findings
+
+
+def print_findings(findings: list[HostFinding]) -> None:
+    """One line per host and check; a host's name stands at its first."""
+    rows = []
+    before = ""
+    for one in findings:
+        rows.append(
+            (one.host if one.host != before else "", one.check, one.state, one.what, one.remedy)
+        )
+        before = one.host
+    print_table(("host", "check", "state", "what", "what to do"), rows)

@@ -1,0 +1,350 @@
+"""The doctor of several hosts: what he makes of what he hears, and of silence."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+import socket
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch import runs, visits
+from launch.commands.doctor_hosts import examine, host_here
+from launch.commands.output import CommandError
+from launch.doctor_hosts import (
+    SILENCES,
+    WAYS,
+    HostFinding,
+    before_start,
+    judge,
+    own_key_problem,
+    rate_problem,
+)
+from launch.keys import KEYS_VARIABLE, secret_file
+from launch.plan import load_plan
+from launch.planned import MAIN, Plan
+from launch.supervisor import RunningGraph
+from launch.visits import Reach, Visit, way_to
+from messages.bus import Publisher
+from messages.security import new_key_pair, write_secret
+from messages.topics import TOPICS
+from messages.types import (
+    ArmState,
+    ClockOffset,
+    Clocks,
+    HostKey,
+    HostStatus,
+    NodeProcess,
+    PortStatus,
+    Status,
+)
+from tests.hosts import Hosts, hosts
+
+ROOT = Path(__file__).resolve().parent.parent
+DEADLINE_S = 30.0
+BEACON = {"type": "tests.launch_nodes:Beacon"}
+ADDRESSES = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+NAMES = ("main", "left", "right")
+
+
+@pytest.fixture(autouse=True)
+def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    made = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(made / "r"))
+    monkeypatch.setenv(KEYS_VARIABLE, str(made / "k"))
+    yield made
+    shutil.rmtree(made)
+
+
+@pytest.fixture(scope="module")
+def three() -> Plan:
+    plan = load_plan(ROOT / "launch" / "three.yaml")
+    keys = {name: new_key_pair()[0] for name in NAMES}
+    return plan.model_copy(update={"keys": keys})
+
+
+def port(topic: str, rate_hz: float, *, rejected: int = 0) -> PortStatus:
+    return PortStatus(
+        topic=topic, rate_hz=rate_hz, age_s=0.0, messages=9, dropped=0, gaps=0, rejected=rejected
+    )
+
+
+def said(node: str, *outputs: PortStatus, note: str = "", inputs: Any = ()) -> Status:
+    return Status(
+        node=node, state="running", pid=1, uptime_s=9.0, cpu_ratio=0.1, resident_bytes=1,
+        inputs=tuple(inputs), outputs=outputs, errors=0, last_error="", note=note, plan_hash="",
+    )  # fmt: skip
+
+
+def good(plan: Plan) -> dict[str, Visit]:
+    """What three hosts say where all is well."""
+    found = {}
+    for name in plan.hosts:
+        nodes = plan.nodes_on(name)
+        found[name] = Visit(
+            name,
+            "speaks",
+            status=HostStatus(
+                host=name, run="1.2.3", plan_hash=plan.hash, code="abc", python="3.11.7",
+                uptime_s=5.0, load_ratio=0.5, disk_free_bytes=9 << 30, memory_free_bytes=9 << 30,
+                nodes=tuple(
+                    NodeProcess(name=one.name, state="ready", restarts=0, hangs=0) for one in nodes
+                ),
+                missing_devices=(), software="flexsheet 1",
+                keys=tuple(HostKey(host=host, key=key) for host, key in plan.keys.items()),
+            ),
+            clock_id=f"clock-{name}",
+            clocks=Clocks(
+                max_offset_uncertainty_s=0.005, max_drift_ratio=5e-4,
+                offsets=tuple(
+                    ClockOffset(clock_id=f"clock-{other}", at_ns=1, offset_ns=7, drift_ratio=0.0,
+                                uncertainty_s=1e-4, resets=0)
+                    for other in plan.hosts if other != name
+                ),
+            ),
+        )  # fmt: skip
+        for node in nodes:
+            ports = [
+                port(one.topic, TOPICS[one.topic].rate_hz[1])  # type: ignore[index]  # has one
+                for one in node.outputs
+                if TOPICS[one.topic].rate_hz is not None and one.endpoints
+            ]
+            found[name].nodes[node.name] = said(node.name, *ports, note="well")
+        if name != MAIN:
+            found[name].arms[name] = arm(name)
+    return found
+
+
+def arm(side: str, **values: Any) -> ArmState:
+    return ArmState.model_construct(
+        **{"side": side, "mode": "idle", "reason": "", "faults": (), "ready": True} | values
+    )
+
+
+def bad(found: list[HostFinding]) -> list[tuple[str, str, str]]:
+    return [(one.host, one.check, one.state) for one in found if one.state != "ok"]
+
+
+def test_where_all_is_well_nothing_is_found(three: Plan) -> None:
+    found = judge(three, "main", good(three))
+    assert bad(found) == []
+    checks = {one.check for one in found}
+    assert checks >= {
+        "reachable", "launcher", "plan", "keys", "software", "clocks", "nodes", "rates", "camera",
+        "picture", "arm left", "arm right", "disk", "load",
+    }  # fmt: skip
+    assert {one.host for one in found} == set(NAMES)
+
+
+def changed(visit: Visit, **values: Any) -> None:
+    assert visit.status is not None
+    visit.status = visit.status.model_copy(update=values)
+
+
+TROUBLES: dict[str, tuple[Any, tuple[str, str, str], str]] = {
+    "plan": (lambda v: changed(v["left"], plan_hash="else"), ("left", "plan", "failed"), "same"),
+    "stop": (lambda v: changed(v["left"], estop="a hand"), ("left", "e-stop", "warning"), "reset"),
+    "keys": (
+        lambda v: changed(v["right"], keys=v["right"].status.keys[1:]),
+        ("right", "keys", "failed"), "copy",
+    ),
+    "python": (
+        lambda v: changed(v["left"], python="3.12.1"), ("left", "software", "warning"), "git"
+    ),
+    "code": (lambda v: changed(v["left"], code="def"), ("left", "software", "warning"), "git"),
+    "away": (
+        lambda v: changed(v["left"], nodes=(
+            NodeProcess(name="arm_left_bridge", state="away", restarts=2, hangs=0),)),
+        ("left", "nodes", "failed"), "log",
+    ),
+    "device": (
+        lambda v: changed(v["main"], missing_devices=("/dev/video0",)),
+        ("main", "devices", "failed"), "plugged",
+    ),
+    "disk": (lambda v: changed(v["main"], disk_free_bytes=1), ("main", "disk", "warning"), "room"),
+    "memory": (
+        lambda v: changed(v["main"], memory_free_bytes=1), ("main", "load", "warning"), "top"
+    ),
+    "clock": (
+        lambda v: setattr(v["left"], "clocks", v["left"].clocks.model_copy(update={"offsets": ()})),
+        ("left", "clocks", "failed"), "chrony",
+    ),
+    "no clock": (lambda v: setattr(v["left"], "clocks", None), ("left", "clocks", "failed"), "log"),
+    "rate": (
+        lambda v: v["main"].nodes.update(
+            triangulator=said("triangulator", port("fingertip", 12.0))),
+        ("main", "rates", "warning"), "upstream",
+    ),
+    "refused": (
+        lambda v: v["left"].nodes.update(
+            arm_left_bridge=said("arm_left_bridge", port("arm_left", 140.0, rejected=3))),
+        ("left", "rates", "warning"), "log",
+    ),
+    "camera": (
+        lambda v: v["main"].nodes.update(camera=said("camera", note="no pictures: gone")),
+        ("main", "camera", "failed"), "program",
+    ),
+    "picture": (
+        lambda v: v["main"].nodes.pop("renderer"), ("main", "picture", "failed"), "log"
+    ),
+    "arm": (
+        lambda v: v["right"].arms.update(right=arm("right", mode="disconnected", reason="away")),
+        ("right", "arm right", "failed"), "controller at 127.0.0.1:5023",
+    ),
+    "fault": (
+        lambda v: v["right"].arms.update(right=arm("right", mode="fault", faults=("J1",))),
+        ("right", "arm right", "warning"), "reset",
+    ),
+    "bridge": (lambda v: v["right"].arms.clear(), ("right", "arm right", "failed"), "log"),
+    "version": (
+        lambda v: v["left"].refused.append("message refused"),
+        ("left", "messages", "failed"), "commit",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TROUBLES)
+def test_each_trouble_is_found_where_it_is_and_has_a_remedy(three: Plan, name: str) -> None:
+    bring_about, expected, remedy = TROUBLES[name]
+    found = good(three)
+    bring_about(found)
+    findings = judge(three, "main", found)
+    assert expected in bad(findings)
+    assert {host for host, _, _ in bad(findings)} == {expected[0]}
+    wanted = [one for one in findings if (one.host, one.check, one.state) == expected]
+    assert remedy in wanted[0].remedy
+
+
+@pytest.mark.parametrize("reach", [*WAYS, *SILENCES])
+def test_silence_has_a_cause_and_the_rest_was_not_asked(three: Plan, reach: Reach) -> None:
+    found = good(three) | {"left": Visit("left", reach)}
+    findings = [one for one in judge(three, "main", found) if one.host == "left"]
+    states = [one.state for one in findings if one.state != "ok"]
+    assert states == ["failed", "not asked"]
+    failed = next(one for one in findings if one.state == "failed")
+    assert failed.remedy
+    assert "{" not in failed.what + failed.remedy
+
+
+def test_before_anything_is_started_nothing_is_wrong(three: Plan) -> None:
+    found = {name: Visit(name, "closed") for name in NAMES} | {"main": Visit("main", "itself")}
+    states = {one.state for one in judge(three, "main", found)}
+    assert states == {"ok", "warning", "not asked"}
+
+
+@pytest.mark.parametrize(
+    ("topic", "rate_hz", "wrong"),
+    [
+        ("arm_left", 140.0, False), ("arm_left", 99.0, False), ("arm_left", 60.0, True),
+        ("arm_left", 0.0, True), ("arm_left", 300.0, True), ("scene", 0.0, False),
+        ("of a later version", 0.0, False),
+    ],
+)  # fmt: skip
+def test_rates_are_held_against_the_table(topic: str, rate_hz: float, wrong: bool) -> None:
+    assert (rate_problem(port(topic, rate_hz)) is not None) is wrong
+
+
+async def test_how_far_one_comes_by_tcp(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        taken = server.getsockname()[1]
+        assert await way_to("127.0.0.1", taken) == "speaks"
+    assert await way_to("127.0.0.1", taken) == "closed"
+
+    async def ways(numbers: dict[int, int]) -> Reach:
+        async def connect(_: str, port: int) -> int:
+            return numbers[port]
+
+        monkeypatch.setattr(visits, "_connect", connect)
+        return await way_to("192.0.2.9", 20_000)
+
+    assert await ways({20_000: errno.ENETUNREACH}) == "no way"
+    assert await ways({20_000: errno.EHOSTUNREACH, 22: errno.EHOSTUNREACH}) == "absent"
+    assert await ways({20_000: errno.ETIMEDOUT, 22: errno.ETIMEDOUT}) == "dropped"
+    assert await ways({20_000: errno.ETIMEDOUT, 22: errno.ECONNREFUSED}) == "blocked"
+    assert await ways({20_000: errno.EHOSTUNREACH, 22: 0}) == "blocked"
+
+
+async def shaken(known: Hosts, server: str | None, expected: str, asker: str = "main") -> Reach:
+    """What the asker finds at a publisher of `server` where he expects `expected`."""
+    keys = None if server is None else known.ring(server)
+    publisher = Publisher(TOPICS["host"], ["tcp://127.0.0.1:*"], keys=keys)
+    try:
+        return await visits._shake_hands(publisher.endpoints[0], expected, known.ring(asker))
+    finally:
+        publisher.close()
+
+
+async def test_keys_that_do_not_fit_are_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    with hosts("main", "left") as known:
+        assert await shaken(known, "left", "left") == "speaks"
+        assert await shaken(known, "main", "left") == "other key"
+        assert await shaken(known, "left", "left", asker="stranger") == "refuses us"
+        assert await shaken(known, None, "left") == "no keys"
+        monkeypatch.setattr(visits, "HANDSHAKE_S", 0.1)
+        with socket.create_server(("127.0.0.1", 0)) as mute:
+            endpoint = f"tcp://127.0.0.1:{mute.getsockname()[1]}"
+            assert await visits._shake_hands(endpoint, "left", known.ring("main")) == "silent"
+
+
+def plan_of(folder: Path, **values: Any) -> Plan:
+    path = folder / "graph.yaml"
+    nodes = {"beacon": BEACON, "other": BEACON | {"host": "left", "topics": {"twin__finger": None}}}
+    path.write_text(json.dumps({"nodes": nodes, "hosts": ADDRESSES} | values))
+    return load_plan(path)
+
+
+async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
+    addresses: dict[str, dict[str, str]] = {}
+    for name, host in ADDRESSES.items():
+        public, secret = new_key_pair()
+        write_secret(secret_file(name), secret)
+        addresses[name] = host | {"key": public}
+    plan = plan_of(folder, hosts=addresses)
+    asked_not = await examine(plan, "left", None, 2.0)
+    assert {("main", "launcher", "warning"), ("left", "launcher", "warning")} <= set(bad(asked_not))
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        found = await examine(plan, "main", graph.run, 10.0)
+        for check in ("reachable", "launcher", "plan", "keys", "clocks", "nodes"):
+            states = {one.host: one.state for one in found if one.check == check}
+            assert states == {"main": "ok", "left": "ok"}, (check, found)
+        # Another host of the plan asks, from outside of any run, about another plan.
+        other = plan_of(folder, hosts=addresses, from_tools=["twin/stereo"], nodes={
+            "beacon": BEACON | {"parameters": {"rate_hz": 17.0}},
+            "other": BEACON | {"host": "left", "topics": {"twin__finger": None}},
+        })  # fmt: skip
+        assert other.hash != plan.hash
+        found = await examine(other, "left", None, 10.0)
+        assert ("main", "plan", "failed") in bad(found)
+
+
+def test_own_keys_and_address_are_looked_at_before_the_start(
+    folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("launch.doctor_hosts.opengl_problem", lambda: "no EGL")
+    assert "there is no key" in (own_key_problem(three, "main") or "")
+    public, secret = new_key_pair()
+    write_secret(secret_file("main"), secret)
+    assert "belongs to another public key" in (own_key_problem(three, "main") or "")
+    fitting = three.model_copy(update={"keys": three.keys | {"main": public}})
+    assert own_key_problem(fitting, "main") is None
+    secret_file("main").chmod(0o644)
+    problem = own_key_problem(fitting, "main")
+    assert "others may read it" in (problem or "")
+    failed = {one.check for one in before_start(fitting, "main", problem) if one.state == "failed"}
+    assert failed == {"address", "keys", "opengl"}
+
+
+def test_which_host_this_is(folder: Path, three: Plan) -> None:
+    two = plan_of(folder)
+    assert host_here(two, None, None) == MAIN
+    assert host_here(two, None, "left") == "left"
+    with pytest.raises(CommandError, match="none of the addresses"):
+        host_here(three, None, None)
+    with pytest.raises(CommandError, match='did you mean "left"'):
+        host_here(two, None, "lef")

@@ -1,0 +1,180 @@
+"""A launcher's e-stop: who it takes one from, and that it survives all launchers."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+
+import pytest
+
+from launch.estop_file import STATE_VARIABLE, EStopFile
+from launch.host import HostVoice, waits_for_a_person
+from launch.plan import load_plan
+from launch.planned import RUN_DIRECTORY, Plan
+from messages.base import Header
+from messages.bus import Publisher, Source, Subscriber
+from messages.clock import SystemClock
+from messages.topics import topic_named
+from messages.types import EStop
+from nodes.node import PortCounts
+
+DEADLINE_S = 20.0
+STOP = EStop(engaged=True, reason="hand in the sheet")
+RESET = EStop(engaged=False, reason="")
+BRIDGE = {"type": "arm_bridge", "parameters": {"side": "left"},
+          "topics": {"arm": "arm_left", "other_arm": "arm_right"}}  # fmt: skip
+HOSTS = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+
+
+@pytest.fixture(autouse=True)
+def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    made = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    monkeypatch.setenv(STATE_VARIABLE, str(made / "state"))
+    yield made
+    shutil.rmtree(made)
+
+
+def plan_of(folder: Path, *, arming: str = "by_command") -> Plan:
+    """A graph in which an arm waits for a person's word; only its launchers are started."""
+    path = folder / "graph.yaml"
+    bridge = BRIDGE | {"parameters": {"side": "left", "arming": arming}}
+    topics = ["arm_right", "scene", "sheet_target"]
+    values = {"nodes": {"bridge": bridge}, "hosts": HOSTS, "from_tools": topics}
+    path.write_text(json.dumps(values))
+    return load_plan(path)
+
+
+@dataclass
+class Launchers:
+    """The launchers' voices of all hosts, and a tool that says e-stops."""
+
+    folder: Path
+    plan: Plan
+    said: list[str] = field(default_factory=list)
+    voices: dict[str, HostVoice] = field(default_factory=dict)
+
+    async def __aenter__(self) -> Self:
+        self._clock = SystemClock()
+        self._epoch, self._sequence = self._clock.now_ns(), 0
+        for host in self.plan.hosts:
+            self.voices[host] = HostVoice(
+                self.plan, host, run_id="1", code="", processes=tuple,
+                endpoints=lambda ends: tuple(map(self._near, ends)),
+                sources=lambda ones: tuple(
+                    Source(self._near(one.endpoint), one.writer, one.host) for one in ones
+                ),
+                keys=None, on_problem=self.said.append,
+            )  # fmt: skip
+            self.voices[host].start()
+        writer = self.plan.writer("estop", "tools")
+        assert writer is not None
+        self._tool = Publisher(topic_named("estop"), [self._near(one) for one in writer.endpoints])
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        for voice in self.voices.values():
+            await voice.close()
+        self._tool.close()
+
+    def _near(self, endpoint: str) -> str:
+        return endpoint.replace(RUN_DIRECTORY, str(self.folder))
+
+    def say(self, estop: EStop, *, before_ns: int = 0) -> None:
+        """As a tool on main does; before_ns: of a time so long ago."""
+        self._sequence += 1
+        now_ns = self._clock.now_ns() - before_ns
+        self._tool.send(
+            estop,
+            Header(self._sequence, now_ns, now_ns, self._clock.id, "tools", self._epoch,
+                   self.plan.hash),
+        )  # fmt: skip
+
+    async def heard_late(self) -> set[str]:
+        """Reasons of the e-stops that a bridge hears which is started only now."""
+        found: set[str] = set()
+        others = [one for one in self.plan.sources_to_read("estop") if one.writer != "tools"]
+        subscriber = Subscriber(
+            topic_named("estop"),
+            [Source(self._near(one.endpoint), one.writer, one.host) for one in others],
+            lambda estop, _: found.add(estop.reason),
+            PortCounts(),
+        )
+        subscriber.start()
+        await asyncio.sleep(0.3)
+        subscriber.close()
+        return found
+
+
+async def until(condition: Callable[[], bool], what: object = "") -> None:
+    loop = asyncio.get_running_loop()
+    end_s = loop.time() + DEADLINE_S
+    while not condition():
+        assert loop.time() < end_s, what
+        await asyncio.sleep(0.01)
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in (folder / "state").glob("*"))
+
+
+async def test_a_stop_outlives_all_launchers_until_it_is_reset(folder: Path) -> None:
+    plan = plan_of(folder)
+    async with Launchers(folder, plan) as first:
+        await asyncio.sleep(0.3)
+        first.say(STOP)
+        await until(lambda: files(folder) == ["estop-left.json", "estop-main.json"], first.said)
+    async with Launchers(folder, plan) as second:
+        assert await second.heard_late() == {STOP.reason}
+        # What a console said last before all this is no answer to it.
+        second.say(RESET, before_ns=10**10)
+        await asyncio.sleep(0.3)
+        assert len(files(folder)) == 2
+        second.say(RESET)
+        await until(lambda: files(folder) == [], second.said)
+        assert await second.heard_late() == set()
+    async with Launchers(folder, plan) as third:
+        assert await third.heard_late() == set()
+
+
+async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:
+    plan = plan_of(folder)
+    file = EStopFile("left")
+    file.path.parent.mkdir()
+    file.path.write_text("{")
+    async with Launchers(folder, plan) as launchers:
+        assert any("cannot be read" in reason for reason in await launchers.heard_late())
+        assert any("arms reset" in line for line in launchers.said)
+
+
+async def test_what_cannot_be_written_is_said_and_kept_all_the_same(folder: Path) -> None:
+    plan = plan_of(folder)
+    (folder / "state").write_text("no folder")
+    async with Launchers(folder, plan) as launchers:
+        await asyncio.sleep(0.3)
+        launchers.say(STOP)
+        await until(lambda: any("cannot be written" in line for line in launchers.said))
+        assert STOP.reason in await launchers.heard_late()
+
+
+def test_simulated_arms_that_go_by_themselves_forget(folder: Path) -> None:
+    assert waits_for_a_person(plan_of(folder))
+    assert not waits_for_a_person(plan_of(folder, arming="by_itself"))
+
+
+def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
+    file = EStopFile("main")
+    assert file.read() is None
+    file.remove()
+    file.write(STOP)
+    assert file.read() == STOP
+    file.write(EStop(engaged=True, reason="another"))
+    assert file.read() == EStop(engaged=True, reason="another")
+    file.remove()
+    assert file.read() is None
+    assert files(folder) == []
