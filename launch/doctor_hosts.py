@@ -380,8 +380,8 @@ def _arm(node: PlannedNode, visit: Visit) -> HostFinding:
     if arm.faults:
         remedy = "when the cause is mended: flexsheet arms reset"
         return HostFinding(visit.host, check, "warning", what, remedy)
-    ready = "ready" if arm.ready else "not ready (flexsheet arms ready lets it move)"
-    return HostFinding(visit.host, check, "ok", f"{what}, {ready}")
+    ready = "ready" if arm.ready else "flexsheet arms ready lets it move"
+    return HostFinding(visit.host, check, "ok", f"{what}; {ready}")
 
 
 def _room(visit: Visit) -> Iterator[HostFinding]:

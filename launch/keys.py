@@ -13,6 +13,7 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
 from launch.documents import BadInputError, Problem, did_you_mean, read_document
 from launch.plan import load_keys
@@ -98,7 +99,8 @@ def install(launch_file: Path, host: str, key: str) -> None:
     yaml.preserve_quotes = True
     yaml.width = 1 << 16
     tree: CommentedMap = yaml.load(document.text)
-    tree["hosts"][host]["key"] = key
+    # Plain, a key that begins with "?" would make no YAML.
+    tree["hosts"][host]["key"] = SingleQuotedScalarString(key)
     text = StringIO()
     yaml.dump(tree, text)
     part = launch_file.with_suffix(".part")

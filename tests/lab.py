@@ -20,6 +20,7 @@ from typing import Any, Self
 
 import pytest
 from ruamel.yaml import YAML
+from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
 from launch.estop_file import STATE_VARIABLE
 from launch.keys import KEYS_VARIABLE
@@ -104,7 +105,7 @@ class Lab:
         for host in HOSTS:
             public, secret = new_key_pair()
             write_secret(self.folder / host / "keys" / f"{host}.secret", secret)
-            values["hosts"][host]["key"] = public
+            values["hosts"][host]["key"] = SingleQuotedScalarString(public)
         yaml.dump(values, self.launch_file)
 
     def bag(self, host: str) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+import os
 import shutil
 import socket
 import tempfile
@@ -48,7 +49,9 @@ from tests.hosts import Hosts, hosts
 ROOT = Path(__file__).resolve().parent.parent
 DEADLINE_S = 30.0
 BEACON = {"type": "tests.launch_nodes:Beacon"}
-ADDRESSES = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+# Of this process's own: ports follow from names, and tests may run beside each other.
+NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"
+ADDRESSES = {"main": {"address": f"{NET}.1"}, "left": {"address": f"{NET}.2"}}
 NAMES = ("main", "left", "right")
 
 
@@ -340,8 +343,11 @@ def test_own_keys_and_address_are_looked_at_before_the_start(
     assert failed == {"address", "keys", "opengl"}
 
 
-def test_which_host_this_is(folder: Path, three: Plan) -> None:
+def test_which_host_this_is(folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     two = plan_of(folder)
+    monkeypatch.setattr("launch.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
+    assert host_here(two, None, None) == "left"
+    monkeypatch.setattr("launch.doctor_hosts.own_addresses", lambda: {f"{NET}.1", f"{NET}.2"})
     assert host_here(two, None, None) == MAIN
     assert host_here(two, None, "left") == "left"
     with pytest.raises(CommandError, match="none of the addresses"):

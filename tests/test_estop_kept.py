@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -29,7 +30,9 @@ STOP = EStop(engaged=True, reason="hand in the sheet")
 RESET = EStop(engaged=False, reason="")
 BRIDGE = {"type": "arm_bridge", "parameters": {"side": "left"},
           "topics": {"arm": "arm_left", "other_arm": "arm_right"}}  # fmt: skip
-HOSTS = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+# Of this process's own: ports follow from names, and tests may run beside each other.
+NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"
+HOSTS = {"main": {"address": f"{NET}.1"}, "left": {"address": f"{NET}.2"}}
 
 
 @pytest.fixture(autouse=True)

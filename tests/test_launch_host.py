@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -22,7 +23,9 @@ from messages.types import EStop, HostStatus
 
 DEADLINE_S = 30.0
 BEACON = {"type": "tests.launch_nodes:Beacon"}
-HOSTS = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
+# Of this process's own: ports follow from names, and tests may run beside each other.
+NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"
+HOSTS = {"main": {"address": f"{NET}.1"}, "left": {"address": f"{NET}.2"}}
 STOP, RESET = EStop(engaged=True, reason="hand in the sheet"), EStop(engaged=False, reason="")
 
 

@@ -110,6 +110,20 @@ def test_what_is_no_key_is_said(keys: Path, text: str) -> None:
     assert not is_key(text)
 
 
+@pytest.mark.parametrize("first", ".-:+=^!/*?&<>()[]{}@%0")
+def test_any_key_can_stand_in_a_launch_file(tmp_path: Path, first: str) -> None:
+    """Some of its characters mean something in YAML, each at another place."""
+    file = tmp_path / "graph.yaml"
+    file.write_text(
+        'nodes: {beacon: {type: "tests.launch_nodes:Beacon"}}\n'
+        "hosts: {main: {address: 127.0.0.1}}\n"
+    )
+    key = f"{first}0000{ONE[5:]}"
+    install(file, "main", key)
+    install(file, "main", key)
+    assert load_plan(file).keys == {"main": key}
+
+
 def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:
     file = tmp_path / "lab.yaml"
     file.write_text(LAB)
