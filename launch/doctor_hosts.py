@@ -186,7 +186,10 @@ def _plan(plan: Plan, here: str, visit: Visit) -> Iterator[HostFinding]:
     else:
         remedy = "launch file, scene and --set the same on all hosts, then start again"
         if visit.host == here:
-            remedy = "the file was changed since: start again"
+            remedy = (
+                "the file was changed since, or started with --set: start again, or, to ask about "
+                "what runs: flexsheet doctor hosts"
+            )
         yield HostFinding(
             visit.host,
             "plan",

@@ -24,7 +24,7 @@ from launch.commands.output import (
 app = typer.Typer(
     add_completion=False,
     invoke_without_command=True,
-    help="Check this machine, or with `scene` whether the arms reach a scene's working range.",
+    help="Check this machine; with a graph of several computers, all of them.",
     epilog=examples("flexsheet doctor", "flexsheet doctor --sweep", "flexsheet doctor --json"),
 )
 
@@ -39,10 +39,11 @@ def doctor(
 ) -> None:
     """Check this machine; exit code 1 when something must be put right.
 
-    With `scene`, check instead whether the arms reach a scene's working range.
+    Where a graph of several computers runs here, all of them are asked too.
     """
     if context.invoked_subcommand is not None:
         return
+    from launch.commands.doctor_hosts import ask_running, print_findings
     from launch.doctor import check_all
     from launch.runs import sweep as sweep_leftovers
 
@@ -54,14 +55,20 @@ def doctor(
         for finding in check_all():
             status.update(f"checked {finding.check}")
             findings.append(finding)
+        status.update("asking all hosts")
+        of_hosts = ask_running()
     if as_json:
-        print_json([asdict(finding) for finding in findings])
+        print_json([asdict(one) for one in findings] + [asdict(one) for one in of_hosts])
     else:
         print_table(
             ("check", "state", "what", "what to do"),
             [(one.check, one.state, one.what, one.remedy) for one in findings],
         )
-    if any(finding.state == "failed" for finding in findings):
+        if of_hosts:
+            print()
+            print_findings(of_hosts)
+    states = {one.state for one in findings} | {one.state for one in of_hosts}
+    if "failed" in states:
         raise typer.Exit(FAILED)
 
 

@@ -14,6 +14,7 @@ from launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
+    examples,
     print_json,
     print_table,
     words,
@@ -29,7 +30,14 @@ PATIENCE_S = 4.0
 
 def register(app: typer.Typer) -> None:
     """Adds the command to `flexsheet doctor`."""
-    app.command("hosts")(hosts)
+    app.command(
+        "hosts",
+        epilog=examples(
+            "flexsheet doctor hosts",
+            "flexsheet doctor hosts launch/lab.yaml",
+            "flexsheet doctor hosts launch/lab.yaml --host left --json",
+        ),
+    )(hosts)
 
 
 def hosts(
@@ -63,6 +71,19 @@ def hosts(
         print_findings(findings)
     if any(one.state == "failed" for one in findings):
         raise typer.Exit(FAILED)
+
+
+def ask_running(patience_s: float = PATIENCE_S) -> list[HostFinding]:
+    """Findings about all hosts of the graph that runs here; none where it has one alone."""
+    from launch.runs import live_runs
+    from launch.tools import host_of
+
+    if not any(run.plan_file.is_file() for run in live_runs()):
+        return []
+    plan, run = running_graph(None)
+    if len(plan.hosts) == 1:
+        return []
+    return asyncio.run(examine(plan, host_of(run), run, patience_s))
 
 
 def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
