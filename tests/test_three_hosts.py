@@ -19,7 +19,7 @@ LONGEST_M = 0.24 * 1.15
 PATIENT: dict[str, Any] = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
 """A test's computers are busier than a lab's."""
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 
 def truth(lab: Lab, side: str) -> tuple[np.ndarray, np.ndarray]:
