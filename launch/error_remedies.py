@@ -33,8 +33,9 @@ AREAS = (
         "Starting nodes and keeping them running, on one computer or on several: "
         "[architecture.md](architecture.md), [clocks.md](clocks.md), [deploy.md](deploy.md).",
         ("launch/supervisor.py", "launch/runs.py", "launch/host.py", "launch/child.py",
-         "launch/estop_file.py", "launch/doctor", "launch/system.py", "launch/service.py", "nodes/runner.py",
-         "nodes/clock/", "launch/notify.py", "nodes/cache.py", "nodes/methods.py"),
+         "launch/estop_file.py", "launch/doctor", "launch/system.py", "launch/service.py",
+         "nodes/runner.py", "nodes/clock/", "launch/notify.py", "nodes/cache.py",
+         "nodes/methods.py"),
     ),
     Area(
         "Topics and messages",
