@@ -1,52 +1,64 @@
-"""What the documentation shows, runs."""
+"""The documentation hangs together: each page in the navigation, no link into the void."""
 
 from __future__ import annotations
 
-import re
-import subprocess
-import sys
+from collections import Counter
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
-PAGE = ROOT / "docs" / "write-your-own-node.md"
+import pytest
+
+from tests.doc_pages import DOCS, ROOT, anchors, headings, links, name, nav_pages, pages, site_pages
+
+MOST_CLICKS = 2
+START = DOCS / "index.md"
+TROUBLE = DOCS / "troubleshooting.md"
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), flags=re.DOTALL)
+def targets(page: Path) -> set[Path]:
+    """Pages of the site that a page links to."""
+    found = ((page.parent / link.target.partition("#")[0]).resolve() for link in links(page))
+    return {target for target in found if target.suffix == ".md" and DOCS in target.parents}
 
 
-def test_the_example_node_runs_as_it_is_printed(tmp_path: Path) -> None:
-    script = tmp_path / "example.py"
-    script.write_text("\n".join(blocks("python")))
-    result = subprocess.run(
-        [sys.executable, "-W", "error", str(script)],
-        cwd=ROOT,
-        env={"PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
+def test_each_page_is_in_the_navigation_once() -> None:
+    listed = Counter(nav_pages())
+    assert set(listed) == {str(page.relative_to(DOCS)) for page in site_pages()}, (
+        "nav in zensical.toml and docs/ differ; add the page where a reader would look for it"
     )
-    assert result.returncode == 0, result.stderr
+    assert set(listed.values()) == {1}
 
 
-def test_the_example_node_fits_into_a_launch_file(tmp_path: Path) -> None:
-    (tmp_path / "speed_guard.py").write_text(blocks("python")[0])
-    launch_file = tmp_path / "guard.yaml"
-    launch_file.write_text("from_tools: [fingertip]\n" + blocks("yaml")[0])
-    result = subprocess.run(
-        [sys.executable, str(ROOT / "flexsheet.py"), "launch", str(launch_file), "--dry-run"],
-        env={"PYTHONPATH": str(tmp_path), "COLUMNS": "200"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert result.returncode == 0, result.stderr
-    assert "guard" in result.stdout
-    assert "fingertip" in result.stdout
+@pytest.mark.parametrize("page", pages(), ids=name)
+def test_links_anchors_and_pictures_are_there(page: Path) -> None:
+    for link in links(page):
+        if link.target.startswith(("http://", "https://")):
+            continue
+        file, _, anchor = link.target.partition("#")
+        target = (page.parent / file).resolve() if file else page
+        assert target.is_relative_to(ROOT), f"{link.place}: {link.target} is out of the project"
+        assert target.is_file(), f"{link.place}: there is no file {link.target}"
+        if link.is_picture:
+            assert target.suffix in (".png", ".svg"), f"{link.place}: {link.target} is no picture"
+        if anchor:
+            assert anchor in anchors(target), (
+                f"{link.place}: {link.target} meets no heading; words without signs make anchors "
+                "that are the same everywhere"
+            )
 
 
-def test_links_between_pages_lead_somewhere() -> None:
-    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-    for page in pages:
-        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text()):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+@pytest.mark.parametrize("page", site_pages(), ids=name)
+def test_a_page_has_one_title(page: Path) -> None:
+    lines = page.read_text().splitlines()
+    assert lines[0].startswith("# "), f"{name(page)} does not begin with its title"
+    assert headings(page)
+
+
+def test_what_fails_is_explained_within_two_clicks() -> None:
+    assert TROUBLE in targets(START)
+    assert DOCS / "limits.md" in targets(START) | targets(TROUBLE)
+    assert DOCS / "errors.md" in targets(TROUBLE) or not (DOCS / "errors.md").exists()
+
+
+def test_all_pages_are_linked_from_a_page_of_the_site() -> None:
+    linked = {target for page in site_pages() for target in targets(page) - {page}}
+    assert set(site_pages()) - linked <= {START}

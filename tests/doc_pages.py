@@ -1,0 +1,147 @@
+"""The documentation as data: its pages, their blocks of code, headings and links."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+import unicodedata
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+DOCS = ROOT / "docs"
+SITE = ROOT / "zensical.toml"
+
+FENCE = re.compile(r"^( *)```(\S*)")
+NOT_RUN = re.compile(r"<!-- not run: (.+) -->")
+LINK = re.compile(r"(!?)\[(?:[^\]\[]|\[[^\]]*\])*\]\(([^)\s]+)\)")
+CODE_SPAN = re.compile(r"(?<!`)`([^`\n]+)`(?!`)")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block; `not_run` is the reason that the page itself gives for not running it."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+    not_run: str | None
+
+    @property
+    def place(self) -> str:
+        return f"{name(self.page)}:{self.line}"
+
+
+@dataclass(frozen=True)
+class Link:
+    page: Path
+    line: int
+    target: str
+    is_picture: bool
+
+    @property
+    def place(self) -> str:
+        return f"{name(self.page)}:{self.line}"
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def site_pages() -> list[Path]:
+    """Those that the site consists of."""
+    return sorted(DOCS.rglob("*.md"))
+
+
+def pages() -> list[Path]:
+    """All pages for people."""
+    return [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *site_pages()]
+
+
+def nav_pages() -> list[str]:
+    """Files of the site's navigation, in its order."""
+
+    def walk(entry: Any) -> Iterator[str]:
+        match entry:
+            case str():
+                yield entry
+            case dict():
+                for below in entry.values():
+                    yield from walk(below)
+            case list():
+                for below in entry:
+                    yield from walk(below)
+
+    return list(walk(tomllib.loads(SITE.read_text())["project"]["nav"]))
+
+
+def blocks(page: Path) -> list[Block]:
+    """Fenced blocks, also those in lists; a comment before one says why it is not run."""
+    found: list[Block] = []
+    indent, language, begun, inside = "", "", 0, None
+    comment: str | None = None
+    for number, line in enumerate(page.read_text().splitlines(), start=1):
+        fence = FENCE.match(line)
+        if inside is None:
+            if fence:
+                indent, language, begun, inside = fence[1], fence[2], number, []
+            elif reason := NOT_RUN.search(line):
+                comment = reason[1]
+            elif line.strip():
+                comment = None
+        elif fence:
+            text = "\n".join(inside) + "\n"
+            found.append(Block(page, begun, language, text, comment))
+            inside, comment = None, None
+        else:
+            inside.append(line.removeprefix(indent))
+    assert inside is None, f"{name(page)}:{begun}: the block does not end"
+    return found
+
+
+def prose(page: Path) -> list[tuple[int, str]]:
+    """Lines outside of blocks, with their numbers."""
+    lines, inside = [], False
+    for number, line in enumerate(page.read_text().splitlines(), start=1):
+        if FENCE.match(line):
+            inside = not inside
+        elif not inside:
+            lines.append((number, line))
+    return lines
+
+
+def links(page: Path) -> list[Link]:
+    """Links and pictures, outside of code."""
+    return [
+        Link(page, number, match[2], is_picture=bool(match[1]))
+        for number, line in prose(page)
+        for match in LINK.finditer(CODE_SPAN.sub("", line))
+    ]
+
+
+def code_spans(page: Path) -> list[tuple[int, str]]:
+    """Code within lines of text."""
+    return [(number, span) for number, line in prose(page) for span in CODE_SPAN.findall(line)]
+
+
+def headings(page: Path) -> list[str]:
+    return [line.lstrip("#").strip() for _, line in prose(page) if re.match(r"#{1,6} ", line)]
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings that hosts of repositories and the site's generator both make.
+
+    Of two headings with one name the second has another anchor in each, so only the first counts.
+    """
+    found = set()
+    for heading in headings(page):
+        words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).replace("`", "")
+        there = re.sub(r"[^\w\- ]", "", words.lower()).replace(" ", "-")
+        plain = unicodedata.normalize("NFKD", words).encode("ascii", "ignore").decode()
+        here = re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", plain).strip().lower())
+        if here == there:
+            found.add(here)
+    return found

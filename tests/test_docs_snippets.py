@@ -1,0 +1,244 @@
+"""What the documentation shows, runs.
+
+Blocks of Python run, page by page, each page in one namespace.  Blocks of YAML are checked as what
+they look like: a launch file, nodes of one, a node's parameters, parts of a scene.  In blocks of
+shell, and in code within the text, each call of ours is parsed as the command line would; what is
+cheap is run.  `<!-- not run: why -->` before a block leaves it at reading and parsing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import sys
+import types
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from launch import cli
+from launch.documents import read_document, validate
+from launch.plan import LaunchFile, load_plan, load_scene
+from messages.scene import Scene
+from nodes import node_class
+from nodes.node import parameters_of
+from tests.doc_pages import ROOT, Block, blocks, code_spans, name, pages
+from tests.test_cli_help import parse
+
+LANGUAGES = {"python", "yaml", "bash", "text"}
+BLOCKS = {page: blocks(page) for page in pages()}
+SCENE = ROOT / "launch" / "scenes" / "cylinder.yaml"
+
+OURS = {"flexsheet", "make", "python", "pytest"}
+OTHERS = {
+    ".", "cd", "chmod", "chown", "cp", "dask", "docker", "docker/keys.sh", "git", "ip",
+    "journalctl", "mkdir", "pip-compile", "ssh", "systemctl", "useradd",
+}  # fmt: skip
+"""Programs of others that pages may call."""
+
+LACKS_SOMETHING = ("MissingParameter", "NoArgsIsHelpError")
+"""What a command line says to the bare name of a command."""
+
+CHEAP = (
+    "flexsheet node ",
+    "flexsheet topic list",
+    "flexsheet topic info",
+    "flexsheet calibrate board",
+    "flexsheet keys new",
+)
+"""Run as they stand, in a folder of their own."""
+
+
+def with_language(language: str) -> dict[Path, list[Block]]:
+    found = {page: [b for b in all_ if b.language == language] for page, all_ in BLOCKS.items()}
+    return {page: those for page, those in found.items() if those}
+
+
+@pytest.fixture
+def clone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to be in, with the project's launch files and nothing of the user's."""
+    (tmp_path / "launch").symlink_to(ROOT / "launch")
+    for linked in ("scenes", "calibrations"):
+        (tmp_path / linked).symlink_to(ROOT / "launch" / linked)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FLEXSHEET_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("FLEXSHEET_KEYS", str(tmp_path / "keys"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path
+
+
+def test_each_block_says_what_it_is() -> None:
+    for block in (block for those in BLOCKS.values() for block in those):
+        assert block.language in LANGUAGES, (
+            f"{block.place}: ```{block.language}; one of {', '.join(sorted(LANGUAGES))}"
+        )
+
+
+# Python
+
+
+@pytest.mark.parametrize("page", with_language("python"), ids=name)
+def test_python_runs(page: Path, clone: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    module = types.ModuleType(f"page_{page.stem.replace('-', '_')}")
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    with (
+        patch.dict("nodes.models.shapes.SHAPES"),
+        patch.dict("nodes.triangulator.triangulation.TRIANGULATION_METHODS"),
+    ):
+        for block in with_language("python")[page]:
+            # Its lines count as the page's, for the trace of what fails.
+            source = "\n" * block.line + block.text
+            code = compile(source, str(page), "exec")
+            if block.not_run is None:
+                exec(code, module.__dict__)
+
+
+# YAML
+
+
+@pytest.mark.parametrize(
+    "block", [b for those in with_language("yaml").values() for b in those], ids=lambda b: b.place
+)
+def test_yaml_is_what_it_looks_like(
+    block: Block, clone: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = YAML(typ="safe").load(block.text)
+    if block.not_run is None:
+        write_modules(block.page, clone, monkeypatch)
+        check_yaml(block.text, values, clone, block.place)
+
+
+def write_modules(page: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file for the page's first block of Python, if it is to be one: it begins by saying so."""
+    first = next(iter(with_language("python").get(page, [])), None)
+    if first is not None and first.text.startswith('"""'):
+        for named in re.findall(r"(\w+):\w+", page.read_text()):
+            (folder / f"{named}.py").write_text(first.text)
+        monkeypatch.syspath_prepend(folder)
+
+
+def check_yaml(text: str, values: Mapping[str, Any], folder: Path, place: str) -> None:
+    keys = set(values)
+    file = folder / "block.yaml"
+    if keys <= set(LaunchFile.model_fields):
+        file.write_text(text if "nodes" in keys else f"{text}\nnodes: {{}}\n")
+        spec = validate(LaunchFile, read_document(file))
+        check_nodes({name: one.model_dump() for name, one in spec.nodes.items()})
+        if {"scene", "nodes"} <= keys:
+            load_plan(file)
+    elif keys <= set(Scene.model_fields):
+        whole = YAML(typ="safe").load(SCENE.read_text()) | dict(values)
+        YAML(typ="safe").dump(whole, file)
+        load_scene(file)
+    elif all(isinstance(one, dict) and "type" in one for one in values.values()):
+        check_nodes(values)
+    elif keys == {"source"}:
+        parameters_of(node_class("camera")).model_validate(values)
+    else:
+        pytest.fail(f"{place}: neither a launch file, nor nodes, nor parts of a scene: {keys}")
+
+
+def check_nodes(nodes: Mapping[str, Mapping[str, Any]]) -> None:
+    for node in nodes.values():
+        parameters_of(node_class(node["type"])).model_validate(node.get("parameters") or {})
+
+
+# Shell
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """The calls of a block, word by word, without comments, sudo and what is set for one call."""
+    for line in text.replace("\\\n", " ").splitlines():
+        call: list[str] = []
+        for word in [*shlex.split(line, comments=True), "&&"]:
+            if word in ("&&", "|", ";"):
+                if call:
+                    yield call
+                call = []
+            elif call or not (word == "sudo" or re.fullmatch(r"[A-Z_]+=.*", word)):
+                call.append(word)
+
+
+def program(call: Sequence[str]) -> list[str]:
+    """The call without `-u USER`, which belongs to sudo, and what follows that."""
+    while call[0] == "-u" or re.fullmatch(r"[A-Z_]+=.*", call[0]):
+        call = call[2:] if call[0] == "-u" else call[1:]
+    return list(call)
+
+
+def check_call(
+    call: Sequence[str], written: set[str], place: str, *, may_name_only: bool = False
+) -> None:
+    """Whether a call can be made as it stands; or is the name of one at least.
+
+    written: files that calls of the page have written.
+    """
+    match program(call):
+        case ["flexsheet", *rest]:
+            try:
+                parse(shlex.join(["flexsheet", *(word for word in rest if word != "--help")]))
+            except Exception as error:
+                if not (may_name_only and type(error).__name__ in LACKS_SOMETHING):
+                    pytest.fail(f"{place}: {shlex.join(call)}: {error}")
+            for word in rest:
+                if re.fullmatch(r"launch/.*\.yaml", word) and word not in written:
+                    assert (ROOT / word).exists(), f"{place}: there is no {word}"
+        case ["make", *rest]:
+            goals = [word for word in rest if "=" not in word]
+            targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+            assert set(goals) <= set(targets), f"{place}: there is no `make {' '.join(goals)}`"
+        case ["python", "-m", module, *_]:
+            assert importlib.util.find_spec(module), f"{place}: there is no module {module}"
+        case ["pytest", *rest]:
+            for word in rest:
+                assert word.startswith("-") or (ROOT / word).exists(), f"{place}: no {word}"
+        case ["cp", _, to]:
+            written.add(to)
+        case [other, *_]:
+            assert other in OTHERS, f"{place}: {other} is no program that pages call"
+
+
+@pytest.mark.parametrize("page", with_language("bash"), ids=name)
+def test_each_call_in_a_block_can_be_made(page: Path) -> None:
+    written: set[str] = set()
+    for block in with_language("bash")[page]:
+        for call in commands(block.text):
+            check_call(call, written, block.place)
+
+
+@pytest.mark.parametrize("page", pages(), ids=name)
+def test_each_call_within_the_text_can_be_made(page: Path) -> None:
+    """Those that are whole: without dots, bars and words in capitals to be filled in."""
+    written = {word for those in BLOCKS[page] for call in calls_of(those) for word in call}
+    for line, span in code_spans(page):
+        first = span.split(maxsplit=1)[0] if span.split() else ""
+        if first in OURS and " " in span and not re.search(r"\.\.\.|…| \| |\b[A-Z]{1,}\b|\[", span):
+            for call in commands(span):
+                check_call(call, written, f"{name(page)}:{line}", may_name_only=True)
+
+
+def calls_of(block: Block) -> Iterator[list[str]]:
+    return commands(block.text) if block.language == "bash" else iter(())
+
+
+def cheap_calls() -> list[str]:
+    calls = {
+        shlex.join(program(call))
+        for those in with_language("bash").values()
+        for block in those
+        if block.not_run is None
+        for call in commands(block.text)
+    }
+    return sorted(call for call in calls if call.startswith(CHEAP) or "--dry-run" in call)
+
+
+@pytest.mark.parametrize("call", cheap_calls())
+def test_what_is_cheap_runs(call: str, clone: Path) -> None:
+    result = CliRunner().invoke(cli.app, shlex.split(call)[1:])
+    assert result.exit_code == 0, f"{call}: {result.output} {result.exception}"
