@@ -6,8 +6,10 @@ STAMP := $(VENV)/.installed
 DEV_STAMP := $(VENV)/.installed-dev
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
 LOCK := build/pip-tools
+SITE_VENV := .venv-docs
+SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test lint bench faults soak fuzz limits pages docs lock clean
+.PHONY: setup demo try test lint bench faults soak fuzz limits pages charts docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
@@ -27,16 +29,18 @@ $(DEV_STAMP): requirements-dev.lock $(STAMP)
 	$(INSTALL) --require-hashes -r requirements-dev.lock
 	@touch $@
 
-# Both locks anew, after a change of pyproject.toml; what is pinned stays where it may.
+# All locks anew, after a change of pyproject.toml or docs/requirements.in; what is pinned stays
+# where it may.
 lock:
 	$(PYTHON) -m venv $(LOCK)
 	$(LOCK)/bin/pip install --quiet --disable-pip-version-check pip-tools
-	$(call compile,--extra export,requirements.lock)
-	$(call compile,--extra export --extra dev,requirements-dev.lock)
+	$(call compile,--all-build-deps --extra export,requirements.lock,pyproject.toml)
+	$(call compile,--all-build-deps --extra export --extra dev,requirements-dev.lock,pyproject.toml)
+	$(call compile,,docs/requirements.lock,docs/requirements.in)
 
-compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) --all-build-deps \
+compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) \
 	--strip-extras --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
-	--no-emit-find-links -o $(2) pyproject.toml
+	--no-emit-find-links -o $(2) $(3)
 
 demo: setup
 	$(BIN)/flexsheet demo
@@ -92,9 +96,22 @@ pages: setup
 	$(BIN)/python -m launch.parameters_reference > docs/parameters.md
 	$(BIN)/python -m launch.errors_reference > docs/errors.md
 
-docs: pages
+# docs/charts: every method of every family, on this machine; half an hour.
+charts: setup
 	$(BIN)/flexsheet chart --output docs/charts
 
+# The site: open site/index.html.  Its generator is no part of the program, so it has an environment
+# of its own.
+$(SITE_STAMP): docs/requirements.lock | $(BIN)/python
+	$(PYTHON) -m venv $(SITE_VENV)
+	$(SITE_VENV)/bin/pip install --quiet --disable-pip-version-check --require-hashes \
+		-r docs/requirements.lock
+	@touch $@
+
+docs: $(SITE_STAMP)
+	$(SITE_VENV)/bin/python -m zensical build --clean --strict
+	$(SITE_VENV)/bin/python -m website.sources site
+
 clean:
-	rm -rf $(VENV) build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(SITE_VENV) site .cache build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,215 @@
+"""The pictures of the graph: `python -m website.graph docs/images` writes them.
+
+Boxes and the ways of arrows are placed by hand; which arrows there are is told by launch files, and
+a test compares.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+Place = tuple[float, float]
+
+WIDTH, HEIGHT = 132, 34
+"""Of a box."""
+
+STYLE = """
+  text { font: 13px system-ui, sans-serif; fill: #1f2328; text-anchor: middle }
+  .label { font-size: 11.5px; fill: #57606a; paint-order: stroke; stroke: #ffffff;
+    stroke-width: 4px }
+  .host { fill: none; stroke: #8c959f; stroke-dasharray: 5 4 }
+  .box { fill: #eef2ff; stroke: #4f5fb0 }
+  .device { fill: #f6f8fa; stroke: #8c959f }
+  .arrow { fill: none; stroke: #57606a; stroke-width: 1.4 }
+  .wire { stroke-dasharray: 4 3 }
+  #head { fill: #57606a }
+  @media (prefers-color-scheme: dark) {
+    text { fill: #e6edf3 }
+    .label { fill: #a5adba; stroke: #14151a }
+    .box { fill: #232a4d; stroke: #8794dd }
+    .device { fill: #22262e }
+    .arrow { stroke: #a5adba }
+    #head { fill: #a5adba }
+  }
+"""
+
+
+@dataclass(frozen=True)
+class Arrow:
+    """Topics that a node writes and another reads, or a wire to a device: not a topic.
+
+    way: its corners, as SVG has them; the label stands at `label_at`.
+    """
+
+    writer: str
+    reader: str
+    topics: tuple[str, ...]
+    way: str
+    label_at: Place
+    wire: str = ""
+    both_ways: bool = False
+
+
+@dataclass(frozen=True)
+class Picture:
+    """hosts: name to left, top, width, height.  boxes: nodes' middles.  devices: the same."""
+
+    title: str
+    size: tuple[int, int]
+    hosts: dict[str, tuple[float, float, float, float]]
+    boxes: dict[str, Place]
+    devices: dict[str, Place]
+    arrows: Sequence[Arrow]
+
+
+def _arrow(writer: str, reader: str, topics: str, way: str, label_at: Place) -> Arrow:
+    return Arrow(writer, reader, tuple(topics.split(", ")), way, label_at)
+
+
+def _wire(
+    writer: str, reader: str, what: str, way: str, label_at: Place, *, both: bool = True
+) -> Arrow:
+    return Arrow(writer, reader, (), way, label_at, wire=what, both_ways=both)
+
+
+LAB = Picture(
+    title="Three computers: which node says what to which",
+    size=(960, 520),
+    hosts={
+        "main PC": (10, 10, 940, 290),
+        "left arm's PC": (10, 350, 300, 75),
+        "right arm's PC": (430, 350, 300, 75),
+    },
+    boxes={
+        "camera": (90, 75),
+        "triangulator": (290, 75),
+        "planner": (540, 75),
+        "fem_solver": (540, 165),
+        "renderer": (790, 165),
+        "recorder": (860, 75),
+        "arm_left_bridge": (160, 395),
+        "arm_right_bridge": (580, 395),
+    },
+    devices={"left RV-1A": (160, 490), "right RV-1A": (580, 490), "projector": (860, 490)},
+    arrows=(
+        _arrow("camera", "triangulator", "stereo", "156,75 224,75", (190, 68)),
+        _arrow("triangulator", "planner", "fingertip", "356,75 474,75", (415, 68)),
+        _arrow("triangulator", "fem_solver", "fingertip", "310,92 310,165 474,165", (390, 158)),
+        _arrow(
+            "triangulator", "renderer", "fingertip", "270,92 270,225 760,225 760,182", (380, 218)
+        ),
+        _arrow("fem_solver", "planner", "soft_body", "520,148 520,92", (486, 124)),
+        _arrow("planner", "renderer", "sheet_target", "606,75 730,75 730,148", (668, 68)),
+        _arrow("fem_solver", "renderer", "skin, soft_body", "606,165 724,165", (678, 158)),
+        _arrow("renderer", "recorder", "frame", "830,148 830,92", (852, 124)),
+        _arrow(
+            "planner",
+            "arm_left_bridge",
+            "sheet_target",
+            "580,92 580,130 625,130 625,265 130,265 130,378",
+            (200, 258),
+        ),
+        _arrow("planner", "arm_right_bridge", "sheet_target", "625,265 625,378", (664, 285)),
+        _arrow("arm_left_bridge", "arm_right_bridge", "arm_left", "226,388 514,388", (370, 381)),
+        _arrow("arm_right_bridge", "arm_left_bridge", "arm_right", "514,404 226,404", (370, 418)),
+        _arrow(
+            "arm_left_bridge", "renderer", "arm_left", "190,378 190,322 790,322 790,182", (260, 316)
+        ),
+        _arrow("arm_right_bridge", "renderer", "arm_right", "646,388 820,388 820,182", (780, 381)),
+        _wire("arm_left_bridge", "left RV-1A", "Modbus or MXT", "160,412 160,473", (215, 447)),
+        _wire("arm_right_bridge", "right RV-1A", "Modbus or MXT", "580,412 580,473", (635, 447)),
+        _wire("renderer", "projector", "light", "856,165 890,165 890,473", (908, 330), both=False),
+    ),
+)
+
+TWIN = Picture(
+    title="The twin in place of finger, camera, arms and eye",
+    size=(960, 300),
+    hosts={"this computer": (10, 10, 940, 280)},
+    boxes={
+        "twin_finger": (100, 80),
+        "camera": (310, 80),
+        "twin_arms": (100, 220),
+        "arm_left_bridge": (310, 190),
+        "arm_right_bridge": (310, 250),
+        "twin_eye": (600, 150),
+        "recorder": (860, 150),
+        "renderer": (600, 250),
+        "fem_solver": (860, 250),
+    },
+    devices={},
+    arrows=(
+        _arrow("twin_finger", "camera", "twin/stereo", "166,80 244,80", (205, 73)),
+        _arrow("twin_finger", "twin_eye", "twin/finger", "100,63 100,38 600,38 600,133", (490, 31)),
+        _arrow("twin_arms", "twin_eye", "twin/arms", "100,203 100,140 534,140", (470, 133)),
+        _wire(
+            "arm_left_bridge", "twin_arms", "Modbus", "244,190 205,190 205,212 166,212", (205, 183)
+        ),
+        _wire(
+            "arm_right_bridge", "twin_arms", "Modbus", "244,250 205,250 205,228 166,228", (205, 267)
+        ),
+        _arrow("renderer", "twin_eye", "frame", "600,233 600,167", (624, 204)),
+        _arrow(
+            "fem_solver",
+            "twin_eye",
+            "skin, soft_body",
+            "860,233 860,200 645,200 645,167",
+            (752, 193),
+        ),
+        _arrow("twin_eye", "recorder", "twin/eye", "666,150 794,150", (730, 143)),
+    ),
+)
+
+PICTURES = {"graph.svg": LAB, "graph-twin.svg": TWIN}
+
+
+def svg(picture: Picture) -> str:
+    """The picture as a file of its own, which follows light and dark."""
+    width, height = picture.size
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        f'width="{width}" height="{height}" role="img" aria-label="{picture.title}">',
+        f"<style>{STYLE}</style>",
+        '<defs><marker id="tip" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
+        'markerHeight="7" orient="auto-start-reverse"><path id="head" d="M0 0L8 4L0 8z"/>'
+        "</marker></defs>",
+    ]
+    for name, (left, top, wide, high) in picture.hosts.items():
+        lines.append(
+            f'<rect class="host" x="{left}" y="{top}" width="{wide}" height="{high}" rx="8"/>'
+        )
+        lines.append(
+            f'<text class="label" x="{left + 10}" y="{top + 18}" '
+            f'style="text-anchor:start">{name}</text>'
+        )
+    for arrow in picture.arrows:
+        start = ' marker-start="url(#tip)"' if arrow.both_ways else ""
+        kind = "arrow wire" if arrow.wire else "arrow"
+        lines.append(
+            f'<polyline class="{kind}" points="{arrow.way}" marker-end="url(#tip)"{start}/>'
+        )
+    for kind, places in (("box", picture.boxes), ("device", picture.devices)):
+        for name, (x, y) in places.items():
+            round_px = 5 if kind == "box" else HEIGHT // 2
+            lines.append(
+                f'<rect class="{kind}" x="{x - WIDTH / 2:g}" y="{y - HEIGHT / 2:g}" '
+                f'width="{WIDTH}" height="{HEIGHT}" rx="{round_px}"/>'
+            )
+            lines.append(f'<text x="{x}" y="{y + 4.5}">{name}</text>')
+    for arrow in picture.arrows:
+        (x, y), label = arrow.label_at, arrow.wire or ", ".join(arrow.topics)
+        lines.append(f'<text class="label" x="{x}" y="{y}">{label}</text>')
+    return "\n".join([*lines, "</svg>", ""])
+
+
+def main(folder: Path) -> None:
+    """Write all pictures."""
+    for name, picture in PICTURES.items():
+        (folder / name).write_text(svg(picture))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
