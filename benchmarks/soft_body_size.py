@@ -9,7 +9,8 @@ into `TABLE_BYTES`: to solve for 20,000 nodes would take hours, and 10,000 place
 nonlinear table.  What a whole table would take is said beside it.  The floor is how long this
 machine takes, there and then, to read as many bytes as the answer needs, by a plain dot product.
 
-Writes soft-body-size.png and soft-body-size.json.  A minute, 3 GB.
+Writes soft-body-size.svg and soft-body-size.json.  A minute, 3 GB.  With --redraw nothing is
+measured: the numbers in the folder are drawn anew.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from launch.machine import machine_name
 from launch.plan import load_scene
+from launch.svg import COLOURS, drawn_for_pages, save_svg
 from messages.scene import Scene, cylinder_of
 from nodes.fem_solver.body import spec_of
 from nodes.fem_solver.contact import LinearSoftBody, SkinResponse
@@ -40,8 +42,12 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
+NAME, BY_SIZE, BY_CONTACT = "soft-body-size", "by_skin_nodes", "by_contact_nodes"
+HEAD = """\
+| method | skin nodes | contact nodes | reads | slow slide, µs | random, µs | floor, µs | table |
+|---|---|---|---|---|---|---|---|"""
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-SPACINGS_M = (0.007, 0.006, 0.0045, 0.003, 0.0022, 0.0016, 0.00106)
+SPACINGS_M = (0.007, 0.006, 0.0045, 0.003, 0.0024, 0.0022, 0.0016, 0.00106)
 DEPTH_M = 0.005
 CONTACT_SPACING_M = 0.0022
 CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
@@ -49,7 +55,7 @@ LINEAR_RANGE_M = (0.012, 0.018)
 """Wider than the method is good for, so that the contact grows with the depth."""
 TABLE_BYTES, MOST_PLACES = 400_000_000, 800
 FLOOR_BYTES = 400_000_000
-STEPS = 150
+STEPS = 600
 SLOW_STEP_M = 2e-5
 ROWS_PER_ANSWER = 6 * 4
 """Of the nonlinear table: six nodes, four depths."""
@@ -57,8 +63,8 @@ ROWS_PER_ANSWER = 6 * 4
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One measurement; times in s: median and 99 of 100 at random places, median of a slow slide,
-    and what reading `read_bytes` from random places of memory takes."""
+    """One measurement; times in s: median and 99 of 100 at random places and on a slow slide, and
+    what reading `read_bytes` from random places of memory takes."""
 
     method: str
     skin_nodes: int
@@ -68,6 +74,7 @@ class Point:
     random_s: float
     random_p99_s: float
     slow_s: float
+    slow_p99_s: float
     floor_s: float
     whole_table_bytes: int
 
@@ -135,11 +142,13 @@ def floor_s(read_bytes: float) -> float:
 
 
 def pushes_on(body: Synthetic, depth_m: float, *, slow: bool) -> list[Push]:
-    """At random places of the patch, or along a line at 0.02 mm a step."""
+    """At random places of the patch, or to and fro along a line at 0.02 mm a step."""
     rng = np.random.default_rng(2)
     ways = rng.uniform(-body.half_m, body.half_m, (STEPS, 2))
     if slow:
-        ways = np.column_stack([np.arange(STEPS), 0.7 * np.arange(STEPS)]) * SLOW_STEP_M
+        gone = SLOW_STEP_M * np.arange(STEPS)
+        to_and_fro = np.abs((gone + body.half_m) % (4.0 * body.half_m) - 2.0 * body.half_m)
+        ways = np.outer(to_and_fro - body.half_m, [1.0, 0.7])
     found = body.shape.closest(body.centre + np.column_stack([ways, np.zeros(STEPS)]))
     return [Push(at, way, depth_m) for at, way in zip(found.point, found.normal, strict=True)]
 
@@ -236,6 +245,7 @@ def measured(
         random_s=float(np.median(at_random)),
         random_p99_s=float(np.quantile(at_random, 0.99)),
         slow_s=float(np.median(slowly)),
+        slow_p99_s=float(np.quantile(slowly, 0.99)),
         floor_s=floor_s(read),
         whole_table_bytes=whole_table_bytes,
     )
@@ -247,7 +257,7 @@ def draw(by_size: Sequence[Point], by_contact: Sequence[Point], path: Path) -> N
     figure = Figure(figsize=(16, 5), layout="constrained")
     size, contact, memory = figure.subplots(1, 3)
     for number, method in enumerate(dict.fromkeys(point.method for point in by_size)):
-        color = f"C{number}"
+        color = COLOURS[number]
         for axes, points, across in (
             (size, by_size, "skin_nodes"),
             (contact, by_contact, "contact_nodes"),
@@ -260,6 +270,7 @@ def draw(by_size: Sequence[Point], by_contact: Sequence[Point], path: Path) -> N
                 ("random_s", "random places", "o-"),
                 ("random_p99_s", "random places, p99", "v:"),
                 ("slow_s", "slow slide", "s--"),
+                ("slow_p99_s", "slow slide, p99", "^:"),
                 ("floor_s", "floor: reading as much", "_-."),
             ):
                 shown = [1e6 * getattr(point, name) for point in mine]
@@ -280,7 +291,7 @@ def draw(by_size: Sequence[Point], by_contact: Sequence[Point], path: Path) -> N
         axes.grid(visible=True, which="both", alpha=0.2)
         axes.legend(fontsize=7)
     contact.set_title(f"{by_contact[0].skin_nodes} skin nodes", fontsize=10)
-    figure.savefig(path, dpi=90)
+    save_svg(figure, path)
 
 
 def main() -> None:
@@ -288,10 +299,23 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--output", type=Path, default=Path("runs/charts"))
-    folder = parser.parse_args().output
+    parser.add_argument("--redraw", action="store_true")
+    asked = parser.parse_args()
+    numbers, picture = asked.output / f"{NAME}.json", asked.output / f"{NAME}.svg"
+    if not asked.redraw:
+        asked.output.mkdir(parents=True, exist_ok=True)
+        numbers.write_text(json.dumps(measure_all(), indent=1) + "\n")
+    kept = json.loads(numbers.read_text())
+    with drawn_for_pages():
+        draw(*([Point(**one) for one in kept[key]] for key in (BY_SIZE, BY_CONTACT)), picture)
+
+
+def measure_all() -> dict[str, Any]:
+    """All sizes, all contacts, as they are kept."""
     scene = load_scene(SCENE_FILE)
     shape = make_shape(dict(cylinder_of(scene)))
     by_size, by_contact = [], []
+    print(HEAD)
     for spacing in SPACINGS_M:
         mesh = build_mesh(spec_of(scene, spacing).mesh)
         for measure in (linear_point, table_point):
@@ -301,21 +325,19 @@ def main() -> None:
             for depth in CONTACT_DEPTHS_M:
                 by_contact.append(linear_point(scene, mesh, shape, depth))
                 say(by_contact[-1])
-    folder.mkdir(parents=True, exist_ok=True)
-    draw(by_size, by_contact, folder / "soft-body-size.png")
-    content = {
+    return {
         "machine": machine_name(),
         "tables": "of made-up numbers and of the right size, at some of the places",
-        "by_skin_nodes": [asdict(point) for point in by_size],
-        "by_contact_nodes": [asdict(point) for point in by_contact],
+        BY_SIZE: [asdict(point) for point in by_size],
+        BY_CONTACT: [asdict(point) for point in by_contact],
     }
-    (folder / "soft-body-size.json").write_text(json.dumps(content, indent=1) + "\n")
 
 
 def say(point: Point) -> None:
     print(
         f"| {point.method} | {point.skin_nodes} | {point.contact_nodes:g} |"
-        f" {point.read_bytes / 1e6:.2f} MB | {1e6 * point.slow_s:.0f} |"
+        f" {point.read_bytes / 1e6:.2f} MB |"
+        f" {1e6 * point.slow_s:.0f} / {1e6 * point.slow_p99_s:.0f} |"
         f" {1e6 * point.random_s:.0f} / {1e6 * point.random_p99_s:.0f} |"
         f" {1e6 * point.floor_s:.0f} | {point.whole_table_bytes / 1e6:.0f} MB |",
         flush=True,

@@ -261,11 +261,11 @@ def _as_today(result: dict[str, Any]) -> dict[str, Any]:
 def write_overview(folder: Path) -> Path:
     """One page of all the charts that lie in the folder; returns its path."""
     path = folder / OVERVIEW
-    path.write_text("\n".join(_overview_lines(kept_charts(folder))) + "\n", encoding="utf-8")
+    path.write_text("\n".join(_overview_lines(folder)) + "\n", encoding="utf-8")
     return path
 
 
-def _overview_lines(results: Sequence[dict[str, Any]]) -> Iterator[str]:
+def _overview_lines(folder: Path) -> Iterator[str]:
     yield "# Speed against accuracy\n"
     yield (
         "Every method of every family, timed and judged on one machine and one scene by "
@@ -273,7 +273,7 @@ def _overview_lines(results: Sequence[dict[str, Any]]) -> Iterator[str]:
         "good for; the front has those that no other method beats in both. The numbers of each "
         "picture stand beside it as JSON.\n"
     )
-    for result in results:
+    for result in kept_charts(folder):
         name, unit = result["family"], result["unit"]
         commit = (result.get("code") or {}).get("commit") or "unknown"
         yield f"## {name}\n"
@@ -287,6 +287,10 @@ def _overview_lines(results: Sequence[dict[str, Any]]) -> Iterator[str]:
         yield "|---|---|---|---|---|"
         yield from map(_overview_row, methods_of(result["points"]))
         yield ""
+        # benchmarks of the same methods leave theirs as FAMILY-WHAT
+        for more in sorted(folder.glob(f"{name}-*.svg")):
+            if more.stem not in FAMILIES:
+                yield f"![{more.stem}]({more.name})\n\n[Numbers]({more.stem}.json).\n"
 
 
 def methods_of(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,10 @@ Progress = Callable[[str], None]
 
 TOLD_SHARE = 0.25
 """Progress is told in such steps."""
+
+
+class NoSoftBodyError(RuntimeError):
+    """A scene whose soft body cannot be made; the text says why, and a remedy."""
 
 
 def prepare_plan(plan: Plan, progress: Progress) -> None:
@@ -57,26 +62,29 @@ def prepare_soft_body(
 ) -> Path:
     """The file with the nonlinear table of a scene's soft body, made if it is not there.
 
-    scheduler: as the fem_solver node's parameter.  LabError where that is of no use, ValueError for
-    a body that cannot be meshed, MemoryError where there is too little for it.
+    scheduler: as the fem_solver node's parameter.  NoSoftBodyError where that is of no use, the
+    body cannot be meshed, or memory is too little for it.
     """
     from nodes.fem_solver import body, precompute_table
     from nodes.fem_solver.making import Maker
     from nodes.fem_solver.precompute import Need
+    from nodes.fem_solver.remaining import Remaining
 
     folder = cache_dir or default_cache_dir()
-    told = 0.0
+    remaining, told = Remaining(), -1
 
     def made(done: int, total: int, need: Need) -> None:
         nonlocal told
-        if done == 0:
-            told = 0.0
-        if done / total >= told:
-            progress(f"making the soft body: {100 * done // total} % ({need.text()})")
-            told += TOLD_SHARE
+        far = remaining.text(done, total, time.monotonic())
+        if 100 * done // total != told:
+            progress(f"making the soft body: {far} ({need.text()})")
+            told = 100 * done // total
 
     maker = Maker(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
-    bodies = maker.bodies(scene, "auto", made)
-    if len(bodies) == 1:
-        maker.tabulated(scene, bodies[0], made)
+    try:
+        bodies = maker.bodies(scene, "auto", made)
+        if len(bodies) == 1:
+            maker.tabulated(scene, bodies[0], made)
+    except (ValueError, MemoryError, precompute_table.WorkersError) as error:
+        raise NoSoftBodyError(str(error)) from error
     return precompute_table.table_path(body.table_spec_of(scene, bodies[0].spec), folder)

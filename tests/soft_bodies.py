@@ -1,6 +1,9 @@
-"""Specifications of soft bodies for tests, without a scene."""
+"""Soft bodies for tests: specifications without a scene, and an executor without processes."""
 
 from __future__ import annotations
+
+from concurrent.futures import Executor, Future
+from typing import Any
 
 import numpy as np
 
@@ -31,3 +34,12 @@ def cylinder_spec(
         slab_depth_m=0.0,
     )
     return SoftBodySpec(mesh, poisson_ratio, sticking)
+
+
+class Here(Executor):
+    """Does what is submitted at once, in this process."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import sys
-from concurrent.futures import Executor, Future
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,17 +18,9 @@ from nodes.fem_solver.families import FORCE, LARGEST, NEWTON, SOFT_BODY, Charted
 from nodes.fem_solver.precompute_table import save_table
 from nodes.fem_solver.table import Table
 from nodes.methods import measure
+from tests.soft_bodies import Here
 
 SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
-
-
-class Here(Executor):
-    """Does what is submitted at once, in this process."""
-
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
 
 
 def small_scene() -> Scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,9 @@ from nodes.fem_solver.newton import (
     NeoHookeanBody,
     Solved,
     SphereObstacle,
+    StuckError,
 )
+from nodes.fem_solver.pushes import PushJob, Site, solve_push
 from tests.solids import box
 
 Floats = NDArray[np.float64]
@@ -164,6 +167,39 @@ def test_a_push_deeper_than_the_body_is_bounded_flagged_and_not_inside_out() -> 
     assert last.centre[2] > FINGER - 0.03
     forces = [state.force_n[2] for state in states]
     assert all(a <= b for a, b in itertools.pairwise(forces))
+
+
+def test_where_newton_does_not_settle_the_push_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though no element is turned over: the last answer stays, flagged, and a table takes the push
+    to be as deep as that."""
+    body = pad(divisions=(4, 4, 2))
+    job = PushJob(
+        nodes=body.solid.nodes,
+        elements=body.solid.elements,
+        fixed=body.fixed,
+        faces=body.obstacle._faces,
+        site=Site(centre(FINGER), np.array([0.0, 0.0, 1.0])),
+        poisson_ratio=NU,
+        finger_radius_m=FINGER,
+        depths_m=(0.001, 0.002, 0.003, 0.004),
+    )
+    settle = NeoHookeanBody.settle
+
+    def never_deeper(
+        body: NeoHookeanBody, displacement: Floats, to: Floats, *rest: Any, **also: Any
+    ) -> Any:
+        if to[2] < FINGER - 0.0022:
+            raise StuckError("not settled")
+        return settle(body, displacement, to, *rest, **also)
+
+    monkeypatch.setattr(NeoHookeanBody, "settle", never_deeper)
+    answer = solve_push(job)
+    assert answer.reached == 2
+    assert answer.force_n[1] @ job.site.normal > 0.0
+    for held in (2, 3):
+        assert np.array_equal(answer.moved[held], answer.moved[2])
+    # it went as far as a quarter of a step leads, and no farther
+    assert np.linalg.norm(answer.moved[2] - answer.moved[1], axis=1).max() < 0.0003
 
 
 def test_a_finger_in_the_air_moves_nothing(body: NeoHookeanBody) -> None:

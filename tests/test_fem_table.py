@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from concurrent.futures import Executor, Future
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,8 +27,8 @@ from nodes.fem_solver.precompute_table import (
     table_path,
 )
 from nodes.fem_solver.pushes import PushAnswer, Site, solve_push
-from nodes.fem_solver.table import Cubics, Table, TableSoftBody, sound_levels
-from tests.soft_bodies import cylinder_spec
+from nodes.fem_solver.table import END_SPAN_M, Cubics, Table, TableSoftBody, sound_levels
+from tests.soft_bodies import Here, cylinder_spec
 
 Floats = NDArray[np.float64]
 
@@ -38,15 +36,6 @@ RADIUS, LENGTH, FINGER = 0.02, 0.06, 0.007
 SPEC = TableSpec(cylinder_spec(RADIUS, LENGTH, touch_angle_rad=1.2, skin_spacing_m=0.005), FINGER)
 DEPTHS = (0.0015, 0.003, 0.005, 0.0075)
 MODULUS = 4000.0
-
-
-class Here(Executor):
-    """Does what is submitted at once, in this process."""
-
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        future.set_result(fn(*args, **kwargs))
-        return future
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -153,7 +142,7 @@ def test_deeper_than_solved_is_flagged_bounded_and_never_inverted(
 
     for depth in (0.004, 0.0075, 0.03):
         answer = body.respond(push(0.004, 0.1, depth))
-        assert answer.in_range == (depth <= DEPTHS[-1] - 0.0025)
+        assert answer.in_range == (depth <= DEPTHS[-1] - END_SPAN_M)
         assert np.linalg.norm(answer.displacement, axis=1).max() < 1.2 * DEPTHS[-1]
         turned = np.einsum("ij,ij->i", normals(rest), normals(rest + answer.displacement))
         assert turned.min() > 0.0

@@ -8,7 +8,14 @@ from typing import Annotated
 import typer
 
 from launch.commands.graph import JsonOption
-from launch.commands.output import examples, print_json, progress_words, words
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    examples,
+    print_json,
+    progress_words,
+    words,
+)
 
 app = typer.Typer(add_completion=False)
 
@@ -45,7 +52,7 @@ def prepare(
 ) -> None:
     """Work out how a scene's sheet dents, once; experiments and the demo do so by themselves."""
     from launch.plan import load_scene
-    from launch.prepare import prepare_dents, prepare_soft_body
+    from launch.prepare import NoSoftBodyError, prepare_dents, prepare_soft_body
 
     if scheduler is not None and skin_spacing_m is None:
         raise typer.BadParameter("is for the table of --skin-spacing", param_hint="--scheduler")
@@ -53,9 +60,12 @@ def prepare(
     with progress_words() as progress:
         files = {"dent_shapes": prepare_dents(scene, cache, progress)}
         if skin_spacing_m is not None:
-            files["soft_body"] = prepare_soft_body(
-                scene, skin_spacing_m, cache, scheduler, progress
-            )
+            try:
+                files["soft_body"] = prepare_soft_body(
+                    scene, skin_spacing_m, cache, scheduler, progress
+                )
+            except NoSoftBodyError as error:
+                raise CommandError(f"no soft body of {scene_file}: {error}", BAD_INPUT) from error
     if as_json:
         print_json({name: str(file) for name, file in files.items()})
         return

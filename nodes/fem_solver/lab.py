@@ -26,7 +26,7 @@ TRIES = 3
 """A push whose worker is lost is given to others so many times."""
 
 
-class LabError(RuntimeError):
+class LabError(precompute_table.WorkersError):
     """The lab's machines are of no use; the text names the parameter, its value and a remedy."""
 
     def __init__(self, address: str, what: str, remedy: str) -> None:

@@ -18,6 +18,7 @@ from nodes.fem_solver.contact import Response
 from nodes.fem_solver.making import Maker, MethodChoice
 from nodes.fem_solver.pace import Pace
 from nodes.fem_solver.place import Entry
+from nodes.fem_solver.remaining import Remaining
 from nodes.node import Input, Node, NodeParameters, Output
 
 
@@ -70,6 +71,7 @@ class FemSolver(Node):
         folder = self.parameters.cache_dir or cache.default_cache_dir()
         self._maker = Maker(cache_dir=folder, **self.parameters.model_dump(include=own))
         self._making: asyncio.Task[None] | None = None
+        self._remaining = Remaining()
         self._use([])
         self._forget()
         self.note = "waiting for a scene"
@@ -132,7 +134,8 @@ class FemSolver(Node):
     def _progress(self, done: int, total: int, need: precompute.Need) -> None:
         if self._stop.is_set():
             raise precompute.Interrupted
-        self.note = f"precomputing the soft body: {100 * done // total} % ({need.text()})"
+        far = self._remaining.text(done, total, self.clock.now_ns() * 1e-9)
+        self.note = f"precomputing the soft body: {far} ({need.text()})"
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         if not self._bodies:

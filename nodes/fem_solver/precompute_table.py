@@ -105,8 +105,12 @@ def _solve(job: pushes.PushJob) -> pushes.PushAnswer:
     return pushes.solve_push(job, asked_to_stop.get())
 
 
-class LostWorkersError(RuntimeError):
-    """Whoever was to solve pushes is gone; what they had solved is kept."""
+class WorkersError(RuntimeError):
+    """Whoever was to solve pushes is of no use."""
+
+
+class LostWorkersError(WorkersError):
+    """They are gone; what they had solved is kept."""
 
 
 def code_version() -> str:

@@ -42,7 +42,7 @@ BLEND_M = (0.0007, 0.0015)
 """Up to the first depth the linear method's answer counts, from the second on the solutions'."""
 LEAST_COSINE = -0.25
 """No triangle of the skin is shown that is turned so that its normal falls below this."""
-END_SPAN_M = 0.0025
+END_SPAN_M = 0.00125
 """The range ends this far before what was solved; deeper pushes approach that."""
 FADE_RATIO = 2.0
 """Past the end of the touchable skin the dent fades over so many finger radii."""

@@ -1,0 +1,88 @@
+"""The nonlinear table of shapes that are no cylinder: made on their own mesh, smooth, bounded."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.soft_body_limits import Body, body_of, overturned, scene_of
+from nodes.fem_solver import pushes
+from nodes.fem_solver.body import SceneBody, table_spec_of, with_table
+from nodes.fem_solver.contact import Response
+from nodes.fem_solver.place import Push
+from nodes.fem_solver.precompute_table import compute_table
+from nodes.fem_solver.table import END_SPAN_M
+from tests.soft_bodies import Here
+
+DEPTHS = (0.0015, 0.002, 0.003, 0.004)
+BASE = {"kind": "base", "height_m": 0.01}
+SCENES = {
+    "sphere": scene_of({"shape": "sphere", "radius_m": 0.025}, BASE, height_m=0.025),
+    "rounded_box": scene_of(
+        {"shape": "rounded_box", "size_m": [0.06, 0.05, 0.03], "edge_radius_m": 0.01},
+        BASE,
+        height_m=0.015,
+    ),
+}
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def both(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Body, SceneBody]:
+    """The body by the linear method, and by a table of few sites and few, shallow depths."""
+    scene = SCENES[request.param]
+    linear = body_of(scene, 0.0065)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pushes, "DEPTHS_M", DEPTHS)
+        patch.setattr(pushes, "APART_RATIO", 6.0)
+        spec = table_spec_of(scene, linear.soft.spec)
+        folder: Path = tmp_path_factory.mktemp("table")
+        table = compute_table(spec, linear.model, folder, Here(), lambda *_: None)
+    return linear, with_table(linear.soft, scene, linear.model, table)
+
+
+def pushed(body: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Push]:
+    found = body.shape.closest(body.front + np.array([x, y, 0.0]))
+    push = Push(found.point, found.normal, depth)
+    return body.method.respond(push), push
+
+
+def test_it_dents_where_it_is_pushed_as_the_linear_method_does(
+    both: tuple[Body, SceneBody],
+) -> None:
+    linear, table = both
+    for x, y in ((0.0, 0.0), (0.004, 0.003), (-0.005, 0.002)):
+        answer, push = pushed(table, x, y, 0.0025)
+        other, _ = pushed(linear.soft, x, y, 0.0025)
+        assert answer.in_range
+        inward = -(answer.displacement @ push.normal.astype(np.float32))
+        assert inward.max() == pytest.approx(0.0025, rel=0.2)
+        deepest = table.rest[int(inward.argmax())]
+        assert np.linalg.norm(deepest - push.surface) < 0.007
+        assert answer.force_n @ push.normal == pytest.approx(other.force_n @ push.normal, rel=0.25)
+        away = np.linalg.norm(table.rest - push.surface, axis=1) > 0.0105
+        apart = np.linalg.norm(answer.displacement - other.displacement, axis=1)
+        assert apart[away].max() < 0.6e-3  # elements of 13 mm
+
+
+def test_a_slide_moves_no_skin_node_a_tenth_of_a_millimetre(both: tuple[Body, SceneBody]) -> None:
+    for depth in (0.002, 0.01):
+        answers = [pushed(both[1], -0.002 + 2e-5 * i, 0.001, depth)[0] for i in range(200)]
+        moves = [
+            np.linalg.norm(a.displacement - b.displacement, axis=1).max()
+            for a, b in itertools.pairwise(answers)
+        ]
+        assert max(moves) < 0.1e-3
+
+
+def test_deeper_than_solved_is_flagged_and_bounded(both: tuple[Body, SceneBody]) -> None:
+    linear, table = both
+    for depth in (DEPTHS[-1] - END_SPAN_M - 1e-4, 0.006, 0.02):
+        answer, _ = pushed(table, 0.001, 0.002, depth)
+        assert answer.in_range == (depth < DEPTHS[-1] - END_SPAN_M)
+        assert np.linalg.norm(answer.displacement, axis=1).max() < 1.2 * DEPTHS[-1]
+        assert overturned(linear, answer.displacement) == 0

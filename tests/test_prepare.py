@@ -1,0 +1,101 @@
+"""`flexsheet prepare`: dents and the soft body's table, made before a scene is shown."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+from launch import cli
+from launch.plan import load_scene
+from nodes.fem_solver import body, precompute_table, pushes
+from nodes.fem_solver.mesh import cylinder
+from tests.soft_bodies import Here
+
+SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
+SPACING_M = 0.005
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small cylinder, that few shallow pushes on a coarse mesh do for; no dents are worked out:
+    they take longer than all else here."""
+    monkeypatch.setattr(pushes, "DEPTHS_M", (0.0015, 0.002, 0.0025, 0.003))
+    monkeypatch.setattr(pushes, "SPACING_RATIO", 1.0)
+    monkeypatch.setattr(pushes, "STATIONS", (0.0,))
+    monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
+    monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
+    monkeypatch.setattr("launch.prepare.prepare_dents", lambda scene, cache, progress: cache)
+    # other processes take seconds to start
+    monkeypatch.setattr(precompute_table, "local_processes", lambda count: nullcontext(Here()))
+    content = YAML(typ="safe").load(SCENE.read_text())
+    content["object"]["geometry"] |= {"radius_m": 0.02, "length_m": 0.05}
+    content["object"]["world_from_object"]["position_m"] = [0.0, 0.0, -0.02]
+    path = tmp_path / "small.yaml"
+    YAML().dump(content, path)
+    return path
+
+
+@pytest.fixture
+def flexsheet(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    """Runs the command in this process: its exit code, and its words without line breaks."""
+
+    def run(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["flexsheet", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            cli.main()
+        return int(end.value.code or 0), " ".join(capsys.readouterr().err.split())
+
+    return run
+
+
+def test_the_table_is_made_where_the_node_looks_for_it_and_once(
+    scene_file: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    flexsheet: Callable[..., tuple[int, str]],
+) -> None:
+    asked = ("prepare", scene_file, "--cache", tmp_path / "cache", "--skin-spacing", SPACING_M)
+    code, said = flexsheet(*asked)
+    assert code == 0
+    assert ": 0 % (" in said.split("deep pushes for")[0]  # what it will take, before it is begun
+    assert "100 % (" in said
+    scene = load_scene(scene_file)
+    spec = body.table_spec_of(scene, body.spec_of(scene, SPACING_M))
+    path = precompute_table.table_path(spec, tmp_path / "cache")
+    assert precompute_table.load_table(spec, tmp_path / "cache") is not None
+    assert path.name in said.replace(" ", "")
+    made = path.stat().st_mtime_ns
+    monkeypatch.setattr(precompute_table, "local_processes", pytest.fail)
+    assert flexsheet(*asked)[0] == 0
+    assert path.stat().st_mtime_ns == made
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--scheduler", "tcp://127.0.0.1:9"), "is for the table of --skin-spacing"),
+        (("--skin-spacing", "0.009"), "skin_spacing_m: 0.009 is more than finger.radius_m"),
+        (
+            ("--skin-spacing", str(SPACING_M), "--scheduler", "tcp://127.0.0.1:9"),
+            'scheduler "tcp://127.0.0.1:9": no scheduler answers',
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused_in_words(
+    scene_file: Path,
+    tmp_path: Path,
+    flexsheet: Callable[..., tuple[int, str]],
+    options: tuple[str, ...],
+    named: str,
+) -> None:
+    code, said = flexsheet("prepare", scene_file, "--cache", tmp_path, *options)
+    assert code == 2
+    assert named in said.replace("│ ", "").replace(" │", "")
+    assert "Traceback" not in said
