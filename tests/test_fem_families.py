@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from contextlib import nullcontext
 from pathlib import Path
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from launch.charts import write_overview
 from launch.compliance import SKIN_SPACING_M, front_curve
 from messages.scene import Scene
 from nodes.fem_solver import charted, peers, precompute, pushes
@@ -21,6 +23,7 @@ from nodes.methods import measure
 from tests.soft_bodies import Here
 
 SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
+CHARTS = Path(__file__).parents[1] / "docs" / "charts"
 
 
 def small_scene() -> Scene:
@@ -109,3 +112,9 @@ def test_the_family_says_what_it_is_judged_by() -> None:
     assert SOFT_BODY.tolerance(scene) == 0.5
     assert "Newton" in SOFT_BODY.reference
     assert len(SOFT_BODY.methods) >= 5
+
+
+def test_the_page_of_charts_shows_what_benchmarks_left_beside_them(tmp_path: Path) -> None:
+    for name in ("soft-body.json", "soft-body-size.svg"):
+        shutil.copy(CHARTS / name, tmp_path)
+    assert "![soft-body-size](soft-body-size.svg)" in write_overview(tmp_path).read_text()
