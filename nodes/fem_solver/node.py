@@ -41,9 +41,7 @@ class FemSolverParameters(NodeParameters):
     step_budget_s: Positive = Field(
         default=0.004, description="answers later than this, five running, change the method"
     )
-    workers: int = Field(
-        default=0, ge=0, description="processes that make a table; 0: one for every core"
-    )
+    workers: int = Field(default=0, ge=0, description="processes that make a table; 0: one a core")
     scheduler: str | None = Field(
         default=None,
         description="a dask.distributed one, as tcp://host:8786, whose workers make the table",
