@@ -307,7 +307,11 @@ def main() -> None:
         numbers.write_text(json.dumps(measure_all(), indent=1) + "\n")
     kept = json.loads(numbers.read_text())
     with drawn_for_pages():
-        draw(*([Point(**one) for one in kept[key]] for key in (BY_SIZE, BY_CONTACT)), picture)
+        draw(points_of(kept[BY_SIZE]), points_of(kept[BY_CONTACT]), picture)
+
+
+def points_of(kept: Sequence[dict[str, Any]]) -> list[Point]:
+    return [Point(**one) for one in kept]
 
 
 def measure_all() -> dict[str, Any]:
