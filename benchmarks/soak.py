@@ -191,7 +191,8 @@ def read_window(bag: Path) -> Window:
                 delay("frame", header.source_ns, message.drawn_ns or header.publish_ns)
             case ArmState():
                 modes[message.mode] += 1
-                faults.update(message.faults)
+                if message.mode == "fault":
+                    faults.update(message.faults)
                 before, last_mode[message.side] = last_mode.get(message.side), message.mode
                 if before == "follow" and message.mode != "follow":
                     stops[f"{message.side} arm: {message.mode}, {message.reason}"] += 1

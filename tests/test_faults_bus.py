@@ -1,0 +1,113 @@
+"""Slow readers, storms and forgers over real sockets: who is not concerned notices nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import resource
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import zmq
+
+from benchmarks.fuzz_targets import TARGETS, wire_frames, wire_seeds
+from messages.bus import queue_length
+from messages.topics import TOPICS, Delivery
+from messages.wire import decode, encode
+from tests.test_messages_bus import Room, connected, finger, header, pictures, room, until
+
+__all__ = ["room"]
+
+
+async def test_a_reader_that_is_stuck_slows_nobody_and_fills_no_memory(room: Room) -> None:
+    """It is not read at all; the publisher never blocks, another reader loses nothing."""
+    topic = TOPICS["twin/stereo"]
+    publisher, ear = room.mouth(topic), room.ear(topic)
+    stuck: Any = zmq.Context.instance().socket(zmq.SUB)
+    stuck.setsockopt(zmq.SUBSCRIBE, b"")
+    stuck.setsockopt(zmq.RCVHWM, queue_length(topic))
+    stuck.connect(room.endpoint())
+    room.closers.append(lambda: stuck.close(linger=0))
+    last = await connected(publisher, ear, pictures)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for number in range(last + 1, last + 2001):
+        publisher.send(pictures(number % 250), header(number))
+        if (number - last) % 10 == 0:
+            await until(lambda: ear.heard and ear.sequences[-1] == number)  # noqa: B023
+    assert len(ear.heard) + ear.counts.dropped == 2000
+    assert ear.counts.gaps == 0
+    grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
+    # Each picture pair has 6 KB, both ears' and the publisher's queues 65 each.
+    assert grown < 60 << 20
+
+
+@pytest.mark.parametrize("name", ["sheet_target", "twin/finger"])
+async def test_a_storm_is_dropped_where_newest_counts_and_told_where_all_count(
+    room: Room, name: str
+) -> None:
+    """A hundred times as many messages as a topic has, faster than they can be handled."""
+    topic = replace(TOPICS["twin/finger"], delivery=TOPICS[name].delivery, rate_hz=(30, 150))
+    publisher, ear = room.mouth(topic), room.ear(topic)
+    start = await connected(publisher, ear, finger) + 1
+    count = 15_000
+    for number in range(start, start + count):
+        publisher.send(finger(0.0), header(number))
+    number = start + count
+    while not ear.heard or ear.sequences[-1] < start + count:
+        publisher.send(finger(1.0), header(number))
+        number += 1
+        await asyncio.sleep(0.002)
+    handled, lost = len(ear.heard), ear.counts.dropped + ear.counts.gaps
+    assert handled + lost == ear.sequences[-1] - start + 1
+    assert lost > 0
+    assert ear.sequences == sorted(ear.sequences)
+    told = any("lost" in problem for problem in ear.problems)
+    assert told == (topic.delivery is Delivery.EVERY and ear.counts.gaps > 0)
+
+
+async def test_of_thousands_of_forgeries_over_a_socket_none_is_taken(room: Room) -> None:
+    """Malformed, of another type, from an earlier start, again: counted, and good ones pass."""
+    topic = TOPICS["fingertip"]
+    endpoint = room.endpoint("forger")
+    forger = room.raw(zmq.PUB, endpoint)
+    ear = room.ear(topic, endpoint)
+    seeds = [seed for seed in wire_seeds() if wire_frames(seed)[0] == "fingertip"]
+    message = wire_message(seeds[0])
+
+    def send(frames: list[Any]) -> None:
+        forger.send_multipart([bytes(one) for one in frames])
+
+    number = 1 << 40
+    while not ear.heard:
+        number += 1
+        send(encode(message, header(number, epoch=5)))
+        await asyncio.sleep(0.001)
+    chance, sent = random.Random(7), 0
+    for _ in range(1000):
+        data = chance.choice(seeds)
+        for _ in range(chance.randrange(1, 4)):
+            data = TARGETS["wire"].mutate(data, chance)
+        frames = wire_frames(data)[1]
+        if len(frames) > 8 or not frames:
+            continue
+        send(frames)
+        send(encode(message, header(chance.randrange(1, number), epoch=5)))
+        send(encode(message, header(number, epoch=4)))
+        sent += 3
+        if sent % 60 == 0:
+            await asyncio.sleep(0.001)
+    heard = {(one.writer, one.epoch, one.sequence) for _, one in ear.heard}
+    number += 1
+    while ("writer", 5, number) not in heard:
+        send(encode(message, header(number, epoch=5)))
+        await asyncio.sleep(0.001)
+        heard = {(one.writer, one.epoch, one.sequence) for _, one in ear.heard}
+    assert ear.counts.rejected > sent // 3
+    ours = [one for _, one in ear.heard if one.writer == "writer"]
+    assert [one.sequence for one in ours] == sorted({one.sequence for one in ours})
+    assert {one.epoch for one in ours} == {5}
+
+
+def wire_message(seed: bytes) -> Any:
+    return decode(wire_frames(seed)[1], TOPICS["fingertip"])[0]
