@@ -69,7 +69,7 @@ def test_lists_nested_to_the_parsers_limit_are_refused_in_a_sentence(place: str)
 
 
 def test_lists_that_only_claim_to_be_long_take_no_memory() -> None:
-    """Each takes its room before its elements are looked for: 8 GB for a message of a megabyte."""
+    """Each asks for its room before its elements are there: 8 GB for a message of a megabyte."""
     claim = b"\xdd" + struct.pack(">I", 60_000)
     bomb = claim * 1000 + bytes(100_000)
     tracemalloc.start()
