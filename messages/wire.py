@@ -53,8 +53,8 @@ HEADER_BYTES_MAX = 1 << 20
 take up to 64 times as much as objects."""
 
 ELEMENTS_MAX = 4096
-"""Of an array or a map in the header.  An array that only claims to be long asks for its room before
-its elements are looked for, and may be the first element of another one."""
+"""Of an array or a map in the header.  An array that only claims to be long asks for its room
+before its elements are there, and may be the first element of another one."""
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
 _INLINE, _FRAME = 1, 2
