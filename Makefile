@@ -102,7 +102,7 @@ charts: setup
 
 # The site: open site/index.html.  Its generator is no part of the program, so it has an environment
 # of its own.
-$(SITE_STAMP): docs/requirements.lock | $(BIN)/python
+$(SITE_STAMP): docs/requirements.lock
 	$(PYTHON) -m venv $(SITE_VENV)
 	$(SITE_VENV)/bin/pip install --quiet --disable-pip-version-check --require-hashes \
 		-r docs/requirements.lock
@@ -110,7 +110,7 @@ $(SITE_STAMP): docs/requirements.lock | $(BIN)/python
 
 docs: $(SITE_STAMP)
 	$(SITE_VENV)/bin/python -m zensical build --clean --strict
-	$(SITE_VENV)/bin/python -m website.sources site
+	$(SITE_VENV)/bin/python -m website.finish site
 
 clean:
 	rm -rf $(VENV) $(SITE_VENV) site .cache build dist runs *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

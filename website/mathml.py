@@ -7,7 +7,7 @@ source is drawn by hosts of repositories, which know the dollar signs, too.
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, Literal
 from xml.etree.ElementTree import Element, SubElement
 
 from latex2mathml.converter import convert
@@ -23,13 +23,22 @@ AFTER_CODE, BEFORE_ESCAPES = 190, 185
 """Priorities of Python-Markdown: code spans come first, backslashes are still there."""
 
 
+PRIME = re.compile(r"<msup>(<m[in]>[^<]*</m[in]>)<mi>&#x02032;</mi></msup>")
+"""A prime is drawn high already; raised once more it would stand above the line."""
+
+
+def mathml(formula: str, display: Literal["inline", "block"]) -> str:
+    """A formula of LaTeX."""
+    return PRIME.sub(r"<mrow>\1<mo>&#x02032;</mo></mrow>", convert(formula, display=display))
+
+
 class InlineFormula(InlineProcessor):
     """$a^2$ within a line."""
 
     def handleMatch(  # type: ignore[override]  # the library's stub knows strings only
         self, m: re.Match[str], data: str
     ) -> tuple[str, int, int]:
-        return self.md.htmlStash.store(convert(m.group(1))), m.start(0), m.end(0)
+        return self.md.htmlStash.store(mathml(m.group(1), "inline")), m.start(0), m.end(0)
 
 
 class FormulaBlock(BlockProcessor):
@@ -39,7 +48,7 @@ class FormulaBlock(BlockProcessor):
         return block.startswith("$$") and block.rstrip().endswith("$$") and len(block.strip()) > 4
 
     def run(self, parent: Element, blocks: list[str]) -> None:
-        formula = convert(blocks.pop(0).strip().strip("$").strip(), display="block")
+        formula = mathml(blocks.pop(0).strip().strip("$").strip(), "block")
         place = SubElement(parent, "div", {"class": "formula"})
         place.text = self.parser.md.htmlStash.store(formula)
 
