@@ -9,6 +9,7 @@ import pytest
 
 from launch.plan import load_plan
 from tests.doc_pages import DOCS, ROOT, anchors, headings, links, name, nav_pages, pages, site_pages
+from website.finish import NetworkError, finish
 from website.graph import LAB, PICTURES, TWIN, Picture, svg
 
 EVERYBODYS = {"scene", "display", "estop", "status"}
@@ -94,3 +95,29 @@ def test_pictures_of_the_graph_show_what_launch_files_say(picture: Picture, file
     if picture is TWIN:  # it shows the twin's part only
         left_out = {link for link in left_out if "twin" in link[0] + link[2]}
     assert {topic for _, topic, _ in left_out} <= EVERYBODYS
+
+
+def test_links_out_of_the_site_lead_to_copies(tmp_path: Path) -> None:
+    site, project = tmp_path / "site", tmp_path / "project"
+    (site / "charts").mkdir(parents=True)
+    (project / "launch").mkdir(parents=True)
+    (project / "launch" / "lab.yaml").write_text("nodes: {}")
+    (site / "a.html").write_text('<a href="../launch/lab.yaml"></a><a href="b.html"></a>')
+    (site / "charts" / "b.html").write_text(
+        '<a href="../../launch/lab.yaml"></a><a href="../a.html"></a>'
+    )
+    assert finish(site, project) == ["launch/lab.yaml"]
+    first, second = ((site / page).read_text() for page in ("a.html", "charts/b.html"))
+    assert first == '<a href="project/launch/lab.yaml.txt"></a><a href="b.html"></a>'
+    assert second == '<a href="../project/launch/lab.yaml.txt"></a><a href="../a.html"></a>'
+    assert (site / "project" / "launch" / "lab.yaml.txt").read_text() == "nodes: {}"
+
+
+def test_nothing_of_the_site_comes_from_the_network(tmp_path: Path) -> None:
+    page = tmp_path / "a.html"
+    page.write_text('<script src="https://unpkg.com/iframe-worker/shim"></script>')
+    finish(tmp_path, tmp_path)
+    assert page.read_text() == '<script src="search-from-files.js"></script>'
+    page.write_text('<link rel="stylesheet" href="https://fonts.example/a.css">')
+    with pytest.raises(NetworkError, match="fonts"):
+        finish(tmp_path, tmp_path)
