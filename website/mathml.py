@@ -35,9 +35,7 @@ def mathml(formula: str, display: Literal["inline", "block"]) -> str:
 class InlineFormula(InlineProcessor):
     """$a^2$ within a line."""
 
-    def handleMatch(  # type: ignore[override]  # the library's stub knows strings only
-        self, m: re.Match[str], data: str
-    ) -> tuple[str, int, int]:
+    def handleMatch(self, m: re.Match[str], data: str) -> tuple[str, int, int]:
         return self.md.htmlStash.store(mathml(m.group(1), "inline")), m.start(0), m.end(0)
 
 
