@@ -67,6 +67,21 @@ after a publisher has gone whose messages still fill the queue.  For the same re
 asks where it need not: a reader that is busy for long answers nothing, and is then hung up on.
 """
 
+VANISHED = {
+    zmq.TCP_KEEPALIVE: 1,
+    zmq.TCP_KEEPALIVE_IDLE: 1,
+    zmq.TCP_KEEPALIVE_INTVL: 1,
+    zmq.TCP_KEEPALIVE_CNT: 4,
+    zmq.TCP_MAXRT: 5000,
+    zmq.CONNECT_TIMEOUT: 2000,
+}
+"""A subscriber leaves it to its system to ask whether the publisher's is there still, and hangs up
+after 5 s without an answer, at once where it was started anew meanwhile.
+
+The publisher's heartbeats are not enough: libzmq 4.3.5 waits for the next one only until a message
+comes, and a subscriber says nothing by which it could learn that nobody listens any more.
+"""
+
 HANDSHAKE_FAILED: dict[int, str] = {
     zmq.EVENT_HANDSHAKE_FAILED_AUTH: "refuses our key; is it the one in its launch file?",
     zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: "does not speak with our keys; does it run without any?",
@@ -616,6 +631,7 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         # A larger frame makes ZeroMQ give the endpoint up, for good and without a word.  So what is
         # merely too large is let in, to be refused and counted; this limit saves the memory.
         options[zmq.MAXMSGSIZE] = topic.max_bytes + REFUSABLE_BYTES
+        options |= VANISHED
     else:
         # A publisher is sent subscriptions and handshakes: a stranger shall not fill the memory.
         options[zmq.MAXMSGSIZE] = SUBSCRIPTION_BYTES

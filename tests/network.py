@@ -84,31 +84,38 @@ class Computers:
         _ip("netns", "add", self._switch)
         _ip("-n", self._switch, "link", "add", "bridge", "type", "bridge")
         _ip("-n", self._switch, "link", "set", "bridge", "up")
-        for name, address in self.address.items():
-            space = self._space(name)
-            _ip("netns", "add", space)
-            _ip(
-                "-n",
-                self._switch,
-                "link",
-                "add",
-                name,
-                "type",
-                "veth",
-                "peer",
-                "eth",
-                "netns",
-                space,
-            )
-            _ip("-n", self._switch, "link", "set", name, "master", "bridge", "up")
-            _ip("-n", space, "link", "set", "lo", "up")
-            _ip("-n", space, "addr", "add", f"{address}/24", "dev", "eth")
-            _ip("-n", space, "link", "set", "eth", "up")
+        for name in self.address:
+            self._set_up(name)
         return self
 
     def __exit__(self, *_: object) -> None:
         for name in (*map(self._space, self.address), self._switch):
             _ip("netns", "del", name)
+
+    def _set_up(self, name: str) -> None:
+        space, address = self._space(name), self.address[name]
+        # The card keeps its number whatever becomes of the system.
+        card = "02:00:00:00:00:" + address.rpartition(".")[2].zfill(2)
+        peer = ["peer", "eth", "netns", space, "address", card]
+        _ip("netns", "add", space)
+        _ip("-n", self._switch, "link", "add", name, "type", "veth", *peer)
+        _ip("-n", self._switch, "link", "set", name, "master", "bridge", "up")
+        _ip("-n", space, "link", "set", "lo", "up")
+        _ip("-n", space, "addr", "add", f"{address}/24", "dev", "eth")
+        _ip("-n", space, "link", "set", "eth", "up")
+
+    def power_cut(self, name: str, *processes: subprocess.Popen[bytes]) -> None:
+        """All that a computer has and does is gone at once, and nobody is told."""
+        self.plug(name, into_switch=False)
+        for process in processes:
+            process.kill()
+            process.wait()
+        _ip("-n", self._switch, "link", "del", name)
+        _ip("netns", "del", self._space(name))
+
+    def boot(self, name: str) -> None:
+        """The computer is up again after a power cut, at its cable and address."""
+        self._set_up(name)
 
     def plug(self, name: str, *, into_switch: bool) -> None:
         """Draw a computer's cable, or put it in again."""
