@@ -19,7 +19,8 @@ from messages.scene import Scene
 from messages.topics import Topic
 from messages.types import FingerPath, Fingertip, StereoPair
 from nodes.models.rigid import rotation_from_rpy
-from nodes.triangulator.node import Triangulator, TriangulatorParameters
+from nodes.triangulator.node import Triangulator
+from nodes.triangulator.parameters import TriangulatorParameters
 from nodes.twin.clutter import Clutter
 from nodes.twin.finger import FingerMotion
 from nodes.twin.pixels import Sensor, TwinCamera

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from messages.arrays import ColorImage, Transform, Triangles, Vector3, Vertices
 from messages.base import Message
+from messages.methods import Methods
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -350,6 +351,9 @@ class Scene(Message):
     finger: Finger
     working_range: WorkingRange
     tolerances: Tolerances
+    methods: Methods = Field(
+        default_factory=Methods, description="what nodes take that are told `auto`"
+    )
 
 
 class UnfitGeometryError(ValueError):

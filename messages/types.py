@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from messages import methods
 from messages.arrays import (
     ArraySpec,
     ColorImage,
@@ -28,8 +29,8 @@ from messages.arrays import (
 from messages.base import Message
 from messages.scene import Finite, NonNegative, Part, Positive
 
+Correction = methods.Correction
 Side = Literal["left", "right"]
-Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 Pattern = Literal["object", "grid", "checker", "white", "black", "places_x", "places_y"]
 Shading = Literal["soft", "flat"]
 StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "anaglyph"]

@@ -18,7 +18,8 @@ from messages.clock import VirtualClock
 from messages.scene import Scene, StereoCamera
 from messages.topics import Topic
 from messages.types import FingerPath, Fingertip, StereoPair, TwinFinger
-from nodes.triangulator.node import Triangulator, TriangulatorParameters
+from nodes.triangulator.node import Triangulator
+from nodes.triangulator.parameters import TriangulatorParameters
 from nodes.twin.clutter import touching_highlight
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from nodes.twin.pixels import Sensor, TwinCamera

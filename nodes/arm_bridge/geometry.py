@@ -14,6 +14,7 @@ from nodes.arm_bridge.kinematics import (
     JOINT_MAX_RAD,
     JOINT_MIN_RAD,
     JOINT_SPEED_RAD_PER_S,
+    JointsFor,
     forward,
     next_joints,
 )
@@ -45,9 +46,11 @@ def _transform(pose: Pose) -> Floats:
 class ArmGeometry:
     """Where an arm of the scene stands, how it holds its edge, and what limits it."""
 
-    def __init__(self, scene: Scene, side: Side) -> None:
+    def __init__(self, scene: Scene, side: Side, *, joints_for: JointsFor = next_joints) -> None:
+        """joints_for: from a flange pose and the present joints to the next joints."""
         self.side: Side = side
         self.left = side == "left"
+        self._joints_for = joints_for
         arm, other = scene.arms.left, scene.arms.right
         if not self.left:
             arm, other = other, arm
@@ -102,7 +105,7 @@ class ArmGeometry:
             motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
         )
         flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
-        return next_joints(self.base_from_world @ flange, present_rad)
+        return self._joints_for(self.base_from_world @ flange, present_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
         """The sheet at rest between this arm's edge and the other's."""

@@ -9,7 +9,7 @@ J2, J3, J5 about y; shoulder 300 mm up, upper arm 250 mm, elbow shift 90 mm back
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder, sin
@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from messages.methods import KinematicsMethod
 from messages.scene import Scene
 from nodes.methods import Family, Trial
 from nodes.models.rigid import (
@@ -31,6 +32,8 @@ from nodes.models.rigid import (
 from nodes.models.sheet import edge_poses, flange_pose
 
 Floats = NDArray[np.float64]
+JointsFor = Callable[[Floats, Floats], Floats]
+"""A flange pose (4, 4) in the base frame and the present joints (6,) to the next joints (6,)."""
 
 SHOULDER_HEIGHT_M = 0.3
 UPPER_ARM_M = 0.25
@@ -568,11 +571,17 @@ def _step_trials(
         )
 
 
-_METHODS: dict[str, Callable[[Floats, Floats], Floats]] = {
-    "closed-form": inverse_kinematics,
-    "closed-form-continuous": next_joints,
-    "damped-least-squares-2": partial(damped_least_squares, iterations=2),
-    "damped-least-squares-20": partial(damped_least_squares, iterations=20),
+STEPS: Mapping[KinematicsMethod, JointsFor] = {
+    "closed_form": inverse_kinematics,
+    "closed_form_continuous": next_joints,
+}
+"""What a bridge may step by; the others of the family know no joint ranges."""
+
+_METHODS: dict[str, JointsFor] = {
+    "closed_form": inverse_kinematics,
+    "closed_form_continuous": next_joints,
+    "damped_least_squares_2": partial(damped_least_squares, iterations=2),
+    "damped_least_squares_20": partial(damped_least_squares, iterations=20),
 }
 
 KINEMATICS = Family(

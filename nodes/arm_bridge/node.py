@@ -6,11 +6,13 @@ import asyncio
 from typing import ClassVar
 
 from messages.base import Header
+from messages.methods import KinematicsMethod, chosen
 from messages.scene import Scene
 from messages.types import Arming, ArmState, EStop, SheetTarget, Side
 from nodes.arm_bridge.control import ArmControl, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, Timing, goal_of
+from nodes.arm_bridge.kinematics import STEPS
 from nodes.arm_bridge.link import ArmLinkError, ArmSilentError
 from nodes.arm_bridge.link_drivers import link_for
 from nodes.arm_bridge.pacing import Pace
@@ -61,7 +63,10 @@ class ArmBridge(Node):
         given = self.parameters
         self._control.interrupt()
         other_side: Side = "right" if given.side == "left" else "left"
-        self._geometry = ArmGeometry(scene, given.side)
+        method: KinematicsMethod = chosen(
+            given.kinematics, scene.methods.kinematics, "closed_form_continuous"
+        )
+        self._geometry = ArmGeometry(scene, given.side, joints_for=STEPS[method])
         self._lookout = Lookout(self._geometry, ArmGeometry(scene, other_side))
         due_s = given.target_period_s or 1.0 / scene.camera.rate_hz
         self._timing = Timing(given.servo_lag_s, due_s, given.furthest_extrapolation_s)

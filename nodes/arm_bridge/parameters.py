@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from messages.methods import KinematicsMethod
 from messages.scene import NonNegative, Positive
 from messages.types import Side
 from nodes.arm_bridge.link_drivers import Driver
@@ -29,6 +30,9 @@ class ArmBridgeParameters(NodeParameters):
     stop_after_s: Positive = 0.1
     furthest_extrapolation_s: Positive = 0.06
     largest_lag_rad: Positive = 0.12
+    kinematics: KinematicsMethod | Literal["auto"] = Field(
+        default="auto", description="auto: as the scene's methods say, else closed_form_continuous"
+    )
     arming: Literal["by_command", "by_itself"] = Field(
         default="by_command",
         description="whether a person must say that it may move (flexsheet arms ready), at first "

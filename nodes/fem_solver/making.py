@@ -3,17 +3,50 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
+from messages.methods import SoftBodyMethod, chosen
 from messages.scene import Scene
 from nodes.fem_solver import body, precompute, precompute_table
 
-MethodChoice = Literal["auto", "linear", "nonlinear_table"]
+MethodChoice = SoftBodyMethod | Literal["auto"]
+"""`auto`: the nonlinear table if it is kept, else linear."""
+
+SKIN_SPACING_M = 0.003
+"""Where neither a parameter nor the scene says another."""
+
+
+def asked(
+    scene: Scene, method: MethodChoice, skin_spacing_m: float | Literal["auto"]
+) -> tuple[MethodChoice, float]:
+    """Method and skin spacing (m) for a scene, from a node's parameters.
+
+    A scene that chose the linear method gets it, even where a table is kept; one that chose the
+    table gets that where it is kept: minutes of work are begun by a parameter only.
+    """
+    choice = scene.methods.soft_body
+    by_scene_m = None if choice is None else choice.skin_spacing_m
+    spacing_m = chosen(skin_spacing_m, by_scene_m, SKIN_SPACING_M)
+    if method == "auto" and choice is not None and choice.method == "linear":
+        return "linear", spacing_m
+    return method, spacing_m
+
+
+def lacking(scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]) -> str:
+    """What a note goes on with where the scene chose a table that nobody made yet, else nothing."""
+    choice = scene.methods.soft_body
+    wanted = choice is not None and choice.method == "nonlinear_table" and method == "auto"
+    if choice is None or not wanted or len(made) > 1:
+        return ""
+    return (
+        "; the scene's nonlinear table is not made yet (flexsheet prepare SCENE "
+        f"--skin-spacing {choice.skin_spacing_m:g})"
+    )
 
 
 @dataclass(slots=True)
@@ -88,3 +121,7 @@ class Maker:
         workers = self.workers or os.cpu_count() or 1
         with precompute_table.local_processes(workers) as executor:
             yield executor, workers
+
+
+GIVEN = {one.name for one in fields(Maker) if one.init} - {"cache_dir", "skin_spacing_m"}
+"""What a maker takes of a node's parameters as it stands there."""

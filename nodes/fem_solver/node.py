@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from dataclasses import fields
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
@@ -15,7 +15,7 @@ from messages.types import Fingertip, Skin, SoftBody
 from nodes import cache
 from nodes.fem_solver import body, precompute
 from nodes.fem_solver.contact import Response
-from nodes.fem_solver.making import Maker, MethodChoice
+from nodes.fem_solver.making import GIVEN, SKIN_SPACING_M, Maker, MethodChoice, asked, lacking
 from nodes.fem_solver.pace import Pace
 from nodes.fem_solver.place import Entry
 from nodes.fem_solver.remaining import Remaining
@@ -25,18 +25,19 @@ from nodes.node import Input, Node, NodeParameters, Output
 class FemSolverParameters(NodeParameters):
     method: MethodChoice = Field(
         default="auto",
-        description="auto: the nonlinear table if it is in the cache, else linear; nonlinear_table "
-        "makes it, in minutes, in the background, if it is not there",
+        description="auto: the scene's, else the nonlinear table if it is in the cache, else "
+        "linear; nonlinear_table makes it, in minutes, in the background, if it is not there",
     )
-    skin_spacing_m: Positive = Field(
-        default=0.003, description="between skin nodes where fingers go; finer is dearer at set-up"
+    skin_spacing_m: Positive | Literal["auto"] = Field(
+        default="auto",
+        description="between skin nodes where fingers go; auto: the scene's, else 0.003",
     )
     linear_depth_m: Positive = Field(default=0.006, description="deeper pushes are out of range")
     largest_depth_m: Positive = Field(default=0.010, description="the skin never goes deeper")
     friction_ratio: NonNegative = Field(
         default=0.0,
         description="the finger sticks until it pulls along the skin by more than this share of "
-        "what it presses, then slips; 0: it slides freely; above 0 the linear method answers",
+        "its pressure, then slips; 0: it slides; above 0 the linear method answers",
     )
     step_budget_s: Positive = Field(
         default=0.004, description="answers later than this, five running, change the method"
@@ -65,9 +66,8 @@ class FemSolver(Node):
 
     async def setup(self) -> None:
         self._stop = threading.Event()
-        own = {field.name for field in fields(Maker) if field.init} - {"cache_dir"}
         folder = self.parameters.cache_dir or cache.default_cache_dir()
-        self._maker = Maker(cache_dir=folder, **self.parameters.model_dump(include=own))
+        self._maker = Maker(SKIN_SPACING_M, folder, **self.parameters.model_dump(include=GIVEN))
         self._making: asyncio.Task[None] | None = None
         self._remaining = Remaining()
         self._use([])
@@ -102,10 +102,10 @@ class FemSolver(Node):
         self._use([])
         self._forget()
         await self._end_making()
+        p, maker = self.parameters, self._maker
+        method, maker.skin_spacing_m = asked(scene, p.method, p.skin_spacing_m)
         try:
-            bodies = await asyncio.to_thread(
-                self._maker.bodies, scene, self.parameters.method, self._progress
-            )
+            bodies = await asyncio.to_thread(maker.bodies, scene, method, self._progress)
         except precompute.Interrupted:
             self.note = "precomputation interrupted"
             return
@@ -113,9 +113,9 @@ class FemSolver(Node):
             self.note = f"no soft body: {error}"
             raise
         self._use(bodies)
+        self.note += lacking(scene, method, bodies)
         self.skin.publish(bodies[0].skin, source_ns=header.source_ns)
-        wanted = self.parameters.method == "nonlinear_table" and not self.parameters.friction_ratio
-        if wanted and len(bodies) == 1:
+        if method == "nonlinear_table" and not p.friction_ratio and len(bodies) == 1:
             self._making = asyncio.create_task(self._make_table(scene, bodies[0]))
 
     async def _make_table(self, scene: Scene, linear: body.SceneBody) -> None:

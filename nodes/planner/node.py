@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from messages.base import Header
+from messages.methods import SheetForceMethod, chosen
 from messages.scene import Scene
 from messages.sheet_calibration import SheetCalibration, load_sheet_calibration
 from messages.types import Fingertip, SheetTarget, SoftBody
 from nodes.models.prediction import path_at
 from nodes.node import Input, Node, Output
+from nodes.planner.force_table import law_by
 from nodes.planner.lead import next_lead_s
 from nodes.planner.motion import Plan, Planned
 from nodes.planner.order import Order
@@ -37,7 +39,7 @@ class Planner(Node):
         self._first_step_s = 0.0
         given = self.parameters
         self._lead_s = FIRST_LEAD_S if given.lead_s is None else given.lead_s
-        self._late = 0
+        self._late, self._law = 0, ""
         path = given.sheet_calibration
         self._calibration: SheetCalibration | None = None
         if path is not None:
@@ -47,7 +49,13 @@ class Planner(Node):
         # An object that cannot be presented must not leave the last one's plan in force.
         self._plan = self._yielding = None
         self._plan = Plan(scene, self.parameters.settings())
-        law = law_for(scene.sheet, self._calibration)
+        if self._calibration is None:
+            method: SheetForceMethod = chosen(
+                self.parameters.sheet_force, scene.methods.sheet_force, "scaled"
+            )
+            law, self._law = law_by(scene, method, self.parameters.cache_dir)
+        else:
+            law, self._law = law_for(scene.sheet, self._calibration), "as calibrated"
         self._yielding = Yielding(scene, law, self.parameters.presents)
         self._first_step_s = 1.0 / scene.camera.rate_hz
         self._order = Order()
@@ -60,7 +68,8 @@ class Planner(Node):
     def _tell(self) -> None:
         late = f"{self._late} fingertips came out of order and were left out" if self._late else ""
         presented = self._yielding.note if self._yielding is not None else ""
-        self.note = "; ".join(filter(None, (presented, late)))
+        law = f"sheet's force: {self._law}"
+        self.note = "; ".join(filter(None, (presented, late, law)))
 
     def on_fingertip(self, fingertip: Fingertip, header: Header) -> None:
         plan, yielding = self._plan, self._yielding

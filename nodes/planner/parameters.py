@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field
 
+from messages.methods import SheetForceMethod
 from messages.scene import NonNegative, Positive
 from nodes.models.motion import SheetBounds
 from nodes.node import NodeParameters
@@ -30,6 +32,14 @@ class PlannerParameters(NodeParameters):
     )
     sheet_calibration: Path | None = Field(
         default=None, description="from calibrate sheet; null: ideal rubber of the scene's modulus"
+    )
+    sheet_force: SheetForceMethod | Literal["auto"] = Field(
+        default="auto",
+        description="by what ideal rubber is told; auto: as the scene's methods say, else scaled; "
+        "a calibration brings its own",
+    )
+    cache_dir: Path | None = Field(
+        default=None, description="of the sheet's force table; null: the user's cache"
     )
     touch_m: float = Field(default=0.0005, description="contact begins this near to the object")
     release_m: Positive = Field(default=0.003, description="contact ends this far from the object")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from messages.base import Header
+from messages.methods import chosen
 from messages.scene import Scene
 from messages.types import (
     ArmState,
@@ -48,7 +49,7 @@ class Renderer(Node):
         self._loop = asyncio.get_running_loop()
         self._screen = self._new_screen()
         self._painter: Painter | None = None
-        self._shown = Display(correction=self.parameters.correction, stereo=self.parameters.stereo)
+        self._shown = Display(correction="two_pass", stereo=self.parameters.stereo)
         self._due_ns = self._since_pixels = 0
         self._period_ns = int(1e9 / self.parameters.rate_hz)
 
@@ -61,13 +62,16 @@ class Renderer(Node):
             self._painter = None
         self._screen.open((scene.projector.width_px, scene.projector.height_px))
         given = self.parameters
-        dents = dent_cache.load(scene, given.cache_dir)
+        if self.display.message is None:
+            correction = chosen(given.correction, scene.methods.correction, "two_pass")
+            self._shown = self._shown.model_copy(update={"correction": correction})
         stage = Stage(
             scene,
             self._screen.context,
             spacing_m=given.spacing_m,
             samples=given.samples,
-            dents=dents,
+            dents=dent_cache.load(scene, given.cache_dir),
+            sheet_shape=chosen(given.sheet_shape, scene.methods.sheet_shape, "dents"),
         )
         lead = Lead(first_s=given.lead_s, light_s=given.light_s, period_s=self._screen.period_s)
         ports = Ports(**{name: self.inputs[name] for name in Ports.__slots__})

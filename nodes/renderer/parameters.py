@@ -7,8 +7,9 @@ from typing import Literal
 
 from pydantic import Field
 
+from messages.methods import Correction, SheetShapeMethod
 from messages.scene import NonNegative, Positive
-from messages.types import Correction, StereoMode
+from messages.types import StereoMode
 from nodes.node import NodeParameters
 from nodes.renderer.gl import SAMPLES
 
@@ -39,7 +40,15 @@ class RendererParameters(NodeParameters):
     samples: int = Field(
         default=SAMPLES, ge=0, le=16, description="of a pixel; fewer draw faster without a GPU"
     )
-    correction: Correction = Field(default="two_pass", description="until a display message")
+    correction: Correction | Literal["auto"] = Field(
+        default="auto",
+        description="until a display message; auto: as the scene's methods say, else two_pass",
+    )
+    sheet_shape: SheetShapeMethod | Literal["auto"] = Field(
+        default="auto",
+        description="what two_pass takes the sheet for; auto: as the scene's methods say, else "
+        "dents",
+    )
     cache_dir: Path | None = Field(
         default=None, description="of the sheet's dent shapes; null: the user's cache"
     )

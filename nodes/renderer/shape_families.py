@@ -21,7 +21,14 @@ from nodes.models.sheet.dents import triangles_of
 from nodes.models.sheet.membrane import push_path
 from nodes.renderer import dent_cache
 from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, flat_mesh, pyramid_mesh
+from nodes.renderer.sheet_mesh import (
+    FLAT_TO_M,
+    TRIANGLES_TO_M,
+    SheetMesh,
+    dented_mesh,
+    flat_mesh,
+    pyramid_mesh,
+)
 
 Floats = NDArray[np.float64]
 
@@ -37,9 +44,6 @@ PLACES: tuple[tuple[str, float, float], ...] = (
     ("near the free edge", 0.0, 0.35),
 )
 """Names, and x over the width, y over the height."""
-
-FLAT_TO_M, TRIANGLES_TO_M = 0.0005, 0.0035
-"""To these pushes the sheet is flat, or a pyramid, as far as a picture tells it."""
 
 
 def sheet_shape_family(judge: Judge) -> Family:

@@ -16,6 +16,9 @@ from nodes.renderer.sheet import Sheet
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
+FLAT_TO_M, TRIANGLES_TO_M = 0.0005, 0.0035
+"""To these pushes the sheet is flat, or a pyramid, as far as a picture tells it."""
+
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 """Triangles between neighbouring corners and the pushed point."""
 

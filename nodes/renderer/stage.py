@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from messages.methods import SheetShapeMethod
 from messages.scene import Mesh, Pose, Scene
 from messages.types import Display, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import apply, inverse, transform, transform_from_rpy
@@ -29,7 +30,16 @@ from nodes.renderer.lens import clip_lens
 from nodes.renderer.output import Image, both_eyes, pack
 from nodes.renderer.projection import Projection, Window
 from nodes.renderer.sheet import Sheet, screen_for
-from nodes.renderer.sheet_mesh import SheetMesh, dented_mesh, finer, lost_share, pyramid_mesh
+from nodes.renderer.sheet_mesh import (
+    FLAT_TO_M,
+    TRIANGLES_TO_M,
+    SheetMesh,
+    dented_mesh,
+    finer,
+    flat_mesh,
+    lost_share,
+    pyramid_mesh,
+)
 from nodes.renderer.surface import Follower, surface_of
 
 Floats = NDArray[np.float64]
@@ -75,6 +85,7 @@ class Stage:
         spacing_m: float,
         samples: int = SAMPLES,
         dents: DentShapes | None = None,
+        sheet_shape: SheetShapeMethod = "dents",
     ) -> None:
         """dents: of the scene's sheet, for the two-pass projection; without them a pushed sheet is
         taken for four triangles.  ValueError for a lens that folds the projector's picture.
@@ -102,7 +113,7 @@ class Stage:
             self._surface.rest_world_m, self._surface.triangles, self._surface.normals_world
         )
         self.canvas.set_paint(self._paint())
-        self.dents, self.note = dents, ""
+        self.dents, self.sheet_shape, self.note = dents, sheet_shape, ""
         self.lost_share = 0.0
         self._box_world = _box_around(self._surface.rest_world_m)
         window = self._window(scene.eyes.centre_world_m)
@@ -276,17 +287,32 @@ class Stage:
         return pack(pictures[0], pictures[-1], display.stereo, swap_eyes=display.swap_eyes)
 
     def sheet_mesh(self, sheet: Sheet) -> SheetMesh:
-        """The sheet as it is dented; as four triangles as long as no dent shapes are at hand.
+        """The sheet as `sheet_shape` has it; of dents, four triangles as long as no dent shapes are
+        at hand.
 
         `note` says where it is not quite so.
         """
-        if self.dents is None:
-            self.note = NO_DENTS
-            mesh = pyramid_mesh(sheet)
+        if self.sheet_shape != "dents" or self.dents is None:
+            self.note = NO_DENTS if self.sheet_shape == "dents" else self._too_deep(sheet)
+            mesh = flat_mesh(sheet) if self.sheet_shape == "flat" else pyramid_mesh(sheet)
             return mesh if self._lens is None else finer(mesh)
         mesh = dented_mesh(sheet, self.dents)
         self.note = mesh.note
         return mesh
+
+    def _too_deep(self, sheet: Sheet) -> str:
+        """Of a push past what the chosen shape stands for; empty within it."""
+        if sheet.pushed_point is None:
+            return ""
+        depth_m = -float(apply(inverse(sheet.world_from_sheet), sheet.pushed_point)[2])
+        to_m = FLAT_TO_M if self.sheet_shape == "flat" else TRIANGLES_TO_M
+        if depth_m <= to_m:
+            return ""
+        told = "flat" if self.sheet_shape == "flat" else "four triangles"
+        return (
+            f"pushed {1e3 * depth_m:.0f} mm: taken for {told}, which holds to {1e3 * to_m:g} mm; "
+            "sheet_shape: dents goes further"
+        )
 
     def _tell_folds(self, mesh: SheetMesh, eye: Floats) -> None:
         """Measure and note what of the sheet gets no light because it is folded."""

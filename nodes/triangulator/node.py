@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
-from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
 
 from messages.base import Header
 from messages.calibration import StereoCalibration, load_calibration
-from messages.scene import Positive, Scene
+from messages.methods import chosen
+from messages.scene import Scene
 from messages.types import Fingertip, FingertipReason, StereoPair
-from nodes.node import Input, Node, NodeParameters, Output
+from nodes.node import Input, Node, Output
 from nodes.triangulator.company import Company
 from nodes.triangulator.filters import TRACKING_METHODS
 from nodes.triangulator.fingertip import Eyesight, look
 from nodes.triangulator.mark import MARK_METHODS, MarkLooks
 from nodes.triangulator.pairs import refuse_other_pictures
+from nodes.triangulator.parameters import TriangulatorParameters
 from nodes.triangulator.skew import sighting_unskewed
 from nodes.triangulator.subpixel import PixelNoise
 from nodes.triangulator.tracking import Tracker, TrackingSettings
@@ -27,34 +26,6 @@ from nodes.triangulator.triangulation import TRIANGULATION_METHODS, Measured, St
 
 AHEAD_STEP_S = 0.01
 """Between the points of the predicted path; a swing of 10 Hz is told ten times."""
-
-
-class TriangulatorParameters(NodeParameters):
-    """How the mark is found, triangulated and tracked."""
-
-    calibration: Path | None = Field(
-        default=None, description="file of `flexsheet calibrate stereo`; null: the scene's optics"
-    )
-    mark: Literal["moments", "weighted_centroid", "subpixel_fit"] = "subpixel_fit"
-    triangulation: Literal["midpoint", "dlt", "optimal"] = "dlt"
-    mark_noise_px: Positive | None = Field(
-        default=None, description="of a mark's centre; null: as the method states for each"
-    )
-    mark_radius_m: Positive = 0.003
-    max_reprojection_px: Positive = 1.5
-    mark_min_contrast: Positive = 60.0
-    mark_min_area_px: Annotated[int, Field(ge=1)] = 4
-    mark_max_area_px: Annotated[int, Field(ge=1)] = 1500
-    window_half_px: Annotated[int, Field(ge=8)] = 16
-    tracking: Literal[
-        "none", "exponential", "one_euro", "constant_velocity", "constant_acceleration", "hand"
-    ] = "hand"
-    max_acceleration_m_per_s2: Positive = Field(
-        default=60.0, description="of a finger; marks that go sharper are not followed"
-    )
-    forget_after_s: Positive = 0.1
-    confirm_frames: Annotated[int, Field(ge=1)] = 3
-    ahead_s: Positive = Field(default=0.12, description="how far ahead fingertips are predicted")
 
 
 class Triangulator(Node):
@@ -79,6 +50,11 @@ class Triangulator(Node):
         self.geometry = StereoGeometry.of(scene.camera, self.calibration)
         self.volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
         self.reasons: Counter[FingertipReason] = Counter()
+        mark = chosen(p.mark, scene.methods.mark, "subpixel_fit")
+        triangulation = chosen(p.triangulation, scene.methods.triangulation, "dlt")
+        tracking = chosen(p.tracking, scene.methods.tracking, "hand")
+        self.methods = f"{mark}, {triangulation}, {tracking}"
+        self.filter = TRACKING_METHODS[tracking](scene.finger.max_speed_m_per_s)
         self.eyesight = Eyesight(
             looks=MarkLooks(
                 min_contrast=p.mark_min_contrast,
@@ -86,8 +62,8 @@ class Triangulator(Node):
                 max_area_px=p.mark_max_area_px,
                 window_half_px=p.window_half_px,
             ),
-            refine=MARK_METHODS[p.mark],
-            triangulate=TRIANGULATION_METHODS[p.triangulation],
+            refine=MARK_METHODS[mark],
+            triangulate=TRIANGULATION_METHODS[triangulation],
             noise_px=p.mark_noise_px,
             mark_radius_m=p.mark_radius_m,
             max_reprojection_px=p.max_reprojection_px,
@@ -135,13 +111,13 @@ class Triangulator(Node):
         self._note()
 
     def _begin(self, epoch: int) -> None:
-        self.epoch, method = epoch, TRACKING_METHODS[self.parameters.tracking]
-        self.tracker = Tracker(method(self.tracking.max_speed_m_per_s), self.tracking)
+        self.epoch = epoch
+        self.tracker = Tracker(self.filter, self.tracking)
         self.company = Company()
 
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
-        self.note = f"{counts}; {self.late} late"
+        self.note = f"{counts}; {self.late} late; by {self.methods}"
 
     def _message(self, at_ns: int, reason: FingertipReason, measured: Measured | None) -> Fingertip:
         tracker = self.tracker
