@@ -17,7 +17,7 @@ from launch.machine import machine_name
 from launch.supervisor import git_state
 from launch.svg import COLOURS, INK, drawn_for_pages, save_svg
 from messages.scene import Scene
-from nodes.methods import Family, Point, measure, pareto_front
+from nodes.methods import Family, Point, Trial, measure, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -55,10 +55,21 @@ def family_named(name: str) -> Family:
         near = get_close_matches(name, FAMILIES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(FAMILIES)}"
         raise UnknownFamilyError(f'unknown family "{name}"{hint}')
-    module_name, _, attribute = FAMILIES[name].partition(":")
+    return family_at(FAMILIES[name])
+
+
+def family_at(place: str) -> Family:
+    """The family that `module:NAME` describes."""
+    module_name, _, attribute = place.partition(":")
     family = getattr(import_module(module_name), attribute)
     assert isinstance(family, Family)
     return family
+
+
+def git_commit() -> str | None:
+    """The commit of this code; None where nobody knows it."""
+    commit: str | None = json.loads(git_state(ROOT))["commit"]
+    return commit
 
 
 def measure_family(
@@ -67,9 +78,10 @@ def measure_family(
     *,
     repeats: int = REPEATS,
     progress: Callable[[str], None] = lambda text: None,
+    wanted: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure every trial of the family; `progress` is told of each, and what is left of what has
-    to be worked out before."""
+    """Measure every trial of the family that is wanted; `progress` is told of each, and what is
+    left of what has to be worked out before."""
     begun, last = time.monotonic(), -1
 
     def told(done: int, total: int) -> None:
@@ -84,7 +96,7 @@ def measure_family(
 
     family.prepare(scene, told)
     points = []
-    for trial in family.trials(scene):
+    for trial in filter(wanted, family.trials(scene)):
         progress(f"{trial.method} {trial.case}")
         points.append(measure(trial, repeats=repeats))
     return points

@@ -28,6 +28,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "demo": ("demo",),
     "try": ("trying",),
     "chart": ("chart",),
+    "tune": ("tune",),
     "calibrate": ("calibrate", "calibrate_arms", "calibrate_projector", "calibrate_sheet"),
     "prepare": ("prepare",),
     "keys": ("keys",),

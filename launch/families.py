@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 
 import numpy as np
 
 from launch.experiments.stroke import stroke_path
 from launch.twin_sheet import twin_errors, twin_force, twin_points
-from messages.scene import Scene
+from messages.scene import Cylinder, Scene
 from messages.types import FingerPath
+from nodes.planner import force_table
 from nodes.planner.sheet_force import sheet_force_family
 from nodes.renderer.families import correction_family
 from nodes.renderer.shape_families import sheet_shape_family
@@ -24,8 +26,11 @@ RESTING = ("hold",)
 
 
 def finger_motions(scene: Scene) -> Mapping[str, Motion]:
-    """The paper's stroke and some gestures, as the twin's finger makes them."""
-    paths = {"stroke": stroke_path(scene, 10.0)}
+    """The paper's stroke, where the object is its cylinder, and some gestures, as the twin's finger
+    makes them."""
+    paths: dict[str, FingerPath] = {}
+    if isinstance(scene.object.geometry, Cylinder):
+        paths["stroke"] = stroke_path(scene, 10.0)
     paths |= {name: GESTURES[name](scene) for name in TRACKED_GESTURES}
     return {name: _motion(scene, path, resting=name in RESTING) for name, path in paths.items()}
 
@@ -47,5 +52,8 @@ def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
 
 
 TRACKING = tracking_family(finger_motions)
-SHEET_FORCE = sheet_force_family(twin_force)
+true_force = lru_cache(maxsize=1024)(twin_force)
+SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_make(scene, None))
+SHEET_LAWS = sheet_force_family(true_force, None)
+"""Those that are at hand at once."""
 SHEET_SHAPE = sheet_shape_family(twin_points)

@@ -31,6 +31,7 @@ class Trial:
     case: what was asked; methods are compared at equal cases.
     error: takes the result of `run`, gives the error in the family's unit.
     in_range: whether the method's stated range covers this case.
+    in_scene: whether the scene's working range asks for this case; others show where methods end.
     size: how large the method made its work of it ({"skin_nodes": 1210}), reported with the case.
     also: further figures of what `run` returned, in units that their names tell.
     doubts: how unsure the reference itself is, of the error ("error") and of further figures.
@@ -41,6 +42,7 @@ class Trial:
     run: Callable[[], Any]
     error: Callable[[Any], float]
     in_range: bool
+    in_scene: bool = True
     size: Case = field(default_factory=dict)
     also: Callable[[Any], Mapping[str, float]] = lambda result: {}
     doubts: Mapping[str, float] = field(default_factory=dict)
@@ -74,7 +76,7 @@ class Family:
 class Point:
     """One method at one case: how long it takes and how wrong it is.
 
-    params: the case and the method's size together.  also, doubts: as of its trial.
+    params: the case and the method's size together.  in_scene, also, doubts: as of its trial.
     """
 
     method: str
@@ -84,6 +86,7 @@ class Point:
     p99_s: float
     error: float
     in_range: bool
+    in_scene: bool = True
     also: Mapping[str, float] = field(default_factory=dict)
     doubts: Mapping[str, float] = field(default_factory=dict)
 
@@ -109,9 +112,16 @@ def measure(trial: Trial, *, repeats: int) -> Point:
         p99_s=float(np.quantile(durations, 0.99)),
         error=float(trial.error(result)),
         in_range=trial.in_range,
+        in_scene=trial.in_scene,
         also=dict(trial.also(result)),
         doubts=dict(trial.doubts),
     )
+
+
+def up_to(largest: float, usual: Sequence[float]) -> tuple[float, ...]:
+    """The usual values that a working range holds, and its end."""
+    within = [value for value in usual if value < largest * (1.0 - 1e-6)]
+    return (*within, largest)
 
 
 def pareto_front(points: Sequence[Point]) -> list[str]:

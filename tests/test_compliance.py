@@ -297,20 +297,12 @@ def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
     assert "cannot be read" in str(result.exception)
 
 
-def test_every_law_is_charted_within_the_scenes_range(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        sheet_force,
-        "membrane_table",
-        lambda rubber, **axes: TableLaw(
-            ScaledLaw(rubber),
-            axes["stretches"],
-            np.array([0.002, 0.05]),
-            axes["xs_m"],
-            axes["ys_m"],
-            np.ones((2, 2, 3, 3)),
-        ),
+def test_every_law_is_charted_within_the_scenes_range() -> None:
+    axes = np.array([1.02, 1.08]), np.array([0.002, 0.05]), np.array([0.0, 0.06])
+    table = TableLaw(
+        ScaledLaw(sheet_force.rubber_of(SHEET)), *axes, np.array([0.0, 0.09]), np.ones((2, 2, 2, 2))
     )
-    family = sheet_force.sheet_force_family(lambda *asked: 2.0)
+    family = sheet_force.sheet_force_family(lambda *asked: 2.0, lambda scene: table)
     trials = list(family.trials(SCENE))
     assert {trial.method for trial in trials} == set(family.methods)
     assert family.tolerance(SCENE) == pytest.approx(10.0)

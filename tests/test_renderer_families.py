@@ -23,6 +23,7 @@ def points() -> list[Point]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(dent_cache, "load_or_solve", lambda scene, folder: few_dents())
         patch.setattr(families, "CASES", ((-50, 0), (0, 25)))
+        patch.setattr(families, "scene_cases", lambda scene: ())
         patch.setattr(families, "SIZES_PX", ((640, 480),))
         return [measure(trial, repeats=1) for trial in family.trials(SCENE)]
 

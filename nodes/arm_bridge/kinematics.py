@@ -10,7 +10,7 @@ J2, J3, J5 about y; shoulder 300 mm up, upper arm 250 mm, elbow shift 90 mm back
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder, sin
 from typing import Literal, NamedTuple, get_args
@@ -551,7 +551,8 @@ def _trials(scene: Scene) -> Iterable[Trial]:
         wrist = pose[:3, 3] - FLANGE_M * pose[:3, 2]
         turned = rotation_from_vector(0.02 * axis) @ pose[:3, :3]
         wanted = transform(turned, wrist + FLANGE_M * turned[:, 2])
-        yield from _step_trials({"past_singularity_deg": past_deg}, start, wanted, edge)
+        for trial in _step_trials({"past_singularity_deg": past_deg}, start, wanted, edge):
+            yield replace(trial, in_scene=False)
 
 
 def _step_trials(

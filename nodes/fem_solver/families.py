@@ -37,7 +37,7 @@ from nodes.fem_solver.mesh import boundary_faces
 from nodes.fem_solver.place import Push
 from nodes.fem_solver.precompute import Need, SoftBodyModel, load_or_compute
 from nodes.fem_solver.pushes import PushJob, Site
-from nodes.methods import Family, Progress, Trial
+from nodes.methods import Family, Progress, Trial, up_to
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -298,18 +298,29 @@ def _silent(done: int, total: int) -> None:
 
 
 def charted(scene: Scene) -> Charted:
-    """The chart of a scene, all of it, with the user's cache."""
+    """The chart of a scene's working range, all of it, with the user's cache."""
+    deepest_m = scene.working_range.push_depth_m
     return Charted(
         scene,
         default_cache_dir(),
-        depths_m=DEPTHS_M,
+        depths_m=up_to(deepest_m, DEPTHS_M),
         linear_m=LINEAR_SPACINGS_M,
         table_m=TABLE_SPACINGS_M,
-        newton_m=NEWTON_DEPTHS_M,
-        peers_m=PEER_DEPTHS_M,
+        newton_m=[depth for depth in NEWTON_DEPTHS_M if depth <= deepest_m],
+        peers_m=[depth for depth in PEER_DEPTHS_M if depth <= deepest_m],
         focused=FOCUSED_RATIOS,
         even_m=EVEN_SPACINGS_M,
     )
+
+
+def linear_only(scene: Scene) -> Charted:
+    """Of the chart, what a node can answer by at once."""
+    return replace(charted(scene), table_m={}, newton_m=(), peers_m=())
+
+
+def tables_only(scene: Scene) -> Charted:
+    """Of the chart, what a node can answer by that takes minutes to make."""
+    return replace(charted(scene), linear_m={}, newton_m=(), peers_m=())
 
 
 SOFT_BODY = Family(
@@ -331,4 +342,16 @@ SOFT_BODY = Family(
     tolerance=lambda scene: 1e3 * scene.tolerances.skin_m,
     along="depth_mm",
     prepare=lambda scene, told: charted(scene).prepare(told),
+)
+SOFT_BODY_LINEAR = replace(
+    SOFT_BODY,
+    methods=tuple(LINEAR_SPACINGS_M),
+    trials=lambda scene: linear_only(scene).trials(),
+    prepare=lambda scene, told: linear_only(scene).prepare(told),
+)
+SOFT_BODY_TABLES = replace(
+    SOFT_BODY,
+    methods=tuple(TABLE_SPACINGS_M),
+    trials=lambda scene: tables_only(scene).trials(),
+    prepare=lambda scene, told: tables_only(scene).prepare(told),
 )

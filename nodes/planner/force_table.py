@@ -52,7 +52,9 @@ def load(scene: Scene, cache_dir: Path | None) -> TableLaw | None:
     kept = load_arrays(file_of(scene, cache_dir))
     if kept is None or not kept.keys() >= set(KEPT):
         return None
-    return TableLaw(ScaledLaw(rubber_of(scene.sheet)), *(kept[name] for name in KEPT))
+    stretches, depths_m, xs_m, ys_m, ratios = (kept[name] for name in KEPT)
+    base = ScaledLaw(rubber_of(scene.sheet))
+    return TableLaw(base, stretches, depths_m, xs_m, ys_m, ratios)
 
 
 def load_or_make(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene, SheetSpec
 from messages.sheet_calibration import SheetCalibration, refuse_other_sheet
-from nodes.methods import Family, Trial
+from nodes.methods import Family, Trial, up_to
 from nodes.models.sheet.fit import law_of
 from nodes.models.sheet.laws import (
     CubicLaw,
@@ -108,41 +108,35 @@ CHART_PLACES: tuple[tuple[str, float, float], ...] = (
 """Names, and x over the width, y over the height."""
 
 
-def sheet_force_family(judge: Judge) -> Family:
-    """Every law at the scene's stretches, slack and at the arms' limit, over depths and places."""
+TableOf = Callable[[Scene], TableLaw]
+
+
+def sheet_force_family(judge: Judge, table_of: TableOf | None) -> Family:
+    """Every law at the scene's stretches, slack and at the arms' limit, over depths and places.
+
+    table_of: makes the table, or has it; None: without the laws that take minutes.
+    """
     return Family(
         name="sheet-force",
         unit="%",
         reference="the twin's membrane",
         methods=("linear", "cubic", "scaled", "table", "membrane"),
-        trials=partial(_trials, judge),
+        trials=partial(_trials, judge, table_of),
         tolerance=lambda scene: 100.0 * scene.tolerances.force_ratio,
     )
 
 
-def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
+def _trials(judge: Judge, table_of: TableOf | None, scene: Scene) -> Iterator[Trial]:
     sheet, radius = scene.sheet, scene.finger.radius_m
     rubber = rubber_of(sheet)
     middle = 0.5 * (sheet.min_stretch_ratio + sheet.max_stretch_ratio)
-    table = membrane_table(
-        rubber,
-        stretches=np.array([sheet.min_stretch_ratio, sheet.max_stretch_ratio]),
-        xs_m=rubber.width_m * np.array([0.0, 0.13, 0.25]),
-        ys_m=rubber.height_m * np.array([0.0, 0.19, 0.36]),
-        finger_radius_m=radius,
-    )
-    laws: tuple[SheetLaw, ...] = (
-        LinearLaw(rubber),
-        CubicLaw(rubber),
-        ScaledLaw(rubber),
-        table,
-        MembraneLaw(rubber),
-    )
+    laws: list[SheetLaw] = [LinearLaw(rubber), CubicLaw(rubber), ScaledLaw(rubber)]
+    if table_of is not None:
+        laws += [table_of(scene), MembraneLaw(rubber)]
     stretches = (1.0, middle, sheet.max_stretch_ratio)
-    for stretch, depth, (where, x, y) in product(stretches, CHART_DEPTHS_M, CHART_PLACES):
+    depths_m = up_to(scene.working_range.push_depth_m, CHART_DEPTHS_M)
+    for stretch, depth, (where, x, y) in product(stretches, depths_m, CHART_PLACES):
         if where != "centre" and stretch != middle:
-            continue
-        if depth > scene.working_range.push_depth_m:
             continue
         place = (x * rubber.width_m, y * rubber.height_m)
         true_n = judge(sheet, stretch, depth, place, radius)
@@ -162,6 +156,7 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
                 ),
                 error=partial(_error_percent, true_n=true_n),
                 in_range=not law.outside(stretch, depth, place_m=place, finger_radius_m=radius),
+                in_scene=stretch >= sheet.min_stretch_ratio,
             )
 
 

@@ -9,16 +9,17 @@ judge shares no code with the renderer, and whoever asks for the family brings i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene, cylinder_of
+from messages.scene import Cylinder, Scene, cylinder_of
 from messages.types import Correction, Display, Pattern
 from nodes.methods import Case, Family, Trial
 from nodes.models.rigid import rotation_from_vector, transform
+from nodes.models.shapes import make_shape
 from nodes.models.sheet import edge_poses
 from nodes.renderer import dent_cache
 from nodes.renderer.gl import Look, headless_context
@@ -26,6 +27,7 @@ from nodes.renderer.output import Image
 from nodes.renderer.sheet import Sheet, sheet_between
 from nodes.renderer.sheet_mesh import SheetMesh, flat_mesh, pyramid_mesh
 from nodes.renderer.stage import Stage, transform_of
+from nodes.renderer.surface import surface_of
 
 Floats = NDArray[np.float64]
 
@@ -91,13 +93,35 @@ def rolled_on(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None
     """world_from_sheet tangent to the cylinder there.
 
     place_m: (x, y) of the sheet where it touches; None: where it would if it had rolled there
-    without slip from the upright pose.
+    without slip from the upright pose.  Any other object is touched where its skin reaches out
+    farthest, and by the sheet's middle.
     """
+    if not isinstance(scene.object.geometry, Cylinder):
+        return _laid_on(scene, tilt_rad, place_m or (0.0, 0.0))
     radius = cylinder_of(scene).radius_m
     axis = transform_of(scene.object.world_from_object)[:3, 3]
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
     x, y = (0.0, -radius * tilt_rad) if place_m is None else place_m
     return transform(rotation, axis + rotation @ np.array([-x, -y, radius]))
+
+
+def _laid_on(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> Floats:
+    geometry = scene.object.geometry
+    skin = surface_of(
+        geometry,
+        make_shape(dict(geometry)),
+        world_from_object=transform_of(scene.object.world_from_object),
+        spacing_m=SPACING_M,
+    ).rest_world_m
+    rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
+    foremost = skin[(skin @ rotation[:, 2]).argmax()]
+    return transform(rotation, foremost - rotation @ np.array([*place_m, 0.0]))
+
+
+def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
+    """The ends of the scene's working range, as `CASES`."""
+    tilt = round(float(np.degrees(scene.working_range.tilt_rad)), 1)
+    return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 
 
 def with_projector_of(scene: Scene, width_px: int, height_px: int) -> Scene:
@@ -119,10 +143,12 @@ def with_projector_of(scene: Scene, width_px: int, height_px: int) -> Scene:
 
 def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
     dents, context = dent_cache.load_or_solve(scene, None), headless_context()
+    largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
     for size in SIZES_PX:
         shown = with_projector_of(scene, *size)
         stage = Stage(shown, context, spacing_m=SPACING_M, dents=dents)
-        for tilt_deg, push_mm in CASES if size == SIZES_PX[0] else LARGE_CASES:
+        cases = (*CASES, *scene_cases(scene)) if size == SIZES_PX[0] else LARGE_CASES
+        for tilt_deg, push_mm in dict.fromkeys(cases):
             if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
                 continue
             case: Case = {
@@ -132,6 +158,7 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
                 "height_px": size[1],
             }
             sheet, judgement = _situation(shown, judge, tilt_deg=tilt_deg, push_mm=push_mm)
+            in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
             for method in METHODS:
                 yield Trial(
                     method=method,
@@ -139,6 +166,7 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
                     run=partial(draw_stereo, stage, method, sheet),
                     error=partial(_error_mm, stage, method, sheet, judgement),
                     in_range=covers(method, tilt_deg=tilt_deg, push_mm=push_mm),
+                    in_scene=in_scene,
                 )
         stage.release()
     context.release()
@@ -146,7 +174,8 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
 
 def _situation(
     scene: Scene, judge: Judge, *, tilt_deg: float, push_mm: float
-) -> tuple[Sheet, Judgement]:
+) -> tuple[Sheet, Callable[[], Judgement]]:
+    """The sheet as it is believed to be, and, worked out when it is first asked for, its judge."""
     pose = rolled_on(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
@@ -158,7 +187,7 @@ def _situation(
         finger_tip=tip,
     )
     assert believed is not None
-    return believed, judge(scene, *edges, tip)
+    return believed, cache(lambda: judge(scene, *edges, tip))
 
 
 def draw_stereo(stage: Stage, method: str, sheet: Sheet) -> None:
@@ -192,9 +221,11 @@ def places_pictures(stage: Stage, method: str, sheet: Sheet) -> tuple[Image, Ima
 PLACES: tuple[Pattern, Pattern] = ("places_x", "places_y")
 
 
-def _error_mm(stage: Stage, method: str, sheet: Sheet, judgement: Judgement, _drawn: None) -> float:
+def _error_mm(
+    stage: Stage, method: str, sheet: Sheet, judgement: Callable[[], Judgement], _drawn: None
+) -> float:
     """Root mean square of all points seen; infinite when none is.  The floor corrects nothing."""
-    errors_m = judgement(*places_pictures(stage, method, sheet))
+    errors_m = judgement()(*places_pictures(stage, method, sheet))
     return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
 
 

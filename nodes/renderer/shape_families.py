@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
 from messages.scene import Scene
-from nodes.methods import Case, Family, Trial
+from nodes.methods import Case, Family, Trial, up_to
 from nodes.models.sheet import edge_poses
 from nodes.models.sheet.dents import triangles_of
 from nodes.models.sheet.membrane import push_path
@@ -36,7 +36,7 @@ Judge = Callable[[Scene, Floats, Floats, Floats], Floats]
 """Points (n, 3) of the true sheet in the world, between two edges and under a fingertip (3,)."""
 
 METHODS = ("flat", "four_triangles", "dents", "membrane")
-DEPTHS_M = (0.01, 0.02, 0.035, 0.05)
+DEPTHS_M = (0.002, 0.01, 0.02, 0.035, 0.05)
 PLACES: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
     ("off-centre", 0.17, 0.21),
@@ -64,8 +64,9 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
     spec = scene.sheet
     middle = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio)
     stretches = (spec.min_stretch_ratio, middle, spec.max_stretch_ratio)
-    for stretch, depth, (where, x, y) in product(stretches, DEPTHS_M, PLACES):
-        if depth > scene.working_range.push_depth_m or (where != "centre" and stretch != middle):
+    depths_m = up_to(scene.working_range.push_depth_m, DEPTHS_M)
+    for stretch, depth, (where, x, y) in product(stretches, depths_m, PLACES):
+        if where != "centre" and stretch != middle:
             continue
         tip = np.array([x * spec.width_m, y * spec.height_m, -depth])
         edges = edge_poses(np.eye(4), stretch * spec.width_m)

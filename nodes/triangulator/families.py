@@ -39,10 +39,13 @@ LARGEST_NOISE_PX = 0.1
 def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
     """Points in slabs of the finger's volume, seen with pixel noise, by rigs of several baselines.
 
-    In range is what a mark's noise and at least the scene's baseline give.
+    In range is what a mark's noise and at least the scene's baseline give; the scene asks for its
+    own baseline (the nearest to it) and for no more noise than it leaves to the mark.
     """
     low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
     own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
+    nearest_m = min(BASELINES_M, key=lambda baseline_m: abs(baseline_m - own_m))
+    allowed_px = max(min(NOISES_PX), _mark_tolerance_px(scene))
     for baseline_m in BASELINES_M:
         changed = scene.camera.right_from_left.copy()
         changed[:3, 3] *= baseline_m / own_m
@@ -63,9 +66,16 @@ def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
                     "baseline_mm": 1e3 * baseline_m,
                 }
                 in_range = baseline_m >= own_m and noise_px <= LARGEST_NOISE_PX
+                in_scene = baseline_m == nearest_m and noise_px <= allowed_px
                 for name in TRIANGULATION_METHODS:
                     yield _triangulation_trial(
-                        name, case, geometry.normalize(*seen), geometry, truth, in_range=in_range
+                        name,
+                        case,
+                        geometry.normalize(*seen),
+                        geometry,
+                        truth,
+                        in_range=in_range,
+                        in_scene=in_scene,
                     )
 
 
@@ -77,6 +87,7 @@ def _triangulation_trial(
     truth: Floats,
     *,
     in_range: bool,
+    in_scene: bool,
 ) -> Trial:
     method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
 
@@ -94,6 +105,7 @@ def _triangulation_trial(
         run=lambda: method(left[:1], right[:1], rig),
         error=error_mm,
         in_range=in_range,
+        in_scene=in_scene,
     )
 
 
@@ -106,6 +118,7 @@ TRIANGULATION = Family(
     tolerance=lambda scene: 1e3 * scene.tolerances.fingertip_m,
 )
 
+MARK_RADIUS_M = 0.003
 MARK_PICTURES = 40
 PICTURE_PX = 57
 RAYS = 5
@@ -189,10 +202,25 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
     return float(np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1])))
 
 
+def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
+    """The mark where the sheet is, resting and at the scene's speed, lit from the front and from
+    the side; as `MARK_CASES`."""
+    left_from_world = StereoGeometry.of(scene.camera).left_from_world
+    px_per_m = scene.camera.left.fx_px / float(rigid.apply(left_from_world, np.zeros(3))[2])
+    radius_px = round(MARK_RADIUS_M * px_per_m, 2)
+    motion_m = scene.working_range.speed_m_per_s * scene.camera.exposure_s
+    motions = (0.0, round(motion_m * px_per_m, 2))
+    return tuple(
+        (radius_px, 1.0, motion_px, slope) for motion_px in motions for slope in (0.0, 3.0)
+    )
+
+
 def _mark_trials(scene: Scene) -> Iterator[Trial]:
-    """Discs all over the pixel grid, moving in all directions."""
-    for radius_px, level, motion_px, slope in MARK_CASES:
-        sensor = PixelNoise()
+    """Discs all over the pixel grid, moving in all directions; their noise is told as multiples of
+    the scene's sensor's."""
+    asked = _scene_cases(scene)
+    for radius_px, level, motion_px, slope in dict.fromkeys((*asked, *MARK_CASES)):
+        sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
         noise = PixelNoise(level * sensor.read_levels, sensor.photons_per_level / level**2)
         random = np.random.default_rng(1)
         centres = PICTURE_PX // 2 + random.uniform(-0.5, 0.5, (MARK_PICTURES, 2))
@@ -212,7 +240,16 @@ def _mark_trials(scene: Scene) -> Iterator[Trial]:
         }
         for name in MARK_METHODS:
             in_range = radius_px >= 3.0 and level <= 2.0 and motion_px <= 4.0
-            yield _mark_trial(name, case, pictures, centres, bound_px=bound_px, in_range=in_range)
+            in_scene = (radius_px, level, motion_px, slope) in asked
+            yield _mark_trial(
+                name,
+                case,
+                pictures,
+                centres,
+                bound_px=bound_px,
+                in_range=in_range,
+                in_scene=in_scene,
+            )
 
 
 def _mark_trial(
@@ -223,6 +260,7 @@ def _mark_trial(
     *,
     bound_px: float,
     in_range: bool,
+    in_scene: bool,
 ) -> Trial:
     looks, noise, refine = MarkLooks(), PixelNoise(), MARK_METHODS[name]
 
@@ -245,6 +283,7 @@ def _mark_trial(
         run=lambda: marks_in(pictures[0]),
         error=error_px,
         in_range=in_range,
+        in_scene=in_scene,
         size={"bound_px": bound_px},
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ LEADS_S = (0.0, 0.02, 0.05)
 """At the exposure; for the picture; for the arms, whose servos trail."""
 
 WARM_UP_S = 0.4
+SPEED_STEP_S = 0.02
+FASTER = 1.5
+"""Over the scene's speed: a motion's unsteadiness and its starts come on top of that."""
 WITHOUT_VELOCITY = ("none", "exponential")
 """Their range is a finger that rests; what was just measured is also right of one that moves."""
 
@@ -35,6 +38,14 @@ class Motion:
     path: TruePath
     duration_s: float
     resting: bool
+
+    @property
+    def fast(self) -> float:
+        """The speed (m/s) that what is judged seldom exceeds: a tenth of the time."""
+        times = np.arange(WARM_UP_S, self.duration_s, SPEED_STEP_S)
+        points = np.array([self.path(float(time)) for time in times])
+        ways = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        return float(np.quantile(ways, 0.9)) / SPEED_STEP_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +106,14 @@ def tracking_family(motions: Callable[[Scene], Mapping[str, Motion]]) -> Family:
     def trials(scene: Scene) -> Iterator[Trial]:
         for name, motion in motions(scene).items():
             seen = measured(scene, motion, seed=1)
+            in_scene = motion.resting or motion.fast <= FASTER * scene.working_range.speed_m_per_s
             for lead_s in LEADS_S:
                 for method in TRACKING_METHODS:
                     just_measured = method == "none" and lead_s == 0.0
                     in_range = method not in WITHOUT_VELOCITY or motion.resting or just_measured
                     case: Case = {"motion": name, "lead_ms": round(1e3 * lead_s)}
-                    yield _trial(scene, method, case, seen, lead_s, in_range=in_range)
+                    trial = _trial(scene, method, case, seen, lead_s, in_range=in_range)
+                    yield replace(trial, in_scene=in_scene)
 
     return Family(
         name="tracking",

@@ -1,0 +1,119 @@
+"""`flexsheet tune`: the cheapest methods that are good enough for a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from launch.commands.graph import JsonOption
+from launch.commands.output import (
+    BAD_INPUT,
+    CommandError,
+    examples,
+    print_json,
+    print_table,
+    progress_words,
+    words,
+)
+
+if TYPE_CHECKING:
+    from launch.tune import Choice
+
+NOT_MET = 3
+"""Exit code: for some family no method is good enough, and the nearest miss was taken."""
+
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command(
+    epilog=examples(
+        "flexsheet tune launch/scenes/light-touch.yaml --dry-run",
+        "flexsheet tune my-scene.yaml --family correction --family soft-body",
+        "flexsheet tune my-scene.yaml --output tuned.yaml --json",
+    )
+)
+def tune(
+    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file.")],
+    *,
+    family: Annotated[
+        list[str] | None,
+        typer.Option("--family", metavar="NAME", help="Only this one; may be given repeatedly."),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("--output", metavar="FILE", help="Write a copy there, and leave SCENE alone."),
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing.")] = False,
+    margin: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=0.9, help="Share of each tolerance that a method must leave over."
+        ),
+    ] = 0.2,
+    as_json: JsonOption = False,
+) -> None:
+    """Choose the cheapest methods that keep a scene's tolerances, and write them into the scene.
+
+    Measures each family on this machine over the scene's working range: seconds to minutes each,
+    the first time.  Says why in a sentence per family.  Nodes whose parameters say `auto` take the
+    choice up.  Exit code 3: for some family no method is good enough; the nearest miss is taken.
+    """
+    from launch import charts, tune
+    from launch.machine import machine_name
+    from launch.plan import load_scene
+
+    scene = load_scene(scene_file)
+    try:
+        tunables = tune.tunables_named(family or [])
+    except tune.UnknownTunableError as error:
+        raise CommandError(f"--family: {error}", BAD_INPUT) from None
+    with progress_words() as progress:
+        choices = tune.tune(scene, tunables, margin=margin, progress=progress)
+    target = None if dry_run else output or scene_file
+    if target is not None:
+        tune.write_choices(scene_file, target, choices)
+    for choice in choices:
+        words.print(choice.sentence(), markup=False)
+    met = all(choice.met for choice in choices)
+    if as_json:
+        report = {
+            "scene": scene.name,
+            "file": None if target is None else str(target),
+            "machine": machine_name(),
+            "commit": charts.git_commit(),
+            "margin": margin,
+            "met": met,
+            "families": [choice.report() for choice in choices],
+        }
+        print_json(charts.finite(report))
+    else:
+        _print_choices(choices)
+    words.print("written: nothing (--dry-run)" if target is None else f"written: {target}")
+    if not met:
+        raise typer.Exit(NOT_MET)
+
+
+def _print_choices(choices: Sequence[Choice]) -> None:
+    from launch.charts import duration
+
+    rows = [
+        (
+            choice.family,
+            choice.chosen.method,
+            duration(choice.chosen.median_s),
+            duration(choice.chosen.slowest_s),
+            f"{choice.chosen.error:.3g}",
+            f"{choice.tolerance:.3g} {choice.unit}",
+            f"{100 * choice.spare_ratio:.0f} %" if choice.met else "-",
+            ""
+            if choice.met
+            else f"missed in {choice.chosen.missed} of {choice.chosen.cases} cases",
+        )
+        for choice in choices
+    ]
+    columns = ("family", "method", "median", "slowest", "leaves", "of", "to spare", "")
+    print_table(columns, rows)
