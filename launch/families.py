@@ -20,6 +20,7 @@ from nodes.twin.finger import FingerMotion
 from nodes.twin.gestures import GESTURES
 
 CORRECTION = correction_family(twin_errors)
+QUICK_CORRECTION = correction_family(twin_errors, solved=False)
 
 TRACKED_GESTURES = ("hold", "reach", "tap", "stop", "stroke-push")
 RESTING = ("hold",)
@@ -57,3 +58,4 @@ SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_m
 SHEET_LAWS = sheet_force_family(true_force, None)
 """Those that are at hand at once."""
 SHEET_SHAPE = sheet_shape_family(twin_points)
+QUICK_SHAPE = sheet_shape_family(twin_points, solved=False)

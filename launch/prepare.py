@@ -5,8 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from launch.planned import Plan
+from messages.methods import SheetShapeMethod, chosen
 from messages.scene import Scene
 from nodes.cache import default_cache_dir
 from nodes.models.sheet.membrane import NoEquilibriumError
@@ -28,8 +30,14 @@ def prepare_plan(plan: Plan, progress: Progress) -> None:
     if scene is None:
         return
     for node in plan.nodes.values():
-        if node.type == "renderer":
+        if node.type == "renderer" and _takes_dents(scene, node.parameters["sheet_shape"]):
             prepare_dents(scene, node.parameters["cache_dir"], progress)
+
+
+def _takes_dents(scene: Scene, asked: SheetShapeMethod | Literal["auto"]) -> bool:
+    """Whether a renderer takes a pushed sheet for what the membrane makes of it."""
+    shape: SheetShapeMethod = chosen(asked, scene.methods.sheet_shape, "dents")
+    return shape == "dents"
 
 
 def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress) -> Path:
@@ -51,6 +59,20 @@ def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress
     except NoEquilibriumError as error:
         progress(f"no dent shapes for this sheet: {error}")
     return dent_cache.file_of(scene, folder)
+
+
+def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
+    """The file with the table of a scene's sheet's force, made if it is not there.
+
+    NoEquilibriumError for a sheet of which the membrane finds none.
+    """
+    from nodes.planner import force_table
+
+    def made(done: int, total: int) -> None:
+        progress(f"working out how the sheet pushes back: {100 * done // total} %")
+
+    force_table.load_or_make(scene, cache_dir, made)
+    return force_table.file_of(scene, cache_dir)
 
 
 def prepare_soft_body(

@@ -105,13 +105,13 @@ TUNABLES = (
     Tunable(
         "sheet-shape",
         "sheet_shape",
-        ("launch.families:SHEET_SHAPE",),
+        ("launch.families:QUICK_SHAPE", "launch.families:SHEET_SHAPE"),
         _by_name("flat", "four_triangles", "dents"),
     ),
     Tunable(
         "correction",
         "correction",
-        ("launch.families:CORRECTION",),
+        ("launch.families:QUICK_CORRECTION", "launch.families:CORRECTION"),
         _by_name("none", "one_plane", "four_triangles", "two_pass"),
     ),
     Tunable(
@@ -346,10 +346,15 @@ def _tuned(
     judged: list[Verdict] = []
     for place in tunable.families:
         family = family_at(place)
-        progress(f"what it takes to judge {', '.join(family.methods)}; minutes, the first time")
-        left = {name: setting for name, setting in settings.items() if name in family.methods}
-        for one in judged:
-            left.pop(one.method, None)
+        known = {one.method for one in judged}
+        left = {
+            name: setting
+            for name, setting in settings.items()
+            if name in family.methods and name not in known
+        }
+        if not left:
+            continue
+        progress(f"{', '.join(left)}; what that needs is worked out, minutes the first time")
         wanted = partial(_is_wanted, left)
         if measured is not None:
             points = measured(family, scene, wanted)
@@ -357,12 +362,11 @@ def _tuned(
             points = measure_family(
                 family, scene, repeats=REPEATS, progress=progress, wanted=wanted
             )
-        tolerance = family.tolerance(scene)
-        judged += verdicts(points, left, tolerance=tolerance, margin=margin)
+        judged += verdicts(points, left, tolerance=family.tolerance(scene), margin=margin)
         if any(one.meets for one in judged):
             break
-    chosen = choose(judged)
-    return Choice(tunable.name, tunable.key, family.unit, tolerance, chosen, tuple(judged))
+    tolerance = family.tolerance(scene)
+    return Choice(tunable.name, tunable.key, family.unit, tolerance, choose(judged), tuple(judged))
 
 
 def _is_wanted(methods: Mapping[str, Setting], trial: Trial) -> bool:

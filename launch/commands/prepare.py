@@ -50,15 +50,25 @@ def prepare(
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Work out how a scene's sheet dents, once; experiments and the demo do so by themselves."""
+    """Work out how a scene's sheet dents, once; experiments and the demo do so by themselves.
+
+    Of a scene whose methods say sheet_force: table, that table as well: a minute or two.
+    """
     from launch.plan import load_scene
-    from launch.prepare import NoSoftBodyError, prepare_dents, prepare_soft_body
+    from launch.prepare import (
+        NoSoftBodyError,
+        prepare_dents,
+        prepare_force_table,
+        prepare_soft_body,
+    )
 
     if scheduler is not None and skin_spacing_m is None:
         raise typer.BadParameter("is for the table of --skin-spacing", param_hint="--scheduler")
     scene = load_scene(scene_file)
     with progress_words() as progress:
         files = {"dent_shapes": prepare_dents(scene, cache, progress)}
+        if scene.methods.sheet_force == "table":
+            files["force_table"] = prepare_force_table(scene, cache, progress)
         if skin_spacing_m is not None:
             try:
                 files["soft_body"] = prepare_soft_body(

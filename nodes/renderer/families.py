@@ -47,6 +47,7 @@ SHAPES: dict[str, Callable[[Sheet], SheetMesh]] = {
 """Two passes onto cheaper shapes than the dent's own."""
 FLOOR = "floor"
 METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
+UNSOLVED = tuple(method for method in METHODS if method != "two_pass")
 CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
@@ -58,14 +59,15 @@ STRETCH = 1.05
 SPACING_M = 0.0025
 
 
-def correction_family(judge: Judge) -> Family:
-    """Every correction over the tilts and pushes of the paper's figures 11 and 13."""
+def correction_family(judge: Judge, *, solved: bool = True) -> Family:
+    """Every correction over the tilts and pushes of the paper's figures 11 and 13, and to the ends
+    of the scene's; without `solved`, those alone that no dent shapes need be solved for."""
     return Family(
         name="correction",
         unit="mm",
         reference="rms error at the points the eye sees on the twin's sheet",
-        methods=METHODS,
-        trials=partial(_trials, judge),
+        methods=METHODS if solved else UNSOLVED,
+        trials=partial(_trials, judge, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
@@ -141,8 +143,9 @@ def with_projector_of(scene: Scene, width_px: int, height_px: int) -> Scene:
     return scene.model_copy(update={"projector": projector.model_copy(update=size)})
 
 
-def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
-    dents, context = dent_cache.load_or_solve(scene, None), headless_context()
+def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
+    dents = dent_cache.load_or_solve(scene, None) if solved else None
+    context = headless_context()
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
     for size in SIZES_PX:
         shown = with_projector_of(scene, *size)
@@ -159,7 +162,7 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
             }
             sheet, judgement = _situation(shown, judge, tilt_deg=tilt_deg, push_mm=push_mm)
             in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
-            for method in METHODS:
+            for method in METHODS if solved else UNSOLVED:
                 yield Trial(
                     method=method,
                     case=case,

@@ -35,7 +35,8 @@ Floats = NDArray[np.float64]
 Judge = Callable[[Scene, Floats, Floats, Floats], Floats]
 """Points (n, 3) of the true sheet in the world, between two edges and under a fingertip (3,)."""
 
-METHODS = ("flat", "four_triangles", "dents", "membrane")
+UNSOLVED = ("flat", "four_triangles")
+METHODS = (*UNSOLVED, "dents", "membrane")
 DEPTHS_M = (0.002, 0.01, 0.02, 0.035, 0.05)
 PLACES: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
@@ -46,20 +47,21 @@ PLACES: tuple[tuple[str, float, float], ...] = (
 """Names, and x over the width, y over the height."""
 
 
-def sheet_shape_family(judge: Judge) -> Family:
-    """Every shape at the scene's stretches, over depths and places."""
+def sheet_shape_family(judge: Judge, *, solved: bool = True) -> Family:
+    """Every shape at the scene's stretches, over depths and places; without `solved`, those alone
+    that nothing need be solved for."""
     return Family(
         name="sheet-shape",
         unit="mm",
         reference="the twin's membrane, rms height",
-        methods=METHODS,
-        trials=partial(_trials, judge),
+        methods=METHODS if solved else UNSOLVED,
+        trials=partial(_trials, judge, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
 
-def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
-    dents = dent_cache.load_or_solve(scene, None)
+def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
+    dents = dent_cache.load_or_solve(scene, None) if solved else None
     rubber, _ = dent_cache.wanted(scene)
     spec = scene.sheet
     middle = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio)
@@ -95,15 +97,14 @@ def _trials(judge: Judge, scene: Scene) -> Iterator[Trial]:
         shapes: dict[str, Callable[[Sheet], SheetMesh]] = {
             "flat": flat_mesh,
             "four_triangles": pyramid_mesh,
-            "dents": lambda sheet: dented_mesh(sheet, dents),
-            "membrane": elements,
         }
         in_range = {
             "flat": depth <= FLAT_TO_M,
             "four_triangles": depth <= TRIANGLES_TO_M,
-            "dents": not dents.outside(stretch, place, depth),
-            "membrane": True,
         }
+        if dents is not None:
+            shapes |= {"dents": partial(dented_mesh, dents=dents), "membrane": elements}
+            in_range |= {"dents": not dents.outside(stretch, place, depth), "membrane": True}
         truth = judge(scene, *edges, tip)
         case: Case = {"stretch": stretch, "depth_mm": 1e3 * depth, "place": where}
         for method, shape in shapes.items():

@@ -1,0 +1,351 @@
+"""Choosing methods for a scene: the cheapest that is good enough, else the nearest miss."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner
+
+from launch import tune
+from launch.cli import app
+from launch.commands.output import CommandError
+from launch.commands.tune import NOT_MET
+from launch.documents import BadInputError
+from launch.plan import load_scene
+from launch.tune import Tunable, choose, tunables_named, verdicts, write_choices, written
+from messages.base import Header
+from messages.clock import VirtualClock
+from messages.methods import Methods, SoftBodyChoice
+from messages.scene import Scene
+from nodes.arm_bridge.kinematics import KINEMATICS
+from nodes.fem_solver.making import asked, lacking
+from nodes.methods import Case, Family, Point, Trial
+from nodes.planner.force_table import law_by
+from nodes.triangulator.families import TRIANGULATION
+from nodes.triangulator.node import Triangulator
+from nodes.triangulator.parameters import TriangulatorParameters
+
+SCENES = Path(__file__).resolve().parent.parent / "launch" / "scenes"
+SCENE = load_scene(SCENES / "cylinder.yaml")
+
+
+def header_at(source_ns: int) -> Header:
+    return Header(1, source_ns, source_ns, "virtual", "test", 0)
+
+
+CHEAP_FIRST = {"cheap": 1e-5, "middle": 1e-4, "dear": 1e-3}
+SETTINGS: dict[str, tune.Setting] = {name: name for name in CHEAP_FIRST}
+
+
+def point(method: str, error: float, *, depth: int = 1, **more: Any) -> Point:
+    case: Case = {"depth_mm": depth}
+    took = more.pop("took", CHEAP_FIRST.get(method, 1e-3))
+    told = {"in_range": True} | more
+    return Point(method, case, case, median_s=took, p99_s=took, error=error, **told)
+
+
+def chosen_of(points: Sequence[Point], *, margin: float = 0.2) -> tune.Verdict:
+    return choose(verdicts(points, SETTINGS, tolerance=1.0, margin=margin))
+
+
+def test_the_cheapest_that_is_good_enough_everywhere_is_chosen() -> None:
+    points = [
+        point("cheap", 0.1),
+        point("cheap", 0.9, depth=2),  # more than the margin leaves
+        point("middle", 0.2),
+        point("middle", 0.7, depth=2),
+        point("dear", 0.01),
+        point("dear", 0.02, depth=2),
+    ]
+    assert chosen_of(points).method == "middle"
+    assert chosen_of(points, margin=0.05).method == "cheap"
+
+
+def test_a_method_out_of_its_range_is_not_taken_however_exact() -> None:
+    points = [point("cheap", 0.0, in_range=False), point("dear", 0.5)]
+    assert chosen_of(points).method == "dear"
+
+
+def test_cases_that_the_scene_does_not_ask_for_do_not_count() -> None:
+    points = [point("cheap", 0.1), point("cheap", 9.0, depth=50, in_scene=False)]
+    assert chosen_of(points).meets
+
+
+def test_of_methods_that_take_the_same_time_the_more_exact_is_chosen() -> None:
+    points = [point("cheap", 0.5, took=1.0e-3), point("dear", 0.1, took=1.05e-3)]
+    assert chosen_of(points).method == "dear"
+
+
+@pytest.mark.parametrize("error", [float("nan"), float("inf")])
+def test_what_nothing_can_judge_is_not_good_enough(error: float) -> None:
+    found = chosen_of([point("cheap", 0.1), point("cheap", error, depth=2)])
+    assert not found.meets
+    assert found.wrong == ({"depth_mm": 2},)
+
+
+def test_where_none_is_good_enough_the_nearest_miss_is_taken() -> None:
+    points = [
+        point("cheap", 3.0),
+        point("cheap", 4.0, depth=2),
+        point("middle", 0.1),
+        point("middle", 1.5, depth=2),
+        point("dear", 0.1),
+        point("dear", 0.3, depth=2, in_range=False),
+    ]
+    found = chosen_of(points)
+    assert (found.method, found.meets, found.missed) == ("dear", False, 1)
+
+
+def family(name: str, methods: Sequence[str]) -> Family:
+    return Family(name, "mm", "the truth", methods, lambda scene: (), lambda scene: 1.0)
+
+
+@pytest.fixture
+def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Families "quick" and "slow" in place of a node's own; which were measured is told."""
+    there = {"quick": family("made-up", ["cheap"]), "slow": family("made-up", ["cheap", "dear"])}
+    monkeypatch.setattr(tune, "family_at", there.__getitem__)
+    return []
+
+
+STAGED = Tunable("made-up", "mark", ("quick", "slow"), {"cheap": "moments", "dear": "subpixel_fit"})
+
+
+@pytest.mark.parametrize(
+    ("cheap_error", "methods", "chosen"),
+    [(0.1, ["cheap"], "cheap"), (2.0, ["cheap", "dear"], "dear")],
+)
+def test_what_takes_minutes_is_asked_only_where_nothing_else_does(
+    stand_ins: list[str], cheap_error: float, methods: list[str], chosen: str
+) -> None:
+    def measured(asked: Family, scene: Scene, wanted: Callable[[Trial], bool]) -> Sequence[Point]:
+        errors = {"cheap": cheap_error, "dear": 0.1}
+        trials = [Trial(name, {}, lambda: None, lambda _: 0.0, True) for name in asked.methods]
+        new = [trial.method for trial in trials if wanted(trial)]
+        stand_ins.extend(new)
+        return [point(name, errors[name]) for name in new]
+
+    (choice,) = tune.tune(SCENE, [STAGED], measured=measured)
+    assert stand_ins == methods
+    assert choice.chosen.method == chosen
+    assert choice.met
+
+
+def choice_of(points: Sequence[Point], key: str = "mark") -> tune.Choice:
+    judged = verdicts(points, SETTINGS, tolerance=1.0)
+    return tune.Choice("made-up", key, "mm", 1.0, choose(judged), tuple(judged))
+
+
+def test_a_sentence_says_why() -> None:
+    met = choice_of([point("cheap", 4.2), point("dear", 0.25)])
+    assert met.sentence() == (
+        "made-up: dear (1 ms) leaves 0.25 of 1 mm allowed; "
+        "cheap is cheaper (10 µs), but leaves 4.2 mm at depth_mm 1"
+    )
+    assert met.spare_ratio == pytest.approx(0.75)
+    alone = choice_of([point("cheap", 0.1), point("dear", 0.05)])
+    assert alone.sentence().endswith("nothing is cheaper")
+
+
+def test_a_miss_is_said_with_how_far_it_misses() -> None:
+    missed = choice_of([point("cheap", 4.2), point("dear", 2.5), point("dear", 0.1, depth=2)])
+    assert not missed.met
+    assert missed.sentence() == (
+        "made-up: no method keeps 1 mm; the nearest is dear (1 ms): 1 of 2 cases missed, "
+        "leaves 2.5 mm at depth_mm 1"
+    )
+
+
+def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    there = {
+        "launch.families:QUICK_SHAPE": family("sheet-shape", ["flat", "four_triangles", "dents"]),
+        "launch.families:QUICK_CORRECTION": family(
+            "correction", ["one_plane", "two_pass_triangles"]
+        ),
+        "launch.families:CORRECTION": family("correction", ["two_pass"]),
+    }
+    monkeypatch.setattr(tune, "family_at", there.__getitem__)
+    errors = {"flat": 9.0, "four_triangles": 0.2, "dents": 0.1, "one_plane": 9.0}
+
+    def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
+        return [point(name, errors.get(name, 0.3), took=1e-3) for name in asked.methods]
+
+    tunables = tunables_named(["correction", "sheet-shape"])
+    shape, correction = tune.tune(SCENE, tunables, measured=measured)
+    assert shape.chosen.setting == "dents"  # as quick as the others, and more exact
+    assert (correction.chosen.method, correction.chosen.setting) == ("two_pass", "two_pass")
+    errors["dents"] = 9.0
+    shape, correction = tune.tune(SCENE, tunables, measured=measured)
+    assert shape.chosen.setting == "four_triangles"
+    assert correction.chosen.method == "two_pass_triangles"
+    assert correction.chosen.setting == "two_pass"
+
+
+def put(text: str, *choices: tune.Choice) -> str:
+    return written(text, choices, today="2026-01-02", machine="a machine", commit="0" * 40)
+
+
+GOOD, BAD = choice_of([point("cheap", 0.1)]), choice_of([point("cheap", 2.0)], "tracking")
+FILE = "# mine\nname: one  # a name\n\nnumber: 1.0e+6\n"
+
+
+def test_choices_are_added_to_a_file_and_all_else_is_left_as_it_was() -> None:
+    text = put(FILE, GOOD, BAD)
+    assert text.startswith(FILE)
+    assert "# Chosen by `flexsheet tune` on 2026-01-02; a machine; code 0000000000.\n" in text
+    assert "  mark: cheap  # 10 µs, leaves 0.1 of 1 mm\n" in text
+    assert "  tracking: cheap  # NOT GOOD ENOUGH, the nearest miss: 10 µs" in text
+    assert YAML(typ="safe").load(text)["methods"] == {"mark": "cheap", "tracking": "cheap"}
+
+
+def test_choices_are_written_over_and_other_families_stay() -> None:
+    text = put(FILE, GOOD, BAD) + "# behind\nlast: 2\n"
+    again = put(text, choice_of([point("dear", 0.2)]))
+    assert again.count("methods:") == again.count("Chosen by") == 1
+    assert YAML(typ="safe").load(again)["methods"] == {"mark": "dear", "tracking": "cheap"}
+    assert "NOT GOOD ENOUGH" in again  # of the one that was not tuned again
+    assert again.startswith(FILE)
+    assert again.endswith("# behind\nlast: 2\n")
+    assert put(again, choice_of([point("dear", 0.2)])) == again
+
+
+def test_choices_on_one_line_are_unfolded() -> None:
+    text = put(
+        "a: 1\nmethods: {mark: x, soft_body: {method: linear, skin_spacing_m: 0.003}}\n", GOOD
+    )
+    assert YAML(typ="safe").load(text)["methods"] == {
+        "mark": "cheap",
+        "soft_body": {"method": "linear", "skin_spacing_m": 0.003},
+    }
+
+
+def scene_choice() -> tune.Choice:
+    settings: dict[str, tune.Setting] = {"cheap": {"method": "linear", "skin_spacing_m": 0.006}}
+    judged = verdicts([point("cheap", 0.1)], settings, tolerance=1.0)
+    return tune.Choice("soft-body", "soft_body", "mm", 1.0, judged[0], tuple(judged))
+
+
+def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    source = tmp_path / "scene.yaml"
+    source.write_text((SCENES / "sphere.yaml").read_text())
+    write_choices(source, tmp_path / "copy.yaml", [scene_choice()])
+    assert source.read_text() == (SCENES / "sphere.yaml").read_text()
+    wanted = SoftBodyChoice(method="linear", skin_spacing_m=0.006)
+    assert load_scene(tmp_path / "copy.yaml").methods == Methods(soft_body=wanted)
+    with pytest.raises(BadInputError, match="give --output FILE"):
+        write_choices(source, tmp_path / "no folder" / "copy.yaml", [scene_choice()])
+    with pytest.raises(BadInputError, match="mark"):  # no method's name
+        write_choices(source, source, [GOOD])
+    assert source.read_text() == (SCENES / "sphere.yaml").read_text()
+    write_choices(source, source, [scene_choice()])
+    assert load_scene(source).methods.soft_body == wanted
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["copy.yaml", "scene.yaml"]
+
+
+def run(*arguments: object) -> Any:
+    return CliRunner().invoke(app, ["tune", *map(str, arguments)])
+
+
+def test_a_real_family_is_tuned_by_the_command(tmp_path: Path) -> None:
+    out = tmp_path / "tuned.yaml"
+    command = [SCENES / "light-touch.yaml", "--family", "kinematics", "--output", out, "--json"]
+    outcome = run(*command)
+    assert outcome.exit_code == 0, outcome.output
+    result = json.loads(outcome.stdout)
+    assert result["met"]
+    (only,) = result["families"]
+    assert only["chosen"].startswith("closed_form")
+    assert load_scene(out).methods.kinematics == only["setting"]
+
+
+def test_a_miss_has_an_exit_code_of_its_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    missed = choice_of([point("cheap", 2.0)])
+    monkeypatch.setattr(tune, "tune", lambda *_, **__: [missed])
+    outcome = run(SCENES / "demanding.yaml", "--dry-run")
+    assert outcome.exit_code == NOT_MET
+    assert "no method keeps 1 mm; the nearest is cheap" in outcome.output
+    assert "written: nothing" in outcome.output
+
+
+def test_an_unknown_family_is_named_with_the_nearest() -> None:
+    outcome = run(SCENES / "cylinder.yaml", "--family", "corection")
+    assert isinstance(outcome.exception, CommandError)
+    assert 'did you mean "correction"?' in str(outcome.exception)
+    assert "no node takes a choice" in str(
+        run(SCENES / "sphere.yaml", "--family", "rolling").exception
+    )
+
+
+def test_every_choice_that_can_be_made_is_one_that_a_scene_can_say() -> None:
+    for tunable in tune.TUNABLES:
+        for setting in tunable.settings.values():
+            assert Methods.model_validate({tunable.key: setting})
+    assert {one.key for one in tune.TUNABLES} == set(Methods.model_fields)
+
+
+def test_families_ask_for_the_scenes_own_cases_only() -> None:
+    asked_for = [trial for trial in TRIANGULATION.trials(SCENE) if trial.in_scene]
+    assert {trial.case["baseline_mm"] for trial in asked_for} == {120.5}
+    assert {trial.case["noise_px"] for trial in asked_for} == {0.01, 0.025}
+    tilts = [trial.case for trial in KINEMATICS.trials(SCENE) if trial.in_scene]
+    assert all("tilt_deg" in case for case in tilts)
+
+
+@pytest.mark.parametrize("name", ["cylinder-tuned", "light-touch", "palpation", "demanding"])
+def test_the_scenes_that_come_tuned_say_a_method_of_every_family(name: str) -> None:
+    text = (SCENES / f"{name}.yaml").read_text()
+    methods = Methods.model_validate(YAML(typ="safe").load(text)["methods"])
+    assert None not in dict(methods).values()
+    assert ("NOT GOOD ENOUGH" in text) == (name in MISSED)
+
+
+MISSED = ("cylinder-tuned", "palpation", "demanding")
+
+
+def with_methods(**methods: object) -> Scene:
+    return SCENE.model_copy(update={"methods": Methods.model_validate(methods)})
+
+
+async def test_a_node_follows_the_scene_where_it_is_told_auto() -> None:
+    def node(**parameters: Any) -> Triangulator:
+        given = TriangulatorParameters(**parameters)
+        return Triangulator(given, name="eye", clock=VirtualClock(), send=lambda *_: None)
+
+    follows, set_by_hand = node(), node(mark="weighted_centroid")
+    for each in (follows, set_by_hand):
+        await each.setup()
+        await each.step("scene", SCENE, header_at(0))
+    assert follows.methods == "subpixel_fit, dlt, hand"
+    for each in (follows, set_by_hand):  # another scene, at run time
+        changed = with_methods(mark="moments", triangulation="midpoint", tracking="one_euro")
+        await each.step("scene", changed, header_at(1))
+    assert follows.methods == "moments, midpoint, one_euro"
+    assert set_by_hand.methods == "weighted_centroid, midpoint, one_euro"
+
+
+def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work() -> None:
+    assert asked(SCENE_BARE, "auto", "auto") == ("auto", 0.003)
+    linear = with_methods(soft_body={"method": "linear", "skin_spacing_m": 0.006})
+    assert asked(linear, "auto", "auto") == ("linear", 0.006)
+    assert asked(linear, "nonlinear_table", 0.0045) == ("nonlinear_table", 0.0045)
+    table = with_methods(soft_body={"method": "nonlinear_table", "skin_spacing_m": 0.0045})
+    assert asked(table, "auto", "auto") == ("auto", 0.0045)
+    assert "--skin-spacing 0.0045" in lacking(table, "auto", [])
+    assert lacking(linear, "auto", []) == ""
+
+
+SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})
+
+
+def test_a_force_table_that_nobody_made_is_stood_in_for_and_that_is_said(tmp_path: Path) -> None:
+    law, told = law_by(SCENE, "table", tmp_path)
+    assert law.name == "scaled"
+    assert "flexsheet prepare" in told
+    assert law_by(SCENE, "linear", tmp_path)[0].name == "linear"
