@@ -72,7 +72,7 @@ async def test_a_finger_meets_the_objects_force_by_the_twins_sheet(
     )
     assert force_n == pytest.approx(float(object_force_n(np.array(depth_m), scale)), rel=GOOD_RATIO)
     assert pull_n < SCENE.sheet.max_edge_force_n
-    assert desk.planner.note == ""
+    assert desk.planner.note == "sheet's force: scaled"
 
 
 async def test_what_is_published_as_retreat_is_where_the_sheet_comes_to_rest() -> None:
