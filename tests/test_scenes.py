@@ -28,7 +28,7 @@ from tests.plans import STEP_S, Desk, scene_with
 Floats = NDArray[np.float64]
 SCENES = Path(__file__).resolve().parent.parent / "launch" / "scenes"
 NAMES = ("cylinder", "sphere", "ellipsoid", "plane", "box", "organ")
-TUNED = ("cylinder-tuned", "light-touch", "palpation", "demanding")
+TUNED = ("light-touch", "palpation", "demanding")
 """One of the above each, with another working range, other tolerances, or methods chosen."""
 ROUND = ("sphere", "ellipsoid", "box", "organ")
 
