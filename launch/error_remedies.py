@@ -123,6 +123,7 @@ REMEDIES = {
     "its first error is the cause.",
     "RunDirectoryError": "set `FLEXSHEET_RUNS` to a folder of your own.",
     "UnknownFamilyError": "take one of the names it lists (`flexsheet chart --help`).",
+    "UnknownTunableError": "take one of the names it lists (docs/tune.md).",
     "UnknownTopicError": "`flexsheet topic list` has all names.",
     "UnknownNodeError": "`flexsheet node list` has all names.",
     "BusError": "another graph holds the endpoint: end it, or `flexsheet doctor --sweep`.",
