@@ -14,7 +14,7 @@ import zmq
 
 from messages import bus
 from messages.base import Header
-from messages.bus import Publisher, Source, Subscriber, queue_length
+from messages.bus import Publisher, Source, Subscriber
 from messages.security import KeyRing
 from messages.topics import TOPICS
 from messages.types import TwinFinger
@@ -119,7 +119,7 @@ async def test_a_reader_that_vanished_is_hung_up_on_and_costs_its_publisher_noth
             for _ in range(10):
                 number += 1
                 publisher.send(pictures(number % 250), header(number))
-            await until(lambda: present.sequences[-1] == number)
+            await until(lambda: present.sequences[-1] == number)  # noqa: B023
             present.heard[:-1] = []
         grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) << 10
         # 3000 of 6 KB were sent; the queue for who does not read holds 65.
