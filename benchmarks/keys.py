@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 import uvloop
 
 from benchmarks import messaging
-from benchmarks.messaging import NODES_USE, PAYLOADS, Design, Sender, percentile_us
+from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Sender, percentile_us
 from launch.machine import machine_name
 from messages.base import Header
 from messages.bus import Publisher, Source, Subscriber
@@ -123,7 +123,8 @@ def measure(rounds: int, seconds: float, keys: KeyRing, loop: Loop) -> list[dict
 
         for design in DESIGNS:
             opener = secure if design.name == WITH else Publisher
-            senders[design.name] = Sender(design, payload, "tcp://127.0.0.1:*", opener)
+            line = BusLine(design, payload, "tcp://127.0.0.1:*", opener)
+            senders[design.name] = Sender(design, payload, line)
         found: dict[str, list[tuple[float, float]]] = {design.name: [] for design in DESIGNS}
         for _ in range(rounds):
             for name in random.sample(list(senders), len(senders)):

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import uvloop
@@ -51,15 +51,13 @@ NODES_USE = "flexsheet uvloop"
 EPOCH = 1
 
 
-@dataclass(frozen=True)
-class Design:
-    """A way to receive.  `typed` ones hand over validated messages, the others bytes."""
+class Line(Protocol):
+    """The sending end of a design; `endpoint` is what its receiver is told."""
 
-    name: str
-    about: str
-    typed: bool
-    receive: Callable[[Topic, str, Callable[[int, int], bool]], None]
-    inline_bytes: int | None = None
+    endpoint: str
+
+    def send(self, sequence: int, stamp_ns: int) -> None: ...
+    def close(self) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -68,6 +66,21 @@ class Payload:
     topic: Topic
     rate_hz: float
     make: Callable[[int], Message]
+
+
+@dataclass(frozen=True)
+class Design:
+    """A way to receive.  `typed` ones hand over validated messages, the others bytes.
+
+    open: makes its sending end; None: a publisher of `messages.bus`.
+    """
+
+    name: str
+    about: str
+    typed: bool
+    receive: Callable[[Topic, str, Callable[[int, int], bool]], None]
+    inline_bytes: int | None = None
+    open: Callable[[Payload, str], Line] | None = None
 
 
 @dataclass
@@ -219,8 +232,16 @@ PAYLOADS = (
 )
 
 
-def receive_rounds(design: Design, topic: Topic, endpoint: str, results: Connection) -> None:
+def receive_rounds(
+    design: Design,
+    topic: Topic,
+    endpoint: str,
+    results: Connection,
+    prepare: Callable[[], None] | None,
+) -> None:
     """A child's work: measure, answer, send the latencies of a round, as each stamp asks."""
+    if prepare is not None:
+        prepare()
     latencies: list[int] = []
     # As nodes do once they are set up: what exists by now is never looked through for garbage.
     gc.collect()
@@ -243,10 +264,16 @@ def receive_rounds(design: Design, topic: Topic, endpoint: str, results: Connect
 
 # A stamp's two lowest bits say what the message is for; four nanoseconds do not matter.
 MEASURE, WARM_UP, END_ROUND, END = range(4)
+PATIENCE_S = 30.0
+CLOSING_S = 5.0
 
 
-class Sender:
-    """The parent's end of one design: a publisher and the child that listens to it."""
+def header_of(sequence: int, stamp_ns: int) -> Header:
+    return Header(sequence, stamp_ns, stamp_ns, "bench", "bench", EPOCH)
+
+
+class BusLine:
+    """A publisher of `messages.bus`; of designs that are not typed it sends as many bytes."""
 
     def __init__(
         self,
@@ -255,43 +282,64 @@ class Sender:
         endpoint: str,
         open_publisher: Callable[[Topic, list[str]], Publisher] = Publisher,
     ) -> None:
-        self.design, self.payload = design, payload
+        self._design, self._payload = design, payload
+        self._raw = [bytearray(frame) for frame in encode(payload.make(0), header_of(0, 0))]
+        self._publisher = open_publisher(payload.topic, [endpoint])
+        self.endpoint = self._publisher.endpoints[0]
+
+    def send(self, sequence: int, stamp_ns: int) -> None:
+        if not self._design.typed:
+            raw = self._raw[0]
+            raw[:16] = sequence.to_bytes(8, "little") + stamp_ns.to_bytes(8, "little")
+            self._publisher._send([bytes(raw), *self._raw[1:]])
+        elif self._design.inline_bytes is None:
+            self._publisher.send(self._payload.make(sequence), header_of(sequence, stamp_ns))
+        else:
+            message = self._payload.make(sequence)
+            inline_bytes = self._design.inline_bytes
+            self._publisher._send(
+                encode(message, header_of(sequence, stamp_ns), inline_bytes=inline_bytes)
+            )
+
+    def close(self) -> None:
+        self._publisher.close()
+
+
+class Sender:
+    """The parent's end of one design: its line and the child that listens to it.
+
+    prepare: what the child does before anything else.
+    """
+
+    def __init__(
+        self,
+        design: Design,
+        payload: Payload,
+        line: Line,
+        prepare: Callable[[], None] | None = None,
+    ) -> None:
+        self.design, self.payload, self._line = design, payload, line
         self.sequence = 0
-        topic = payload.topic
-        self._raw = [bytearray(frame) for frame in encode(payload.make(0), self.header(0))]
-        self._publisher = open_publisher(topic, [endpoint])
         spawn = multiprocessing.get_context("spawn")
         self.results, childs_end = spawn.Pipe()
         self._child = spawn.Process(
             target=receive_rounds,
-            args=(design, topic, self._publisher.endpoints[0], childs_end),
+            args=(design, payload.topic, line.endpoint, childs_end, prepare),
             daemon=True,
         )
         self._child.start()
+        patience_ends = time.monotonic() + PATIENCE_S
         while not self.results.poll(0.01):
+            if not self._child.is_alive() or time.monotonic() > patience_ends:
+                raise RuntimeError(f"{design.name}: nothing arrives")
             self.send(WARM_UP)
         time.sleep(0.05)
         while self.results.poll(0):
             self.results.recv()
 
-    def header(self, stamp_ns: int) -> Header:
-        return Header(self.sequence, stamp_ns, stamp_ns, "bench", "bench", EPOCH)
-
     def send(self, kind: int) -> None:
         self.sequence += 1
-        stamp_ns = (time.monotonic_ns() & ~3) | kind
-        if not self.design.typed:
-            raw = self._raw[0]
-            raw[:16] = self.sequence.to_bytes(8, "little") + stamp_ns.to_bytes(8, "little")
-            frames = [bytes(raw), *self._raw[1:]]
-            self._publisher._send(frames)
-        elif self.design.inline_bytes is None:
-            self._publisher.send(self.payload.make(self.sequence), self.header(stamp_ns))
-        else:
-            message = self.payload.make(self.sequence)
-            self._publisher._send(
-                encode(message, self.header(stamp_ns), inline_bytes=self.design.inline_bytes)
-            )
+        self._line.send(self.sequence, (time.monotonic_ns() & ~3) | kind)
 
     def round(self, count: int) -> list[int]:
         """Latencies in ns of `count` messages at the payload's rate."""
@@ -301,16 +349,32 @@ class Sender:
             next_s += period_s
             time.sleep(max(0.0, next_s - time.monotonic()))
             self.send(MEASURE)
-        time.sleep(0.05)
-        self.send(END_ROUND)
-        if not self.results.poll(20.0):
-            raise RuntimeError(f"{self.design.name}: the receiver fell silent")
-        return list(self.results.recv())
+        patience_ends = time.monotonic() + PATIENCE_S
+        # Asked again and again, for some transports lose messages; only one answer is wanted.
+        while time.monotonic() < patience_ends:
+            time.sleep(0.05)
+            self.send(END_ROUND)
+            if self.results.poll(0.5):
+                return list(self.results.recv())
+        raise RuntimeError(f"{self.design.name}: the receiver fell silent")
 
     def close(self) -> None:
-        self.send(END)
-        self._child.join(5.0)
-        self._publisher.close()
+        patience_ends = time.monotonic() + CLOSING_S
+        while self._child.is_alive() and time.monotonic() < patience_ends:
+            self.send(END)
+            self._child.join(0.2)
+        self._line.close()
+
+
+def opener(transport: str, folder: Path) -> Callable[[Design, Payload, int], Sender]:
+    """Makes the senders of this machine's own transports, "ipc" or "tcp"."""
+
+    def open_sender(design: Design, payload: Payload, number: int) -> Sender:
+        place = f"ipc://{folder}/{payload.topic.name}-{number}"
+        endpoint = place if transport == "ipc" else "tcp://127.0.0.1:*"
+        return Sender(design, payload, BusLine(design, payload, endpoint))
+
+    return open_sender
 
 
 def percentile_us(latencies_ns: Sequence[int], percent: float) -> float:
@@ -318,17 +382,25 @@ def percentile_us(latencies_ns: Sequence[int], percent: float) -> float:
 
 
 def measure(
-    payload: Payload, *, rounds: int, seconds: float, transport: str, folder: Path, step: Any
+    payload: Payload,
+    designs: Sequence[Design],
+    *,
+    rounds: int,
+    seconds: float,
+    open_sender: Callable[[Design, Payload, int], Sender],
+    step: Callable[[], object],
 ) -> list[dict[str, Any]]:
-    """One row per design: p50 and p99 and their ratios to the floor's, medians over the rounds."""
+    """One row per design: p50 and p99 and their ratios to the floor's, medians over the rounds.
+
+    open_sender: is given the design's place among all, too.
+    """
     count = round(seconds * payload.rate_hz)
-    senders = []
-    by_design: dict[str, list[tuple[float, float]]] = {design.name: [] for design in DESIGNS}
+    senders: list[Sender] = []
+    by_design: dict[str, list[tuple[float, float]]] = {design.name: [] for design in designs}
     missing = dict.fromkeys(by_design, 0)
     try:
-        for number, design in enumerate(DESIGNS):
-            endpoint = f"ipc://{folder}/{number}" if transport == "ipc" else "tcp://127.0.0.1:*"
-            senders.append(Sender(design, payload, endpoint))
+        for number, design in enumerate(designs):
+            senders.append(open_sender(design, payload, number))
         for _ in range(rounds):
             for sender in random.sample(senders, len(senders)):
                 latencies = sender.round(count)
@@ -340,32 +412,26 @@ def measure(
         for sender in senders:
             sender.close()
     floor = by_design[FLOOR]
-    return [
-        {
+
+    def row(design: Design) -> dict[str, Any]:
+        p50s, p99s = zip(*by_design[design.name], strict=True)
+        p50_ratios = [own / base for own, (base, _) in zip(p50s, floor, strict=True)]
+        p99_ratios = [own / base for own, (_, base) in zip(p99s, floor, strict=True)]
+        return {
             "payload": payload.name,
             "design": design.name,
             "about": design.about,
             "typed": design.typed,
             "messages": count * rounds,
             "superseded": missing[design.name],
-            "p50_us": statistics.median(p50 for p50, _ in by_design[design.name]),
-            "p99_us": statistics.median(p99 for _, p99 in by_design[design.name]),
-            "p50_ratio": statistics.median(
-                own[0] / base[0] for own, base in zip(by_design[design.name], floor, strict=True)
-            ),
-            "p99_ratio": statistics.median(
-                own[1] / base[1] for own, base in zip(by_design[design.name], floor, strict=True)
-            ),
-            "p50_ratio_range": [
-                pick(
-                    own[0] / base[0]
-                    for own, base in zip(by_design[design.name], floor, strict=True)
-                )
-                for pick in (min, max)
-            ],
+            "p50_us": statistics.median(p50s),
+            "p99_us": statistics.median(p99s),
+            "p50_ratio": statistics.median(p50_ratios),
+            "p99_ratio": statistics.median(p99_ratios),
+            "p50_ratio_range": [min(p50_ratios), max(p50_ratios)],
         }
-        for design in DESIGNS
-    ]
+
+    return [row(design) for design in designs]
 
 
 def codec_costs() -> list[dict[str, Any]]:
@@ -375,12 +441,11 @@ def codec_costs() -> list[dict[str, Any]]:
         call = partial(action, *arguments, **named)
         return min(timeit.repeat(call, number=2000, repeat=7)) / 2000 * 1e6
 
-    header = Header(1, 2, 3, "bench", "bench", EPOCH)
     rows = []
     for payload in PAYLOADS:
         message = payload.make(0)
         for inline_bytes in (INLINE_BYTES, 0):
-            frames = encode(message, header, inline_bytes=inline_bytes)
+            frames = encode(message, header_of(1, 2), inline_bytes=inline_bytes)
             rows.append(
                 {
                     "payload": payload.name,
@@ -388,7 +453,9 @@ def codec_costs() -> list[dict[str, Any]]:
                     "frames": len(frames),
                     "bytes": size_of(frames),
                     "construct_us": best_us(payload.make, 0),
-                    "encode_us": best_us(encode, message, header, inline_bytes=inline_bytes),
+                    "encode_us": best_us(
+                        encode, message, header_of(1, 2), inline_bytes=inline_bytes
+                    ),
                     "decode_us": best_us(decode, frames, payload.topic),
                 }
             )
@@ -499,14 +566,12 @@ def main() -> None:
         task = progress.add_task("measuring", total=rounds * len(DESIGNS) * len(PAYLOADS))
         latency = []
         for payload in PAYLOADS:
-            inner = Path(folder) / payload.topic.name
-            inner.mkdir()
             latency += measure(
                 payload,
+                DESIGNS,
                 rounds=rounds,
                 seconds=seconds,
-                transport=options.transport,
-                folder=inner,
+                open_sender=opener(options.transport, Path(folder)),
                 step=lambda: progress.advance(task),
             )
     report = {

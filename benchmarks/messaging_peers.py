@@ -1,0 +1,311 @@
+"""How long a message takes by flexsheet and by other messaging libraries, in the same run.
+
+    make bench-peers
+    python -m benchmarks.messaging_peers [--quick] [--over ipc tcp veth] [--json FILE]
+        [--markdown FILE]
+
+As `benchmarks.messaging`: one process publishes at a steady rate, one process per library receives;
+the latency is one way, from before a typed message is made to the handler that has it.  All take
+turns in random order in every round, and what counts is the ratio to blocking ZeroMQ within the
+round.  zenoh carries as many bytes, untyped; Cyclone DDS and LCM carry types of their own with the
+same fields, which nobody validates.
+
+As root, everything happens in a network of its own, where loopback has the multicast that LCM
+needs, and a second one is reached by a pair of virtual Ethernet devices ("veth").  There flexsheet
+encrypts and the others do not: nothing of it leaves a computer without keys.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import PackageNotFoundError, version
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import zmq
+from rich.console import Console
+from rich.progress import Progress
+
+from benchmarks import keys, messaging, peers
+from benchmarks.messaging import FLOOR, NODES_USE, PAYLOADS, BusLine, Design, Line, Payload, Sender
+from launch.machine import machine_name
+from messages.bus import Publisher
+from messages.security import KeyRing
+from messages.topics import Topic
+
+CLONE_NEWNET = 0x40000000
+ADDRESSES = ("10.78.0.1", "10.78.0.2")
+DEVICE = "bench"
+PORTS = count(7450)
+DOMAINS = count(1)
+OVER = {
+    "ipc": "within a computer, by ipc where there is such a thing",
+    "tcp": "on loopback, by tcp or UDP",
+    "veth": "between two networks, by tcp or UDP",
+}
+
+
+@dataclass(frozen=True)
+class Peer:
+    """A library that is asked: its package, and a place for each transport."""
+
+    package: str
+    design: Design
+    place: Callable[[str, Path], str]
+
+
+def zenoh_place(over: str, folder: Path) -> str:
+    number = next(PORTS)
+    if over == "ipc":
+        return f"unixsock-stream/{folder}/z{number}"
+    return f"tcp/{ADDRESSES[0] if over == 'veth' else '127.0.0.1'}:{number}"
+
+
+def dds_place(over: str, folder: Path) -> str:
+    interface = (DEVICE, *ADDRESSES) if over == "veth" else ("lo", "127.0.0.1")
+    return " ".join((str(next(DOMAINS)), *interface))
+
+
+def lcm_place(over: str, folder: Path) -> str:
+    return f"udpm://239.255.76.67:{next(PORTS)}?ttl={1 if over == 'veth' else 0}"
+
+
+PEERS = (
+    Peer(
+        "eclipse-zenoh",
+        Design("zenoh", "raw bytes, callback", False, peers.receive_zenoh, open=peers.ZenohLine),
+        zenoh_place,
+    ),
+    Peer(
+        "cyclonedds",
+        Design("Cyclone DDS", "typed, reliable UDP", True, peers.receive_dds, open=peers.DdsLine),
+        dds_place,
+    ),
+    Peer(
+        "lcm",
+        Design("LCM", "typed, UDP multicast", True, peers.receive_lcm, open=peers.LcmLine),
+        lcm_place,
+    ),
+)
+
+
+class KeyedLine(BusLine):
+    """A publisher with keys, which needs a loop that turns."""
+
+    def __init__(self, payload: Payload, place: str, ring: KeyRing, loop: keys.Loop) -> None:
+        async def opened(topic: Topic, bind: list[str]) -> Publisher:
+            return Publisher(topic, bind, keys=ring)
+
+        super().__init__(OURS_KEYED, payload, place, lambda topic, at: loop.do(opened(topic, at)))
+        self._loop = loop
+
+    def close(self) -> None:
+        async def closed() -> None:
+            self._publisher.close()
+
+        self._loop.do(closed())
+
+
+OURS = Design(NODES_USE, "typed, validated", True, messaging.flexsheet_uvloop)
+OURS_KEYED = Design(NODES_USE, "typed, validated, CURVE", True, keys.listen)
+RAW = Design(FLOOR, "raw ZeroMQ: the floor", False, messaging.blocking)
+
+
+def _libc(call: str, *arguments: int) -> None:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if getattr(libc, call)(*arguments):
+        raise OSError(ctypes.get_errno(), f"{call}: {os.strerror(ctypes.get_errno())}")
+
+
+def enter_network(pid: int) -> None:
+    """Go into the network of that process, before any socket is opened."""
+    with open(f"/proc/{pid}/ns/net") as space:
+        _libc("setns", space.fileno(), CLONE_NEWNET)
+
+
+def leave_for_own_network() -> None:
+    """Into a new network with loopback alone, multicast on it; raises OSError without the right."""
+    _libc("unshare", CLONE_NEWNET)
+    _ip("link", "set", "lo", "up", "multicast", "on")
+    _ip("route", "add", "224.0.0.0/4", "dev", "lo")
+
+
+@contextmanager
+def second_network() -> Iterator[int]:
+    """A network beside ours, a virtual cable between them; yields a process that lives there."""
+    holder = subprocess.Popen(
+        ["unshare", "--net", "sh", "-c", "echo here; exec cat"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert holder.stdin is not None
+    assert holder.stdout is not None
+    try:
+        holder.stdout.readline()
+        there = ("nsenter", "-t", str(holder.pid), "-n")
+        _ip("link", "add", DEVICE, "type", "veth", "peer", "name", DEVICE, "netns", str(holder.pid))
+        for command, address in zip(((), there), ADDRESSES, strict=True):
+            _ip("addr", "add", f"{address}/24", "dev", DEVICE, through=command)
+            _ip("link", "set", DEVICE, "up", through=command)
+        # LCM's multicast goes by the cable, on both sides.
+        _ip("route", "replace", "224.0.0.0/4", "dev", DEVICE)
+        _ip("route", "add", "224.0.0.0/4", "dev", DEVICE, through=there)
+        yield holder.pid
+    finally:
+        holder.stdin.close()
+        holder.wait()
+
+
+def _ip(*words: str, through: Sequence[str] = ()) -> None:
+    subprocess.run([*through, "ip", *words], check=True, capture_output=True)
+
+
+def installed(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def measure_over(
+    over: str, found: Sequence[Peer], options: argparse.Namespace, step: Callable[[], object]
+) -> list[dict[str, Any]]:
+    """The rows of one way to be connected."""
+    ours = OURS_KEYED if over == "veth" else OURS
+    places = {one.design.name: one.place for one in found}
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        prepare = None
+        if over == "veth":
+            prepare = partial(enter_network, stack.enter_context(second_network()))
+            ring = stack.enter_context(keys.ring_of_two(folder))
+            loop = keys.Loop()
+            stack.callback(loop.close)
+
+        def open_line(design: Design, payload: Payload, number: int) -> Line:
+            if design.open is not None and design.name in places:
+                return design.open(payload, places[design.name](over, folder))
+            place = {
+                "ipc": f"ipc://{folder}/{payload.topic.name}-{number}",
+                "tcp": "tcp://127.0.0.1:*",
+                "veth": f"tcp://{ADDRESSES[0]}:*",
+            }[over]
+            if design.name == FLOOR:
+                return peers.ZmqLine(payload, place)
+            if over == "veth":
+                return KeyedLine(payload, place, ring, loop)
+            return BusLine(design, payload, place)
+
+        rows = []
+        for payload in PAYLOADS:
+            rows += messaging.measure(
+                payload,
+                (RAW, ours, *(one.design for one in found)),
+                rounds=options.rounds,
+                seconds=options.seconds,
+                open_sender=lambda design, payload, number: Sender(
+                    design, payload, open_line(design, payload, number), prepare
+                ),
+                step=step,
+            )
+    return [{"over": over, **row} for row in rows]
+
+
+HEADS = ("library", "", "p50 µs", "p99 µs", "p50 ratio", "(min-max)", "p99 ratio", "lost")
+
+
+def markdown(report: dict[str, Any]) -> str:
+    """The page docs/messaging-peers.md."""
+    lines = [
+        "# How long a message takes by other libraries",
+        "",
+        f"<!-- Written by `{report['command']}`. -->",
+        "",
+        *"\n\n".join((__doc__ or "").split("\n\n")[2:]).strip().splitlines(),
+        "",
+        f"Command: `{report['command']}`.  Machine: {report['machine']}, ZeroMQ {report['zmq']}, "
+        + ", ".join(f"{name} {number}" for name, number in report["packages"].items())
+        + f"; load average {report['load'][0]:.1f} before and {report['load'][1]:.1f} after.  "
+        f"{report['rounds']} rounds; ratios are medians over the rounds.  Lost: never arrived, or "
+        "superseded by a newer one while the receiver waited for its turn.",
+        *(["", f"Left out: {'; '.join(report['left_out'])}."] if report["left_out"] else []),
+    ]
+    for over in report["over"]:
+        for payload in PAYLOADS:
+            lines += ["", f"## {payload.name} at {payload.rate_hz:.0f} Hz, {OVER[over]}", ""]
+            rows = [
+                messaging.latency_cells(row)
+                for row in report["latency"]
+                if (row["over"], row["payload"]) == (over, payload.name)
+            ]
+            for cells in (HEADS, tuple("---" for _ in HEADS), *rows):
+                lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="2 rounds of 1 s")
+    parser.add_argument("--rounds", type=int, default=6)
+    parser.add_argument("--seconds", type=float, default=1.5, help="per library and round")
+    parser.add_argument("--over", nargs="+", choices=list(OVER), default=list(OVER))
+    parser.add_argument("--json", type=Path, help="also write the figures there")
+    parser.add_argument("--markdown", type=Path, help="also write them there for people")
+    options = parser.parse_args()
+    if options.quick:
+        options.rounds, options.seconds = 2, 1.0
+    packages = {one.package: installed(one.package) for one in PEERS}
+    left_out = [f"{name}, not installed" for name, number in packages.items() if number is None]
+    found = [one for one in PEERS if packages[one.package] is not None]
+    over = list(options.over)
+    words = Console(stderr=True)
+    try:
+        leave_for_own_network()
+    except OSError as error:
+        left_out += [
+            f"LCM and two networks, which need a network of their own (be root): {error.strerror}"
+        ]
+        found = [one for one in found if one.package != "lcm"]
+        over = [one for one in over if one != "veth"]
+    for text in left_out:
+        words.print(f"left out: {text}")
+    load_before = os.getloadavg()[0]
+    latency = []
+    with Progress(console=words) as progress:
+        total = len(over) * len(PAYLOADS) * options.rounds * (2 + len(found))
+        task = progress.add_task("measuring", total=total)
+        for one in over:
+            latency += measure_over(one, found, options, lambda: progress.advance(task))
+    report = {
+        "command": f"python -m benchmarks.messaging_peers --rounds {options.rounds} "
+        f"--seconds {options.seconds:g} --markdown docs/messaging-peers.md",
+        "machine": machine_name(),
+        "load": [load_before, os.getloadavg()[0]],
+        "zmq": zmq.zmq_version(),
+        "packages": {name: number for name, number in packages.items() if number is not None},
+        "left_out": left_out,
+        "over": over,
+        "rounds": options.rounds,
+        "latency": latency,
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+    page = markdown(report)
+    if options.markdown is not None:
+        options.markdown.write_text(page)
+    sys.stdout.write(page)
+
+
+if __name__ == "__main__":
+    main()

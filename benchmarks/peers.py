@@ -1,0 +1,397 @@
+"""How other messaging libraries carry the messages of `benchmarks.messaging`.
+
+Each has a line, the sending end, and a function that receives, in the way its own manual begins
+with.  All are told where the other is: nothing is looked for beyond the interface that is named.
+
+zenoh carries bytes, Cyclone DDS and LCM messages of their own types, with the same fields.  LCM's
+are written as its generator writes them.  DDS's pictures are arrays of octets, their size part of
+the type, which its Python binding copies at once; a sequence it packs number by number, for 25 ms.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from io import BytesIO
+from threading import Event
+from typing import Any
+
+import numpy as np
+import zmq
+
+from benchmarks.messaging import EPOCH, Payload, header_of
+from messages.topics import Topic
+from messages.types import Fingertip, StereoPair
+from messages.wire import encode
+
+Arrived = Callable[[int, int], bool]
+PICTURE_BYTES = 480 * 640
+STAMPS = struct.Struct("<QQ")
+
+
+def raw_bytes(payload: Payload) -> bytearray:
+    """As many bytes as our message has, in one piece; they begin with sequence and stamp."""
+    return bytearray(b"".join(encode(payload.make(0), header_of(0, 0))))
+
+
+class ZmqLine:
+    """Plain ZeroMQ: the floor, where a publisher of `messages.bus` would ask for keys."""
+
+    def __init__(self, payload: Payload, place: str) -> None:
+        self._frames = [bytearray(one) for one in encode(payload.make(0), header_of(0, 0))]
+        self._socket = zmq.Context.instance().socket(zmq.PUB)
+        self._socket.bind(place)
+        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def send(self, sequence: int, stamp_ns: int) -> None:
+        STAMPS.pack_into(self._frames[0], 0, sequence, stamp_ns)
+        head, *arrays = self._frames
+        self._socket.send_multipart([bytes(head), *arrays], zmq.NOBLOCK, copy=not arrays)
+
+    def close(self) -> None:
+        self._socket.close(linger=0)
+
+
+def zenoh_session(mode: str, endpoint: str) -> Any:
+    import json
+
+    import zenoh
+
+    config = zenoh.Config()
+    for key, value in {
+        "mode": "peer",
+        "listen/endpoints": [endpoint] if mode == "listen" else [],
+        "connect/endpoints": [endpoint] if mode == "connect" else [],
+        "scouting/multicast/enabled": False,
+        "scouting/gossip/enabled": False,
+    }.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+class ZenohLine:
+    def __init__(self, payload: Payload, place: str) -> None:
+        self.endpoint = place
+        self._raw = raw_bytes(payload)
+        self._session = zenoh_session("listen", place)
+        self._publisher = self._session.declare_publisher("bench")
+
+    def send(self, sequence: int, stamp_ns: int) -> None:
+        STAMPS.pack_into(self._raw, 0, sequence, stamp_ns)
+        self._publisher.put(self._raw)
+
+    def close(self) -> None:
+        self._session.close()
+
+
+def receive_zenoh(topic: Topic, endpoint: str, arrived: Arrived) -> None:
+    session = zenoh_session("connect", endpoint)
+    ended = Event()
+
+    def on_sample(sample: Any) -> None:
+        if not arrived(*STAMPS.unpack_from(sample.payload.to_bytes())):
+            ended.set()
+
+    session.declare_subscriber("bench", on_sample)
+    ended.wait()
+    session.close()
+
+
+@cache
+def dds_types() -> dict[type, type]:
+    """Our message types' likes, as DDS knows them."""
+    from cyclonedds.idl import make_idl_struct
+    from cyclonedds.idl.types import array, float64, int64, sequence, uint8, uint32, uint64
+
+    stamps = {"sequence": uint64, "source_ns": int64, "publish_ns": int64, "epoch": int64}
+    names = {"clock_id": str, "writer": str}
+    three = array[float64, 3]
+    tip = {
+        "valid": bool,
+        "state": str,
+        "reason": str,
+        "position_world_m": three,
+        "velocity_world_m_per_s": three,
+        "covariance": array[float64, 36],
+        "ahead_world_m": sequence[float64],
+        "ahead_step_s": float64,
+        "measured_world_m": three,
+        "reprojection_px": float64,
+    }
+    pair = {
+        "device": str,
+        "exposure_s": float64,
+        "skew_s": float64,
+        "dropped_frames": int64,
+        "left_origin_px": array[uint32, 2],
+        "right_origin_px": array[uint32, 2],
+        "left": array[uint8, PICTURE_BYTES],
+        "right": array[uint8, PICTURE_BYTES],
+    }
+    return {
+        message: make_idl_struct(
+            message.__name__, f"bench.{message.__name__}", stamps | names | own
+        )
+        for message, own in ((Fingertip, tip), (StereoPair, pair))
+    }
+
+
+def dds_participant(endpoint: str) -> tuple[Any, Any]:
+    """A domain on one interface, which nothing leaves by multicast, and a participant in it.
+
+    endpoint: number of the domain, name of the interface, and the address of each end.
+    """
+    from cyclonedds.domain import Domain, DomainParticipant
+
+    number, interface, *addresses = endpoint.split()
+    peers = "".join(f'<Peer Address="{one}"/>' for one in addresses)
+    domain = Domain(
+        int(number),
+        f"""<CycloneDDS><Domain><General><AllowMulticast>false</AllowMulticast>
+        <Interfaces><NetworkInterface name="{interface}" multicast="false"/></Interfaces></General>
+        <Discovery><ParticipantIndex>auto</ParticipantIndex><Peers>{peers}</Peers></Discovery>
+        </Domain></CycloneDDS>""",
+    )
+    return domain, DomainParticipant(int(number))
+
+
+def dds_qos() -> Any:
+    from cyclonedds.core import Policy, Qos
+    from cyclonedds.util import duration
+
+    return Qos(Policy.Reliability.Reliable(duration(seconds=1)), Policy.History.KeepLast(1000))
+
+
+class DdsLine:
+    def __init__(self, payload: Payload, place: str) -> None:
+        from cyclonedds.pub import DataWriter
+        from cyclonedds.topic import Topic as DdsTopic
+
+        self.endpoint, self._payload = place, payload
+        self._domain, participant = dds_participant(place)
+        self._type = dds_types()[payload.topic.message]
+        topic = DdsTopic(participant, "bench", self._type)
+        self._writer = DataWriter(participant, topic, qos=dds_qos())
+        self._kept = participant, topic
+        self._fields = {name: dds_value(value) for name, value in payload.make(0).__dict__.items()}
+
+    def send(self, sequence: int, stamp_ns: int) -> None:
+        self._writer.write(
+            self._type(
+                sequence=sequence,
+                source_ns=stamp_ns,
+                publish_ns=stamp_ns,
+                epoch=EPOCH,
+                clock_id="bench",
+                writer="bench",
+                **self._fields,
+            )
+        )
+
+    def close(self) -> None:
+        del self._writer, self._kept, self._domain
+
+
+def dds_value(value: Any) -> Any:
+    """As the binding wants it: octets, or a list of numbers."""
+    if isinstance(value, np.ndarray):
+        return value.tobytes() if value.dtype == np.uint8 else value.ravel().tolist()
+    return list(value) if isinstance(value, tuple) else value
+
+
+def receive_dds(topic: Topic, endpoint: str, arrived: Arrived) -> None:
+    from cyclonedds.sub import DataReader
+    from cyclonedds.topic import Topic as DdsTopic
+    from cyclonedds.util import duration
+
+    _domain, participant = dds_participant(endpoint)
+    dds_topic = DdsTopic(participant, "bench", dds_types()[topic.message])
+    reader = DataReader(participant, dds_topic, qos=dds_qos())
+    while True:
+        for message in reader.take_iter(timeout=duration(seconds=10)):
+            if not arrived(message.sequence, message.publish_ns):
+                return
+
+
+LCM_HEADER = struct.Struct(">qQqqq")
+LCM_FINGERPRINT = 0x1234567890ABCDEF
+LCM_TEXT = struct.Struct(">I")
+
+
+def lcm_write_text(out: BytesIO, text: str) -> None:
+    data = text.encode()
+    out.write(LCM_TEXT.pack(len(data) + 1))
+    out.write(data)
+    out.write(b"\0")
+
+
+def lcm_read_text(buffer: BytesIO) -> str:
+    (length,) = LCM_TEXT.unpack(buffer.read(4))
+    return buffer.read(length)[:-1].decode()
+
+
+@dataclass(slots=True)
+class LcmHeader:
+    sequence: int
+    source_ns: int
+    publish_ns: int
+    epoch: int
+    clock_id: str
+    writer: str
+
+    def write(self, out: BytesIO) -> None:
+        out.write(
+            LCM_HEADER.pack(
+                LCM_FINGERPRINT, self.sequence, self.source_ns, self.publish_ns, self.epoch
+            )
+        )
+        lcm_write_text(out, self.clock_id)
+        lcm_write_text(out, self.writer)
+
+    @classmethod
+    def read(cls, buffer: BytesIO) -> LcmHeader:
+        fingerprint, *stamps = LCM_HEADER.unpack(buffer.read(LCM_HEADER.size))
+        if fingerprint != LCM_FINGERPRINT:
+            raise ValueError("not a message of this type")
+        return cls(*stamps, lcm_read_text(buffer), lcm_read_text(buffer))
+
+
+@dataclass(slots=True)
+class LcmFingertip:
+    """The fields of `Fingertip`."""
+
+    header: LcmHeader
+    valid: bool
+    state: str
+    reason: str
+    position_world_m: Any
+    velocity_world_m_per_s: Any
+    covariance: Any
+    points: int
+    ahead_world_m: Any
+    ahead_step_s: float
+    measured_world_m: Any
+    reprojection_px: float
+
+    def encode(self) -> bytes:
+        out = BytesIO()
+        self.header.write(out)
+        out.write(struct.pack(">b", self.valid))
+        lcm_write_text(out, self.state)
+        lcm_write_text(out, self.reason)
+        out.write(struct.pack(">3d", *self.position_world_m[:3]))
+        out.write(struct.pack(">3d", *self.velocity_world_m_per_s[:3]))
+        for row in self.covariance:
+            out.write(struct.pack(">6d", *row[:6]))
+        out.write(struct.pack(">i", self.points))
+        for row in self.ahead_world_m:
+            out.write(struct.pack(">3d", *row[:3]))
+        out.write(struct.pack(">d", self.ahead_step_s))
+        out.write(struct.pack(">3d", *self.measured_world_m[:3]))
+        out.write(struct.pack(">d", self.reprojection_px))
+        return out.getvalue()
+
+    @classmethod
+    def decode(cls, data: bytes) -> LcmFingertip:
+        buffer = BytesIO(data)
+        header = LcmHeader.read(buffer)
+        valid = bool(struct.unpack(">b", buffer.read(1))[0])
+        state, reason = lcm_read_text(buffer), lcm_read_text(buffer)
+        position = struct.unpack(">3d", buffer.read(24))
+        velocity = struct.unpack(">3d", buffer.read(24))
+        covariance = [struct.unpack(">6d", buffer.read(48)) for _ in range(6)]
+        (points,) = struct.unpack(">i", buffer.read(4))
+        ahead = [struct.unpack(">3d", buffer.read(24)) for _ in range(points)]
+        (step,) = struct.unpack(">d", buffer.read(8))
+        measured = struct.unpack(">3d", buffer.read(24))
+        (reprojection,) = struct.unpack(">d", buffer.read(8))
+        return cls(
+            header, valid, state, reason, position, velocity, covariance, points, ahead, step,
+            measured, reprojection,
+        )  # fmt: skip
+
+
+@dataclass(slots=True)
+class LcmStereoPair:
+    """The fields of `StereoPair`; pictures are byte[rows * columns]."""
+
+    header: LcmHeader
+    device: str
+    exposure_s: float
+    skew_s: float
+    dropped_frames: int
+    left_origin_px: Any
+    right_origin_px: Any
+    rows: int
+    columns: int
+    left: Any
+    right: Any
+
+    def encode(self) -> bytes:
+        out = BytesIO()
+        self.header.write(out)
+        lcm_write_text(out, self.device)
+        out.write(struct.pack(">ddq", self.exposure_s, self.skew_s, self.dropped_frames))
+        out.write(struct.pack(">2i", *self.left_origin_px))
+        out.write(struct.pack(">2i", *self.right_origin_px))
+        out.write(struct.pack(">ii", self.rows, self.columns))
+        out.write(self.left)
+        out.write(self.right)
+        return out.getvalue()
+
+    @classmethod
+    def decode(cls, data: bytes) -> LcmStereoPair:
+        buffer = BytesIO(data)
+        header, device = LcmHeader.read(buffer), lcm_read_text(buffer)
+        exposure, skew, dropped = struct.unpack(">ddq", buffer.read(24))
+        left_origin = struct.unpack(">2i", buffer.read(8))
+        right_origin = struct.unpack(">2i", buffer.read(8))
+        rows, columns = struct.unpack(">ii", buffer.read(8))
+        left, right = buffer.read(rows * columns), buffer.read(rows * columns)
+        return cls(
+            header, device, exposure, skew, dropped, left_origin, right_origin, rows, columns,
+            left, right,
+        )  # fmt: skip
+
+
+def lcm_message(message: Fingertip | StereoPair, header: LcmHeader) -> LcmFingertip | LcmStereoPair:
+    values = dict(message.__dict__)
+    if isinstance(message, Fingertip):
+        return LcmFingertip(header=header, points=len(message.ahead_world_m), **values)
+    rows, columns = message.left.shape
+    return LcmStereoPair(header=header, rows=rows, columns=columns, **values)
+
+
+class LcmLine:
+    def __init__(self, payload: Payload, place: str) -> None:
+        import lcm
+
+        self.endpoint = place
+        self._message: Any = payload.make(0)
+        self._lcm = lcm.LCM(place)
+
+    def send(self, sequence: int, stamp_ns: int) -> None:
+        header = LcmHeader(sequence, stamp_ns, stamp_ns, EPOCH, "bench", "bench")
+        self._lcm.publish("bench", lcm_message(self._message, header).encode())
+
+    def close(self) -> None:
+        del self._lcm
+
+
+def receive_lcm(topic: Topic, endpoint: str, arrived: Arrived) -> None:
+    import lcm
+
+    kind = LcmFingertip if topic.message is Fingertip else LcmStereoPair
+    going = True
+
+    def on_message(channel: str, data: bytes) -> None:
+        nonlocal going
+        header = kind.decode(data).header
+        going = arrived(header.sequence, header.publish_ns)
+
+    opened = lcm.LCM(endpoint)
+    opened.subscribe("bench", on_message)
+    while going:
+        opened.handle()
