@@ -29,8 +29,9 @@ from functools import cache, lru_cache
 from math import prod
 from typing import Any, TypeAlias, TypeVar, overload
 
-import msgpack
 import numpy as np
+from msgpack import ExtType, Packer, unpackb
+from numpy import ndarray
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
@@ -58,8 +59,9 @@ before its elements are there, and may be the first element of another one."""
 
 _DTYPE_CODES = {dtype.str: code for code, dtype in enumerate(DTYPES)}
 _INLINE, _FRAME = 1, 2
+_BUFFERS = (bytes, memoryview)
 _MAX_INTEGER = 2**63 - 1
-# The constructor of msgpack.ExtType checks what is right by construction, for half the time of all.
+# The constructor of ExtType checks what is right by construction, for half the time of all.
 _extension = tuple.__new__
 
 
@@ -78,14 +80,13 @@ class WireError(ValueError):
 class Codec:
     """What encoding and decoding need to know of one message type."""
 
-    __slots__ = ("fingerprint", "name", "prefix", "type", "validator")
+    __slots__ = ("fingerprint", "name", "type", "validate")
 
     def __init__(self, message_type: type[Message]) -> None:
         self.type = message_type
         self.name = message_type.__name__
         self.fingerprint = schema_fingerprint(message_type)
-        self.prefix = (PROTOCOL, self.name, self.fingerprint)
-        self.validator = message_type.__pydantic_validator__
+        self.validate = message_type.__pydantic_validator__.validate_python
 
 
 codec_of = cache(Codec)
@@ -106,21 +107,24 @@ def encode(
     frames: list[Buffer] = [b""]
 
     def pack(value: object) -> object:
-        if isinstance(value, np.ndarray):
+        if isinstance(value, ndarray):
+            what = _dtype_and_shape(value.dtype, value.shape)
+            if value.nbytes <= inline_bytes or not value.nbytes:
+                return _extension(ExtType, (_INLINE, what + value.tobytes()))
             array = value if value.flags.c_contiguous else np.ascontiguousarray(value)
-            what = _dtype_and_shape(array.dtype.str, array.shape)
-            if array.nbytes <= inline_bytes or not array.nbytes:
-                return _extension(msgpack.ExtType, (_INLINE, what + array.tobytes()))
             frames.append(array.data.cast("B"))
-            return _extension(msgpack.ExtType, (_FRAME, what))
+            return _extension(ExtType, (_FRAME, what))
         if isinstance(value, BaseModel):
             return value.__dict__
         raise TypeError(f"{type(value).__name__} has no form on the wire")
 
+    codec = codec_of(type(message))
     try:
-        frames[0] = msgpack.packb(
+        frames[0] = Packer(default=pack).pack(
             (
-                *codec_of(type(message)).prefix,
+                PROTOCOL,
+                codec.name,
+                codec.fingerprint,
                 header.sequence,
                 header.source_ns,
                 header.publish_ns,
@@ -129,13 +133,12 @@ def encode(
                 header.epoch,
                 header.plan,
                 message.__dict__,
-            ),
-            default=pack,
+            )
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise WireError("field", f"{type(message).__name__} cannot be encoded: {error}") from error
-    if max_bytes is not None:
-        _check_size(frames, max_bytes, type(message).__name__)
+    if max_bytes is not None and size_of(frames) > max_bytes:
+        raise _too_large(frames, max_bytes, codec.name)
     if len(frames[0]) > HEADER_BYTES_MAX:
         raise _too_much_header(frames)
     return frames
@@ -152,7 +155,7 @@ class Envelope:
     def open(self) -> Message:
         """The validated message; raises WireError with the fields that are wrong."""
         try:
-            return self.codec.validator.validate_python(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped
+            return self.codec.validate(self.fields)  # type: ignore[no-any-return]  # pydantic's validator is untyped
         except ValidationError as error:
             raise WireError("field", _describe(error, self.codec.name)) from error
 
@@ -168,7 +171,8 @@ def read_envelope(
     """
     if isinstance(expected, Topic):
         codec = codec_of(expected.message)
-        _check_size(frames, expected.max_bytes, f'topic "{expected.name}"')
+        if sum(map(len, frames)) > expected.max_bytes:
+            raise _too_large(frames, expected.max_bytes, f'topic "{expected.name}"')
     else:
         codec = codec_of(expected)
     wanted = codec.fingerprint if fingerprint is None else fingerprint
@@ -234,7 +238,7 @@ def _unpack(frames: Sequence[Any]) -> Any:
         if code == _INLINE:
             if len(data) - offset != size:
                 raise _wrong_size(len(data) - offset, size, dtype, shape)
-            return np.ndarray(shape, dtype, buffer=data, offset=offset)
+            return ndarray(shape, dtype, data, offset)
         used += 1
         if len(data) != offset or used >= len(frames):
             raise WireError("frames", f"an array's frame is missing: got {len(frames)} frames")
@@ -248,10 +252,10 @@ def _unpack(frames: Sequence[Any]) -> Any:
         raise WireError("frames", "a message without frames")
     try:
         # A zmq.Frame is no buffer to msgpack; its bytes are.
-        first = frames[0] if isinstance(frames[0], bytes | memoryview) else frames[0].buffer
+        first = frames[0] if isinstance(frames[0], _BUFFERS) else frames[0].buffer
         if len(first) > HEADER_BYTES_MAX:
             raise _too_much_header(frames)
-        unpacked = msgpack.unpackb(
+        unpacked = unpackb(
             first,
             ext_hook=unpack,
             use_list=False,
@@ -287,10 +291,10 @@ def _read_only(frame: Any) -> memoryview:
 
 
 @lru_cache(maxsize=1024)
-def _dtype_and_shape(dtype: str, shape: tuple[int, ...]) -> bytes:
-    if dtype not in _DTYPE_CODES:
-        raise TypeError(f"arrays of {dtype} have no form on the wire")
-    head = struct.pack(f"<BBxx{len(shape)}I", _DTYPE_CODES[dtype], len(shape), *shape)
+def _dtype_and_shape(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
+    if dtype.str not in _DTYPE_CODES:
+        raise TypeError(f"arrays of {dtype.str} have no form on the wire")
+    head = struct.pack(f"<BBxx{len(shape)}I", _DTYPE_CODES[dtype.str], len(shape), *shape)
     return head + bytes(-len(head) % 8)
 
 
@@ -304,10 +308,11 @@ def _read_dtype_and_shape(head: bytes) -> tuple[np.dtype[Any], tuple[int, ...], 
     return DTYPES[code], shape, len(head), DTYPES[code].itemsize * prod(shape)
 
 
-def _check_size(frames: Sequence[Any], max_bytes: int, what: str) -> None:
-    size = size_of(frames)
-    if size > max_bytes:
-        raise WireError("size", f"{what}: message of {size} bytes, at most {max_bytes} are allowed")
+def _too_large(frames: Sequence[Any], max_bytes: int, what: str) -> WireError:
+    return WireError(
+        "size",
+        f"{what}: message of {size_of(frames)} bytes, at most {max_bytes} are allowed",
+    )
 
 
 def _describe(error: ValidationError, name: str) -> str:
