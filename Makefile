@@ -9,7 +9,7 @@ LOCK := build/pip-tools
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test lint bench faults soak fuzz limits pages charts docs lock clean
+.PHONY: setup demo try test lint bench bench-peers faults soak fuzz limits pages charts docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
@@ -70,6 +70,11 @@ bench: setup $(DEV_STAMP)
 	$(BIN)/python -m benchmarks.frame_cpu
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.fingertip_accuracy
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_endurance
+
+# docs/messaging-peers.md: other messaging libraries in turns with ours (a network of its own: root).
+bench-peers: setup
+	$(INSTALL) --no-build-isolation -e '.[peers]'
+	$(BIN)/python -m benchmarks.messaging_peers
 
 # Kills, cuts and spoils everything between three computers (network namespaces: root).
 faults: setup $(DEV_STAMP)

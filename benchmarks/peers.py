@@ -252,10 +252,13 @@ class LcmHeader:
 
     @classmethod
     def read(cls, buffer: BytesIO) -> LcmHeader:
-        fingerprint, *stamps = LCM_HEADER.unpack(buffer.read(LCM_HEADER.size))
+        fingerprint, sequence, source, publish, epoch = LCM_HEADER.unpack(
+            buffer.read(LCM_HEADER.size)
+        )
         if fingerprint != LCM_FINGERPRINT:
             raise ValueError("not a message of this type")
-        return cls(*stamps, lcm_read_text(buffer), lcm_read_text(buffer))
+        clock_id, writer = lcm_read_text(buffer), lcm_read_text(buffer)
+        return cls(sequence, source, publish, epoch, clock_id, writer)
 
 
 @dataclass(slots=True)

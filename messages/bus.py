@@ -56,6 +56,10 @@ HANDSHAKE_MS = 5000
 GIVEN_UP_S = 0.5
 CLOCKS_REMEMBERED = 16
 
+# As plain numbers: what Python's enumerations do with them takes longer than ZeroMQ.
+EVENTS, POLLIN = int(zmq.EVENTS), int(zmq.POLLIN)
+NOBLOCK, NOBLOCK_MORE = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
+
 _log = logging.getLogger("flexsheet.bus")
 
 
@@ -203,10 +207,13 @@ class Publisher:
 
     def _send(self, frames: list[Any]) -> None:
         # A PUB socket drops for a subscriber whose queue is full, which that one sees as a gap.
+        send = self._socket.send
         if len(frames) == 1:
-            self._socket.send(frames[0], zmq.NOBLOCK)
+            send(frames[0], NOBLOCK)
         else:
-            self._socket.send_multipart(frames, zmq.NOBLOCK, copy=False)
+            for frame in frames[:-1]:
+                send(frame, NOBLOCK_MORE, copy=False)
+            send(frames[-1], NOBLOCK, copy=False)
 
     def _serve_late_subscribers(self) -> None:
         """Send the last message again if somebody subscribed; until nobody else did meanwhile."""
@@ -597,20 +604,20 @@ class _Line:
     def _has_more(self) -> bool:
         if self._socket is None or self._socket.closed:
             return False
-        events: Any = self._socket.getsockopt(zmq.EVENTS)
-        return bool(events & zmq.POLLIN)
+        events: Any = self._socket.getsockopt(EVENTS)
+        return bool(events & POLLIN)
 
     def _receive(self) -> list[Any] | None:
         """The frames of one message, or None where there is none; large ones are not copied."""
         if self._socket is None or self._socket.closed:
             return None
         try:
-            frame = self._socket.recv(zmq.NOBLOCK, copy=False)
+            frame = self._socket.recv(NOBLOCK, copy=False)
         except zmq.Again:
             return None
         frames = [frame]
         while frame.more:
-            frame = self._socket.recv(zmq.NOBLOCK, copy=False)
+            frame = self._socket.recv(NOBLOCK, copy=False)
             frames.append(frame)
         return frames
 

@@ -1,0 +1,163 @@
+"""What the graph costs while nothing happens: CPU time of each process, in % of one core.
+
+    python -m benchmarks.idle [--seconds 30] [--case standing watching] [--json FILE]
+
+The nodes of `launch/demo.yaml` without twin_finger and twin_eye.  The arms are ready and stand;
+twin_arms plays their controllers, which a lab has outside its computers, and is not in the sum.
+
+standing   the camera gives no pictures
+watching   the camera gives 60 pairs a second, from files, without a finger in them
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import socket
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import psutil
+from rich.console import Console
+from rich.table import Table
+from ruamel.yaml import YAML
+
+from launch.experiments.run import DEMO_FILE
+from launch.machine import machine_name
+from launch.plan import load_plan
+from launch.supervisor import RunningGraph
+
+LEFT_OUT = ("twin_finger", "twin_eye")
+OUTSIDE = "twin_arms"
+LAUNCHER = "launcher"
+SETTLING_S = 5.0
+PICTURES, RATE_HZ, SIZE_PX = 8, 60.0, (480, 640)
+
+
+def free_ports(count: int) -> list[int]:
+    opened = [socket.socket() for _ in range(count)]
+    try:
+        for one in opened:
+            one.bind(("127.0.0.1", 0))
+        return [int(one.getsockname()[1]) for one in opened]
+    finally:
+        for one in opened:
+            one.close()
+
+
+def no_pictures(folder: Path) -> dict[str, Any]:
+    """The camera's entry in the launch file."""
+    return {"type": "camera", "parameters": {"source": "twin"}, "topics": {"twin__stereo": None}}
+
+
+def empty_pictures(folder: Path) -> dict[str, Any]:
+    """The same, with files of a dim background and its noise."""
+    random = np.random.default_rng(0)
+    for side in ("left", "right"):
+        for number in range(PICTURES):
+            picture = random.normal(40.0, 2.0, SIZE_PX).astype(np.uint8)
+            cv2.imwrite(str(folder / f"{side}{number}.bmp"), picture)
+    source = {
+        "kind": "images",
+        "left": str(folder / "left*.bmp"),
+        "right": str(folder / "right*.bmp"),
+        "rate_hz": RATE_HZ,
+        "loop": True,
+    }
+    return {
+        "type": "camera",
+        "parameters": {"source": source},
+        "topics": {"twin__stereo": None},
+    }
+
+
+CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
+    "standing": no_pictures,
+    "watching": empty_pictures,
+}
+
+
+def launch_file(folder: Path, camera: dict[str, Any]) -> Path:
+    """The demo's graph without what plays finger and eye."""
+    yaml = YAML()
+    values = yaml.load(DEMO_FILE)
+    values["scene"] = str((DEMO_FILE.parent / values["scene"]).resolve())
+    nodes = values["nodes"]
+    for name in LEFT_OUT:
+        del nodes[name]
+    nodes["camera"] = camera
+    calibration = nodes["triangulator"]["parameters"]["calibration"]
+    nodes["triangulator"]["parameters"]["calibration"] = str(DEMO_FILE.parent / calibration)
+    ports = dict(zip(("left", "right"), free_ports(2), strict=True))
+    nodes[OUTSIDE]["parameters"] = {f"{side}_port": port for side, port in ports.items()}
+    for side, port in ports.items():
+        nodes[f"arm_{side}_bridge"]["parameters"]["port"] = port
+    path = folder / "idle.yaml"
+    yaml.dump(values, path)
+    return path
+
+
+def cpu_s(pids: dict[str, int]) -> dict[str, float]:
+    times = {name: psutil.Process(pid).cpu_times() for name, pid in pids.items()}
+    return {name: time.user + time.system for name, time in times.items()}
+
+
+async def measure(case: str, seconds: float) -> dict[str, Any]:
+    """CPU time over wall time, per process and of the graph's own processes together."""
+    with tempfile.TemporaryDirectory() as folder:
+        plan = load_plan(launch_file(Path(folder), CASES[case](Path(folder))))
+        async with RunningGraph(plan) as graph:
+            await graph.wait_ready()
+            await asyncio.sleep(SETTLING_S)
+            pids = {**graph.pids, LAUNCHER: os.getpid()}
+            loop = asyncio.get_running_loop()
+            begun_s, before = loop.time(), cpu_s(pids)
+            await asyncio.sleep(seconds)
+            wall_s, after = loop.time() - begun_s, cpu_s(pids)
+    percent = {name: 100.0 * (after[name] - before[name]) / wall_s for name in pids}
+    return {
+        "case": case,
+        "percent": percent,
+        "sum_percent": sum(share for name, share in percent.items() if name != OUTSIDE),
+    }
+
+
+def print_table(report: dict[str, Any]) -> None:
+    table = Table(title="CPU time, % of one core", title_justify="left")
+    table.add_column("process")
+    for result in report["cases"]:
+        table.add_column(result["case"], justify="right")
+    for name in report["cases"][0]["percent"]:
+        shown = f"{name} (outside)" if name == OUTSIDE else name
+        table.add_row(shown, *(f"{result['percent'][name]:.1f}" for result in report["cases"]))
+    table.add_section()
+    table.add_row("all but outside", *(f"{one['sum_percent']:.1f}" for one in report["cases"]))
+    Console(file=sys.stdout).print(table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--case", nargs="+", choices=list(CASES), default=list(CASES))
+    parser.add_argument("--json", type=Path, help="also write the figures there")
+    options = parser.parse_args()
+    report = {
+        "command": f"python -m benchmarks.idle --seconds {options.seconds:g}",
+        "machine": machine_name(),
+        "load": os.getloadavg()[0],
+        "cases": [asyncio.run(measure(case, options.seconds)) for case in options.case],
+    }
+    if options.json is not None:
+        options.json.write_text(json.dumps(report, indent=1) + "\n")
+    print_table(report)
+
+
+if __name__ == "__main__":
+    main()
