@@ -41,9 +41,9 @@ class ZmqLine:
 
     def __init__(self, payload: Payload, place: str) -> None:
         self._frames = [bytearray(one) for one in encode(payload.make(0), header_of(0, 0))]
-        self._socket = zmq.Context.instance().socket(zmq.PUB)
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PUB)
         self._socket.bind(place)
-        self.endpoint = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        self.endpoint: str = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def send(self, sequence: int, stamp_ns: int) -> None:
         STAMPS.pack_into(self._frames[0], 0, sequence, stamp_ns)
