@@ -1,21 +1,26 @@
 """Steps one node through its recorded inputs with a virtual clock, twice, and compares.
 
-The node is built from the plan in the bag.  Each recorded input is handed to it in the order in
-which the recorder got it, the clock standing at that moment; timers that came due are called
-before.  The same bag must give the same bytes each time.  Against what the node published live,
-fields are compared with a tolerance: live, messages reach a node and the recorder in slightly
-different order and time.
+The node is built from the plan in the bag.  It has said in its status which messages it took, in
+which order and when (`messages.types.Status.taken`); by that it is stepped again, so that what a
+late reader skipped live is skipped here.  Where the bag has no such word (as of earlier code), each
+recorded input is handed to it in the order in which the recorder got it, and timers that came due
+are called before.  The same bag must give the same bytes each time.  Against what the node sent
+live, fields are compared with a tolerance.
 """
 
 from __future__ import annotations
 
 import asyncio
 import hashlib
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from launch.documents import did_you_mean
@@ -23,11 +28,24 @@ from launch.planned import Plan, PlannedNode
 from messages.bag import BagError, BagReader
 from messages.base import Header, Message
 from messages.clock import VirtualClock
-from messages.topics import TOPICS, Topic
-from messages.types import Clocks
+from messages.topics import TOPICS, Delivery, Topic
+from messages.types import Clocks, Status
 from messages.wire import decode, encode
 from nodes import node_class
 from nodes.node import Node, parameters_of, timers_of
+
+REFUSALS = {
+    "camera": "it reads a device, which is not in the bag; with stereo recorded, "
+    "`bag verify triangulator` starts from what it read",
+    "arm_bridge": "it would command an arm, and what the arm answered is in the bag as this node's "
+    "output only; `bag verify planner` shows what it was told",
+    "twin_arms": "it answers the arms' bridges over TCP, and what they said there is not recorded",
+    "twin_finger": "it films by its own clock, and what it did is what the bag holds as "
+    "twin/finger",
+    "recorder": "it writes a bag, and what it wrote is this one",
+    "console": "it serves a page, and what people did there is in the bag as its outputs only",
+}
+"""Why nodes of a type are not stepped through a bag."""
 
 CLOCKS = "clocks"
 EPOCH = 0
@@ -44,9 +62,15 @@ class Sent:
 
 @dataclass(slots=True)
 class Pass:
-    """One run through the bag."""
+    """One run through the bag.
+
+    as_taken: it took what the node said that it took; else all, in the recorder's order.
+    missing: messages that it took and the bag does not hold.
+    """
 
     messages_in: int = 0
+    missing: int = 0
+    as_taken: bool = False
     sent: list[Sent] = field(default_factory=list)
     errors: int = 0
     last_error: str = ""
@@ -78,11 +102,13 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What `bag verify` found."""
+    """What `bag verify` found; as_taken, missing: see `Pass`."""
 
     node: str
     bag: str
+    as_taken: bool
     messages_in: int
+    missing: int
     messages_out: int
     same_bytes: bool
     digest: str
@@ -118,14 +144,16 @@ def verify(bag: Path, name: str, *, tolerance: float = 1e-6) -> Verification:
             f'{bag}: no node "{name}" in its plan; {did_you_mean(name, list(plan.nodes))}'
         )
     node = plan.nodes[name]
-    if node_class(node.type).opens_devices:
-        raise BagError(f"{name} reaches for devices of its own (an arm would move): not replayed")
+    if why := refusal(node):
+        raise BagError(f"{name} is not replayed: {why}")
     _check_inputs(bag, reader, plan, node)
     first, second = (asyncio.run(replay(bag, node)) for _ in range(2))
     return Verification(
         node=name,
         bag=str(bag),
+        as_taken=first.as_taken,
         messages_in=first.messages_in,
+        missing=first.missing,
         messages_out=len(first.sent),
         same_bytes=first.sent == second.sent,
         digest=first.digest(),
@@ -136,22 +164,43 @@ def verify(bag: Path, name: str, *, tolerance: float = 1e-6) -> Verification:
     )
 
 
+def refusal(node: PlannedNode) -> str:
+    """Why a node cannot be stepped through a bag, in a sentence; empty: it can."""
+    # Of any type of parameters: those of the node's own class.
+    parameters: Any = parameters_of(node_class(node.type)).model_validate(node.parameters)
+    if node.type == "camera" and parameters.source.kind == "twin":
+        return ""  # it hands on what came on twin/stereo, and reaches for nothing
+    if node.type == "renderer" and parameters.output == "window":
+        return (
+            "it shows its frames in a window; its drawing is verified with a bag of a headless run"
+        )
+    if node.type in REFUSALS:
+        return REFUSALS[node.type]
+    if node_class(node.type).opens_devices:
+        return "it reaches for devices of its own, which are not in the bag"
+    return ""
+
+
 async def replay(bag: Path, planned: PlannedNode) -> Pass:
     """Step a node through its inputs in the bag."""
-    ports: dict[str, list[str]] = {}
-    for port in planned.inputs:
-        ports.setdefault(port.topic, []).append(port.port)
-    reader = BagReader(bag, {*ports, CLOCKS} & set(BagReader(bag).topics))
-    start_ns = reader.info().start_ns
-    clock_id = reader.metadata.get("recording", {}).get("clock_id", "recorded")
-    clock = VirtualClock(start_ns, clock_id=clock_id)
     result = Pass()
+    lives = lives_in(bag, planned.name)
+    for life in lives:
+        result.as_taken = True
+        await _replay_life(bag, planned, life, result)
+    if not lives:
+        await _replay_in_order(bag, planned, result)
+    return result
+
+
+def _node_of(planned: PlannedNode, clock: VirtualClock, result: Pass) -> Node:
+    """The node, built as a launcher would; what it sends is kept."""
 
     def keep(topic: Topic, message: Message, header: Header) -> None:
         result.sent.append(Sent(topic.name, tuple(bytes(one) for one in encode(message, header))))
 
     class_ = node_class(planned.type)
-    node = class_(
+    return class_(
         parameters_of(class_).model_validate(planned.parameters),
         name=planned.name,
         clock=clock,
@@ -159,8 +208,32 @@ async def replay(bag: Path, planned: PlannedNode) -> Pass:
         topics={port.port: port.topic for port in (*planned.inputs, *planned.outputs)},
         epoch=EPOCH,
     )
+
+
+@asynccontextmanager
+async def _set_up(node: Node, result: Pass) -> AsyncIterator[None]:
     try:
         await node.setup()
+        yield
+        await node.settle()
+    finally:
+        node.stop_mailboxes()
+        await node.close()
+        result.errors += node.errors
+        result.last_error = node.last_error or result.last_error
+
+
+async def _replay_in_order(bag: Path, planned: PlannedNode, result: Pass) -> None:
+    """Hand it all its inputs, in the recorder's order."""
+    ports: dict[str, list[str]] = {}
+    for port in planned.inputs:
+        ports.setdefault(port.topic, []).append(port.port)
+    reader = BagReader(bag, {*ports, CLOCKS} & set(BagReader(bag).topics))
+    start_ns = reader.info().start_ns
+    clock_id = reader.metadata.get("recording", {}).get("clock_id", "recorded")
+    clock = VirtualClock(start_ns, clock_id=clock_id)
+    node = _node_of(planned, clock, result)
+    async with _set_up(node, result):
         timers = Timers(node, start_ns)
         for topic, message, header, log_ns in reader:
             await timers.call_until(log_ns, clock)
@@ -170,11 +243,128 @@ async def replay(bag: Path, planned: PlannedNode) -> Pass:
             result.messages_in += topic in ports
             for port_name in ports.get(topic, ()):
                 await node.step(port_name, message, header)
-    finally:
-        node.stop_mailboxes()
-        await node.close()
-    result.errors, result.last_error = node.errors, node.last_error
-    return result
+                await node.settle()
+
+
+async def _replay_life(bag: Path, planned: PlannedNode, life: Life, result: Pass) -> None:
+    """Hand it what it took, from one start of it to its end."""
+    clock = VirtualClock(int(life.steps[0, 3]), clock_id=life.clock_id)
+    node = _node_of(planned, clock, result)
+    names, timers = list(node.inputs), timers_of(type(node))
+    async with _set_up(node, result):
+        messages = Waiting(bag, node)
+        # What it was told before the bag began, it will not say that it took.
+        for port, message, header in messages.told_before(life):
+            result.messages_in += 1
+            await node.step(port, message, header)
+        for number, sequence, epoch, at_ns in life.steps.tolist():
+            if number < 0:
+                clock.move_to(at_ns)
+                await node.call_timer(-1 - number, timers[-1 - number])
+            else:
+                taken = messages.find(names[number], sequence, epoch)
+                if taken is None:
+                    result.missing += 1
+                    continue
+                clock.move_to(at_ns)
+                result.messages_in += 1
+                await node.step(names[number], *taken)
+            await node.settle()
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """What a node took between one start and the next: rows of `Status.taken`, its host's clock."""
+
+    clock_id: str
+    steps: NDArray[np.int64]
+
+
+def lives_in(bag: Path, name: str) -> list[Life]:
+    """What the node said that it took, per start of it; none in bags of earlier code."""
+    told: dict[int, list[NDArray[np.int64]]] = {}
+    clock_ids: dict[int, str] = {}
+    if "status" not in BagReader(bag).topics:
+        return []
+    for _, message, header, _ in BagReader(bag, ["status"]):
+        if isinstance(message, Status) and message.node == name and len(message.taken):
+            before = told.setdefault(header.epoch, [])
+            # A young node tells all from its start again.
+            if before and (before[0][0] == message.taken[0]).all():
+                before.clear()
+            before.append(message.taken)
+            clock_ids[header.epoch] = header.clock_id
+    return [Life(clock_ids[epoch], np.concatenate(parts)) for epoch, parts in told.items()]
+
+
+class Waiting:
+    """The recorded inputs of a node, read on as far as what it took needs it."""
+
+    LOOK_AHEAD = 5000
+    """Messages after which one that should be in the bag is taken to be missing."""
+
+    def __init__(self, bag: Path, node: Node) -> None:
+        self._bag, self._node = bag, node
+        self._ports: dict[str, list[str]] = {}
+        for port, source in node.inputs.items():
+            self._ports.setdefault(source.topic.name, []).append(port)
+        topics = {*self._ports, CLOCKS} & set(BagReader(bag).topics)
+        self._messages = iter(BagReader(bag, topics))
+        self._waiting: dict[str, deque[tuple[Message, Header]]] = {
+            port: deque() for port in node.inputs
+        }
+
+    def told_before(self, life: Life) -> list[tuple[str, Message, Header]]:
+        """Latched messages that came before the first step, in order."""
+        steps = {(names, *key) for names, *key in life.steps[:, :3].tolist()}
+        latched = {
+            source.topic.name
+            for source in self._node.inputs.values()
+            if source.topic.delivery is Delivery.LATCHED
+        }
+        recorded = BagReader(self._bag)
+        found: dict[str, tuple[Message, Header]] = {}
+        for topic, message, header, _ in BagReader(self._bag, latched & set(recorded.topics)):
+            for number, port in enumerate(self._node.inputs):
+                if port not in self._ports[topic]:
+                    continue
+                taken = (number, header.sequence, header.epoch) in steps
+                if not taken and header.publish_ns <= life.steps[0, 3]:
+                    found[port] = (message, header)
+        return [(port, *entry) for port, entry in found.items()]
+
+    def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
+        """That message; None where the bag does not have it."""
+        waiting = self._waiting[port]
+        latest = self._node.inputs[port].topic.delivery is Delivery.LATEST
+        read = seen = 0
+        while True:
+            for i in range(seen, len(waiting)):
+                message, header = waiting[i]
+                if header.epoch != epoch or header.sequence < sequence:
+                    continue
+                if header.sequence > sequence:
+                    return None
+                del waiting[i]
+                # What a reader of the newest has passed over, it never takes.
+                for _ in range(i if latest else 0):
+                    waiting.popleft()
+                return message, header
+            seen = len(waiting)
+            if read == self.LOOK_AHEAD or not self._read():
+                return None
+            read += 1
+
+    def _read(self) -> bool:
+        entry = next(self._messages, None)
+        if entry is None:
+            return False
+        topic, message, header, _ = entry
+        if isinstance(message, Clocks) and header.clock_id == self._node.clock.id:
+            self._node.clock_table.update(message)
+        for port in self._ports.get(topic, ()):
+            self._waiting[port].append((message, header))
+        return True
 
 
 class Timers:
@@ -183,21 +373,21 @@ class Timers:
     def __init__(self, node: Node, start_ns: int) -> None:
         self._node = node
         self._periods_ns = {
-            timer.method: round(1e9 / float(getattr(node.parameters, timer.rate_parameter)))
-            for timer in timers_of(type(node))
+            (number, timer): round(1e9 / float(getattr(node.parameters, timer.rate_parameter)))
+            for number, timer in enumerate(timers_of(type(node)))
         }
         self._due_ns = dict.fromkeys(self._periods_ns, start_ns)
 
     async def call_until(self, now_ns: int, clock: VirtualClock) -> None:
         """Call all that comes due up to `now_ns`, in the order of time."""
         while self._due_ns:
-            method = min(self._due_ns, key=lambda name: (self._due_ns[name], name))
-            due_ns = self._due_ns[method]
+            next_one = min(self._due_ns, key=lambda one: (self._due_ns[one], one[1].method))
+            due_ns = self._due_ns[next_one]
             if due_ns > now_ns:
                 return
             clock.move_to(due_ns)
-            await self._node.call(method, getattr(self._node, method))
-            self._due_ns[method] = due_ns + self._periods_ns[method]
+            await self._node.call_timer(*next_one)
+            self._due_ns[next_one] = due_ns + self._periods_ns[next_one]
 
 
 def compare(

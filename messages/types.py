@@ -346,6 +346,12 @@ class Status(Message):
     clock_offsets: tuple[ClockOffset, ...] = Field(
         default=(), description="of the other clocks that it hears, as it knows them"
     )
+    taken: Annotated[NDArray[np.int64], ArraySpec("<i8", ("steps", 4))] = Field(
+        default_factory=lambda: np.zeros((0, 4), np.int64),
+        description="what it handled since its last status (in its first seconds: since its "
+        "start), in order, for `bag verify`: which input, counted from 0, or of its timers -1, -2, "
+        "...; the message's sequence and its writer's epoch; when, ns",
+    )
 
 
 class NodeProcess(Part):

@@ -24,9 +24,12 @@ import traceback
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin, get_type_hints
 
+import numpy as np
 import structlog
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from messages.base import Header, Message
@@ -41,6 +44,9 @@ Handler = Callable[[Any, Header], Awaitable[None] | None]
 
 RATE_WINDOW_NS = 1_000_000_000
 EVERY_QUEUE_LENGTH = 1000
+STEPS_KEPT = 20_000
+TOLD_AGAIN_NS = 5_000_000_000
+"""So long after its start a node tells all its steps each time: a recorder may come late."""
 
 
 class NodeParameters(BaseModel):
@@ -85,6 +91,31 @@ class PortCounts:
         )
 
 
+class Steps:
+    """What a node handled, in order, until its status has told it; a replay goes by that.
+
+    Rows are those of `messages.types.Status.taken`.
+    """
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._started_ns = clock.now_ns()
+        self._rows: deque[tuple[int, int, int, int]] = deque(maxlen=STEPS_KEPT)
+
+    def message(self, port: int, header: Header, at_ns: int) -> None:
+        self._rows.append((port, header.sequence, header.epoch, at_ns))
+
+    def timer(self, number: int) -> None:
+        self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
+
+    def told(self) -> NDArray[np.int64]:
+        """The rows (n, 4), forgotten with that unless the node is young."""
+        rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
+        if self._clock.now_ns() > self._started_ns + TOLD_AGAIN_NS:
+            self._rows.clear()
+        return rows
+
+
 class Input(Generic[M]):
     """A subscribed topic: the newest message with its header, and what was counted.
 
@@ -98,6 +129,7 @@ class Input(Generic[M]):
         self.received_ns: int = 0
         self.clock_trouble = ""
         self.counts = PortCounts()
+        self.noted: Callable[[Header, int], None] | None = None
         self._clock = clock
 
     def age_s(self) -> float:
@@ -113,6 +145,8 @@ class Input(Generic[M]):
         self.message, self.header, self.clock_trouble = message, header, clock_trouble
         self.received_ns = self._clock.now_ns()
         self.counts.count(header, self.received_ns)
+        if self.noted is not None:
+            self.noted(header, self.received_ns)
 
 
 class Output(Generic[M]):
@@ -213,6 +247,9 @@ class Node:
     opens_devices: ClassVar[bool] = False
     """Whether it reaches for devices, ports or files of its own: a replay must not start it."""
 
+    async def settle(self) -> None:
+        """Wait for work that handlers have left to others; a replay stands still until then."""
+
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
         """Topics to subscribe to beside the declared ports, for a node whose inputs depend on its
@@ -245,6 +282,7 @@ class Node:
         self.troubles_told = 0
         self.note = ""
         self.started_ns = clock.now_ns()
+        self._steps = Steps(clock)
         if epoch is None:
             epoch = self.started_ns
         for port in ports_of(type(self)).values():
@@ -256,6 +294,9 @@ class Node:
                 )
             if port.direction == "input":
                 self.inputs[port.name] = Input(topic, clock)
+                if not self.opens_devices:
+                    number = len(self.inputs) - 1
+                    self.inputs[port.name].noted = partial(self._steps.message, number)
                 setattr(self, port.name, self.inputs[port.name])
             else:
                 self.outputs[port.name] = Output(
@@ -316,6 +357,16 @@ class Node:
                 await result
         except Exception as error:
             self.report_error(what, error)
+
+    def taken(self) -> NDArray[np.int64]:
+        """What was handled since this was asked last; see `messages.types.Status.taken`."""
+        return self._steps.told()
+
+    async def call_timer(self, number: int, timer: Timer) -> None:
+        """Call the method of one of `timers_of` the node."""
+        if not self.opens_devices:
+            self._steps.timer(number)
+        await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:
         """Count an error and keep it for the status.

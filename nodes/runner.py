@@ -187,14 +187,13 @@ class Links:
             publisher.close()
 
 
-async def run_timer(node: Node, timer: Timer) -> None:
+async def run_timer(node: Node, number: int, timer: Timer) -> None:
     """Call a node's periodic method on an absolute grid; calls that came due late are skipped."""
     period_s = 1.0 / float(getattr(node.parameters, timer.rate_parameter))
-    method = getattr(node, timer.method)
     loop = asyncio.get_running_loop()
     due_s = loop.time()
     while True:
-        await node.call(timer.method, method)
+        await node.call_timer(number, timer)
         due_s += period_s
         now_s = loop.time()
         if due_s <= now_s:
@@ -244,6 +243,7 @@ def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
         plan_hash=node.plan_hash,
         clock_id=node.clock.id,
         clock_offsets=tuple(node.clock_table.offsets.values()),
+        taken=node.taken(),
     )
 
 
@@ -270,7 +270,10 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
         raise
     try:
         links.open_inputs(node)
-        tasks = [asyncio.create_task(run_timer(node, timer)) for timer in timers_of(class_)]
+        tasks = [
+            asyncio.create_task(run_timer(node, number, timer))
+            for number, timer in enumerate(timers_of(class_))
+        ]
         life = Life(config.ready_fd)
         tasks.append(asyncio.create_task(run_status(node, process, life.sign)))
         tasks.append(asyncio.create_task(stop.wait()))

@@ -181,11 +181,11 @@ def verify(
     ] = 1e-6,
     as_json: JsonOption = False,
 ) -> None:
-    """Step one node through its recorded inputs, twice, and compare.
+    """Step one node through what it took of its recorded inputs, twice, and compare.
 
-    Exit code 1: the two passes gave different bytes, or the node failed.  Exit code 3: they gave
-    the same, but other numbers than the node published live; a live node skips inputs when it is
-    late, and which ones is not in the bag.
+    Exit code 1: the two passes gave different bytes, or the node failed, or it cannot be replayed.
+    Exit code 3: they gave the same, but other numbers than the node published live: as from a node
+    that reads the clock by itself, or from a bag of code that did not say what its nodes took.
     """
     from launch.replay import verify as verify_node
 
@@ -239,7 +239,8 @@ def _print_verification(result: Verification) -> None:
     print_fields(
         [
             ("node", result.node),
-            ("messages in", result.messages_in),
+            ("order", "as it took them" if result.as_taken else "as the recorder got them"),
+            ("messages in", f"{result.messages_in}, missing {result.missing}"),
             ("messages out", result.messages_out),
             ("same bytes twice", "yes" if result.same_bytes else "NO"),
             ("sha256 of them", result.digest),

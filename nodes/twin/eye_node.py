@@ -65,6 +65,10 @@ class TwinEyeNode(Node):
             await asyncio.gather(self._task, return_exceptions=True)
         self._worker.shutdown()
 
+    async def settle(self) -> None:
+        if self._task is not None:
+            await self._task
+
     def on_frame(self, frame: Frame, header: Header) -> None:
         key = (frame.label, frame.correction)
         if not frame.pixels or not frame.label or key in self._waiting or self._just_taken(key):

@@ -1,0 +1,238 @@
+"""What a viewer of the console costs the graph, and what the viewer gets.
+
+The demo's graph runs with a console: without a viewer, with one that takes all that the page is
+sent over a websocket without drawing it (as from another computer), and with Chromium on this
+machine, which draws it by software where there is no graphics card.  Each node's rates and losses
+come from its status; pictures a second are windows of updates that reach the viewer, and those that
+Chromium draws.
+
+    python -m benchmarks.console [--seconds 20] [--set node.parameter=value] [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import viser
+import websockets
+from playwright.async_api import Page, WebSocket, async_playwright
+
+from launch.machine import machine_name
+from launch.plan import load_plan
+from launch.planned import local_endpoints
+from launch.prepare import prepare_plan
+from launch.supervisor import RunningGraph
+from messages.base import Header
+from messages.bus import Subscriber
+from messages.topics import topic_named
+from messages.types import Status
+from nodes.node import PortCounts
+
+DEMO = Path(__file__).resolve().parent.parent / "launch" / "demo.yaml"
+CHROMIUM = Path("/usr/bin/chromium")
+DRAWN_WITHOUT_GPU = (
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+WINDOW = {"width": 1200, "height": 800}
+SETTLE_S = 5.0
+TOPICS = ("fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "frame")
+PICTURE_BYTES = 10_000
+"""Smaller windows of updates do not hold the sheet, but a table alone."""
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (0.0, 0.0, 1.0),
+    "fov": 0.75,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": WINDOW["height"],
+    "image_width": WINDOW["width"],
+    "look_at": (0.0, 0.0, 0.0),
+    "up_direction": (0.0, 1.0, 0.0),
+}
+
+COUNT_DRAWN = """() => {
+    window.drawn = 0;
+    const count = () => { window.drawn += 1; requestAnimationFrame(count); };
+    requestAnimationFrame(count);
+}"""
+
+
+class Statuses:
+    """The newest status of each node."""
+
+    def __init__(self) -> None:
+        self.newest: dict[str, Status] = {}
+
+    def take(self, status: Status, header: Header) -> None:
+        self.newest[status.node] = status
+
+    def lost(self) -> dict[str, int]:
+        """Messages that readers skipped or lost so far, by topic; the console's own left out."""
+        found = dict.fromkeys(TOPICS, 0)
+        for status in self.newest.values():
+            for port in status.inputs if status.node not in ("console", "recorder") else ():
+                if port.topic in found:
+                    found[port.topic] += port.dropped + port.gaps
+        return found
+
+    def written(self) -> dict[str, int]:
+        return {
+            port.topic: port.messages
+            for status in self.newest.values()
+            for port in status.outputs
+            if port.topic in TOPICS
+        }
+
+
+@dataclass
+class Got:
+    """What has reached a viewer: pictures and bytes."""
+
+    pictures: int = 0
+    size_bytes: int = 0
+
+    def take(self, window: bytes | str) -> None:
+        self.pictures += len(window) > PICTURE_BYTES
+        self.size_bytes += len(window)
+
+
+async def watch(statuses: Statuses, seconds: float) -> dict[str, Any]:
+    """Rates and losses over some seconds, and the console's share of a core at their end."""
+    written, lost = statuses.written(), statuses.lost()
+    await asyncio.sleep(seconds)
+    return {
+        "rate_hz": {
+            topic: (count - written.get(topic, 0)) / seconds
+            for topic, count in statuses.written().items()
+        },
+        "skipped_per_s": {
+            topic: (count - lost[topic]) / seconds for topic, count in statuses.lost().items()
+        },
+        "console_cpu": statuses.newest["console"].cpu_ratio,
+    }
+
+
+async def look(url: str, got: Got) -> None:
+    """Be a viewer that takes everything and draws nothing."""
+    protocol = websockets.Subprotocol(f"viser-v{viser.__version__}")
+    async with websockets.connect(url, subprotocols=[protocol], max_size=None) as socket:
+        await socket.send(msgspec.msgpack.encode(CAMERA))
+        async for window in socket:
+            got.take(window)
+
+
+@asynccontextmanager
+async def browser(url: str, got: Got) -> AsyncIterator[Page]:
+    """Chromium at the page, without a window."""
+    async with async_playwright() as play:
+        chromium = await play.chromium.launch(
+            executable_path=str(CHROMIUM), args=list(DRAWN_WITHOUT_GPU)
+        )
+        page = await chromium.new_page(viewport=WINDOW)  # type: ignore[arg-type]  # it is a ViewportSize
+
+        def connected(socket: WebSocket) -> None:
+            socket.on("framereceived", got.take)
+
+        page.on("websocket", connected)
+        await page.goto(url, timeout=120_000)
+        await page.get_by_role("button", name="E-STOP").wait_for(timeout=120_000)
+        await page.evaluate(COUNT_DRAWN)
+        yield page
+        await chromium.close()
+
+
+async def run(seconds: float, settings: list[str]) -> dict[str, Any]:
+    plan = load_plan(DEMO, settings=settings, console=True)
+    prepare_plan(plan, lambda text: None)
+    place = f"127.0.0.1:{plan.nodes['console'].parameters['page_port']}"
+    statuses = Statuses()
+    result: dict[str, Any] = {"machine": machine_name()}
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready(180)
+        endpoints = local_endpoints(graph.run, plan.endpoints_to_read("status"))
+        subscriber = Subscriber(topic_named("status"), endpoints, statuses.take, PortCounts())
+        subscriber.start()
+        await asyncio.sleep(SETTLE_S)
+        result["load_before"] = os.getloadavg()[0]
+        result["alone"] = await watch(statuses, seconds)
+
+        got = Got()
+        viewer = asyncio.create_task(look(f"ws://{place}", got))
+        await asyncio.sleep(SETTLE_S)
+        result["websocket"] = await viewed(statuses, seconds, got)
+        viewer.cancel()
+        with suppress(asyncio.CancelledError):
+            await viewer
+
+        if CHROMIUM.exists():
+            got = Got()
+            async with browser(f"http://{place}/", got) as page:
+                await asyncio.sleep(SETTLE_S)
+                before = await page.evaluate("() => window.drawn")
+                result["browser"] = await viewed(statuses, seconds, got)
+                drawn = await page.evaluate("() => window.drawn") - before
+                result["browser"]["drawn_per_s"] = drawn / seconds
+        subscriber.close()
+    return result
+
+
+async def viewed(statuses: Statuses, seconds: float, got: Got) -> dict[str, Any]:
+    """`watch`, and what reached the viewer meanwhile."""
+    got.pictures = got.size_bytes = 0
+    found = await watch(statuses, seconds)
+    found["pictures_per_s"] = got.pictures / seconds
+    found["mb_per_s"] = 1e-6 * got.size_bytes / seconds
+    return found
+
+
+def show(result: dict[str, Any]) -> None:
+    cases = [name for name in ("alone", "websocket", "browser") if name in result]
+    print(f"{result['machine']}; load {result['load_before']:.1f}")
+    print(f"{'Hz (skipped a second)':>22}" + "".join(f"{name:>18}" for name in cases))
+    for topic in TOPICS:
+        cells = (
+            f"{result[name]['rate_hz'].get(topic, 0.0):.1f} "
+            f"({result[name]['skipped_per_s'].get(topic, 0.0):.1f})"
+            for name in cases
+        )
+        print(f"{topic:>22}" + "".join(f"{cell:>18}" for cell in cells))
+    for name in cases:
+        one = result[name]
+        print(f"{name}: console {100 * one['console_cpu']:.0f} % of a core", end="")
+        if "pictures_per_s" in one:
+            print(f", {one['pictures_per_s']:.1f} pictures/s, {one['mb_per_s']:.1f} MB/s", end="")
+        if "drawn_per_s" in one:
+            print(f", {one['drawn_per_s']:.1f} frames drawn/s", end="")
+        print()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0)
+    parser.add_argument("--set", action="append", default=[], dest="settings")
+    parser.add_argument("--json", action="store_true")
+    given = parser.parse_args()
+    result = asyncio.run(run(given.seconds, given.settings))
+    if given.json:
+        print(json.dumps(result, indent=1))
+    else:
+        show(result)
+
+
+if __name__ == "__main__":
+    main()
