@@ -38,7 +38,7 @@ from nodes.arm_bridge import kinematics
 from nodes.console import panels, scenes
 from nodes.console.aim import HOVER_M, Aim
 from nodes.console.arms import PIECES, link_poses, rounded_box
-from nodes.console.desk import SETTLE_S, Look, SceneDesk
+from nodes.console.desk import SETTLE_S, Desk, Files, Look, SceneDesk
 from nodes.console.finger import Finger
 from nodes.console.guard import COOKIE, ConsoleError, Guard, read_token
 from nodes.console.history import SERIES, WINDOW_S, History
@@ -293,6 +293,45 @@ async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path)
     with pytest.raises(scenes.SceneChoiceError):
         desk.settle(31.0)
     assert len(sent) == 2
+
+
+def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "plan.json").write_text(f'{{"scene": {scene.model_dump_json()}}}')
+    other = scene.model_copy(update={"name": "other"})
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "other.json").write_text(other.model_dump_json())
+    files = Files(tmp_path / "plan.json", tmp_path / "scenes", tmp_path, tmp_path / "console.json")
+    warnings: list[str] = []
+
+    def desk() -> tuple[Desk, list[Message]]:
+        sent: list[Message] = []
+        made = Desk(sent.append, files, Finger(sent.append, speed_m_per_s=0.1), warnings.append)
+        made.begin()
+        return made, sent
+
+    first, sent = desk()
+    assert [one.name for one in sent if isinstance(one, Scene)] == [scene.name]
+    first.scenes.choose("other")
+    first.scenes.slide(1.0, young_modulus_pa=9e3)
+    first.scenes.settle(2.0)
+    first.record(True)
+    again, sent = desk()
+    assert again.scenes.sliders == first.scenes.sliders
+    taken_up, recording = sent
+    assert isinstance(taken_up, Scene)
+    assert (taken_up.name, taken_up.object.material.young_modulus_pa) == ("other", 9e3)
+    assert recording == Recording(running=True)
+    again.record(False)
+    again.scenes.choose("other")
+    third, sent = desk()
+    assert [type(message) for message in sent] == [Scene], "nothing is being recorded"
+    assert third.scenes.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
+    assert warnings == []
+    files.kept.write_text("{")
+    (begun,) = desk()[1]
+    assert isinstance(begun, Scene)
+    assert begun.name == scene.name
+    assert "cannot be taken up again" in warnings[0]
 
 
 def test_looking_puts_back_what_another_had_set() -> None:

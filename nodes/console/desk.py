@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +16,7 @@ from messages.types import Correction, Display, EStop, Moment, Recording, TwinEy
 from nodes.console import scenes
 from nodes.console.aim import Aim
 from nodes.console.finger import Finger
+from nodes.console.kept import Kept, load_kept, save_kept
 from nodes.console.replay import Timeline, bags_in
 
 Floats = NDArray[np.float64]
@@ -47,19 +48,23 @@ class Sliders:
 class SceneDesk:
     """The scene that the graph works with: chosen, and changed by the sliders."""
 
-    def __init__(self, publish: Publish, folder: Path, first: Scene) -> None:
+    def __init__(
+        self, publish: Publish, folder: Path, first: Scene, sliders: Sliders | None = None
+    ) -> None:
+        """sliders: where they stood when the console was ended; None: nobody had moved them."""
         self._publish, self._folder = publish, folder
         self.names = scenes.scene_names(folder)
-        self._base = self.scene = first
-        self.sliders = Sliders.of(first)
+        self.base, self.moved = first, sliders is not None
+        self.sliders = sliders or Sliders.of(first)
+        self.scene = self._edited() if self.moved else first
         self._due_s: float | None = None
         self._making_aim: asyncio.Task[None] | None = None
 
     def choose(self, name: str) -> None:
         """Go over to another of the run's scenes; SceneChoiceError."""
-        self._base = scenes.load(self._folder, name)
-        self.sliders = Sliders.of(self._base)
-        self._send(self._base)
+        self.base, self.moved = scenes.load(self._folder, name), False
+        self.sliders = Sliders.of(self.base)
+        self._send(self.base)
 
     def slide(self, now_s: float, **changes: float) -> None:
         """One slider was moved; the scene follows once it rests."""
@@ -71,20 +76,20 @@ class SceneDesk:
         if self._due_s is None or now_s < self._due_s:
             return False
         self._due_s = None
-        given = self.sliders
-        self._send(
-            scenes.edited(
-                self._base,
-                young_modulus_pa=given.young_modulus_pa,
-                stretch_ratio=given.stretch_ratio,
-                size_ratio=given.size_ratio,
-            )
-        )
+        scene, self.moved = self._edited(), True
+        self._send(scene)
         return True
+
+    def _edited(self) -> Scene:
+        return scenes.edited(self.base, **asdict(self.sliders))
 
     def _send(self, scene: Scene) -> None:
         self.scene = scene
         self._publish(scene)
+
+    def tell(self) -> None:
+        """Say again which scene holds."""
+        self._publish(self.scene)
 
     def make_aim(self, finger: Finger, failed: Callable[[str], None]) -> None:
         """Let the finger point at the present scene's object, as soon as that is worked out."""
@@ -198,19 +203,40 @@ class Replay:
             self.playing = False
 
 
+@dataclass(frozen=True, slots=True)
+class Files:
+    """Where a console reads and writes: the run's plan and scenes, bags, and what it keeps."""
+
+    plan: Path
+    scenes: Path
+    bags: Path
+    kept: Path
+
+
 class Desk:
-    """All of it together, and what needs no state: stop, mark, record."""
+    """All of it together, and what needs no state: stop, mark, record.
+
+    A console that is started again goes on with the scene, the sliders and the recording that its
+    run had; warn is told why it cannot.
+    """
 
     def __init__(
-        self, publish: Publish, *, scenes_folder: Path, bags: Path, first: Scene, finger: Finger
+        self, publish: Publish, files: Files, finger: Finger, warn: Callable[[str], None]
     ) -> None:
-        self._publish = publish
-        self.scenes = SceneDesk(publish, scenes_folder, first)
+        self._files = files
+        first, sliders, self.recording = first_state(files, warn)
+        self.scenes = SceneDesk(self._kept_after(publish), files.scenes, first, sliders)
         self.finger = finger
         self.look = Look(publish)
-        self.replay = Replay(bags)
-        self.recording = False
+        self.replay = Replay(files.bags)
+        self._publish = publish
         self.stopped: str | None = None
+
+    def begin(self) -> None:
+        """Say what holds, as a latched word dies with who said it."""
+        self.scenes.tell()
+        if self.recording:
+            self._publish(Recording(running=True))
 
     def stop(self, reason: str) -> None:
         self.stopped = reason
@@ -223,6 +249,32 @@ class Desk:
     def record(self, running: bool) -> None:
         self.recording = running
         self._publish(Recording(running=running))
+        self._keep()
 
     def mark(self, label: str) -> None:
         self._publish(Moment(label=label.strip() or "moment"))
+
+    def _kept_after(self, publish: Publish) -> Publish:
+        def published(message: Message) -> None:
+            publish(message)
+            self._keep()
+
+        return published
+
+    def _keep(self) -> None:
+        desk = self.scenes
+        sliders = astuple(desk.sliders) if desk.moved else None
+        kept = Kept(base=desk.base, sliders=sliders, recording=self.recording)
+        save_kept(self._files.kept, kept)
+
+
+def first_state(files: Files, warn: Callable[[str], None]) -> tuple[Scene, Sliders | None, bool]:
+    """The scene to begin with, where the sliders stood, and whether a recording goes on."""
+    try:
+        kept = load_kept(files.kept)
+    except scenes.SceneChoiceError as error:
+        warn(str(error))
+        kept = None
+    if kept is None:
+        return scenes.first_scene(files.plan), None, False
+    return kept.base, None if kept.sliders is None else Sliders(*kept.sliders), kept.recording

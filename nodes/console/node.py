@@ -15,12 +15,11 @@ from messages.scene import Positive, Scene
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
 from messages.wire import WireError
-from nodes.console.desk import Desk
+from nodes.console.desk import Desk, Files
 from nodes.console.finger import Finger
 from nodes.console.guard import Guard, read_token, start_server
 from nodes.console.newest import Newest
 from nodes.console.operator import Operator
-from nodes.console.scenes import first_scene
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
 SHOWN = {
@@ -45,6 +44,7 @@ class ConsoleParameters(NodeParameters):
     bags: Path = Field(default=Path("runs"), description="folder whose bags can be replayed")
     plan: Path = Field(default=Path("@run/plan.json"), description="holds the first scene")
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
+    kept: Path = Field(default=Path("@run/console.json"), description="what it takes up again")
 
     @field_validator("address")
     @classmethod
@@ -99,15 +99,13 @@ class Console(Node):
         self._newest = Newest(self._refused)
         self._server = start_server(given.address, given.page_port, guard, "flexsheet")
         self.url = f"http://{given.address}:{self._server.get_port()}/"
-        scene = first_scene(given.plan)
         finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
-        desk = Desk(
-            self._publish, scenes_folder=given.scenes, bags=given.bags, first=scene, finger=finger
-        )
+        files = Files(given.plan, given.scenes, given.bags, given.kept)
+        desk = Desk(self._publish, files, finger, self.log.warning)
         self.operator = Operator(
             self._server, self._newest, desk, self._ask, with_finger=given.drives_finger
         )
-        self.scene.publish(scene)
+        desk.begin()
         self.note = f"{self.url}, nobody looks"
 
     async def close(self) -> None:

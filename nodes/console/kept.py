@@ -1,0 +1,44 @@
+"""What a console that is started again takes up from the one before it in the same run."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from messages.scene import Scene
+from nodes.console.scenes import SceneChoiceError
+
+
+class Kept(BaseModel):
+    """base: the scene that was chosen; sliders: what they made of it, None: they rest.
+
+    recording: whether the recorder had been told to record.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    base: Scene
+    sliders: tuple[float, float, float] | None = None
+    recording: bool = False
+
+
+def load_kept(path: Path) -> Kept | None:
+    """What was kept; None where nothing was.  SceneChoiceError for a file that holds something else."""
+    try:
+        return Kept.model_validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValidationError) as error:
+        first = str(error).splitlines()[0]
+        raise SceneChoiceError(
+            f"{path}: cannot be taken up again, so the first scene holds: {first}"
+        ) from error
+
+
+def save_kept(path: Path, kept: Kept) -> None:
+    """Write it whole or not at all."""
+    beside = path.with_name(f"{path.name}.new")
+    beside.write_text(kept.model_dump_json())
+    os.replace(beside, path)
