@@ -25,7 +25,7 @@ class Kept(BaseModel):
 
 
 def load_kept(path: Path) -> Kept | None:
-    """What was kept; None where nothing was.  SceneChoiceError for a file that holds something else."""
+    """What was kept; None where nothing was.  SceneChoiceError for a file of something else."""
     try:
         return Kept.model_validate_json(path.read_bytes())
     except FileNotFoundError:
