@@ -392,3 +392,33 @@ async def test_an_arm_that_is_cut_off_is_silent_and_heard_again() -> None:
             assert await exchange(through) == 9
         finally:
             through.close()
+
+
+@pytest.mark.parametrize("answer", ["97", "17", "1734", "174200", "2b0e01", "00" * 40])
+async def test_an_answer_that_is_not_modbus_is_one_error_and_no_trace(
+    answer: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The frame is right, what is in it is not; raised into the loop it would be logged by it."""
+    served: list[asyncio.Task[None] | None] = []
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        served.append(asyncio.current_task())
+        while request := await reader.read(1024):
+            body = request[6:7] + bytes.fromhex(answer)
+            writer.write(request[:4] + struct.pack(">H", len(body)) + body)
+        writer.close()
+
+    server = await asyncio.start_server(serve, "127.0.0.1", 0)
+    link = ModbusLink("127.0.0.1", server.sockets[0].getsockname()[1], timeout_s=1.0)
+    try:
+        for connection in (1, 2, 3):
+            with pytest.raises(ArmAnswerError, match="is not Modbus"):
+                await exchange(link)
+            assert not link.connected
+            assert link.connections == connection
+    finally:
+        link.close()
+        await asyncio.gather(*(one for one in served if one is not None))
+        server.close()
+        await server.wait_closed()
+    assert caplog.records == []

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusException
+from pymodbus.framer import FramerSocket
+from pymodbus.pdu import DecodePDU, ModbusPDU
 
 from nodes.arm_bridge.link import (
     ArmAnswerError,
@@ -161,6 +163,33 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
     )
 
 
+class _Framer(FramerSocket):
+    """The library's, whose error on an answer that is none fails the request that awaits one.
+
+    Else it would be raised into the loop, which ends the connection, prints a trace each time, and
+    lets the request wait for its time-out.
+    """
+
+    def __init__(self, client: AsyncModbusTcpClient) -> None:
+        super().__init__(DecodePDU(False))
+        self._client = client
+        self.undecodable = False
+
+    def handleFrame(  # pymodbus calls it so
+        self, data: bytes, exp_devid: int, exp_tid: int
+    ) -> tuple[int, ModbusPDU | None]:
+        try:
+            return super().handleFrame(data, exp_devid, exp_tid)
+        except ModbusException as error:
+            self.undecodable = True
+            awaited = self._client.ctx.response_future
+            if not awaited.done():
+                awaited.set_exception(error)
+                # Nobody may be waiting: then the next request tells, and not the future's end.
+                awaited.exception()
+            return len(data), None
+
+
 class ModbusLink:
     """An `ArmLink`: one connection to one arm.
 
@@ -184,6 +213,7 @@ class ModbusLink:
         self._pause_s = 0.0
         self._try_again_ns = 0
         self._client: AsyncModbusTcpClient | None = None
+        self._framer: _Framer | None = None
         self._sequence = 0
         self.connections = 0
 
@@ -225,6 +255,8 @@ class ModbusLink:
         client = AsyncModbusTcpClient(
             self.host, port=self.port, timeout=self._timeout_s, retries=0, reconnect_delay=0
         )
+        self._framer = _Framer(client)
+        client.ctx.framer = self._framer
         if not await client.connect():
             client.close()
             raise ArmSilentError(f"no connection to {self.host}:{self.port}")
@@ -246,6 +278,8 @@ class ModbusLink:
                 values=values,
             )
         except ModbusException as error:
+            if self._framer is not None and self._framer.undecodable:
+                raise ArmAnswerError(f"answer of {self.host}:{self.port} is not Modbus") from error
             raise ArmSilentError(
                 f"no answer from {self.host}:{self.port} within {self._timeout_s * 1e3:.0f} ms"
             ) from error
