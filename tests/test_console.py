@@ -19,10 +19,12 @@ from launch.plan import BadInputError, load_plan
 from messages.bag import BagError, BagReader, BagWriter
 from messages.base import Header, Message
 from messages.clock import VirtualClock
+from messages.methods import Methods
 from messages.scene import Scene
 from messages.topics import TOPICS, Topic
 from messages.types import (
     ArmState,
+    Correction,
     Display,
     EStop,
     FingerPath,
@@ -334,14 +336,14 @@ def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_
     assert "cannot be taken up again" in warnings[0]
 
 
-def test_looking_puts_back_what_another_had_set() -> None:
+def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
     sent: list[Display] = []
 
     def publish(message: Message) -> None:
         assert isinstance(message, Display)
         sent.append(message)
 
-    look = Look(publish)
+    look = Look(publish, scene)
     look.advance(1.0)
     assert not sent, "nobody wants to look"
     anothers = Display(correction="one_plane", stereo="anaglyph", label="mine")
@@ -362,6 +364,46 @@ def test_looking_puts_back_what_another_had_set() -> None:
     look.advance(3.2)
     look.advance(60.0)
     assert sent[-1] is anothers, "a picture that never comes is given up"
+    look.follow(scene)
+    assert len(sent) == 4, "a scene changes nothing of what another has set"
+
+
+def test_after_a_look_each_scene_has_its_own_correction_until_one_is_picked(
+    scene: Scene, tmp_path: Path
+) -> None:
+    def corrected_by(correction: Correction | None) -> Scene:
+        return scene.model_copy(update={"methods": Methods(correction=correction)})
+
+    (tmp_path / "plan.json").write_text(
+        f'{{"scene": {corrected_by("four_triangles").model_dump_json()}}}'
+    )
+    for name, correction in (("flat", "one_plane"), ("silent", None)):
+        (tmp_path / f"{name}.json").write_text(corrected_by(correction).model_dump_json())
+    sent: list[Message] = []
+    files = Files(tmp_path / "plan.json", tmp_path, tmp_path, tmp_path / "console.json")
+    desk = Desk(sent.append, files, Finger(sent.append, speed_m_per_s=0.1), print)
+
+    def corrections() -> list[str]:
+        return [message.correction for message in sent if isinstance(message, Display)]
+
+    desk.begin()
+    desk.scenes.choose("flat")
+    assert corrections() == [], "the renderer follows the scene by itself"
+    desk.scenes.choose("silent")
+    desk.look.follow(corrected_by("four_triangles"))
+    desk.look.wanted = True
+    desk.look.advance(1.0)
+    desk.look.advance(60.0)
+    rested = sent[-1]
+    assert isinstance(rested, Display)
+    desk.look.heed(rested)  # a console hears what it says
+    assert corrections() == ["four_triangles", "four_triangles"]
+    desk.scenes.choose("flat")
+    desk.scenes.choose("silent")
+    assert corrections()[2:] == ["one_plane", "two_pass"]
+    desk.look.picked = "none"
+    desk.scenes.choose("flat")
+    assert corrections()[4:] == ["none"]
 
 
 # The guard.

@@ -6,11 +6,13 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from messages.base import Message
+from messages.methods import chosen
 from messages.scene import Scene
 from messages.types import Correction, Display, EStop, Moment, Recording, TwinEye
 from nodes.console import scenes
@@ -49,7 +51,11 @@ class SceneDesk:
     """The scene that the graph works with: chosen, and changed by the sliders."""
 
     def __init__(
-        self, publish: Publish, folder: Path, first: Scene, sliders: Sliders | None = None
+        self,
+        publish: Callable[[Scene], None],
+        folder: Path,
+        first: Scene,
+        sliders: Sliders | None = None,
     ) -> None:
         """sliders: where they stood when the console was ended; None: nobody had moved them."""
         self._publish, self._folder = publish, folder
@@ -113,13 +119,16 @@ class SceneDesk:
 class Look:
     """Through the user's eye: asks the renderer for a frame with its pixels, now and then.
 
-    What another has set for the display is put back when nobody looks any more.
+    What another has set for the display is put back when nobody looks any more; where nobody has,
+    the correction of the scene, or the one that was picked at the console.
     """
 
-    def __init__(self, publish: Publish) -> None:
+    def __init__(self, publish: Publish, scene: Scene) -> None:
         self._publish = publish
         self.wanted = False
-        self.correction: Correction = "two_pass"
+        self.picked: Correction | Literal["auto"] = "auto"
+        self._by_scene = scene.methods.correction
+        self._holds = False
         self._number = 0
         self._asked_s: float | None = None
         self._again_s = 0.0
@@ -129,16 +138,27 @@ class Look:
     def label(self) -> str:
         return f"console {self._number}"
 
+    @property
+    def correction(self) -> Correction:
+        """As picked at the console, else as the scene says."""
+        return chosen(self.picked, self._by_scene, "two_pass")
+
+    def follow(self, scene: Scene) -> None:
+        """Go over to a scene's correction; a renderer that was once told heeds no scene's."""
+        self._by_scene = scene.methods.correction
+        if self._holds and self._asked_s is None:
+            self._put_back()
+
     def heed(self, display: Display) -> None:
         """Another one's display message."""
         if not display.label.startswith("console "):
-            self._others = display
+            self._others, self._holds = display, False
 
     def advance(self, now_s: float) -> None:
         """Ask for the next picture if it is time, or give the last one up."""
         if self._asked_s is not None:
             if now_s > self._asked_s + LOOK_PATIENCE_S:
-                self._put_back(now_s)
+                self._rest(now_s)
         elif self.wanted and now_s >= self._again_s:
             self._number += 1
             self._asked_s = now_s
@@ -160,12 +180,17 @@ class Look:
         """A picture has come; says whether it is ours."""
         if eye.label != self.label:
             return False
-        self._put_back(now_s)
+        self._rest(now_s)
         return True
 
-    def _put_back(self, now_s: float) -> None:
+    def _rest(self, now_s: float) -> None:
         self._asked_s, self._again_s = None, now_s + LOOK_EVERY_S
-        self._publish(self._others or Display(correction=self.correction, stereo="side_by_side"))
+        self._put_back()
+
+    def _put_back(self) -> None:
+        self._holds = self._others is None
+        own = Display(correction=self.correction, stereo="side_by_side", label="console rests")
+        self._publish(self._others or own)
 
 
 class Replay:
@@ -225,9 +250,9 @@ class Desk:
     ) -> None:
         self._files = files
         first, sliders, self.recording = first_state(files, warn)
-        self.scenes = SceneDesk(self._kept_after(publish), files.scenes, first, sliders)
+        self.scenes = SceneDesk(self._send_scene, files.scenes, first, sliders)
         self.finger = finger
-        self.look = Look(publish)
+        self.look = Look(publish, self.scenes.scene)
         self.replay = Replay(files.bags)
         self._publish = publish
         self.stopped: str | None = None
@@ -254,12 +279,10 @@ class Desk:
     def mark(self, label: str) -> None:
         self._publish(Moment(label=label.strip() or "moment"))
 
-    def _kept_after(self, publish: Publish) -> Publish:
-        def published(message: Message) -> None:
-            publish(message)
-            self._keep()
-
-        return published
+    def _send_scene(self, scene: Scene) -> None:
+        self._publish(scene)
+        self.look.follow(scene)
+        self._keep()
 
     def _keep(self) -> None:
         desk = self.scenes

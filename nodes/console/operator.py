@@ -153,6 +153,7 @@ class Operator:
             self._drawn_scene, self._drawn_skin = scene, None
             scenes = self.desk.scenes
             self._page.show_scene(scene, scenes.names, scenes.sliders)
+            self._page.show_correction(self.desk.look.correction)
 
     def _follow_skin(self) -> None:
         skin = self.source.newest("skin", Skin)
@@ -214,7 +215,7 @@ class Operator:
         self.desk.look.again()
 
     def _correct(self, correction: Correction) -> None:
-        self.desk.look.correction = correction
+        self.desk.look.picked = correction
         self.desk.look.again()
 
     def _recorder_waits(self) -> bool | None:

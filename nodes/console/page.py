@@ -14,6 +14,7 @@ import viser
 from numpy.typing import NDArray
 
 from messages.scene import Scene
+from messages.types import Correction
 from nodes.console import panels
 from nodes.console.desk import Desk, Sliders
 from nodes.console.history import SERIES, WINDOW_S
@@ -144,9 +145,9 @@ class Page:
         self._look = self._gui.add_checkbox(
             "Look through the user's eye", False, hint="A picture every few seconds"
         )
-        correction = self._gui.add_dropdown("Correction", CORRECTIONS)
+        self._correction = self._gui.add_dropdown("Correction", CORRECTIONS)
         self._on_value(self._look, lambda on: self._ask("look", on))
-        self._on_value(correction, lambda name: self._ask("correct", name))
+        self._on_value(self._correction, lambda name: self._ask("correct", name))
         blank = np.full((90, 120, 3), 235, dtype=np.uint8)
         self._pictures = {
             name: self._gui.add_image(blank, label=label, jpeg_quality=80)
@@ -214,6 +215,10 @@ class Page:
         self._stiffness.value = 1e-3 * sliders.young_modulus_pa
         self._tension.value = 100.0 * (sliders.stretch_ratio - 1.0)
         self._size.value = round(100.0 * sliders.size_ratio)
+
+    def show_correction(self, correction: Correction) -> None:
+        """The one that the scene chose, or a viewer."""
+        self._correction.value = correction
 
     def show_problem(self, text: str) -> None:
         self._set("problem", self._problem, panels.problem(text))
