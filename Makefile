@@ -9,7 +9,8 @@ LOCK := build/pip-tools
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test lint bench bench-peers faults soak fuzz limits pages charts docs lock clean
+.PHONY: setup demo try test lint bench bench-peers faults deploy-trial soak fuzz limits pages charts \
+	docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
@@ -79,6 +80,10 @@ bench-peers: setup
 # Kills, cuts and spoils everything between three computers (network namespaces: root).
 faults: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.faults
+
+# docs/deploy.md, typed on three computers that are namespaces (root).
+deploy-trial: setup $(DEV_STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.deploy_trial
 
 # An hour of strokes and pushes: what grows, drifts or is lost (docs/soak.md).
 soak: setup

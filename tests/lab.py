@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -53,6 +53,51 @@ def missing() -> str | None:
     return None
 
 
+class Network:
+    """Namespaces named after computers, at a switch whose cables can be spoilt, while it is entered.
+
+    addresses: of each computer, in one /24.
+    """
+
+    def __init__(self, tag: str, addresses: Mapping[str, str]) -> None:
+        self._tag, self._addresses = tag, addresses
+
+    def space(self, name: str) -> str:
+        return f"{self._tag}-{name}"
+
+    async def __aenter__(self) -> Self:
+        spaces = [self.space(name) for name in self._addresses]
+        for space in spaces:
+            _ip("netns", "add", space)
+        self._switch = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "tests.switch", *spaces, cwd=ROOT,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        )  # fmt: skip
+        assert self._switch.stdout is not None
+        assert await self._switch.stdout.readline() == b"ready\n"
+        for name, address in self._addresses.items():
+            space = self.space(name)
+            _ip("-n", space, "link", "set", "lo", "up")
+            _ip("-n", space, "addr", "add", f"{address}/24", "dev", "eth")
+            _ip("-n", space, "link", "set", "eth", "up")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        assert self._switch.stdin is not None
+        self._switch.stdin.close()
+        await self._switch.wait()
+        for name in self._addresses:
+            _ip("netns", "del", self.space(name))
+
+    async def cable(self, host: str, **values: Any) -> None:
+        """Set what the cable of a computer does to frames; nothing: it is a good one."""
+        assert self._switch.stdin is not None
+        assert self._switch.stdout is not None
+        self._switch.stdin.write(json.dumps({self.space(host): values}).encode() + b"\n")
+        await self._switch.stdin.drain()
+        assert await self._switch.stdout.readline() == b"done\n"
+
+
 class Lab:
     """Use as an async context manager; skips the test where it cannot be.
 
@@ -77,7 +122,7 @@ class Lab:
         self._write_launch_file(without, {"arming": arming, **bridge}, watchdog_s)
         self.launchers: dict[str, subprocess.Popen[bytes]] = {}
         self._subscribers: dict[str, list[Subscriber]] = {}
-        self._cables: dict[str, dict[str, Any]] = {}
+        self.network = Network(f"fs{os.getpid()}", ADDRESS)
 
     def _write_launch_file(
         self, without: Collection[str], bridge: dict[str, Any], watchdog_s: float
@@ -112,21 +157,7 @@ class Lab:
         return self.folder / f"{host}.mcap"
 
     async def __aenter__(self) -> Self:
-        self._tag = f"fs{os.getpid()}"
-        spaces = [self._space(name) for name in HOSTS]
-        for space in spaces:
-            _ip("netns", "add", space)
-        self._switch = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "tests.switch", *spaces, cwd=ROOT,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-        )  # fmt: skip
-        assert self._switch.stdout is not None
-        assert await self._switch.stdout.readline() == b"ready\n"
-        for name in HOSTS:
-            space = self._space(name)
-            _ip("-n", space, "link", "set", "lo", "up")
-            _ip("-n", space, "addr", "add", f"{ADDRESS[name]}/24", "dev", "eth")
-            _ip("-n", space, "link", "set", "eth", "up")
+        await self.network.__aenter__()
         return self
 
     async def __aexit__(self, *_: object) -> None:
@@ -138,15 +169,8 @@ class Lab:
             for process in running:
                 await asyncio.to_thread(process.wait, 40)
         finally:
-            assert self._switch.stdin is not None
-            self._switch.stdin.close()
-            await self._switch.wait()
-            for name in HOSTS:
-                _ip("netns", "del", self._space(name))
+            await self.network.__aexit__()
             shutil.rmtree(self.folder)
-
-    def _space(self, name: str) -> str:
-        return f"{self._tag}-{name}"
 
     def _environment(self, host: str) -> dict[str, str]:
         return {
@@ -158,7 +182,7 @@ class Lab:
 
     def command(self, host: str, *arguments: str) -> list[str]:
         flexsheet = [sys.executable, str(ROOT / "flexsheet.py")]
-        return ["ip", "netns", "exec", self._space(host), *flexsheet, *arguments]
+        return ["ip", "netns", "exec", self.network.space(host), *flexsheet, *arguments]
 
     def start(self, *hosts: str) -> None:
         """`flexsheet launch` on those hosts."""
@@ -181,12 +205,8 @@ class Lab:
         return process.returncode, output.decode()
 
     async def cable(self, host: str, **values: Any) -> None:
-        """Set what the cable of a computer does to frames; nothing: it is a good one."""
-        assert self._switch.stdin is not None
-        assert self._switch.stdout is not None
-        self._switch.stdin.write(json.dumps({self._space(host): values}).encode() + b"\n")
-        await self._switch.stdin.drain()
-        assert await self._switch.stdout.readline() == b"done\n"
+        """As that of `Network`."""
+        await self.network.cable(host, **values)
 
     def run_directory(self, host: str) -> Path | None:
         """Of the newest launcher there that has got so far as to write its plan."""

@@ -31,15 +31,16 @@ from nodes.node import parameters_of
 from tests.doc_pages import ROOT, Block, blocks, code_spans, name, pages
 from tests.test_cli_help import parse
 
-LANGUAGES = {"python", "yaml", "bash", "sh", "text"}
-SHELLS = ("bash", "sh")
+LANGUAGES = {"python", "yaml", "bash", "sh", "console", "text"}
+SHELLS = ("bash", "sh", "console")
 BLOCKS = {page: blocks(page) for page in pages()}
 SCENE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 
 OURS = {"flexsheet", "make", "python", "pytest"}
 OTHERS = {
-    ".", "cd", "chmod", "chown", "cp", "dask", "docker", "docker/keys.sh", "git", "ip",
-    "journalctl", "mkdir", "pip-compile", "ssh", "systemctl", "useradd",
+    ".", "cd", "chmod", "chown", "cp", "dask", "docker", "docker/keys.sh", "git", "install",
+    "ip", "journalctl", "mkdir", "nano", "pip-compile", "scp", "sleep", "ssh", "systemctl",
+    "systemd-analyze", "useradd", "^C",
 }  # fmt: skip
 """Programs of others that pages may call."""
 
@@ -157,6 +158,7 @@ def check_nodes(nodes: Mapping[str, Mapping[str, Any]]) -> None:
 def commands(text: str) -> Iterator[list[str]]:
     """The calls of a block, word by word, without comments, sudo and what is set for one call."""
     for line in text.replace("\\\n", " ").splitlines():
+        line = re.sub(r"^\w+\$ ", "", line)  # noqa: PLW2901  # a prompt of a console
         call: list[str] = []
         for word in [*shlex.split(line, comments=True), "&&"]:
             if word in ("&&", "|", ";"):

@@ -1,0 +1,342 @@
+"""docs/deploy.md, followed literally on three computers: `python -m benchmarks.deploy_trial`.
+
+Three network namespaces at a switch, each with a file system of its own where it matters (/etc,
+/opt/flexsheet, /var/lib, /run, home, runs), play the computers (root is needed); what the page's
+blocks of `console` say is typed there, in order, into one shell each.  Judged by each command's
+exit code and, from the main computer's bag, by whether both arms followed the stroke.
+
+What a namespace has not is lent: the packages of this Python (so that `make setup` finds them
+there), `ssh`, `scp`, `sudo`, `nano` and `systemctl` as small programs that do what the page needs
+of them (`benchmarks/standins`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from launch.runs import root as runs_root
+from messages.bag import BagReader
+from messages.scene import Scene
+from messages.types import ArmState, SheetTarget, TwinFinger
+from nodes.models.rigid import transform_from_rpy
+from tests.lab import ROOT, Network, missing
+
+PAGE = ROOT / "docs" / "deploy.md"
+HOSTS = ("main", "left", "right")
+ADDRESSES = {"main": "192.0.2.10", "left": "192.0.2.11", "right": "192.0.2.12"}
+"""Others than those of launch/three.yaml, which therefore must be edited."""
+
+PROMPT = re.compile(rf"(each|{'|'.join(HOSTS)})\$ (.*)")
+EXIT_CODE = re.compile(r"# .*exit code (\d+)")
+SYSTEM_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+READY_S, COMMAND_S = 300.0, 300.0
+FOLLOWED_M, FOLLOWED_SHARE = 0.005, 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A line at a prompt of the page: on which computers, what is typed, how it is to end."""
+
+    line: int
+    hosts: tuple[str, ...]
+    command: str
+    code: int
+
+
+@dataclass(frozen=True, slots=True)
+class Done:
+    """What came of a step on one computer."""
+
+    line: int
+    host: str
+    command: str
+    code: int
+    wanted: int
+    took_s: float
+    words: str
+
+
+def steps(text: str) -> Iterator[Step]:
+    """What a page says at its prompts, in its blocks of console; ValueError for other lines."""
+    inside = False
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.startswith("```"):
+            inside = not inside and line == "```console"
+        elif inside:
+            found = PROMPT.fullmatch(line)
+            if found is None:
+                raise ValueError(f"line {number} has no prompt (each$, {'$, '.join(HOSTS)}$)")
+            code = EXIT_CODE.search(found[2])
+            hosts = HOSTS if found[1] == "each" else (found[1],)
+            yield Step(number, hosts, found[2], int(code[1]) if code else 0)
+
+
+class Computer:
+    """A shell in a network namespace, with files of its own."""
+
+    def __init__(self, name: str, space: str, folder: Path) -> None:
+        self.name, self.folder, self._space = name, folder / name, space
+        self._shell: asyncio.subprocess.Process
+
+    async def start(self) -> None:
+        home = self.folder / "home"
+        for part in ("home", "opt", "var", "run", "runs"):
+            (self.folder / part).mkdir(parents=True)
+        shutil.copytree("/etc", self.folder / "etc", symlinks=True)
+        (home / ".gitconfig").write_text("[safe]\n\tdirectory = *\n")
+        mounts = {"etc": "/etc", "opt": "/opt/flexsheet", "var": "/var/lib", "run": "/run",
+                  "runs": str(runs_root())}  # fmt: skip
+        lent = {sysconfig.get_path("purelib"): "packages", sys.base_prefix: "python", ROOT: "clone"}
+        script = [f"mount --bind {what} {self.folder.parent / to}" for what, to in lent.items()]
+        script += [f"mount --bind {self.folder / what} {to}" for what, to in mounts.items()]
+        path = f"{self.folder.parent / 'clone/benchmarks/standins'}:{SYSTEM_PATH}"
+        environment = {"HOME": str(home), "USER": "root", "PATH": path, "LANG": "C.UTF-8",
+                       "TRIAL": str(self.folder.parent), "OPENBLAS_NUM_THREADS": "1",
+                       "PYTHON": str(self.folder.parent / "python/bin" / Path(sys.executable).name)}  # fmt: skip
+        self._shell = await asyncio.create_subprocess_exec(
+            "ip", "netns", "exec", self._space, "unshare", "--mount", "bash", "-c",
+            f"set -e; {'; '.join(script)}; cd; exec bash",
+            env=environment, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT, limit=1 << 22, cwd="/",
+        )  # fmt: skip
+        (self.folder / "pid").write_text(str(self._shell.pid))
+        await self.type("set -m")
+
+    async def type(self, command: str) -> tuple[int, str]:
+        """Type a command; its exit code and words."""
+        assert self._shell.stdin is not None
+        assert self._shell.stdout is not None
+        self._shell.stdin.write(f"{command}\nprintf '\\001%d\\n' $?\n".encode())
+        words = []
+        async with asyncio.timeout(COMMAND_S):
+            while line := (await self._shell.stdout.readline()).decode(errors="replace"):
+                before, mark, code = line.partition("\x01")
+                words.append(before)
+                if mark:
+                    return int(code), "".join(words)
+        raise RuntimeError(f"the shell of {self.name} has ended: {''.join(words)}")
+
+    async def follow(self, command: str) -> tuple[int, str]:
+        """Do a line of the page: a launch stays until ^C, and is waited for until it is ready."""
+        command = re.sub(r"\bNAME\b", self.name, command).replace("URL", "$TRIAL/clone")
+        if command == "make setup":
+            self._lend_packages()
+        if command == "^C":
+            return await self.type("kill -INT $LAUNCHED && wait $LAUNCHED")
+        if command.startswith("flexsheet launch") and "--dry-run" not in command:
+            log = self.folder / "launch.log"
+            await self.type(f"{command} > {log} 2>&1 & LAUNCHED=$!")
+            end_s = time.monotonic() + READY_S
+            while time.monotonic() < end_s:
+                if "nodes are ready" in log.read_text():
+                    return 0, log.read_text()
+                code, _ = await self.type("kill -0 $LAUNCHED")
+                if code:
+                    break
+                await asyncio.sleep(0.1)
+            return 1, log.read_text()
+        return await self.type(command)
+
+    def _lend_packages(self) -> None:
+        """A virtual environment in which what the lock asks for is there already."""
+        trial, venv = self.folder.parent, self.folder / "opt" / ".venv"
+        home = trial / "python" / "bin"
+        site = venv / f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packages"
+        site.mkdir(parents=True)
+        (venv / "bin").mkdir()
+        (venv / "pyvenv.cfg").write_text(f"home = {home}\ninclude-system-site-packages = false\n")
+        (site / "lent.pth").write_text(f"{trial / 'packages'}\n")
+        python = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+        (venv / "bin/python").symlink_to(home / python)
+        (venv / "bin/activate").write_text("PATH=/opt/flexsheet/.venv/bin:$PATH\n")
+        (venv / "bin/pip").write_text('#!/bin/sh\nexec "${0%/*}/python" -m pip "$@"\n')
+        (venv / "bin/pip").chmod(0o755)
+
+    async def close(self) -> None:
+        assert self._shell.stdin is not None
+        self._shell.stdin.write(b"kill -INT $LAUNCHED 2>/dev/null; wait; exit\n")
+        self._shell.stdin.close()
+        try:
+            async with asyncio.timeout(40.0):
+                await self._shell.wait()
+        except TimeoutError:
+            self._shell.kill()
+            await self._shell.wait()
+
+
+@dataclass(frozen=True, slots=True)
+class Stroke:
+    """How the arms followed, while the finger's path ran.
+
+    following: share of the arms' words that say so.  apart_m: of the sheet's centre, as both arms
+    hold it, from where the planner wanted it, 95 %.  travel_m: how far that centre went.
+    """
+
+    seconds: float
+    following: float
+    apart_m: float
+    travel_m: float
+
+    def problems(self) -> list[str]:
+        found = []
+        if self.following < FOLLOWED_SHARE:
+            found.append(f"the arms followed {self.following:.0%} of the stroke only")
+        if not self.apart_m < FOLLOWED_M:
+            found.append(f"the sheet was {self.apart_m * 1e3:.1f} mm from where it was wanted")
+        if self.travel_m < 0.01:
+            found.append(f"the sheet moved by {self.travel_m * 1e3:.1f} mm only")
+        return found
+
+
+def judge_stroke(bag: Path) -> Stroke:
+    """What both arms did during the path that a command gave to the twin's finger."""
+    reader = BagReader(bag, ["scene", "arm_left", "arm_right", "sheet_target", "twin/finger"])
+    states: dict[str, list[tuple[int, ArmState]]] = {"left": [], "right": []}
+    targets, path, scene = [], [], None
+    for _, message, header, _ in reader:
+        match message:
+            case Scene():
+                scene = message
+            case ArmState():
+                states[message.side].append((header.source_ns, message))
+            case SheetTarget():
+                targets.append((message.valid_at_ns, message.world_from_sheet[:3, 3]))
+            case TwinFinger():
+                if message.path_label and not message.path_done and message.path_time_s > 0:
+                    path.append(header.source_ns)
+    if scene is None or not path or not targets or not all(states.values()):
+        raise ValueError(f"{bag}: no stroke is in it")
+    begin, end = path[0], path[-1]
+    times = np.array([at for at, _ in targets if begin <= at <= end])
+    wanted = np.array([centre for at, centre in targets if begin <= at <= end])
+    edges, follow = [], []
+    for side, said in states.items():
+        mount = getattr(scene.arms, side).flange_from_edge
+        flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
+        at = np.array([stamp for stamp, _ in said])
+        edge = np.array([(one.world_from_flange @ flange_from_edge)[:3, 3] for _, one in said])
+        edges.append(np.column_stack([np.interp(times, at, edge[:, k]) for k in range(3)]))
+        follow += [one.mode == "follow" for stamp, one in said if begin <= stamp <= end]
+    centre = (edges[0] + edges[1]) / 2
+    return Stroke(
+        seconds=(end - begin) * 1e-9,
+        following=float(np.mean(follow)),
+        apart_m=float(np.quantile(np.linalg.norm(centre - wanted, axis=1), 0.95)),
+        travel_m=float(np.ptp(centre, axis=0).max()),
+    )
+
+
+async def try_page(folder: Path, until: int) -> list[Done]:
+    """Follow the page up to a line of it; ends early where a command ends otherwise than said."""
+    done: list[Done] = []
+    async with Network(f"fs{os.getpid()}", ADDRESSES) as network:
+        computers = {name: Computer(name, network.space(name), folder) for name in HOSTS}
+        for computer in computers.values():
+            await computer.start()
+        try:
+            for step in steps(PAGE.read_text()):
+                if step.line > until:
+                    break
+                done += await asyncio.gather(
+                    *(_follow(computers[host], step) for host in step.hosts)
+                )
+                if any(one.code != one.wanted for one in done):
+                    break
+        finally:
+            await asyncio.gather(*(computer.close() for computer in computers.values()))
+    return done
+
+
+async def _follow(computer: Computer, step: Step) -> Done:
+    began_s = time.monotonic()
+    code, words = await computer.follow(step.command)
+    took_s = time.monotonic() - began_s
+    one = Done(step.line, computer.name, step.command, code, step.code, took_s, words)
+    print(f"{step.line:4} {computer.name:>5}$ {step.command[:90]}  [{code}, {took_s:.1f} s]",
+          file=sys.stderr, flush=True)  # fmt: skip
+    if code != step.code:
+        print(words, file=sys.stderr)
+    return one
+
+
+def prepare(folder: Path) -> None:
+    """What the computers share: their cupboard of lent things."""
+    folder.chmod(0o755)
+    for name in ("packages", "python", "clone"):
+        (folder / name).mkdir()
+    (folder / "addresses.json").write_text(json.dumps(ADDRESSES))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--until", type=int, default=10**9, metavar="LINE", help="of the page")
+    parser.add_argument("--keep", action="store_true", help="the folder of the three computers")
+    given = parser.parse_args()
+    if why := missing():
+        print(f"skipped: {why}", file=sys.stderr)
+        return 0
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    made = [path for path in (Path("/opt/flexsheet"), runs_root()) if not path.exists()]
+    try:
+        for path in made:
+            path.mkdir(parents=True, mode=0o700)
+        prepare(folder)
+        done = asyncio.run(try_page(folder, given.until))
+        problems = [f"{PAGE.name}:{one.line}: {one.host}: {one.command}: exit code {one.code}"
+                    for one in done if one.code != one.wanted]  # fmt: skip
+        stroke = None
+        bags = sorted((folder / "main/opt/runs").glob("*.mcap"))
+        if not problems and bags:
+            stroke = judge_stroke(bags[0])
+            problems += stroke.problems()
+        elif not problems:
+            problems.append("no stroke was recorded")
+    finally:
+        for path in made:
+            path.rmdir()
+        if given.keep:
+            print(f"kept: {folder}", file=sys.stderr)
+        else:
+            shutil.rmtree(folder)
+    commit = subprocess.run(
+        ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"],
+        capture_output=True, text=True, check=False,
+    ).stdout.strip()  # fmt: skip
+    report = {
+        "commit": commit,
+        "commands": len(done),
+        "took_s": sum(one.took_s for one in done),
+        "stroke": asdict(stroke) if stroke else None,
+        "problems": problems,
+    }
+    if given.json:
+        print(json.dumps(report | {"steps": [asdict(one) for one in done]}, indent=1))
+    else:
+        print(f"{len(done)} commands of {PAGE.name} typed at commit {commit}")
+        if stroke:
+            print(f"stroke of {stroke.seconds:.1f} s: both arms followed {stroke.following:.1%} of "
+                  f"it, the sheet within {stroke.apart_m * 1e3:.2f} mm (95 %) of where it was "
+                  f"wanted, over {stroke.travel_m * 1e3:.0f} mm")  # fmt: skip
+        print(f"problems: {'; '.join(problems) or 'none'}")
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
