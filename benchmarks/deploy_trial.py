@@ -17,7 +17,6 @@ import asyncio
 import json
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -106,9 +105,10 @@ class Computer:
         script = [f"mount --bind {what} {self.folder.parent / to}" for what, to in lent.items()]
         script += [f"mount --bind {self.folder / what} {to}" for what, to in mounts.items()]
         path = f"{self.folder.parent / 'clone/benchmarks/standins'}:{SYSTEM_PATH}"
-        environment = {"HOME": str(home), "USER": "root", "PATH": path, "LANG": "C.UTF-8",
-                       "TRIAL": str(self.folder.parent), "OPENBLAS_NUM_THREADS": "1",
-                       "PYTHON": str(self.folder.parent / "python/bin" / Path(sys.executable).name)}  # fmt: skip
+        environment = {
+            "HOME": str(home), "USER": "root", "PATH": path, "LANG": "C.UTF-8",
+            "TRIAL": str(self.folder.parent), "OPENBLAS_NUM_THREADS": "1",
+        }  # fmt: skip
         self._shell = await asyncio.create_subprocess_exec(
             "ip", "netns", "exec", self._space, "unshare", "--mount", "bash", "-c",
             f"set -e; {'; '.join(script)}; cd; exec bash",
@@ -141,6 +141,7 @@ class Computer:
             return await self.type("kill -INT $LAUNCHED && wait $LAUNCHED")
         if command.startswith("flexsheet launch") and "--dry-run" not in command:
             log = self.folder / "launch.log"
+            log.touch()
             await self.type(f"{command} > {log} 2>&1 & LAUNCHED=$!")
             end_s = time.monotonic() + READY_S
             while time.monotonic() < end_s:

@@ -54,7 +54,7 @@ def missing() -> str | None:
 
 
 class Network:
-    """Namespaces named after computers, at a switch whose cables can be spoilt, while it is entered.
+    """Namespaces named after computers, at a switch whose cables can be spoilt; while entered.
 
     addresses: of each computer, in one /24.
     """
