@@ -108,6 +108,8 @@ class Computer:
         environment = {
             "HOME": str(home), "USER": "root", "PATH": path, "LANG": "C.UTF-8",
             "TRIAL": str(self.folder.parent), "OPENBLAS_NUM_THREADS": "1",
+            # Where Python itself is somebody's own, its library is none that others can read.
+            "LD_LIBRARY_PATH": str(self.folder.parent / "python/lib"),
         }  # fmt: skip
         self._shell = await asyncio.create_subprocess_exec(
             "ip", "netns", "exec", self._space, "unshare", "--mount", "bash", "-c",
