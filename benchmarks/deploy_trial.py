@@ -95,12 +95,16 @@ class Computer:
 
     async def start(self) -> None:
         home = self.folder / "home"
-        for part in ("home", "opt", "var", "run", "runs"):
+        for part in ("home", "users", "opt", "var", "cache", "run", "runs"):
             (self.folder / part).mkdir(parents=True)
+        clone = self.folder.parent / "clone"
+        safe = f"[safe]\n\tdirectory = {clone}\n\tdirectory = {clone}/.git\n"
+        (home / ".gitconfig").write_text(safe)
         shutil.copytree("/etc", self.folder / "etc", symlinks=True)
-        (home / ".gitconfig").write_text("[safe]\n\tdirectory = *\n")
-        mounts = {"etc": "/etc", "opt": "/opt/flexsheet", "var": "/var/lib", "run": "/run",
-                  "runs": str(runs_root())}  # fmt: skip
+        mounts = {
+            "etc": "/etc", "opt": "/opt/flexsheet", "var": "/var/lib", "cache": "/var/cache",
+            "users": "/home", "run": "/run", "runs": str(runs_root()),
+        }  # fmt: skip
         lent = {sysconfig.get_path("purelib"): "packages", sys.base_prefix: "python", ROOT: "clone"}
         script = [f"mount --bind {what} {self.folder.parent / to}" for what, to in lent.items()]
         script += [f"mount --bind {self.folder / what} {to}" for what, to in mounts.items()]

@@ -7,8 +7,21 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from launch.planned import Plan
+
 TEMPLATE = Path(__file__).parent / "systemd" / "flexsheet@.service"
 SOFTWARE = Path(__file__).resolve().parent.parent
+
+
+STATE = Path("/var/lib/flexsheet")
+"""Where the service may write and what is there stays."""
+
+
+def bags_of(plan: Plan, host: str) -> Iterator[Path]:
+    """Where a host's recorders put what they record."""
+    for node in plan.nodes_on(host):
+        if node.type == "recorder":
+            yield Path(node.parameters["bag"])
 
 
 @dataclass(frozen=True, slots=True)

@@ -647,7 +647,8 @@ def git_state(directory: Path) -> str:
     def git(*arguments: str) -> str | None:
         try:
             result = subprocess.run(
-                ["git", "-C", str(directory), *arguments],
+                # A service's user is seldom the one who cloned; git would answer owners alone.
+                ["git", "-c", "safe.directory=*", "-C", str(directory), *arguments],
                 capture_output=True,
                 text=True,
                 timeout=5,

@@ -40,7 +40,7 @@ def install(
 ) -> None:
     """Write the unit flexsheet@.service and the host's environment; start nothing."""
     from launch.plan import load_plan
-    from launch.service import files_of
+    from launch.service import STATE, bags_of, files_of
 
     plan = load_plan(launch_file)
     if host not in plan.hosts:
@@ -50,6 +50,13 @@ def install(
         )
     if not user or set(user) - set(USER_PATTERN):
         raise CommandError(f'--user "{user}" is no name of a user', BAD_INPUT)
+    for bag in bags_of(plan, host):
+        if not bag.is_relative_to(STATE):
+            words.print(
+                f"{bag} cannot be recorded: the service may write to {STATE} only; change the "
+                "launch file",
+                markup=False, style="yellow",
+            )  # fmt: skip
     files = files_of(launch_file=launch_file, host=host, user=user, root=root)
     if as_json:
         print_json([{"path": str(file.path), "text": file.text} for file in files])
