@@ -184,7 +184,7 @@ def check_call(
     written: files that calls of the page have written.
     """
     match program(call):
-        case ["flexsheet", *rest]:
+        case ["flexsheet" | "/opt/flexsheet/.venv/bin/flexsheet", *rest]:
             try:
                 parse(shlex.join(["flexsheet", *(word for word in rest if word != "--help")]))
             except SystemExit:  # of an option that does something at once
