@@ -60,8 +60,9 @@ MARGIN_NS = 1_500_000_000
 class Result:
     """What came of one trouble.
 
-    stopped_s: until neither arm followed, None: they never stopped.  back_s: from when the trouble
-    was over until both followed, None: never.  during_ns: from its beginning until all was well.
+    stopped_s: until neither arm followed, None: they never stopped.  back_s: the longest that they
+    did not both follow, without the time that the trouble itself lasted; None: they never did
+    again.  during_ns: from its beginning until all was well.
     """
 
     trouble: str
@@ -108,12 +109,7 @@ async def tried(lab: Lab, name: str, work: Work) -> Result:
     stopped_s = next(
         (at for at, modes in told if at > span.begun_s and "follow" not in modes), None
     )
-    over_s = max(span.over_s, stopped_s or 0.0)
-    # What it was like at that moment, and what changed after.
-    later = [(max(at, over_s), modes) for at, modes in told if at > over_s]
-    earlier = [(over_s, modes) for at, modes in told if at <= over_s][-1:]
-    back = [at for at, modes in (*earlier, *later) if modes == {"follow"}]
-    back_s = None if failed else (back[0] if back else time.monotonic()) - span.over_s
+    back_s = None if failed else longest_away_s(told, span)
     states = [state for _, state in lab.seen[begin:] if isinstance(state, ArmState)]
     faults = {fault for state in states for fault in state.faults if state.mode == "fault"}
     longest_m = max((state.edge_distance_m or 0.0 for state in states), default=0.0)
@@ -125,6 +121,22 @@ async def tried(lab: Lab, name: str, work: Work) -> Result:
         tuple(sorted(faults)),
         longest_m,
     )
+
+
+def longest_away_s(told: list[tuple[float, set[str]]], span: Span) -> float:
+    """The longest time that not both arms followed, as far as it lies after the trouble was over.
+
+    A busy computer makes arms hold for moments of its own, which are shorter.
+    """
+    longest_s = 0.0
+    since_s: float | None = None
+    for at_s, modes in [*told, (time.monotonic(), {"follow"})]:
+        if modes != {"follow"}:
+            since_s = at_s if since_s is None else since_s
+        elif since_s is not None:
+            longest_s = max(longest_s, at_s - max(since_s, span.over_s))
+            since_s = None
+    return longest_s
 
 
 async def matrix(lab: Lab, only: str) -> list[Result]:
