@@ -285,9 +285,11 @@ def _wrong_size(got: int, wanted: int, dtype: np.dtype[Any], shape: tuple[int, .
     )
 
 
-def _read_only(frame: Any) -> memoryview:
-    view = memoryview(frame.buffer if hasattr(frame, "buffer") else frame)
-    return view if view.readonly else view.toreadonly()
+def _read_only(frame: Any) -> Buffer:
+    buffer: Buffer = frame if isinstance(frame, _BUFFERS) else frame.buffer
+    if isinstance(buffer, bytes) or buffer.readonly:
+        return buffer
+    return buffer.toreadonly()
 
 
 @lru_cache(maxsize=1024)

@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -172,6 +173,23 @@ async def test_every_counts_and_reports_an_overflow(room: Room) -> None:
     assert len(ear.heard) + ear.counts.gaps == ear.sequences[-1] - start + 1
     assert ear.sequences == sorted(ear.sequences)
     assert "messages of writer lost" in ear.problems[0]
+
+
+async def test_what_has_just_left_its_writer_waits_for_no_newer(
+    room: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    topic = TOPICS["stereo"]
+    publisher = room.mouth(topic)
+    ear = room.ear(topic)
+    start = await connected(publisher, ear, pictures) + 1
+    now = SimpleNamespace(monotonic_ns=lambda: header(start).publish_ns)
+    monkeypatch.setattr("messages.bus.time", now)
+    for number in range(start, start + 40):
+        publisher.send(pictures(number % 250), header(number))
+    await until(lambda: ear.heard and ear.sequences[-1] == start + 39)
+    assert ear.sequences[0] == start
+    assert ear.sequences == sorted(ear.sequences)
+    assert len(ear.heard) + ear.counts.dropped == 40
 
 
 async def test_latest_hands_over_the_newest_and_counts_the_rest(room: Room) -> None:
