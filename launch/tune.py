@@ -94,7 +94,7 @@ TUNABLES = (
         "kinematics",
         "kinematics",
         ("nodes.arm_bridge.kinematics:KINEMATICS",),
-        _by_name("closed_form", "closed_form_continuous"),
+        _by_name("closed_form_continuous"),
     ),
     Tunable(
         "sheet-force",

@@ -18,7 +18,8 @@ TriangulationMethod = Literal["midpoint", "dlt", "optimal"]
 TrackingMethod = Literal[
     "none", "exponential", "one_euro", "constant_velocity", "constant_acceleration", "hand"
 ]
-KinematicsMethod = Literal["closed_form", "closed_form_continuous"]
+KinematicsMethod = Literal["closed_form_continuous"]
+"""The one by which an arm's way is checked beforehand: its steps have to stay on that branch."""
 SheetForceMethod = Literal["linear", "cubic", "scaled", "table"]
 SheetShapeMethod = Literal["flat", "four_triangles", "dents"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]

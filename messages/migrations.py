@@ -18,7 +18,18 @@ Fields = dict[str, Any]
 Migration = Callable[[Fields], Fields]
 Schema = Mapping[str, Any]
 
-MIGRATIONS: dict[tuple[str, str], Migration] = {}
+
+def _one_way_of_stepping(scene: Fields) -> Fields:
+    """The arms' `closed_form` is no longer a choice."""
+    methods = scene.get("methods", {})
+    if methods.get("kinematics") != "closed_form":
+        return scene
+    return scene | {"methods": methods | {"kinematics": "closed_form_continuous"}}
+
+
+MIGRATIONS: dict[tuple[str, str], Migration] = {
+    ("Scene", "d7307561a5180666"): _one_way_of_stepping,
+}
 
 _IGNORED = frozenset({"title", "description", "default", "discriminator", "$defs"})
 _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf", "oneOf",

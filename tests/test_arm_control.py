@@ -4,21 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from messages.clock import VirtualClock
+from messages.methods import KinematicsMethod
 from messages.scene import Scene
 from messages.types import ArmState, EStop, Side
 from nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, goal_ahead, pace
-from nodes.arm_bridge.kinematics import KINEMATICS, forward
+from nodes.arm_bridge.kinematics import KINEMATICS, STEPS, forward, next_joints
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.methods import measure
 from nodes.models.motion import SheetMotion
@@ -446,6 +449,13 @@ def test_every_method_of_the_family_is_within_tolerance_in_its_range() -> None:
     assert {point.method for point in points} == set(KINEMATICS.methods)
     for point in points:
         assert not point.in_range or point.error <= KINEMATICS.tolerance(SCENE)
+
+
+def test_a_bridge_steps_by_what_its_way_is_checked_with_and_by_nothing_else() -> None:
+    assert set(STEPS.values()) == {next_joints}
+    assert set(get_args(KinematicsMethod)) == set(STEPS)
+    with pytest.raises(ValidationError):
+        ArmBridgeParameters.model_validate({"side": "left", "kinematics": "closed_form"})
 
 
 def test_without_a_connection_the_last_measured_pose_is_kept_and_none_is_made_up() -> None:

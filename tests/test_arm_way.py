@@ -324,6 +324,7 @@ async def test_the_twins_arms_stand_before_a_barred_way_and_go_a_clear_one() -> 
         assert {rig.newest(side).mode for side in sides} == {"hold"}
         assert nodes["left"].note.split(";")[0] == nodes["right"].note.split(";")[0]
         assert "left arm, at " in nodes["left"].note
+        assert nodes["left"].note.endswith("; joints by closed_form_continuous")
         for servo, place in zip(servos, places, strict=True):
             assert (servo.joints_rad == place).all()
         task.cancel()

@@ -37,6 +37,19 @@ def test_the_first_release_is_read_whole() -> None:
     assert np.isfinite(finger.position_world_m).all()
 
 
+@pytest.mark.parametrize("kinematics", ["closed_form", "closed_form_continuous", None])
+def test_a_scene_that_stepped_to_the_nearest_of_all_branches_is_still_read(
+    kinematics: str | None,
+) -> None:
+    recorded = next(message for name, message, *_ in BagReader(FIRST_RELEASE) if name == "scene")
+    fields = recorded.model_dump()
+    fields["methods"]["kinematics"] = kinematics
+    migration = migration_for(Scene, "d7307561a5180666", {})
+    assert migration is not None
+    taken = Scene.model_validate(migration(fields)).methods.kinematics
+    assert taken == (None if kinematics is None else "closed_form_continuous")
+
+
 class Before(Message):
     mode: Literal["on", "off"]
     size_mm: float

@@ -573,10 +573,11 @@ def _step_trials(
 
 
 STEPS: Mapping[KinematicsMethod, JointsFor] = {
-    "closed_form": inverse_kinematics,
     "closed_form_continuous": next_joints,
 }
-"""What a bridge may step by; the others of the family know no joint ranges."""
+"""What a bridge may step by: the branch that its way was checked on.  Of the others of the family,
+which are there to compare, one leaves that branch past a singularity and the rest know no ranges.
+"""
 
 _METHODS: dict[str, JointsFor] = {
     "closed_form": inverse_kinematics,

@@ -67,6 +67,7 @@ class ArmBridge(Node):
             given.kinematics, scene.methods.kinematics, "closed_form_continuous"
         )
         self._geometry = ArmGeometry(scene, given.side, joints_for=STEPS[method])
+        self._method = method
         self._lookout = Lookout(self._geometry, ArmGeometry(scene, other_side))
         due_s = given.target_period_s or 1.0 / scene.camera.rate_hz
         self._timing = Timing(given.servo_lag_s, due_s, given.furthest_extrapolation_s)
@@ -105,7 +106,7 @@ class ArmBridge(Node):
         if self._link.due(now_ns):
             await self._exchange(geometry, step_s)
         what, why = self._control.mode, self._control.reason
-        self.note = f"{what} {why}; {self._failures} failed exchanges"
+        self.note = f"{what} {why}; {self._failures} failed exchanges; joints by {self._method}"
         if self._control.last_measured_rad is not None:
             now_ns, newest = self.clock.now_ns(), self._newest
             state = arm_state(self._control, geometry, self._other(), newest, now_ns)
