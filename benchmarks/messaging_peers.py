@@ -8,7 +8,7 @@ As `benchmarks.messaging`: one process publishes at a steady rate, one process p
 the latency is one way, from before a typed message is made to the handler that has it.  All take
 turns in random order in every round, and what counts is the ratio to blocking ZeroMQ within the
 round.  zenoh carries as many bytes, untyped; Cyclone DDS and LCM carry types of their own with the
-same fields, which nobody validates.
+same fields, which nobody validates.  dora is not asked: its nodes run under a daemon of its own.
 
 As root, everything happens in a network of its own, where loopback has the multicast that LCM
 needs, and a second one is reached by a pair of virtual Ethernet devices ("veth").  There flexsheet
