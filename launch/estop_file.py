@@ -1,12 +1,15 @@
 """An e-stop as a file: what a launcher that is started anew must know though all who knew are gone.
 
-Only a reset removes it.  What cannot be read counts as a stop.
+Only a reset removes it.  What cannot be read counts as a stop.  A file belongs to the arms that it
+stops, so that graphs of the same arms share it, whatever their launch files, and others do not.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from messages.types import EStop
@@ -24,10 +27,14 @@ def directory() -> Path:
 
 
 class EStopFile:
-    """The e-stop that a host's launcher keeps."""
+    """The e-stop that a host's launcher keeps.
 
-    def __init__(self, host: str) -> None:
-        self.path = directory() / f"estop-{host}.json"
+    arms: where the arms are reached.
+    """
+
+    def __init__(self, host: str, arms: Sequence[str]) -> None:
+        which = hashlib.sha256("\n".join(sorted(arms)).encode()).hexdigest()[:8]
+        self.path = directory() / f"estop-{host}-{which}.json"
 
     def read(self) -> EStop | None:
         """The e-stop that was engaged; None where none is."""
@@ -35,7 +42,7 @@ class EStopFile:
             reason = json.loads(self.path.read_text())["reason"]
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             reason = f"{self.path} cannot be read ({error}), which may have held one"
         return EStop(engaged=True, reason=str(reason))
 

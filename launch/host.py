@@ -28,11 +28,18 @@ from messages.clock import SystemClock
 from messages.clock_table import ClockTable
 from messages.security import KeyChange, KeyRing
 from messages.topics import topic_named
-from messages.types import EStop, HostKey, HostStatus, NodeProcess
+from messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
 from nodes.node import PortCounts
 
 PERIOD_S = 1.0
 DEVICES = "/dev/"
+REASON_LENGTH = 1000
+"""What is longer is cut: an e-stop must fit into every message that repeats it."""
+
+RESET_WITHIN_S = 5.0
+"""How long the arms have to say that a reset has been taken."""
+
+ARMS = ("arm_left", "arm_right")
 
 Processes = Callable[[], tuple[NodeProcess, ...]]
 Endpoints = Callable[[tuple[str, ...]], tuple[str, ...]]
@@ -81,7 +88,10 @@ class HostVoice:
         self._task: asyncio.Task[None] | None = None
         self._kept: EStop | None = None
         self._engaged_ns = 0
-        self._file = EStopFile(host) if waits_for_a_person(plan) else None
+        self._resetting: asyncio.Task[None] | None = None
+        self._file = EStopFile(host, arms_of(plan)) if waits_for_a_person(plan) else None
+        self._unwritten = False
+        self._untold = ""
         nodes = plan.nodes_on(host)
         self._devices, self._folder = devices_of(nodes), folder_of(nodes)
 
@@ -99,14 +109,15 @@ class HostVoice:
             for source in self._plan.sources_to_read("estop", self._host)
             if source.writer != self._name
         ]
-        self._hear("estop", others, self._keep)
+        self._heard.append(self._hear("estop", others, self._keep))
         measured = self._plan.writer("clocks", clock_node(self._host))
         if measured is not None:
             source = measured.source_for(self._host)
-            self._hear("clocks", [source], lambda clocks, _: self._clock_table.update(clocks))
+            take = self._clock_table.update
+            self._heard.append(self._hear("clocks", [source], lambda clocks, _: take(clocks)))
         self._task = asyncio.create_task(self._speak(), name=f"host {self._host}")
 
-    def _hear(self, topic: str, sources: list[Source], handler: Handler) -> None:
+    def _hear(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
         subscriber = Subscriber(
             topic_named(topic),
             self._sources(sources),
@@ -117,7 +128,7 @@ class HostVoice:
             plan=self._plan.hash,
         )
         subscriber.start()
-        self._heard.append(subscriber)
+        return subscriber
 
     def renew_keys(self, change: KeyChange) -> None:
         """Take over keys that have been read anew."""
@@ -128,9 +139,10 @@ class HostVoice:
 
     async def close(self) -> None:
         """Fall silent; may be called twice."""
-        if self._task is not None:
-            self._task.cancel()
-            await asyncio.gather(self._task, return_exceptions=True)
+        for task in (self._task, self._resetting):
+            if task is not None:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
         for subscriber in self._heard:
             subscriber.close()
         for publisher in self.publishers.values():
@@ -142,41 +154,84 @@ class HostVoice:
         if estop.engaged:
             if self._kept is not None and header.writer in self._launchers:
                 return
-            before = self._kept
-            if before is None:
+            if self._kept is None:
                 self._on_problem(f"e-stop of {header.writer}, kept until it is reset")
-            self._engage(estop, now_ns if clock_trouble else header.source_ns)
-            if before is None or before.reason != estop.reason:
-                self._write_down(estop)
+            # A stamp from the future would bar every reset to come.
+            self._engage(estop, now_ns if clock_trouble else min(header.source_ns, now_ns))
         elif header.writer in self._plan.may_reset_estop() and self._kept is not None:
             # A late reader is given each writer's last word: a reset may be older than the stop.
             if header.source_ns < self._engaged_ns:
                 return
             if clock_trouble:
                 self._on_problem(f"e-stop not reset: by {header.writer}, {clock_trouble}")
-                return
-            self._on_problem(f"e-stop reset by {header.writer}")
-            self._kept = None
-            self.publishers["estop"].forget()
-            self._write_down(None)
+            elif self._resetting is None or self._resetting.done():
+                self._resetting = asyncio.create_task(self._reset(header.writer, self._kept))
 
     def _engage(self, estop: EStop, at_ns: int) -> None:
-        self._kept, self._engaged_ns = estop, max(self._engaged_ns, at_ns)
-        self._publish("estop", estop)
+        known = self._kept
+        self._kept = EStop(engaged=True, reason=estop.reason[:REASON_LENGTH])
+        self._engaged_ns = max(self._engaged_ns, at_ns)
+        self._publish("estop", self._kept)
+        if known != self._kept:
+            self._write_down()
 
-    def _write_down(self, estop: EStop | None) -> None:
+    async def _reset(self, writer: str, kept: EStop) -> None:
+        """Forget the e-stop once all arms say that they have: they refuse while they move."""
+        stopped = {topic for topic in ARMS if self._plan.writers.get(topic)}
+        all_clear = asyncio.Event()
+
+        def take(state: ArmState, _: Header) -> None:
+            if not shows_estop(state):
+                stopped.discard(f"arm_{state.side}")
+            if not stopped:
+                all_clear.set()
+
+        arms = [
+            self._hear(topic, list(self._plan.sources_to_read(topic, self._host)), take)
+            for topic in stopped
+        ]
+        begun_ns = self._engaged_ns
+        try:
+            if stopped:
+                await asyncio.wait([asyncio.create_task(all_clear.wait())], timeout=RESET_WITHIN_S)
+        finally:
+            for subscriber in arms:
+                subscriber.close()
+        if self._kept is not kept or self._engaged_ns != begun_ns:
+            self._on_problem(f"e-stop not reset by {writer}: it was engaged again meanwhile")
+        elif stopped:
+            self._on_problem(
+                f"e-stop kept: {', '.join(sorted(stopped))} did not say within "
+                f"{RESET_WITHIN_S:g} s that {writer}'s reset was taken; once their bridges run and "
+                "the arms rest: flexsheet arms reset"
+            )
+        else:
+            self._on_problem(f"e-stop reset by {writer}")
+            self._kept = None
+            self.publishers["estop"].forget()
+            self._write_down()
+
+    def _write_down(self) -> None:
+        """Let the file be as what is kept; what fails is tried again."""
         if self._file is None:
             return
         try:
-            if estop is None:
+            if self._kept is None:
                 self._file.remove()
             else:
-                self._file.write(estop)
+                self._file.write(self._kept)
         except OSError as error:
-            self._on_problem(
-                f"e-stop: {self._file.path} cannot be written ({error.strerror}); should all "
-                "launchers end, the next start does not know of this"
-            )
+            if not self._unwritten:
+                after = (
+                    "stands though it was reset" if self._kept is None else "knows nothing of it"
+                )
+                self._on_problem(
+                    f"e-stop: {self._file.path} cannot be written ({error.strerror}); should all "
+                    f"launchers end, the next start {after}"
+                )
+            self._unwritten = True
+        else:
+            self._unwritten = False
 
     def _publish(self, topic: str, message: Message) -> None:
         if topic not in self.publishers:
@@ -196,7 +251,15 @@ class HostVoice:
 
     async def _speak(self) -> None:
         while True:
-            self._publish("host", self._status())
+            try:
+                self._publish("host", self._status())
+            except OSError as error:
+                untold = f"how this host is cannot be told: {error}"
+                if untold != self._untold:
+                    self._on_problem(untold)
+                self._untold = untold
+            if self._unwritten:
+                self._write_down()
             await asyncio.sleep(PERIOD_S)
 
     def _status(self) -> HostStatus:
@@ -219,6 +282,17 @@ class HostVoice:
             else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
             estop=None if self._kept is None else self._kept.reason,
         )
+
+
+def shows_estop(state: ArmState) -> bool:
+    """Whether an arm's bridge still holds an e-stop."""
+    return state.mode == "estop" or any(fault.startswith("e-stop: ") for fault in state.faults)
+
+
+def arms_of(plan: Plan) -> list[str]:
+    """Where the plan's arms are reached."""
+    bridges = [node.parameters for node in plan.nodes.values() if node.type == "arm_bridge"]
+    return [f"{one.get('host')}:{one.get('port')}" for one in bridges]
 
 
 def waits_for_a_person(plan: Plan) -> bool:

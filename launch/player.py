@@ -20,6 +20,15 @@ Progress = Callable[[float, float], None]
 """Called with (seconds of the bag played, seconds in all)."""
 
 
+NOT_AGAIN = {
+    "status": "it tells of nodes that were",
+    "arming": "a person's word that arms may move is not said again",
+    "estop": "a person's word on an e-stop is not said again",
+    "recording": "what was recorded then is not recorded again",
+}
+"""Topics that are never played, and why."""
+
+
 @dataclass(frozen=True, slots=True)
 class Selection:
     """What of a bag can be played into a graph: the topics, and those left out with the reason."""
@@ -36,8 +45,8 @@ def select_topics(recorded: Collection[str], plan: Plan, wanted: Collection[str]
     for name in recorded:
         if wanted and name not in wanted:
             continue
-        if name == "status":
-            left_out[name] = "it tells of nodes that were"
+        if name in NOT_AGAIN:
+            left_out[name] = NOT_AGAIN[name]
         elif name in writable:
             chosen.append(name)
         else:

@@ -66,11 +66,13 @@ class Pass:
 
     as_taken: it took what the node said that it took; else all, in the recorder's order.
     missing: messages that it took and the bag does not hold.
+    told_until_ns: of what it took later it could not say any more; its host's clock.
     """
 
     messages_in: int = 0
     missing: int = 0
     as_taken: bool = False
+    told_until_ns: int | None = None
     sent: list[Sent] = field(default_factory=list)
     errors: int = 0
     last_error: str = ""
@@ -186,7 +188,7 @@ async def replay(bag: Path, planned: PlannedNode) -> Pass:
     result = Pass()
     lives = lives_in(bag, planned.name)
     for life in lives:
-        result.as_taken = True
+        result.as_taken, result.told_until_ns = True, int(life.steps[-1, 3])
         await _replay_life(bag, planned, life, result)
     if not lives:
         await _replay_in_order(bag, planned, result)
@@ -398,7 +400,8 @@ def compare(
     recorded: dict[str, dict[int, Message]] = {topic: {} for topic in outputs}
     comparisons = {topic: Comparison() for topic in sorted(outputs)}
     for topic, message, header, _ in BagReader(bag, outputs & set(BagReader(bag).topics)):
-        if header.writer == node.name:
+        untold = replayed.told_until_ns is not None and header.source_ns > replayed.told_until_ns
+        if header.writer == node.name and not untold:
             recorded[topic][header.source_ns] = message
             comparisons[topic].recorded += 1
     for one in replayed.sent:

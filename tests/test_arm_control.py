@@ -471,11 +471,30 @@ def test_without_a_connection_the_last_measured_pose_is_kept_and_none_is_made_up
 def test_a_reset_from_before_the_stop_does_not_clear_it() -> None:
     control = ArmControl(PATIENCE, largest_lag_rad=0.1)
     stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
-    assert control.take_estop(stop, 200) is None
-    assert control.take_estop(reset, 100) == "it is older than the stop"
+    assert control.take_estop(stop, 200, 200) is None
+    assert control.take_estop(reset, 100, 210) == "it is older than the stop"
     assert control.estop_reason == "hand"
-    assert control.take_estop(reset, 300) is None
+    assert control.take_estop(reset, 300, 310) is None
     assert control.estop_reason is None
+
+
+def test_last_words_of_several_writers_may_come_in_any_order() -> None:
+    """To a bridge that is started anew: the newest stop counts, not the one that came last."""
+    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+    stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
+    assert control.take_estop(stop, 30, 100) is None
+    assert control.take_estop(stop, 5, 100) is None
+    assert control.take_estop(reset, 20, 100) == "it is older than the stop"
+    assert control.estop_reason == "hand"
+
+
+def test_a_stop_whose_stamp_is_doubtful_or_of_the_future_can_be_reset_afterwards() -> None:
+    stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
+    for stamp_ns, doubt in ((10_000, ""), (5, "clock main is not measured")):
+        control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+        assert control.take_estop(stop, stamp_ns, 100, doubt) is None
+        assert control.take_estop(reset, 99, 101) == "it is older than the stop"
+        assert control.take_estop(reset, 102, 103) is None
 
 
 def test_a_sheet_that_seems_impossibly_long_is_not_relaxed() -> None:

@@ -9,13 +9,14 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Self
 
 import pytest
 
 from launch.estop_file import STATE_VARIABLE, EStopFile
-from launch.host import HostVoice, waits_for_a_person
+from launch.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
 from launch.plan import load_plan
 from launch.planned import RUN_DIRECTORY, Plan
 from messages.base import Header
@@ -24,6 +25,7 @@ from messages.clock import SystemClock
 from messages.topics import topic_named
 from messages.types import EStop
 from nodes.node import PortCounts
+from tests.arm_states import arm_state
 
 DEADLINE_S = 20.0
 STOP = EStop(engaged=True, reason="hand in the sheet")
@@ -80,6 +82,25 @@ class Launchers:
         self._tool = Publisher(topic_named("estop"), [self._near(one) for one in writer.endpoints])
         return self
 
+    async def arms(self, modes: dict[str, str]) -> None:
+        """As bridges do: say how the arms are, until cancelled."""
+        publishers = {}
+        for side in modes:
+            writer = self.plan.writers[f"arm_{side}"][0]
+            ends = [self._near(one) for one in writer.endpoints]
+            publishers[side] = writer.name, Publisher(topic_named(f"arm_{side}"), ends)
+        try:
+            for number in count(1):
+                for side, (name, publisher) in publishers.items():
+                    now_ns = self._clock.now_ns()
+                    header = Header(number, now_ns, now_ns, self._clock.id, name, self._epoch,
+                                    self.plan.hash)  # fmt: skip
+                    publisher.send(arm_state(side, mode=modes[side]), header)
+                await asyncio.sleep(0.01)
+        finally:
+            for _, publisher in publishers.values():
+                publisher.close()
+
     async def __aexit__(self, *_: object) -> None:
         for voice in self.voices.values():
             await voice.close()
@@ -131,31 +152,39 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(folder: Path) -> 
     async with Launchers(folder, plan) as first:
         await asyncio.sleep(0.3)
         first.say(STOP)
-        await until(lambda: files(folder) == ["estop-left.json", "estop-main.json"], first.said)
+        await until(lambda: len(files(folder)) == 2, first.said)
     async with Launchers(folder, plan) as second:
         assert await second.heard_late() == {STOP.reason}
         # What a console said last before all this is no answer to it.
         second.say(RESET, before_ns=10**10)
         await asyncio.sleep(0.3)
         assert len(files(folder)) == 2
+        modes = {"left": "estop", "right": "idle"}
+        arms = asyncio.create_task(second.arms(modes))
+        second.say(RESET)
+        # The left bridge refuses while its arm moves: a stop that it holds is not forgotten.
+        await until(lambda: sum("e-stop kept: arm_left" in line for line in second.said) == 2)
+        assert len(files(folder)) == 2
+        modes["left"] = "idle"
         second.say(RESET)
         await until(lambda: files(folder) == [], second.said)
         assert await second.heard_late() == set()
+        arms.cancel()
     async with Launchers(folder, plan) as third:
         assert await third.heard_late() == set()
 
 
 async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:
     plan = plan_of(folder)
-    file = EStopFile("left")
+    file = EStopFile("left", arms_of(plan))
     file.path.parent.mkdir()
-    file.path.write_text("{")
+    file.path.write_text("[" * 100_000)
     async with Launchers(folder, plan) as launchers:
         assert any("cannot be read" in reason for reason in await launchers.heard_late())
         assert any("arms reset" in line for line in launchers.said)
 
 
-async def test_what_cannot_be_written_is_said_and_kept_all_the_same(folder: Path) -> None:
+async def test_what_cannot_be_written_is_said_kept_and_tried_again(folder: Path) -> None:
     plan = plan_of(folder)
     (folder / "state").write_text("no folder")
     async with Launchers(folder, plan) as launchers:
@@ -163,6 +192,25 @@ async def test_what_cannot_be_written_is_said_and_kept_all_the_same(folder: Path
         launchers.say(STOP)
         await until(lambda: any("cannot be written" in line for line in launchers.said))
         assert STOP.reason in await launchers.heard_late()
+        (folder / "state").unlink()
+        await until(lambda: len(files(folder)) == 2)
+
+
+async def test_a_reason_without_end_is_cut(folder: Path) -> None:
+    async with Launchers(folder, plan_of(folder)) as launchers:
+        await asyncio.sleep(0.3)
+        launchers.say(EStop(engaged=True, reason="a" * 1_000_000))
+        await until(lambda: len(files(folder)) == 2, launchers.said)
+        assert await launchers.heard_late() == {"a" * REASON_LENGTH}
+
+
+def test_graphs_of_other_arms_keep_stops_of_their_own(folder: Path) -> None:
+    """And those of the same arms share them, whatever their launch files."""
+    lab, twin = EStopFile("main", ["192.0.2.1:502", "192.0.2.2:502"]), EStopFile("main", ["::1:7"])
+    lab.write(STOP)
+    twin.remove()
+    assert twin.read() is None
+    assert EStopFile("main", ["192.0.2.2:502", "192.0.2.1:502"]).read() == STOP
 
 
 def test_simulated_arms_that_go_by_themselves_forget(folder: Path) -> None:
@@ -171,7 +219,7 @@ def test_simulated_arms_that_go_by_themselves_forget(folder: Path) -> None:
 
 
 def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
-    file = EStopFile("main")
+    file = EStopFile("main", ["127.0.0.1:5020"])
     assert file.read() is None
     file.remove()
     file.write(STOP)

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from launch.planned import Plan
+    from launch.runs import Run
+    from launch.tools import ToolsWriter
     from messages.base import Message
     from messages.types import ArmState
 
@@ -35,6 +37,9 @@ app = typer.Typer(
 TOPICS = ("arm_left", "arm_right")
 ANSWER_S = 3.0
 FRESH_S, TURN_S = 0.5, 0.02
+ATTEMPTS = 4
+"""To say a stop while another tool speaks there; each waits up to a second."""
+
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for whoever reads it.")]
 
 
@@ -118,7 +123,8 @@ async def _say(
 
     It is said once only: a person means now, not when the network is back.
     """
-    from launch.tools import READER_RECONNECT_S, ToolsWriter, host_of, subscriber_to
+    from launch.tools import READER_RECONNECT_S, host_of, subscriber_to
+    from messages.types import EStop
 
     plan, run = running_graph(run_directory)
     _refuse_reset_from_elsewhere(plan, host_of(run), word)
@@ -142,8 +148,11 @@ async def _say(
         for subscriber in subscribers:
             subscriber.start()
         if word is not None:
-            writer = ToolsWriter(plan, run, [word[0]])
-            await asyncio.sleep(READER_RECONNECT_S)
+            stop = isinstance(word[1], EStop) and word[1].engaged
+            writer = await _writer(plan, run, word[0], insist=stop)
+            # A stop waits for nobody: it is latched, and readers get it as they come.
+            if not stop:
+                await asyncio.sleep(READER_RECONNECT_S)
             writer.publish(*word)
         for _ in range(round(ANSWER_S / TURN_S)):
             await asyncio.sleep(TURN_S)
@@ -161,6 +170,19 @@ async def _say(
     if not good:
         words.print("[red]not so[/]: see the reasons; each bridge's log says what it refused")
     return 0 if good else FAILED
+
+
+async def _writer(plan: Plan, run: Run, topic: str, *, insist: bool) -> ToolsWriter:
+    """A tool's publisher of a topic; insist: wait for a tool that speaks there now to end."""
+    from launch.tools import ToolsWriter
+    from messages.bus import BusError
+
+    for _ in range(ATTEMPTS if insist else 0):
+        try:
+            return ToolsWriter(plan, run, [topic])
+        except BusError:
+            await asyncio.sleep(TURN_S)
+    return ToolsWriter(plan, run, [topic])
 
 
 def _refuse_reset_from_elsewhere(plan: Plan, host: str, word: tuple[str, Message] | None) -> None:

@@ -256,15 +256,19 @@ class ArmControl:
     def engage_estop(self, reason: str) -> None:
         self.estop_reason = reason
 
-    def take_estop(self, estop: EStop, stamp_ns: int, clock_trouble: str = "") -> str | None:
+    def take_estop(
+        self, estop: EStop, stamp_ns: int, now_ns: int, clock_trouble: str = ""
+    ) -> str | None:
         """Engage or reset; returns why a reset is refused.
 
         stamp_ns: when the message was made, which clock_trouble says not to be sure of.  Several
-        nodes may write e-stops, and the last word of each comes anew to a late reader: a reset from
-        before the stop does not clear it.
+        nodes may write e-stops, and the last word of each comes anew to a late reader, in any
+        order: a reset from before the last stop does not clear it.
         """
         if estop.engaged:
-            self._engaged_ns = stamp_ns
+            # A stamp from the future would bar every reset to come.
+            engaged_ns = now_ns if clock_trouble else min(stamp_ns, now_ns)
+            self._engaged_ns = max(self._engaged_ns, engaged_ns)
             self.engage_estop(estop.reason)
         elif clock_trouble:
             return clock_trouble

@@ -74,8 +74,9 @@ class ArmBridge(Node):
         self._pace = Pace(1.0 / given.rate_hz, due_s)
 
     def on_estop(self, estop: EStop, header: Header) -> None:
+        stamp_ns, now_ns = header.source_ns, self.clock.now_ns()
         doubt = self.estop.clock_trouble
-        if refusal := self._control.take_estop(estop, header.source_ns, doubt):
+        if refusal := self._control.take_estop(estop, stamp_ns, now_ns, doubt):
             self.log.warning("reset refused", reason=refusal)
 
     def on_arming(self, arming: Arming, header: Header) -> None:
