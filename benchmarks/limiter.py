@@ -483,9 +483,9 @@ class Bridge:
         elif chance < 0.001:
             self.unanswered = int(random.integers(1, 5))
         elif chance < 0.0015:
-            self.control.take_estop(EStop(engaged=True, reason="drill"), stamp_ns)
+            self.control.take_estop(EStop(engaged=True, reason="drill"), stamp_ns, stamp_ns)
         elif chance > 0.98 and (self.control.faults or self.control.estop_reason):
-            self.control.take_estop(EStop(engaged=False, reason=""), stamp_ns)
+            self.control.take_estop(EStop(engaged=False, reason=""), stamp_ns, stamp_ns)
 
 
 def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
