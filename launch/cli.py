@@ -106,9 +106,9 @@ def exit_code(error: Exception) -> int | None:
     if isinstance(error, CommandError):
         return error.code
     # Imported only now: a command that goes well should not wait for these.
-    from launch.commands.failures import BAD_INPUTS, FAILURES
+    from launch.commands.failures import BAD_INPUTS, is_failure
     from launch.commands.output import BAD_INPUT, FAILED
 
     if isinstance(error, BAD_INPUTS):
         return BAD_INPUT
-    return FAILED if isinstance(error, FAILURES) else None
+    return FAILED if is_failure(error) else None

@@ -304,9 +304,10 @@ def _rates(visit: Visit) -> HostFinding:
             if port.rejected:
                 refused.append(f"{name} {port.rejected} of {port.topic}")
             wrong = rate_problem(port)
+            topic = TOPICS.get(port.topic)  # a host with other code may have others
             if wrong:
                 odd.append(f"{name} {verb} {wrong}")
-            elif TOPICS[port.topic].rate_hz is not None:
+            elif topic is not None and topic.rate_hz is not None:
                 right += 1
     if odd or refused:
         words = _shown(odd)

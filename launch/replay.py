@@ -439,10 +439,18 @@ def _difference(a: Any, b: Any) -> float:
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         if a.shape != b.shape:
             return float("inf")
-        return float(np.abs(a.astype(float) - b.astype(float)).max(initial=0.0))
+        return _distance(a.astype(float), b.astype(float))
     if isinstance(a, float | int) and isinstance(b, float | int):
-        return float(abs(a - b))
+        return _distance(np.array(a, float), np.array(b, float))
     return 0.0 if a == b else 1.0
+
+
+def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """The greatest difference; infinite where one is no number and the other is another thing."""
+    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    with np.errstate(invalid="ignore"):
+        apart = np.where(same, 0.0, np.abs(a - b))
+    return float(np.where(np.isnan(apart), np.inf, apart).max(initial=0.0))
 
 
 def _check_inputs(bag: Path, reader: BagReader, plan: Plan, node: PlannedNode) -> None:

@@ -8,8 +8,11 @@ that is said.
 
 from __future__ import annotations
 
+import errno
+import json
 import math
 import os
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -379,106 +382,190 @@ METHODS = "methods"
 def written(
     text: str, choices: Sequence[Choice], *, today: str, machine: str, commit: str | None
 ) -> str:
-    """A scene file's text with these choices in its `methods`; all else stays as it is, to the
-    byte, and so do the methods of other families."""
-    lines = text.splitlines()
-    start, end, kept = _block(text, lines)
-    code = "" if commit is None else f"; code {commit[:10]}"
-    block = [
-        f"# Chosen by `flexsheet tune` on {today}; {machine}{code}.",
-        f"{METHODS}:",
-    ]
+    """A scene file's text with these choices in its `methods`.  All else stays as it is, to the
+    byte, and so do the methods of other families; a `methods` on one line is unfolded."""
+    lines = text.splitlines(keepends=True)
+    ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
+    block = _block(text, lines)
     chosen = {choice.key: choice for choice in choices}
-    for key in dict.fromkeys([one.key for one in TUNABLES] + list(kept)):
+    code = "" if commit is None else f"; code {commit[:10]}"
+    head = f"# Chosen by `flexsheet tune` on {today}; {machine}{code}.{ending}"
+    new = [head, block.header or f"{METHODS}:{ending}"]
+    for key, own in block.parts:
         if key in chosen:
-            block.append(_line(chosen[key]))
-        elif key in kept:
-            block += kept[key]
-    if start == len(lines):
-        while lines and not lines[-1].strip():
-            lines.pop()
-        start = end = len(lines)
-        block.insert(0, "")
-    return "\n".join([*lines[:start], *block, *lines[end:]]) + "\n"
+            new.append(_line(chosen.pop(key), block.indent) + ending)
+        else:
+            new += [line if line.endswith("\n") else line + ending for line in own]
+    new += [_line(chosen[one.key], block.indent) + ending for one in TUNABLES if one.key in chosen]
+    before, after = lines[: block.start], lines[block.end :]
+    if before and not before[-1].endswith("\n"):
+        before[-1] += ending
+    if block.start == len(lines) and before and before[-1].strip():
+        before.append(ending)
+    return "".join([*before, *new, *after])
 
 
-def _line(choice: Choice) -> str:
+def _line(choice: Choice, indent: str) -> str:
     setting = choice.chosen.setting
-    value = setting
-    if isinstance(setting, dict):
-        value = "{" + ", ".join(f"{name}: {item}" for name, item in setting.items()) + "}"
     took, allowed = duration(choice.chosen.median_s), f"{_figure(choice.tolerance)} {choice.unit}"
     told = f"{took}, leaves {_figure(choice.chosen.error)} of {allowed}"
     if not choice.met:
         missed = f"{choice.chosen.missed} of {choice.chosen.cases} cases missed"
         told = f"NOT GOOD ENOUGH, the nearest miss: {told}; {missed}"
-    return f"  {choice.key}: {value}  # {told}"
+    return f"{indent}{choice.key}: {_flow(setting)}  # {told}"
 
 
-def _block(text: str, lines: Sequence[str]) -> tuple[int, int, dict[str, list[str]]]:
-    """First line of the `methods`, with the comment above them that was written along, and the line
-    after them; and the lines of each of their keys.  Both are the end where there are none."""
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """The `methods` of a scene file's lines.
+
+    start: its first line, with the comment above that was written along.  end: the line after it;
+    both are the file's end where there are none.  header: the line of `methods:`, where it can
+    stay.  parts: what comes after it, in order: a family's key and its lines; and comments, without
+    a key.
+    """
+
+    start: int
+    end: int
+    header: str = ""
+    indent: str = "  "
+    parts: tuple[tuple[str, list[str]], ...] = ()
+
+
+def _block(text: str, lines: Sequence[str]) -> _Block:
     tree = YAML(typ="rt", pure=True).load(text)
     names = list(tree)
     if METHODS not in names:
-        return len(lines), len(lines), {}
-    start = tree.lc.data[METHODS][0]
+        return _Block(len(lines), len(lines))
+    start = first = tree.lc.data[METHODS][0]
     later = [tree.lc.data[name][0] for name in names if tree.lc.data[name][0] > start]
     end = min(later, default=len(lines))
     while end > start + 1 and (not lines[end - 1].strip() or lines[end - 1].startswith("#")):
         end -= 1
-    kept: dict[str, list[str]] = {}
-    inner = tree[METHODS]
-    if isinstance(inner, CommentedMap):
-        if inner.fa.flow_style():
-            kept = {name: [f"  {name}: {_flow(item)}"] for name, item in inner.items()}
-        else:
-            at = {name: inner.lc.data[name][0] for name in inner}
-            for name, line in at.items():
-                stop = min([other for other in at.values() if other > line], default=end)
-                kept[name] = list(lines[line:stop])
     if start > 0 and lines[start - 1].startswith("# Chosen by `flexsheet tune`"):
         start -= 1
-    return start, end, kept
+    inner = tree[METHODS]
+    if not isinstance(inner, CommentedMap):
+        return _Block(start, end, parts=(("", list(lines[first + 1 : end])),))
+    if inner.fa.flow_style():
+        unfolded = ((name, [f"  {name}: {_flow(item)}"]) for name, item in inner.items())
+        return _Block(start, end, parts=tuple(unfolded))
+    at = {name: tuple(inner.lc.data[name][:2]) for name in inner}
+    starts = sorted(line for line, _ in at.values())
+    parts = [("", list(lines[first + 1 : starts[0]]))]
+    for name, (line, _) in sorted(at.items(), key=lambda item: item[1]):
+        own = list(lines[line : min((one for one in starts if one > line), default=end)])
+        behind: list[str] = []
+        while len(own) > 1 and (not own[-1].strip() or own[-1].lstrip().startswith("#")):
+            behind.insert(0, own.pop())
+        parts += [(name, own), ("", behind)]
+    indent = " " * min(column for _, column in at.values())
+    return _Block(start, end, lines[first], indent, tuple(parts))
 
 
 def _flow(item: Any) -> str:
     if isinstance(item, Mapping):
-        return "{" + ", ".join(f"{name}: {value}" for name, value in item.items()) + "}"
-    return str(item)
+        return "{" + ", ".join(f"{name}: {_flow(value)}" for name, value in item.items()) + "}"
+    return "null" if item is None else str(item)
+
+
+FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
+"""Keys of a scene file that name a file relative to it."""
+
+
+def moved(text: str, source: Path, target: Path) -> str:
+    """A scene file's text as it must read in the target's folder: files that it names relative to
+    itself are named from there.  BadInputError where a name cannot be put in."""
+    here, there = source.absolute().parent.resolve(), target.resolve().parent
+    if here == there or source.resolve() == target.resolve():
+        return text
+    tree = YAML(typ="rt", pure=True).load(text)
+    lines = text.splitlines(keepends=True)
+    for key in FILES:
+        holder: Any = tree
+        for part in key[:-1]:
+            holder = holder.get(part) if isinstance(holder, CommentedMap) else None
+        name = holder.get(key[-1]) if isinstance(holder, CommentedMap) else None
+        if not isinstance(name, str) or os.path.isabs(name):
+            continue
+        line, column = holder.lc.value(key[-1])
+        rest = lines[line][column:]
+        old = next((one for one in (f'"{name}"', f"'{name}'", name) if rest.startswith(one)), None)
+        if old is None:
+            what = f'names "{name}", which is not to be found from {there}'
+            remedy = "give the file's whole path, or --output a file beside the scene"
+            raise BadInputError([Problem(f"{source}:{line + 1}", key, what, remedy)])
+        new = json.dumps(os.path.relpath(here / name, there), ensure_ascii=False)
+        lines[line] = lines[line][:column] + new + rest[len(old) :]
+    return "".join(lines)
+
+
+def check_target(source: Path, target: Path) -> None:
+    """Before anything is measured: can a scene be written there?  BadInputError where not."""
+    moved(_read(source), source, target)
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        draft = _draft_of(target.resolve())
+        draft.touch()
+        draft.unlink()
+    except OSError as error:
+        raise _unwritable(target, error) from error
+
+
+def _unwritable(target: Path, error: OSError) -> BadInputError:
+    what = f"cannot be written: {error.strerror or error}"
+    remedy = "give --output FILE, in a folder that is there and may be written to"
+    return BadInputError([Problem(str(target), (), what, remedy)])
+
+
+def _read(source: Path) -> str:
+    return source.read_bytes().decode("utf-8")  # read_text would change how lines end
+
+
+def _draft_of(target: Path) -> Path:
+    return target.with_name(f".{target.stem}.{os.getpid()}.yaml")
 
 
 def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None:
     """Put the choices into a scene file, or into a copy of it; a reader sees the old or the new.
 
-    BadInputError where the result would be no scene, or another one, and where the target cannot be
-    written.
+    A link stays one: what it leads to is written.  BadInputError where the result would be no
+    scene, or another one, and where the target cannot be written.
     """
     text = written(
-        source.read_text(encoding="utf-8"),
+        moved(_read(source), source, target),
         choices,
         today=datetime.now(UTC).date().isoformat(),
         machine=machine_name(),
         commit=git_commit(),
     )
     before = load_scene(source)
-    # In the source's folder, as a scene names its mesh from there.
-    draft = source.with_name(f".{source.stem}.{os.getpid()}.yaml")
+    # In the target's folder, as a scene names its mesh from there.
+    place = target.resolve()
+    draft = _draft_of(place)
     try:
-        draft.write_text(text, encoding="utf-8")
-        after = load_scene(draft)
+        draft.write_bytes(text.encode())
+        after = _loaded(draft, source)
         same = {"methods": before.methods}
         if after.model_copy(update=same).model_dump_json() != before.model_dump_json():
             problem = Problem(str(source), (METHODS,), "cannot be put in without a change", "")
             raise BadInputError([problem])
-        if target.resolve().parent == source.resolve().parent:
-            draft.replace(target)
-        else:
-            beside = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-            beside.write_text(text, encoding="utf-8")
-            beside.replace(target)
+        shutil.copymode(place if place.exists() else source, draft)
+        draft.replace(place)
     except OSError as error:
-        what = f"cannot be written: {error.strerror or error}"
-        raise BadInputError([Problem(str(target), (), what, "give --output FILE")]) from error
+        raise _unwritable(target, error) from error
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _loaded(draft: Path, source: Path) -> Scene:
+    """The scene of the draft; what is wrong with it is said of the source."""
+    try:
+        return load_scene(draft)
+    except BadInputError as error:
+        what = "with the choices put in, "
+        problems = [
+            Problem(str(source), one.key, what + one.what, one.remedy) for one in error.problems
+        ]
+        raise BadInputError(problems) from error

@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -16,8 +17,11 @@ from typer.main import get_command
 from launch import cli
 from launch.cli_reference import commands
 from launch.commands import complete
-from launch.commands.output import examples_in
+from launch.commands.experiment import DEMO_FILE
+from launch.commands.failures import LATE
+from launch.commands.output import FAILED, examples_in, print_json, print_json_line
 from launch.errors_reference import explained, undocumented
+from launch.plan import load_plan
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -57,6 +61,11 @@ def test_a_command_explains_itself_with_examples_that_parse(name: str) -> None:
     assert lines, f"flexsheet {name}: no example"
     for line in lines:
         assert parse(line) == name, f"an example of {name} calls another command: {line}"
+        words = shlex.split(line)
+        settings = [value for key, value in pairwise(words) if key == "--set"]
+        if settings:
+            given = [Path(word) for word in words if word.endswith(".yaml")]
+            load_plan(ROOT / given[0] if given else DEMO_FILE, settings=settings)
     for parameter in command.params:
         assert parameter.help, f"flexsheet {name}: {parameter.name} is not explained"
 
@@ -66,6 +75,20 @@ def test_a_command_can_print_json_and_only_the_first_one_installs_completion(nam
     options = {option for parameter in COMMANDS[name].params for option in parameter.opts}
     assert "--json" in options
     assert "--install-completion" not in options
+
+
+def test_json_has_no_nan_and_no_infinity(capsys: pytest.CaptureFixture[str]) -> None:
+    data = {"a": [1.5, float("nan"), (float("-inf"),)], "b": "NaN"}
+    for write in (print_json, print_json_line):
+        write(data)
+        assert json.loads(capsys.readouterr().out) == {"a": [1.5, None, [None]], "b": "NaN"}
+
+
+@pytest.mark.parametrize("module", LATE)
+def test_what_cannot_be_worked_with_is_a_failure_and_no_error_of_ours(module: str) -> None:
+    kind = getattr(import_module(module), LATE[module])
+    assert cli.exit_code(kind("so")) == FAILED
+    assert cli.exit_code(ValueError("so")) is None
 
 
 @pytest.mark.parametrize("page", ["cli", "errors", "parameters"])

@@ -144,6 +144,14 @@ def test_where_all_is_well_nothing_is_found(three: Plan) -> None:
     assert {one.host for one in found} == set(NAMES)
 
 
+def test_a_host_with_other_code_may_speak_of_topics_that_are_unknown_here(three: Plan) -> None:
+    visits = good(three)
+    visits["left"].nodes["arm_left_bridge"] = said(
+        "arm_left_bridge", port("a_topic_of_tomorrow", 50.0), note="well"
+    )
+    assert "failed" not in {one.state for one in judge(three, "main", visits)}
+
+
 def changed(visit: Visit, **values: Any) -> None:
     assert visit.status is not None
     visit.status = visit.status.model_copy(update=values)

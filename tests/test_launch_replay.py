@@ -81,6 +81,25 @@ def test_inputs_that_were_not_recorded_are_named(tmp_path: Path) -> None:
         verify(bag, "relay")
 
 
+@pytest.mark.parametrize(("live", "again", "size"), [
+    (float("nan"), 1.0, float("inf")),
+    (float("inf"), 1.0, float("inf")),
+    (float("nan"), float("nan"), 0.0),
+    (float("inf"), float("inf"), 0.0),
+    (True, False, 1.0),
+])  # fmt: skip
+def test_what_is_no_number_differs_from_what_is_one(live: float, again: float, size: float) -> None:
+    path = finger(1)
+    one, other = (
+        path.model_copy(
+            update={"path_time_s": value, "position_world_m": np.array([0.0, value, 0.0])}
+        )
+        for value in (live, again)
+    )
+    expected = {} if size == 0.0 else {"path_time_s": size, "position_world_m": size}
+    assert field_differences(one, other) == expected
+
+
 def test_differences_are_found_field_by_field() -> None:
     one = finger(1)
     other = one.model_copy(

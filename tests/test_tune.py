@@ -237,14 +237,110 @@ def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert source.read_text() == (SCENES / "sphere.yaml").read_text()
     wanted = SoftBodyChoice(method="linear", skin_spacing_m=0.006)
     assert load_scene(tmp_path / "copy.yaml").methods == Methods(soft_body=wanted)
-    with pytest.raises(BadInputError, match="give --output FILE"):
+    with pytest.raises(BadInputError, match="a folder that is there"):
         write_choices(source, tmp_path / "no folder" / "copy.yaml", [scene_choice()])
-    with pytest.raises(BadInputError, match="mark"):  # no method's name
+    with pytest.raises(BadInputError, match="mark") as refused:  # no method's name
         write_choices(source, source, [GOOD])
+    assert str(refused.value).startswith(f"{source}: methods.mark: with the choices put in, ")
     assert source.read_text() == (SCENES / "sphere.yaml").read_text()
     write_choices(source, source, [scene_choice()])
     assert load_scene(source).methods.soft_body == wanted
     assert sorted(path.name for path in tmp_path.iterdir()) == ["copy.yaml", "scene.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("a: 1\r\nb: 2\r\n", "a: 1\r\nb: 2\r\n\r\n# C\r\nmethods:\r\n  mark: cheap\r\n"),
+        ("a: 1", "a: 1\n\n# C\nmethods:\n  mark: cheap\n"),
+        ("a: 1\n\n\n", "a: 1\n\n\n# C\nmethods:\n  mark: cheap\n"),
+        (
+            "methods:  # mine\n    # why\n    mark: moments\n    # of tracking\n    tracking: none"
+            "\n\n# behind\nlast: 2",
+            "# C\nmethods:  # mine\n    # why\n    mark: cheap\n    # of tracking\n"
+            "    tracking: none\n\n# behind\nlast: 2",
+        ),
+        (
+            "methods:\n  soft_body:\n    method: linear\n    skin_spacing_m: 0.003\n",
+            "# C\nmethods:\n  soft_body:\n    method: linear\n    skin_spacing_m: 0.003\n"
+            "  mark: cheap\n",
+        ),
+        ("methods: {tracking: null}\n", "# C\nmethods:\n  tracking: null\n  mark: cheap\n"),
+        ("methods:\nlast: 2\n", "# C\nmethods:\n  mark: cheap\nlast: 2\n"),
+    ],
+)
+def test_all_else_stays_to_the_byte(before: str, after: str) -> None:
+    text = put(before, GOOD)
+    text = text.replace(
+        "Chosen by `flexsheet tune` on 2026-01-02; a machine; code 0000000000.", "C"
+    )
+    assert text.replace("  # 10 µs, leaves 0.1 of 1 mm", "") == after
+
+
+@pytest.mark.parametrize("quote", ["", "'", '"'])
+def test_files_are_named_from_where_a_scene_goes(tmp_path: Path, quote: str) -> None:
+    text = (
+        f"a: 1\nobject:\n  geometry: {{file: {quote}o.obj{quote}, x: 1}}  # o.obj\n"
+        f"  appearance:\n    image_file: {quote}../p.png{quote}\n"
+    )
+    found = tune.moved(text, tmp_path / "here" / "a.yaml", tmp_path / "there" / "b.yaml")
+    wanted = text.replace(f"{quote}../p.png{quote}", '"../p.png"', 1)
+    assert found == wanted.replace(f"{quote}o.obj{quote}", '"../here/o.obj"', 1)
+    assert tune.moved(text, tmp_path / "a.yaml", tmp_path / "b.yaml") == text
+
+
+def test_a_copy_elsewhere_is_the_same_scene(tmp_path: Path) -> None:
+    """From a folder that may only be read, which the tests' user may be above."""
+    here, there = tmp_path / "here", tmp_path / "far" / "there: b"
+    here.mkdir()
+    there.mkdir(parents=True)
+    text = (SCENES / "palpation.yaml").read_text()
+    assert "file: organ.obj" in text
+    source, target = here / "scene.yaml", there / "copy.yaml"
+    source.write_text(text)
+    (here / "organ.obj").write_bytes((SCENES / "organ.obj").read_bytes())
+    here.chmod(0o555)
+    try:
+        tune.check_target(source, target)
+        write_choices(source, target, [scene_choice()])
+    finally:
+        here.chmod(0o755)
+    assert 'file: "../../here/organ.obj"' in target.read_text()
+    bare = {"methods": Methods()}
+    one, other = (load_scene(path).model_copy(update=bare) for path in (source, target))
+    assert one.model_dump_json() == other.model_dump_json()
+    assert [path.name for path in there.iterdir()] == ["copy.yaml"]
+    assert {path.name for path in here.iterdir()} == {"scene.yaml", "organ.obj"}
+
+
+def test_a_files_name_that_cannot_be_put_in_is_refused(tmp_path: Path) -> None:
+    source = tmp_path / "scene.yaml"
+    text = (SCENES / "palpation.yaml").read_text()
+    source.write_text(text.replace("organ.obj", r'"orga\x6e.obj"'))
+    (tmp_path / "far").mkdir()
+    with pytest.raises(BadInputError, match=r"geometry\.file: names .organ\.obj.*whole path"):
+        tune.check_target(source, tmp_path / "far" / "copy.yaml")
+
+
+def test_a_link_to_a_scene_stays_a_link(tmp_path: Path) -> None:
+    scene, link = tmp_path / "scene.yaml", tmp_path / "link.yaml"
+    scene.write_text((SCENES / "sphere.yaml").read_text())
+    scene.chmod(0o640)
+    link.symlink_to(scene)
+    write_choices(link, link, [scene_choice()])
+    assert link.is_symlink()
+    assert load_scene(scene).methods.soft_body is not None
+    assert scene.stat().st_mode & 0o777 == 0o640
+
+
+@pytest.mark.parametrize("where", ["no folder/x.yaml", "."])
+def test_where_nothing_can_be_written_nothing_is_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    monkeypatch.setattr(tune, "tune", lambda *_, **__: pytest.fail("measured"))
+    outcome = run(SCENES / "sphere.yaml", "--output", tmp_path / where)
+    assert isinstance(outcome.exception, BadInputError)
+    assert "give --output FILE, in a folder that is there" in str(outcome.exception)
 
 
 def run(*arguments: object) -> Any:

@@ -18,6 +18,7 @@ from launch.commands.output import (
     progress_words,
     words,
 )
+from launch.finite import finite
 
 app = typer.Typer(add_completion=False)
 
@@ -71,7 +72,7 @@ def chart(
     for each in families:
         with progress_words() as progress:
             points = charts.measure_family(each, scene, progress=progress)
-        result = charts.finite(charts.chart_result(each, scene, points))
+        result = finite(charts.chart_result(each, scene, points))
         picture, _ = charts.write_chart(result, output)
         words.print(f"chart: {picture}")
         results.append(result)

@@ -70,7 +70,7 @@ def _record(
 @app.command(
     epilog=examples(
         "flexsheet experiment stroke --seconds 30",
-        "flexsheet experiment stroke --set triangulator.method=none --json",
+        "flexsheet experiment stroke --set triangulator.tracking=none --json",
     )
 )
 def stroke(

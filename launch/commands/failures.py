@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 from launch.documents import BadInputError
 from launch.experiments import ExperimentError
 from launch.export import ExportError
@@ -21,3 +23,17 @@ FAILURES: tuple[type[Exception], ...] = (
     ExportError,
     NodeFailedError,
 )
+LATE = {
+    "messages.scene": "UnfitGeometryError",
+    "nodes.fem_solver.mesh.solid": "UnfitMeshError",
+    "nodes.fem_solver.newton": "StuckError",
+    "nodes.fem_solver.precompute_table": "WorkersError",
+    "nodes.models.sheet.membrane": "NoEquilibriumError",
+}
+"""Failures of modules that take long to import; who has not imported one has not had its error."""
+
+
+def is_failure(error: Exception) -> bool:
+    """Has something failed that the user can put right?"""
+    late = (getattr(sys.modules[name], kind) for name, kind in LATE.items() if name in sys.modules)
+    return isinstance(error, (*FAILURES, *late))

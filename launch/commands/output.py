@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
+from launch.finite import finite
+
 if TYPE_CHECKING:
     from rich.console import Console
     from rich.status import Status
@@ -65,13 +67,13 @@ def examples_in(epilog: str | None) -> list[str]:
 
 
 def print_json(data: Any) -> None:
-    """One JSON document on stdout."""
-    print(json.dumps(data, indent=2))
+    """One JSON document on stdout; NaN and infinity, which JSON lacks, are null."""
+    print(json.dumps(finite(data), indent=2, allow_nan=False))
 
 
 def print_json_line(data: Any) -> None:
-    """One JSON document on one line of stdout, at once."""
-    print(json.dumps(data), flush=True)
+    """One JSON document on one line of stdout, at once; see `print_json`."""
+    print(json.dumps(finite(data), allow_nan=False), flush=True)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

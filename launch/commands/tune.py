@@ -71,11 +71,11 @@ def tune(
         tunables = tune.tunables_named(family or [])
     except tune.UnknownTunableError as error:
         raise CommandError(f"--family: {error}", BAD_INPUT) from None
-    with progress_words() as progress:
-        choices = tune.tune(scene, tunables, margin=margin, progress=progress)
     target = None if dry_run else output or scene_file
     if target is not None:
-        tune.write_choices(scene_file, target, choices)
+        tune.check_target(scene_file, target)  # what follows takes minutes
+    with progress_words() as progress:
+        choices = tune.tune(scene, tunables, margin=margin, progress=progress)
     for choice in choices:
         words.print(choice.sentence(), markup=False)
     met = all(choice.met for choice in choices)
@@ -89,9 +89,11 @@ def tune(
             "met": met,
             "families": [choice.report() for choice in choices],
         }
-        print_json(charts.finite(report))
+        print_json(report)
     else:
         _print_choices(choices)
+    if target is not None:
+        tune.write_choices(scene_file, target, choices)
     words.print("written: nothing (--dry-run)" if target is None else f"written: {target}")
     if not met:
         raise typer.Exit(NOT_MET)
