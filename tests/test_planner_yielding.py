@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,6 +15,8 @@ from messages.types import SheetTarget, SoftBody
 from nodes.models.motion import SheetMotion
 from nodes.models.rigid import moved, twist_between
 from nodes.models.sheet.fit import law_of
+from nodes.models.sheet.laws import CubicLaw, LinearLaw, ScaledLaw, SheetLaw
+from nodes.models.sheet.rubber import Rubber
 from nodes.planner.compliance import GOOD_RATIO, UnfitCurveError
 from nodes.planner.motion import withdrawn
 from nodes.planner.sheet_force import law_for, rubber_of
@@ -130,6 +134,26 @@ async def test_the_same_curve_again_changes_nothing_and_another_does() -> None:
     assert yielding.retreat(0.03, (0.0, 0.0)) == first
     yielding.take(soft_body(0.7), touching=False)
     assert yielding.retreat(0.03, (0.0, 0.0))[0] > first[0]
+
+
+@pytest.mark.parametrize("law", [LinearLaw, CubicLaw, ScaledLaw])
+def test_a_law_that_is_asked_beyond_its_range_is_named_with_the_reason(
+    law: Callable[[Rubber], SheetLaw],
+) -> None:
+    for depth_m in (0.002, 0.05):
+        working_range = SCENE.working_range.model_copy(update={"push_depth_m": depth_m})
+        scene = SCENE.model_copy(update={"working_range": working_range})
+        asked = law(rubber_of(scene.sheet))
+        yielding = Yielding(scene, asked, "curve")
+        yielding.take(soft_body(), touching=False)
+        indentation_m = depth_m - yielding.retreat(depth_m, (0.0, 0.0))[0]
+        why = asked.outside(
+            yielding.stretch_ratio, indentation_m, place_m=(0.0, 0.0), finger_radius_m=RADIUS
+        )
+        assert bool(why) == ("law of the sheet's force" in yielding.note)
+        assert yielding.note.endswith(why)
+        # All three are wrong about a push of a millimetre or two; deep, the line is.
+        assert bool(why) == (depth_m < 0.01 or law is LinearLaw)
 
 
 async def test_in_touch_the_stretch_stays_and_the_retreat_makes_up_for_it() -> None:

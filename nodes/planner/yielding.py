@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from messages.types import SoftBody
-from nodes.models.sheet.laws import Place, SheetLaw
+from nodes.models.sheet.laws import CENTRE, Place, SheetLaw
 from nodes.planner.compliance import (
     FELT_N,
     Compliance,
@@ -81,7 +81,20 @@ class Yielding:
             position_error_m=scene.tolerances.sheet_position_m,
         )
         self._compliance = fitted
-        self.stretch_ratio, self.note = fitted.stretch_ratio, fitted.note
+        self.stretch_ratio = fitted.stretch_ratio
+        self.note = "; ".join(filter(None, (fitted.note, self._beyond_law(fitted))))
+
+    def _beyond_law(self, fitted: Compliance) -> str:
+        """Why the law is not to be trusted for the deepest push at the sheet's middle, or nothing;
+        what is asked is how deep the finger is in the sheet then."""
+        deepest_m = self._scene.working_range.push_depth_m
+        why = self._law.outside(
+            fitted.stretch_ratio,
+            float(fitted.indentation_m(deepest_m)),
+            place_m=CENTRE,
+            finger_radius_m=self._scene.finger.radius_m,
+        )
+        return f"beyond the {self._law.name} law of the sheet's force: {why}" if why else ""
 
     def retreat(self, depth_m: float, place_m: Place) -> tuple[float, float]:
         """How far (m) the sheet shall be behind the object's tangent plane for a finger so deep in
