@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,11 +17,13 @@ from ruamel.yaml import YAML
 
 from messages.scene import Scene
 from nodes.methods import measure as measure_trial
+from nodes.triangulator import families
 from nodes.triangulator.families import MARK, DrawnDisc, centre_bound_px, noisy
 from nodes.triangulator.mark import (
     MARK_METHODS,
     Mark,
     MarkLooks,
+    Spot,
     find_spots,
     overexposed,
     window_around,
@@ -271,3 +274,23 @@ def test_the_mark_family_tells_the_methods_apart() -> None:
     assert MARK.tolerance(scene) < worst["weighted_centroid"] < worst["moments"]
     for point in points:
         assert point.error > 0.7 * float(point.params["bound_px"])
+
+
+def test_mark_methods_are_judged_with_the_noise_that_the_node_tells_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
+    believed: list[PixelNoise] = []
+
+    def spy(
+        images: Sequence[Image], spots: Sequence[Spot], looks: MarkLooks, noise: PixelNoise
+    ) -> list[Mark]:
+        believed.append(noise)
+        return []
+
+    monkeypatch.setattr(families, "MARK_METHODS", {"moments": spy})
+    loud = {"read_noise_levels": 4.0, "photons_per_level": 10.0}
+    camera = scene.camera.model_copy(update=loud)
+    trial = next(iter(MARK.trials(scene.model_copy(update={"camera": camera}))))
+    trial.run()
+    assert believed == [PixelNoise(4.0, 10.0)]

@@ -40,13 +40,15 @@ def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
     """Points in slabs of the finger's volume, seen with pixel noise, by rigs of several baselines.
 
     In range is what a mark's noise and at least the scene's baseline give; the scene asks for its
-    own baseline (the nearest to it) and for no more noise than it leaves to the mark.
+    own baseline, which takes the place of the nearest, and for no more noise than it leaves to the
+    mark.
     """
     low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
     own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
     nearest_m = min(BASELINES_M, key=lambda baseline_m: abs(baseline_m - own_m))
     allowed_px = max(min(NOISES_PX), _mark_tolerance_px(scene))
-    for baseline_m in BASELINES_M:
+    baselines_m = (own_m if each_m == nearest_m else each_m for each_m in BASELINES_M)
+    for baseline_m in baselines_m:
         changed = scene.camera.right_from_left.copy()
         changed[:3, 3] *= baseline_m / own_m
         geometry = StereoGeometry.of(scene.camera.model_copy(update={"right_from_left": changed}))
@@ -63,10 +65,10 @@ def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
                 case: Case = {
                     "depth_mm": round(1e3 * depth_m),
                     "noise_px": noise_px,
-                    "baseline_mm": 1e3 * baseline_m,
+                    "baseline_mm": round(1e3 * baseline_m, 2),
                 }
                 in_range = baseline_m >= own_m and noise_px <= LARGEST_NOISE_PX
-                in_scene = baseline_m == nearest_m and noise_px <= allowed_px
+                in_scene = baseline_m == own_m and noise_px <= allowed_px
                 for name in TRIANGULATION_METHODS:
                     yield _triangulation_trial(
                         name,
@@ -217,10 +219,10 @@ def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
 
 def _mark_trials(scene: Scene) -> Iterator[Trial]:
     """Discs all over the pixel grid, moving in all directions; their noise is told as multiples of
-    the scene's sensor's."""
+    the scene's sensor's, which is what a fit believes."""
     asked = _scene_cases(scene)
+    sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
     for radius_px, level, motion_px, slope in dict.fromkeys((*asked, *MARK_CASES)):
-        sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
         noise = PixelNoise(level * sensor.read_levels, sensor.photons_per_level / level**2)
         random = np.random.default_rng(1)
         centres = PICTURE_PX // 2 + random.uniform(-0.5, 0.5, (MARK_PICTURES, 2))
@@ -246,6 +248,7 @@ def _mark_trials(scene: Scene) -> Iterator[Trial]:
                 case,
                 pictures,
                 centres,
+                sensor=sensor,
                 bound_px=bound_px,
                 in_range=in_range,
                 in_scene=in_scene,
@@ -258,15 +261,16 @@ def _mark_trial(
     pictures: list[Image],
     centres: Floats,
     *,
+    sensor: PixelNoise,
     bound_px: float,
     in_range: bool,
     in_scene: bool,
 ) -> Trial:
-    looks, noise, refine = MarkLooks(), PixelNoise(), MARK_METHODS[name]
+    looks, refine = MarkLooks(), MARK_METHODS[name]
 
     def marks_in(picture: Image) -> list[Mark]:
         spots = find_spots(picture, looks)
-        return refine([picture] * len(spots), spots, looks, noise)
+        return refine([picture] * len(spots), spots, looks, sensor)
 
     def error_px(_: list[Mark]) -> float:
         """Per axis; a mark that was not found, or not alone, counts as far off as the picture."""
