@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
@@ -23,7 +24,7 @@ from messages.clock import VirtualClock
 from messages.methods import Methods, SoftBodyChoice
 from messages.scene import Scene
 from nodes.arm_bridge.kinematics import KINEMATICS
-from nodes.fem_solver.making import asked, lacking
+from nodes.fem_solver.making import Maker, asked
 from nodes.methods import Case, Family, Point, Trial
 from nodes.planner.force_table import law_by
 from nodes.triangulator.families import TRIANGULATION
@@ -390,6 +391,14 @@ def test_families_ask_for_the_scenes_own_cases_only() -> None:
     asked_for = [trial for trial in TRIANGULATION.trials(SCENE) if trial.in_scene]
     assert {trial.case["baseline_mm"] for trial in asked_for} == {120.5}
     assert {trial.case["noise_px"] for trial in asked_for} == {0.01, 0.025}
+    translation = np.diag([0.13 / 0.1205, 1.0, 1.0]) @ SCENE.camera.right_from_left[:3, 3]
+    right_from_left = SCENE.camera.right_from_left.copy()
+    right_from_left[:3, 3] = translation
+    camera = SCENE.camera.model_copy(update={"right_from_left": right_from_left})
+    wider = SCENE.model_copy(update={"camera": camera})
+    asked_for = [trial for trial in TRIANGULATION.trials(wider) if trial.in_scene]
+    assert {trial.case["baseline_mm"] for trial in asked_for} == {130.0}
+    assert all(trial.in_range for trial in asked_for)
     tilts = [trial.case for trial in KINEMATICS.trials(SCENE) if trial.in_scene]
     assert all("tilt_deg" in case for case in tilts)
 
@@ -424,15 +433,20 @@ async def test_a_node_follows_the_scene_where_it_is_told_auto() -> None:
     assert set_by_hand.methods == "weighted_centroid, midpoint, one_euro"
 
 
-def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work() -> None:
+def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path: Path) -> None:
     assert asked(SCENE_BARE, "auto", "auto") == ("auto", 0.003)
     linear = with_methods(soft_body={"method": "linear", "skin_spacing_m": 0.006})
     assert asked(linear, "auto", "auto") == ("linear", 0.006)
     assert asked(linear, "nonlinear_table", 0.0045) == ("nonlinear_table", 0.0045)
     table = with_methods(soft_body={"method": "nonlinear_table", "skin_spacing_m": 0.0045})
     assert asked(table, "auto", "auto") == ("auto", 0.0045)
-    assert "--skin-spacing 0.0045" in lacking(table, "auto", [])
-    assert lacking(linear, "auto", []) == ""
+    for by_hand_m, effective in (("auto", "0.0045"), (0.003, "0.003")):
+        method, spacing_m = asked(table, "auto", by_hand_m)
+        said = Maker(spacing_m, tmp_path).lacking(table, method, [])
+        assert said.endswith(f"--skin-spacing {effective})")
+        dragging = Maker(spacing_m, tmp_path, friction_ratio=0.3)
+        assert dragging.lacking(table, method, []) == "", "there never is a table"
+    assert Maker(0.006, tmp_path).lacking(linear, "auto", []) == ""
 
 
 SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})

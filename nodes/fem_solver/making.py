@@ -37,18 +37,6 @@ def asked(
     return method, spacing_m
 
 
-def lacking(scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]) -> str:
-    """What a note goes on with where the scene chose a table that nobody made yet, else nothing."""
-    choice = scene.methods.soft_body
-    wanted = choice is not None and choice.method == "nonlinear_table" and method == "auto"
-    if choice is None or not wanted or len(made) > 1:
-        return ""
-    return (
-        "; the scene's nonlinear table is not made yet (flexsheet prepare SCENE "
-        f"--skin-spacing {choice.skin_spacing_m:g})"
-    )
-
-
 @dataclass(slots=True)
 class Maker:
     """How soft bodies are made; keeps the last model, which scenes may have in common.
@@ -91,6 +79,18 @@ class Maker:
         if table is None:
             return [linear]
         return [body.with_table(linear, scene, self._model[1], table), linear]
+
+    def lacking(self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]) -> str:
+        """What a note goes on with where the scene chose a table that nobody made yet, else
+        nothing; with friction there is no table to wait for."""
+        choice = scene.methods.soft_body
+        wanted = choice is not None and choice.method == "nonlinear_table" and method == "auto"
+        if not wanted or self.friction_ratio > 0.0 or len(made) > 1:
+            return ""
+        return (
+            "; the scene's nonlinear table is not made yet (flexsheet prepare SCENE "
+            f"--skin-spacing {self.skin_spacing_m:g})"
+        )
 
     def tabulated(
         self, scene: Scene, linear: body.SceneBody, progress: precompute_table.Progress

@@ -15,7 +15,7 @@ from messages.types import Fingertip, Skin, SoftBody
 from nodes import cache
 from nodes.fem_solver import body, precompute
 from nodes.fem_solver.contact import Response
-from nodes.fem_solver.making import GIVEN, SKIN_SPACING_M, Maker, MethodChoice, asked, lacking
+from nodes.fem_solver.making import GIVEN, SKIN_SPACING_M, Maker, MethodChoice, asked
 from nodes.fem_solver.pace import Pace
 from nodes.fem_solver.place import Entry
 from nodes.fem_solver.remaining import Remaining
@@ -113,7 +113,7 @@ class FemSolver(Node):
             self.note = f"no soft body: {error}"
             raise
         self._use(bodies)
-        self.note += lacking(scene, method, bodies)
+        self.note += maker.lacking(scene, method, bodies)
         self.skin.publish(bodies[0].skin, source_ns=header.source_ns)
         if method == "nonlinear_table" and not p.friction_ratio and len(bodies) == 1:
             self._making = asyncio.create_task(self._make_table(scene, bodies[0]))
