@@ -30,14 +30,14 @@ $(DEV_STAMP): requirements-dev.lock $(STAMP)
 	$(INSTALL) --require-hashes -r requirements-dev.lock
 	@touch $@
 
-# All locks anew, after a change of pyproject.toml or docs/requirements.in; what is pinned stays
+# All locks anew, after a change of pyproject.toml or website/requirements.in; what is pinned stays
 # where it may.
 lock:
 	$(PYTHON) -m venv $(LOCK)
 	$(LOCK)/bin/pip install --quiet --disable-pip-version-check pip-tools
 	$(call compile,--all-build-deps --extra export,requirements.lock,pyproject.toml)
 	$(call compile,--all-build-deps --extra export --extra dev,requirements-dev.lock,pyproject.toml)
-	$(call compile,,docs/requirements.lock,docs/requirements.in)
+	$(call compile,,website/requirements.lock,website/requirements.in)
 
 compile = $(LOCK)/bin/pip-compile --quiet --generate-hashes --allow-unsafe $(1) \
 	--strip-extras --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
@@ -112,10 +112,10 @@ charts: setup
 
 # The site: open site/index.html.  Its generator is no part of the program, so it has an environment
 # of its own.
-$(SITE_STAMP): docs/requirements.lock
+$(SITE_STAMP): website/requirements.lock
 	$(PYTHON) -m venv $(SITE_VENV)
 	$(SITE_VENV)/bin/pip install --quiet --disable-pip-version-check --require-hashes \
-		-r docs/requirements.lock
+		-r website/requirements.lock
 	@touch $@
 
 docs: $(SITE_STAMP)

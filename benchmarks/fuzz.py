@@ -82,11 +82,17 @@ def hunt(name: str, corpus: Path, seconds: float) -> None:
     atheris.Fuzz()
 
 
+def findings_in(folder: Path) -> set[str]:
+    """The files of a target's folder that hold what was found, in this run or an earlier one."""
+    return {str(one) for kind in FOUND for one in folder.glob(f"{kind}-*")}
+
+
 def hunted(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
     """One target in a process of its own, and what its end says."""
     folder = corpus / name
     folder.mkdir(parents=True, exist_ok=True)
     log = folder / "log.txt"
+    before = findings_in(folder)
     with log.open("wb") as written:
         command = [sys.executable, "-m", "benchmarks.fuzz", name, "--here"]
         command += ["--corpus", str(corpus), "--seconds", str(seconds)]
@@ -94,15 +100,12 @@ def hunted(name: str, corpus: Path, seconds: float) -> dict[str, Any]:
     text = log.read_text(errors="replace")
     runs = re.findall(r"^#(\d+)\s", text, re.MULTILINE)
     reached = re.findall(r"cov: (\d+)", text)
-    found = sorted(
-        str(one) for kind in ("crash", "oom", "timeout") for one in folder.glob(f"{kind}-*")
-    )
     return {
         "target": name,
         "runs": int(runs[-1]) if runs else 0,
         "reached": [int(reached[0]), int(reached[-1])] if reached else None,
         "exit_code": code,
-        "found": found,
+        "found": sorted(findings_in(folder) - before),
         "log": str(log),
     }
 

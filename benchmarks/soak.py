@@ -4,9 +4,9 @@
 
 Starts `launch/demo.yaml`, strokes and pushes all the while, and records what is logged.  Reports
 
-- per process: how fast its memory grows (its proportional share and what it has resident; the
-  median of the slopes between all pairs of samples, after a warm-up), descriptors, threads,
-  processor time, restarts and hangs;
+- per process: how fast its memory grows (its own, what it shares with none; and what it has
+  resident; the median of the slopes between all pairs of samples, after a warm-up), descriptors,
+  threads, processor time, restarts and hangs;
 - per topic and reader: messages, those superseded or overflown, lost on the way, refused;
 - per window of five minutes: exposure to arm command, to fingertip and to frame, how much of the
   time the arms followed, how much of the cameras' pictures gave a fingertip;
@@ -81,11 +81,15 @@ MIB = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What a process takes at one time."""
+    """What a process takes at one time.
+
+    uss: memory that it shares with none; a proportional share would fall as others load the same
+    libraries, and hide a leak.
+    """
 
     time_s: float
     pid: int
-    pss: int
+    uss: int
     rss: int
     descriptors: int
     threads: int
@@ -329,7 +333,7 @@ class Soak:
                 sample = Sample(
                     time_s=time_s,
                     pid=pid,
-                    pss=memory.pss,
+                    uss=memory.uss,
                     rss=memory.rss,
                     descriptors=process.num_fds(),
                     threads=process.num_threads(),
@@ -417,7 +421,7 @@ def process_report(samples: Sequence[Sample]) -> dict[str, Any]:
 
     return {
         "starts": len({one.pid for one in samples}),
-        "pss": grown("pss"),
+        "uss": grown("uss"),
         "rss": grown("rss"),
         "descriptors": grown("descriptors"),
         "threads": grown("threads"),
@@ -479,7 +483,7 @@ def findings(result: dict[str, Any]) -> list[str]:
     """What grew, drifted or went wrong, a sentence each."""
     found = []
     for name, process in result["processes"].items():
-        memory = process["pss"]
+        memory = process["uss"]
         rate = memory["slope_per_h"]
         grown = memory["end"] - memory["settled"]
         if rate and rate["low_per_h"] > GROWTH_B_PER_H and grown > LEAST_GROWTH_B:
@@ -557,9 +561,9 @@ def in_words(result: dict[str, Any]) -> str:
     processes = [
         [
             name,
-            mib(one["pss"]["start"]),
-            mib(one["pss"]["end"]),
-            growth(one, "pss"),
+            mib(one["uss"]["start"]),
+            mib(one["uss"]["end"]),
+            growth(one, "uss"),
             growth(one, "rss"),
             steady(one, "descriptors"),
             steady(one, "threads"),
@@ -606,10 +610,10 @@ def in_words(result: dict[str, Any]) -> str:
         table(
             [
                 "process",
-                "PSS at first, MiB",
+                "own memory at first, MiB",
                 "at last",
-                "slope of PSS, MiB/h (95 %)",
-                "of RSS",
+                "slope, MiB/h (95 %)",
+                "of what is resident",
                 "descriptors",
                 "threads",
                 "processor",

@@ -96,13 +96,17 @@ def area_of(file: str) -> Area:
 
 
 def explain(message: str) -> list[Said]:
-    """The messages of the code that `message` may be, the best one first."""
-    found = []
+    """The messages of the code that `message` may be, the best one first: those that it holds, then
+    those that hold it, where it has `SHORTEST_MATCH` letters or more."""
+    found: list[tuple[int, Said]] = []
+    part = message.strip().lower()
     for one in messages():
         pattern = ".+?".join(re.escape(part) for part in _FILLED_IN.split(one.template))
         letters = _letters(one.template)
         if letters >= SHORTEST_MATCH and re.search(pattern, message, re.DOTALL):
             found.append((letters, one))
+        elif len(part) >= SHORTEST_MATCH and part in one.template.lower():
+            found.append((-letters, one))
     return [one for _, one in sorted(found, key=lambda pair: -pair[0])]
 
 

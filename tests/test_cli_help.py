@@ -118,6 +118,12 @@ def test_a_message_is_explained(message: str, page: str) -> None:
     assert explained("no such words were ever said") == []
 
 
+def test_a_part_of_a_message_is_enough() -> None:
+    for part in ("start one with", "  Start One With", "no graph is running"):
+        assert explained(part)[0]["message"].startswith("no graph is running")
+    assert explained("running") == []  # too short to be told from others
+
+
 def test_looking_into_a_graph_loads_little() -> None:
     """What `topic echo` needs until it is subscribed: no YAML, no linear algebra, no supervisor."""
     code = (

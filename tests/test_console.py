@@ -53,6 +53,7 @@ from nodes.console.view import finger_mesh, line_segments
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.recorder.node import Recorder, RecorderParameters
 from tests.arm_states import arm_state
+from tests.colours import luminance
 from tests.fingertips import fingertip
 from tests.plans import scene_with
 
@@ -540,12 +541,6 @@ def test_the_banner_shouts_what_matters_most() -> None:
     assert "Waiting" in panels.banner("cylinder", {}, None, "Live")
     assert panels.problem("") == ""
     assert "&lt;" in panels.problem("<")
-
-
-def luminance(color: str) -> float:
-    parts = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
-    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
 import tracemalloc
 import zlib
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 import zstandard
 from ruamel.yaml.error import YAMLError
 
+from benchmarks import fuzz
 from benchmarks.fuzz_targets import MAGIC, Record, example, joined, records_of
 from launch.documents import BadInputError, parse_value, read_document
 from launch.meshes import read_mesh
@@ -28,6 +30,23 @@ from messages.types import EStop, Fingertip
 from messages.wire import WireError, decode, encode
 from nodes.models.shapes import MeshError
 from nodes.node import PortCounts
+
+
+def test_what_an_earlier_run_has_found_is_not_found_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "wire"
+    folder.mkdir()
+    (folder / "crash-old").touch()
+
+    def run(command: list[str], **options: Any) -> subprocess.CompletedProcess[bytes]:
+        (folder / "timeout-new").touch()
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(fuzz.subprocess, "run", run)
+    assert fuzz.hunted("wire", tmp_path, 1.0)["found"] == [str(folder / "timeout-new")]
+    assert fuzz.hunted("wire", tmp_path, 1.0)["found"] == []
+
 
 HEADER = Header(1, 10, 20, "clock", "planner", 1, "plan")
 FINGERTIP = TOPICS["fingertip"]

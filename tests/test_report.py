@@ -19,16 +19,19 @@ from hypothesis import strategies as st
 
 from launch.cli import main
 from launch.experiments.stroke import read_recording, stroke_errors, summary
-from launch.report.album import Album
+from launch.report.album import MARKED_MOST, Album
 from launch.report.charts import stretches_of
 from launch.report.findings import findings_of
+from launch.report.numbers import methods_of
 from launch.report.page import COLOURS, MARK, SECTIONS, page_of
 from launch.report.series import Events, Grid, Moments, Range, Spread, States
 from launch.report.session import read_session
 from launch.report.strokes import seconds_of
 from launch.report.write import report, result_of
 from messages.bag import BagError, BagWriter
+from messages.methods import Methods
 from tests import sessions
+from tests.colours import luminance
 
 LONELY = ("scene", "fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "status",
           "twin/finger", "stereo", "twin/eye", "frame", "moment", "estop")  # fmt: skip
@@ -100,6 +103,15 @@ def test_what_is_kept_does_not_grow_with_what_came() -> None:
     assert events.counts == {"gap": 100, "estop": 1}
 
 
+def test_of_many_moments_the_first_are_shown_and_the_rest_counted() -> None:
+    album = Album(4, [(float(i), str(i)) for i in range(500)])
+    for i in range(500):
+        album.take(float(i), "", (("left", np.zeros((2, 2), np.uint8)),))
+    assert len(album.shots()) == MARKED_MOST
+    assert album.left_out == 500 - MARKED_MOST
+    assert album.seen == 500
+
+
 def test_states_last_until_another_and_gaps_stay_white() -> None:
     grid = Grid(0, 10.0, 10)
     states = States(grid, ("wait", "contact"))
@@ -155,6 +167,18 @@ def test_latencies_speeds_and_forces(numbers: dict[str, Any]) -> None:
     assert right["joint_speed_share"][1] == pytest.approx(3.3 / np.radians(90.0), rel=1e-6)
     assert numbers["arms"]["left"]["edge_force_n"] == 25.0
     assert numbers["arms"]["left"]["modes_s"]["fault"] == pytest.approx(0.98, abs=0.03)
+
+
+def test_a_nodes_methods_are_those_of_its_parameters_else_of_its_scene() -> None:
+    chosen = Methods.model_validate(
+        {"mark": "moments", "soft_body": {"method": "linear", "skin_spacing_m": 0.006}}
+    )
+    tuned = sessions.SCENE.model_copy(update={"methods": chosen})
+    eye = {"mark": "auto", "triangulation": "dlt", "tracking": "auto", "rate_hz": 60.0}
+    assert methods_of(eye, tuned) == "mark moments, triangulation dlt, tracking default"
+    assert methods_of(eye, None) == "mark default, triangulation dlt, tracking default"
+    assert methods_of({"method": "auto"}, tuned) == "linear"
+    assert methods_of({"side": "left"}, tuned) is None
 
 
 def test_topics_know_what_is_missing(numbers: dict[str, Any]) -> None:
@@ -262,12 +286,6 @@ def test_pictures_are_the_sessions(page: str) -> None:
     assert re.search(r"2\.21 s\.[^<]*<strong>Moment: &lt;b&gt;first touch", page)
 
 
-def luminance(color: str) -> float:
-    parts = np.array([int(color[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
-    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
-    return float(linear @ [0.2126, 0.7152, 0.0722])
-
-
 @pytest.mark.parametrize("scheme", COLOURS)
 def test_text_stands_out_as_much_as_wcag_aa_asks(scheme: str) -> None:
     colours = COLOURS[scheme]
@@ -318,6 +336,19 @@ def test_a_bag_of_the_first_release_can_be_reported_on() -> None:
 
 
 # The command.
+
+
+def test_where_no_page_can_be_written_the_bag_is_not_read(
+    bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("launch.report.write.read_session", lambda *_: pytest.fail("it was read"))
+    with pytest.raises(BagError, match="name a file with -o in a folder that is there"):
+        report(bag, tmp_path / "none" / "a.html", lambda done, whole: None)
+    folder = tmp_path / "a.html"
+    folder.mkdir()
+    with pytest.raises(BagError, match="name a file with -o in a folder that is there"):
+        report(bag, folder, lambda done, whole: None)
+    assert [*tmp_path.iterdir()] == [folder]
 
 
 def test_the_command_writes_beside_the_bag_and_over_reports_only(

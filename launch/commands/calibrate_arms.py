@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import shutil
 import sys
@@ -467,29 +468,28 @@ def _tell(
 
 
 def _fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
-    degrees = 57.29577951308232
     rows = [
         (f"{side} arm", f"{one['places_used']} of {one['places']} places used"),
         (
             "uncertainty",
             f"{1e3 * one['position_std_m']:.2f} mm at the screen's centre, "
-            f"{degrees * one['rotation_std_rad']:.3f} degrees",
+            f"{math.degrees(one['rotation_std_rad']):.3f} degrees",
         ),
         (
             "off the scene",
             f"{1e3 * one['moved_from_scene_m']:.1f} mm, "
-            f"{degrees * one['turned_from_scene_rad']:.2f} degrees",
+            f"{math.degrees(one['turned_from_scene_rad']):.2f} degrees",
         ),
         (
             "one place less",
             f"moves the base by up to {1e3 * one['largest_change_m']:.2f} mm, "
-            f"{degrees * one['largest_change_rad']:.3f} degrees; scatter over what the fit states "
-            f"{one['jackknife_ratio']:.2f}",
+            f"{math.degrees(one['largest_change_rad']):.3f} degrees; scatter over what the fit "
+            f"states {one['jackknife_ratio']:.2f}",
         ),
         ("corners", f"{one['corner_sigma_px']:.3f} px"),
         (
             "arm's own error",
-            f"{1e3 * one['arm_sigma_m']:.2f} mm, {degrees * one['arm_sigma_rad']:.3f} degrees",
+            f"{1e3 * one['arm_sigma_m']:.2f} mm, {math.degrees(one['arm_sigma_rad']):.3f} degrees",
         ),
     ]
     if "true_error_m" in one:
@@ -497,7 +497,7 @@ def _fields(side: str, one: dict[str, Any]) -> list[tuple[str, str]]:
             (
                 "error, by the twin",
                 f"{1e3 * one['true_error_m']:.2f} mm at the screen's centre, "
-                f"{degrees * one['true_error_rad']:.3f} degrees",
+                f"{math.degrees(one['true_error_rad']):.3f} degrees",
             )
         )
     return rows

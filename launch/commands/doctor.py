@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -144,7 +145,7 @@ def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
                 side,
                 one["limit"],
                 f"{100 * one['share']:.1f} %",
-                f"{_degrees(one['first_tilt_rad']):.1f}°",
+                f"{math.degrees(one['first_tilt_rad']):.1f}°",
                 f"{1e3 * one['first_depth_m']:.0f} mm",
             )
             for side, arm in arms.items()
@@ -160,7 +161,7 @@ def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
                 kind,
                 one["limit"],
                 _margin(one["margin"], one["unit"]),
-                f"{_degrees(one['tilt_rad']):.1f}°",
+                f"{math.degrees(one['tilt_rad']):.1f}°",
                 f"{1e3 * one['depth_m']:.0f} mm",
             )
             for side, arm in arms.items()
@@ -175,13 +176,9 @@ def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
         words.print("no single change of those that were tried makes all of it reachable")
 
 
-def _degrees(angle_rad: float) -> float:
-    return angle_rad * 57.29577951308232
-
-
 def _margin(value: float, unit: str) -> str:
     shown = {
-        "rad": f"{_degrees(value):.1f}°",
+        "rad": f"{math.degrees(value):.1f}°",
         "m": f"{1e3 * value:.0f} mm",
         "N": f"{value:.1f} N",
         "share": f"{100 * (1.0 - value):.0f} % used",

@@ -22,7 +22,7 @@ SHOWN = 3
 )
 def explain(
     message: Annotated[
-        str, typer.Argument(help="As it was said, or part of it; a fingertip's reason.")
+        str, typer.Argument(help="As it was said, or 8 letters of it; a fingertip's reason.")
     ],
     as_json: JsonOption = False,
 ) -> None:
@@ -37,5 +37,5 @@ def explain(
         print()
     if not found:
         raise CommandError(
-            f'"{message}" is no message that is known; give it whole, or look into docs/errors.md'
+            f'"{message}" is no message that is known; give more of it, or look into docs/errors.md'
         )

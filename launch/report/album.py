@@ -9,6 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+MARKED_MOST = 40
+"""Shots of marked moments that are kept; the others are counted."""
+
 WIDEST_PX = 420
 QUALITY = 82
 
@@ -27,12 +30,14 @@ class Shot:
 class Album:
     """At most `limit` shots, evenly out of all that came, and the first after each moment.
 
-    moments: (seconds, label), in order.  seen: how many came.
+    moments: (seconds, label), in order.  seen: how many came.  left_out: shots of moments
+    beyond the first `MARKED_MOST`.
     """
 
     limit: int
     moments: Sequence[tuple[float, str]] = ()
     seen: int = 0
+    left_out: int = 0
     _every: int = 1
     _held: list[Shot] = field(default_factory=list)
     _marked: list[Shot] = field(default_factory=list)
@@ -43,7 +48,9 @@ class Album:
         """Look at a shot; it is made small only if it is kept."""
         passed = [label for at_s, label in self.moments if at_s <= seconds]
         self.moments = self.moments[len(passed) :]
-        if passed:
+        if passed and len(self._marked) >= MARKED_MOST:
+            self.left_out += 1
+        elif passed:
             self._marked.append(_shot(seconds, title, pictures, "; ".join(passed)))
         elif self.seen % self._every == 0:
             self._held.append(_shot(seconds, title, pictures))

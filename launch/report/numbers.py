@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,10 +10,15 @@ import numpy as np
 from launch.report.series import Range, Spread, States
 from launch.report.session import Arm, NodeSaid, Session
 from launch.report.strokes import Stroke
+from messages.methods import Methods
+from messages.scene import Scene
 from messages.topics import TOPICS
 from nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
 DEGREES = float(np.degrees(1.0))
+
+METHODS = ("method", *Methods.model_fields)
+"""Parameters of nodes that name a method."""
 
 
 def numbers_of(session: Session) -> dict[str, Any]:
@@ -168,7 +174,7 @@ def _node(session: Session, name: str, said: NodeSaid) -> dict[str, Any]:
     planned = None if session.plan is None else session.plan.nodes.get(name)
     cpu = said.cpu.summary(1.0)
     return {
-        "method": None if planned is None else planned.parameters.get("method"),
+        "method": None if planned is None else methods_of(planned.parameters, session.scene),
         "cpu_mean": None if cpu is None else cpu["mean"],
         "cpu_max": None if cpu is None else cpu["max"],
         "resident_mb": 1e-6 * said.resident_bytes,
@@ -179,6 +185,20 @@ def _node(session: Session, name: str, said: NodeSaid) -> dict[str, Any]:
         "note": said.note,
         "notes": said.notes,
     }
+
+
+def methods_of(parameters: Mapping[str, Any], scene: Scene | None) -> str | None:
+    """What a node was told to take, family by family; of `auto`, what the scene chose."""
+    by_scene = scene.methods.model_dump() if scene is not None else {}
+    by_scene["method"] = (by_scene.get("soft_body") or {}).get("method")
+    found = []
+    for name in METHODS:
+        value = parameters.get(name)
+        if value == "auto":
+            value = by_scene.get(name) or "default"
+        if isinstance(value, str):
+            found.append(value if name == "method" else f"{name} {value}")
+    return ", ".join(found) or None
 
 
 def _states(states: States) -> dict[str, float]:

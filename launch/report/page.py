@@ -410,7 +410,8 @@ def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
             yield _missing(missing)
             continue
         if numbers["pictures"][key] > len(shots):
-            yield f"<p>{len(shots)} of {numbers['pictures'][key]}.</p>"
+            rest = f", {album.left_out} of marked moments left out" if album.left_out else ""
+            yield f"<p>{len(shots)} of {numbers['pictures'][key]}{rest}.</p>"
         yield from _album(title, album)
 
 

@@ -21,7 +21,7 @@ from nodes.fem_solver.mesh.bisection import CELL, bisected, lattice
 from nodes.fem_solver.mesh.curving import curved
 from nodes.fem_solver.mesh.grading import LONGEST_EDGE, Grading, longest_edges
 from nodes.fem_solver.mesh.quality import LEAST_RATIO, radius_ratios
-from nodes.fem_solver.mesh.smoothing import FROM_AFAR, settled
+from nodes.fem_solver.mesh.smoothing import FROM_AFAR, settled, surface_of
 from nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError, oriented, with_middles
 from nodes.models.shapes import Shape
 
@@ -88,10 +88,6 @@ def fitted_solid(
     points = field.place(vertices)
     core = distance < -DEEP * _shortest_edges(points, tetrahedra)
 
-    def nearest(points: Floats) -> tuple[Floats, Floats]:
-        found = shape.closest(points)
-        return found.point, found.normal
-
     best, best_ratio = None, LEAST_RATIO
     for _ in range(ATTEMPTS):
         chosen = _without_pinches(tetrahedra, core, distance)
@@ -99,7 +95,7 @@ def fitted_solid(
         begun = points[used]
         cells = oriented(begun, index.reshape(-1, 4))
         hull = np.unique(hull_faces(cells))
-        corners = settled(begun, cells, hull, nearest, springs=FROM_AFAR, anchor=0.0)
+        corners = settled(begun, cells, hull, surface_of(shape), springs=FROM_AFAR, anchor=0.0)
         ratios = radius_ratios(corners, cells)
         if ratios.min() > best_ratio:
             best, best_ratio = (corners, cells), float(ratios.min())
@@ -116,7 +112,7 @@ def fitted_solid(
             "object; take a smaller spacing, or a longer object.geometry.smoothing_m"
         )
     nodes, elements = with_middles(*best)
-    return curved(nodes, elements, lambda points: nearest(points)[0]), elements
+    return curved(nodes, elements, lambda points: shape.closest(points).point), elements
 
 
 def bent_sizes(sizes: Floats, bend: Floats, grading: Grading) -> Floats:

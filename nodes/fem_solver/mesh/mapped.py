@@ -27,7 +27,7 @@ from nodes.fem_solver.mesh.bisection import CELL, bisected, lattice
 from nodes.fem_solver.mesh.curving import curved
 from nodes.fem_solver.mesh.grading import LONGEST_EDGE, Grading, longest_edges
 from nodes.fem_solver.mesh.quality import radius_ratios
-from nodes.fem_solver.mesh.smoothing import ON_SURFACE, Surface, settled
+from nodes.fem_solver.mesh.smoothing import ON_SURFACE, settled, surface_of
 from nodes.fem_solver.mesh.solid import UnfitMeshError, oriented, with_middles
 from nodes.models.shapes import Shape
 
@@ -130,16 +130,6 @@ def below_rectangle(points: Floats, plane: Plane) -> Floats:
     half = 0.5 * np.array([plane.width_m, plane.height_m])
     beside = np.maximum(np.abs(points[:, :2]) - half, 0.0)
     return np.asarray(np.linalg.norm(np.column_stack([beside, points[:, 2]]), axis=1))
-
-
-def surface_of(shape: Shape) -> Surface:
-    """A shape as `settled` asks for it."""
-
-    def nearest(points: Floats) -> tuple[Floats, Floats]:
-        found = shape.closest(points)
-        return found.point, found.normal
-
-    return nearest
 
 
 Place = Callable[[Ints, Ints], tuple[Floats, Floats]]

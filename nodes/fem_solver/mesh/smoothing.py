@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.fem_solver.mesh.quality import radius_ratios
+from nodes.models.shapes import Shape
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -37,6 +38,16 @@ _REGULAR = np.array(
     [[1.0, 0.5, 0.5], [0.0, np.sqrt(0.75), np.sqrt(1.0 / 12.0)], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]
 )
 _FROM_REGULAR = np.linalg.inv(_REGULAR)
+
+
+def surface_of(shape: Shape) -> Surface:
+    """A shape as `settled` asks for it."""
+
+    def nearest(points: Floats) -> tuple[Floats, Floats]:
+        found = shape.closest(points)
+        return found.point, found.normal
+
+    return nearest
 
 
 def settled(
