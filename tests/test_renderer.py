@@ -383,7 +383,7 @@ async def test_frame_follows_the_soft_body_and_carries_its_exposure(bench: Bench
     assert frame.predicted_to_ns == bench.clock.now_ns() + 16 * MS
     # A fingertip alone does not draw while the solver answers.
     bench.forward(40)
-    await bench.step("soft_body", body)
+    await bench.step("soft_body", skin_and_body(0.0005)[1])
     await bench.finger(0.0, 0.0, 0.1)
     assert len(bench.sent) == 2
 
@@ -417,6 +417,28 @@ async def test_timer_keeps_the_picture_alive_only_when_idle(bench: Bench) -> Non
     bench.forward(50)
     bench.node.refresh()
     assert len(bench.sent) == 2
+
+
+async def test_while_nothing_moves_few_frames_are_drawn(bench: Bench) -> None:
+    """And the next one at once when a finger comes, or the sheet goes."""
+    await bench.step("scene", bench.scene)
+    await bench.arms(np.eye(4))
+    _, body = skin_and_body(0.0)
+    for _ in range(60):  # one second, nobody there
+        bench.forward(1000 / 60)
+        await bench.step("soft_body", body)
+    assert 5 <= len(bench.sent) <= 6
+    bench.forward(1000 / 30)
+    await bench.arms(transform(np.eye(3), [0.0, 0.0, 1e-4]))
+    begun = len(bench.sent)
+    await bench.step("soft_body", body)
+    assert len(bench.sent) == begun + 1
+    bench.forward(1000 / 30)
+    await bench.step("soft_body", body)
+    assert len(bench.sent) == begun + 1
+    await bench.finger(0.0, 0.0, 0.1)
+    await bench.step("soft_body", body)
+    assert len(bench.sent) == begun + 2
 
 
 async def test_stale_arms_hold_the_last_plane_and_say_so(bench: Bench) -> None:

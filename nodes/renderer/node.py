@@ -52,6 +52,7 @@ class Renderer(Node):
         self._shown = Display(correction="two_pass", stereo=self.parameters.stereo)
         self._due_ns = self._since_pixels = 0
         self._period_ns = int(1e9 / self.parameters.rate_hz)
+        self._still_ns, self._drawn_ns = int(1e9 / self.parameters.still_rate_hz), 0
 
     async def close(self) -> None:
         self._screen.close()
@@ -118,6 +119,10 @@ class Renderer(Node):
         now_ns = self.clock.now_ns()
         if self._painter is None or now_ns < self._due_ns - self._period_ns // 4:
             return
+        rested_ns = now_ns - self._drawn_ns + self._period_ns // 4
+        if rested_ns < self._still_ns and self._painter.would_repeat(self._shown):
+            return
+        self._drawn_ns = now_ns
         self._draw(self._painter, now_ns)
         # Where drawing is slower than the rate, what has come meanwhile is read before the next.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2

@@ -24,6 +24,7 @@ from nodes.renderer.dent_ahead import DentAhead
 from nodes.renderer.lead import Lead
 from nodes.renderer.output import believed, both_eyes, drawn_for, which_eye
 from nodes.renderer.stage import Stage
+from nodes.renderer.stillness import has_moved, is_touched
 from nodes.renderer.window import Screen
 
 
@@ -61,8 +62,22 @@ class Painter:
         self._belief = SheetBelief(stale_s=stale_s)
         self._dent = DentAhead()
         self._number = 0
+        self._drawn_of: tuple[object, ...] = ()
+        self._drawn_arms: tuple[ArmState | None, ArmState | None] = (None, None)
         if ports.soft_body.message is not None and ports.soft_body.header is not None:
             self.answered(ports.soft_body.message, ports.soft_body.header)
+
+    def would_repeat(self, shown: Display) -> bool:
+        """Whether a frame would show what the last one did: nobody touches, nothing moves."""
+        ports = self._ports
+        arms = (ports.arm_left.message, ports.arm_right.message)
+        others = (ports.skin.message, ports.eye.message, shown)
+        return (
+            len(self._drawn_of) == len(others)
+            and all(one is other for one, other in zip(self._drawn_of, others, strict=True))
+            and not is_touched(ports.fingertip.message, ports.soft_body.message)
+            and not any(map(has_moved, self._drawn_arms, arms))
+        )
 
     def paint(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
         """Draw a frame and hand it to the screen; also the exposure (ns) that it goes back to.
@@ -70,6 +85,8 @@ class Painter:
         What the frame says of its light is as if no window showed it; see `was_shown`.
         """
         ports, stage = self._ports, self.stage
+        self._drawn_of = (ports.skin.message, ports.eye.message, shown)
+        self._drawn_arms = (ports.arm_left.message, ports.arm_right.message)
         predicted_to_ns = self._lead.light_ns(begun_ns)
         lead_s = (predicted_to_ns - self._clock.now_ns()) * 1e-9
         source_ns, shaped_for_ns = self._shape(begun_ns, predicted_to_ns)
