@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from benchmarks.soak import MIB, Sample, findings, process_report
@@ -16,6 +18,12 @@ def test_a_leak_is_judged_by_memory_that_no_other_shares(own_mib_per_h: float, l
         )
         for i in range(360)
     ]  # fmt: skip
-    empty = {"restarts": {}, "hangs": {}, "errors": {}, "ports": [], "last_errors": {}}
+    empty: dict[str, Any] = {
+        "restarts": {},
+        "hangs": {},
+        "errors": {},
+        "ports": [],
+        "last_errors": {},
+    }
     found = findings({"processes": {"node": process_report(samples)}, "windows": [], **empty})
     assert [text.startswith("node: memory grows by 20.0 MiB/h") for text in found] == [True] * leaks
