@@ -20,10 +20,10 @@ INTRODUCTION = """\
 <!-- Written by `python -m launch.cli_reference > docs/cli.md`; a test compares. -->
 
 Data goes to stdout, words to stderr; `--json` makes the data JSON.  Exit codes: 0 done, 1 failed,
-2 the input is wrong, 3 a replay differs from what was live.  Colours and progress bars are for
-terminals; NO_COLOR takes the colours away.  `flexsheet --install-completion` teaches your shell to
-complete commands, options, topics, nodes, families and files.  What a message means:
-[errors.md](errors.md).
+2 the input is wrong, 3 a replay differs from what was live, or `tune` found no method good enough.
+Colours and progress bars are for terminals; NO_COLOR takes the colours away.  `flexsheet
+--install-completion` teaches your shell to complete commands, options, topics, nodes, families and
+files.  What a message means: [errors.md](errors.md).
 """
 
 

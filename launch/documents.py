@@ -6,7 +6,7 @@ wrong with it is reported at once as `Problem`s.
 
 from __future__ import annotations
 
-import re
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -23,12 +23,17 @@ from ruamel.yaml.scalarbool import ScalarBoolean
 from ruamel.yaml.scalarfloat import ScalarFloat
 from ruamel.yaml.scalarint import ScalarInt
 from ruamel.yaml.scalarstring import ScalarString
+from ruamel.yaml.tokens import (
+    FlowMappingEndToken,
+    FlowMappingStartToken,
+    FlowSequenceEndToken,
+    FlowSequenceStartToken,
+)
 
 M = TypeVar("M", bound=BaseModel)
 TEXT_MAX = 1 << 20
 DEPTH_MAX = 50
 VALUES_MAX = 20_000
-BRACKETS = re.compile(r"[\[\]{}]")
 SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarBoolean, bool),
     (ScalarFloat, float),
@@ -110,13 +115,8 @@ def parse_value(text: str) -> Any:
 
 def _tree(text: str) -> Any:
     """The YAML tree of a text, with its comments; raises YAMLError and nothing else."""
-    depth = 0
-    for bracket in BRACKETS.finditer(text):
-        # The parser's time goes with the square of it and more, so it is counted here.
-        depth = depth + 1 if bracket[0] in "[{" else max(depth - 1, 0)
-        if depth > DEPTH_MAX:
-            raise YAMLError(f"more than {DEPTH_MAX} brackets are open at once")
     try:
+        _check_depth(text)
         return YAML(typ="rt", pure=True).load(text)
     except YAMLError:
         raise
@@ -125,6 +125,41 @@ def _tree(text: str) -> Any:
     # Days and numbers that are none, and odd tags, make the parser raise what it likes.
     except Exception as error:
         raise YAMLError(f"holds a value that cannot be read: {error}"[:500]) from error
+
+
+def _check_depth(text: str) -> None:
+    """YAMLError for too many brackets that are open at once, not counting those in comments and
+    strings: the parser's time goes with the square of them and more."""
+    if text.count("[") + text.count("{") <= DEPTH_MAX:
+        return
+    depth = 0
+    for token in YAML(typ="rt", pure=True).scan(text):
+        if isinstance(token, FlowSequenceStartToken | FlowMappingStartToken):
+            depth += 1
+        elif isinstance(token, FlowSequenceEndToken | FlowMappingEndToken):
+            depth -= 1
+        if depth > DEPTH_MAX:
+            raise YAMLError(f"more than {DEPTH_MAX} brackets are open at once")
+
+
+def parse_json(text: str) -> Any:
+    """A value as JSON has it, of any size: it knows no aliases, which could stand for more than is
+    there.  ValueError for what is no JSON; for NaN, infinity and a key that is said twice, too.
+    """
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no JSON")
+
+    def mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) < len(pairs):
+            raise ValueError("a key is said twice")
+        return found
+
+    try:
+        return json.loads(text, parse_constant=refuse, object_pairs_hook=mapping)
+    except RecursionError as error:
+        raise ValueError("values within values within values, too deep") from error
 
 
 def read_document(path: Path) -> Document:

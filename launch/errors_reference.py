@@ -30,7 +30,7 @@ INTRODUCTION = """\
 
 What each message means and what to do.  `flexsheet explain 'THE MESSAGE'` finds the place for you.
 A `<word>` stands for what the message fills in.  Exit codes: 0 done, 1 failed, 2 the input is
-wrong, 3 a replay differs from what was live.
+wrong, 3 a replay differs from what was live, or `tune` found no method good enough.
 
 A node's messages reach you by `flexsheet launch` (its log), by the `note` of its status
 (`flexsheet topic echo status`) and in the console.

@@ -268,6 +268,28 @@ def test_wrong_words_to_topics(
     assert word in said.err
 
 
+def test_a_message_of_any_size_is_taken_as_json(
+    flexsheet: Command, running: Path, tmp_path: Path
+) -> None:
+    skin = {
+        "mesh_id": "m",
+        "vertices_world_m": [[0.0, 0.001 * i, 0.0] for i in range(4000)],
+        "triangles": [[0, i, i + 1] for i in range(8000)],
+    }
+    file = tmp_path / "skin.json"
+    file.write_text(json.dumps(skin))
+    said = flexsheet("topic", "pub", "skin", f"@{file}")
+    assert 'topic "skin" is not part of the graph' in said.err, "it was read, and whole"
+    for text, word in (
+        ('{"engaged": true, "engaged": false, "reason": ""}', "duplicate key"),
+        ('{"engaged": NaN, "reason": ""}', "is no EStop: engaged"),
+        ("[" * 100_000, "brackets are open at once"),
+    ):
+        said = flexsheet("topic", "pub", "estop", text)
+        assert said.code == 2
+        assert word in said.err
+
+
 def test_nobody_publishes_for_a_node(flexsheet: Command, running: Path) -> None:
     finger = (
         "{path_label: '', path_done: true, path_time_s: 0, position_world_m: [0, 0, 0], "

@@ -227,6 +227,17 @@ def test_odd_yaml_is_a_problem_with_its_file(tmp_path: Path, text: str) -> None:
         parse_value(text)
 
 
+@pytest.mark.parametrize(
+    ("open_", "close"), [("#", ""), ('"', '"'), ("'", "'")], ids=["comment", "string", "word"]
+)
+def test_brackets_in_comments_and_strings_nest_nothing(open_: str, close: str) -> None:
+    text = "[1,\n" + f"{open_}{'[' * 200}{close}\n" + "]\n"
+    assert parse_value(text)[0] == 1
+    with pytest.raises(YAMLError, match="brackets are open at once"):
+        # Closing ones in strings close nothing, either.
+        parse_value("""['x]', """ * 200)
+
+
 def test_a_file_too_large_to_be_written_by_hand_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "a.yaml"
     file.write_text("a: 1\n" * 300_000)

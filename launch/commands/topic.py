@@ -183,7 +183,7 @@ def hz(
 def pub(
     *,
     topic: TopicArgument,
-    message: Annotated[str, typer.Argument(help="The message in YAML or JSON, or @FILE.")],
+    message: Annotated[str, typer.Argument(help="In YAML, JSON (of any size), or @FILE.")],
     rate: Annotated[float | None, typer.Option(help="Send again at this rate, Hz.")] = None,
     count: Annotated[int | None, typer.Option(help="Send so many times.", min=1)] = None,
     run: RunOption = None,
@@ -392,7 +392,7 @@ def _parse_message(topic: Topic, text: str) -> Message:
     from pydantic import ValidationError
     from ruamel.yaml.error import YAMLError
 
-    from launch.documents import parse_value
+    from launch.documents import parse_json, parse_value
 
     source = "MESSAGE"
     if text.startswith("@"):
@@ -402,7 +402,11 @@ def _parse_message(topic: Topic, text: str) -> Message:
         except OSError as error:
             raise CommandError(f"{source}: cannot be read: {error.strerror}", BAD_INPUT) from error
     try:
-        return topic.message.model_validate(parse_value(text))
+        try:
+            value = parse_json(text)
+        except ValueError:  # YAML's own errors say what is wrong with either
+            value = parse_value(text)
+        return topic.message.model_validate(value)
     except YAMLError as error:
         raise CommandError(f"{source}: neither YAML nor JSON: {error}", BAD_INPUT) from error
     except ValidationError as error:
