@@ -44,6 +44,9 @@ OTHERS = {
 }  # fmt: skip
 """Programs of others that pages may call."""
 
+AT_ONCE = ("--help", "--version", "--install-completion", "--show-completion")
+"""Options that do what they say as soon as they are read, in the reader's home as well."""
+
 LACKS_SOMETHING = ("MissingParameter", "NoArgsIsHelpError")
 """What a command line says to the bare name of a command."""
 
@@ -186,9 +189,7 @@ def check_call(
     match program(call):
         case ["flexsheet" | "/opt/flexsheet/.venv/bin/flexsheet", *rest]:
             try:
-                parse(shlex.join(["flexsheet", *(word for word in rest if word != "--help")]))
-            except SystemExit:  # of an option that does something at once
-                pass
+                parse(shlex.join(["flexsheet", *(word for word in rest if word not in AT_ONCE)]))
             except Exception as error:
                 if not (may_name_only and type(error).__name__ in LACKS_SOMETHING):
                     pytest.fail(f"{place}: {shlex.join(call)}: {error}")

@@ -150,10 +150,13 @@ async def _say(
         if word is not None:
             stop = isinstance(word[1], EStop) and word[1].engaged
             writer = await _writer(plan, run, word[0], insist=stop)
-            # A stop waits for nobody: it is latched, and readers get it as they come.
+            # A stop waits for nobody: it is latched, and readers get it as they come.  The last
+            # of them may be a launcher, which is to remember it.
+            if stop:
+                writer.publish(*word)
+            await asyncio.sleep(READER_RECONNECT_S)
             if not stop:
-                await asyncio.sleep(READER_RECONNECT_S)
-            writer.publish(*word)
+                writer.publish(*word)
         for _ in range(round(ANSWER_S / TURN_S)):
             await asyncio.sleep(TURN_S)
             if holds():
