@@ -302,8 +302,12 @@ def choose(judged: Sequence[Verdict]) -> Verdict:
     return min(same, key=lambda one: (one.error, one.median_s))
 
 
-def _miss(one: Verdict) -> tuple[int, float, float]:
-    return one.missed, one.error, one.median_s
+def _miss(one: Verdict) -> tuple[int, int, float, float]:
+    """By how much a method misses.
+
+    What it is not meant for comes first: there it gives no answer that could be near.
+    """
+    return len(one.outside), one.missed, one.error, one.median_s
 
 
 def tune(

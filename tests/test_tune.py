@@ -99,7 +99,18 @@ def test_where_none_is_good_enough_the_nearest_miss_is_taken() -> None:
         point("dear", 0.3, depth=2, in_range=False),
     ]
     found = chosen_of(points)
-    assert (found.method, found.meets, found.missed) == ("dear", False, 1)
+    assert (found.method, found.meets, found.missed) == ("middle", False, 1)
+
+
+def test_a_method_that_is_meant_for_little_is_no_near_miss() -> None:
+    """However exact it is there, it gives no answer that could be near anywhere else."""
+    points = [
+        point("cheap", 1.1),
+        *(point("cheap", 0.1, depth=depth, in_range=False) for depth in (2, 3)),
+        *(point("dear", 1.3, depth=depth) for depth in (1, 2, 3)),
+    ]
+    found = chosen_of(points)
+    assert (found.method, found.missed) == ("dear", 3)
 
 
 def family(name: str, methods: Sequence[str]) -> Family:
