@@ -14,7 +14,7 @@ SITE_STAMP := $(SITE_VENV)/.installed
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
-	@$(BIN)/python -m launch.system
+	@$(BIN)/python -m launch.health.system
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -102,9 +102,9 @@ limits: setup $(DEV_STAMP)
 # What is written from the code; after a change of a message, parameter, command or error.
 pages: setup
 	$(BIN)/python -m messages.reference > docs/messages.md
-	$(BIN)/python -m launch.cli_reference > docs/cli.md
-	$(BIN)/python -m launch.parameters_reference > docs/parameters.md
-	$(BIN)/python -m launch.errors_reference > docs/errors.md
+	$(BIN)/python -m launch.reference.cli > docs/cli.md
+	$(BIN)/python -m launch.reference.parameters > docs/parameters.md
+	$(BIN)/python -m launch.reference.errors > docs/errors.md
 
 # docs/charts: every method of every family, on this machine; half an hour.
 charts: setup

@@ -19,7 +19,7 @@ NODE_FLAG = "--node"
 def main() -> None:
     """Run the command, or with `--node CONFIG` one node (the launcher starts those)."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
-        from launch.child import follow_launcher, give_way
+        from launch.running.child import follow_launcher, give_way
 
         follow_launcher()
         give_way()

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.calibration import Board
 from nodes.camera.bundle import fit_rig, linearized, pose_transform
 from nodes.camera.check import Rig, measure_board, plain_corners, plain_opencv, triangulated

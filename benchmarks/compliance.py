@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
-from launch.plan import load_scene
-from launch.twin_sheet import twin_force
+from launch.bench.twin_sheet import twin_force
+from launch.health.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
+from launch.plans.plan import load_scene
 from messages.scene import Scene
 from nodes.models.sheet.laws import CENTRE, Place, SheetLaw
 from nodes.planner.compliance import (

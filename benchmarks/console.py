@@ -26,11 +26,11 @@ import viser
 import websockets
 from playwright.async_api import Page, WebSocket, async_playwright
 
-from launch.machine import machine_name
-from launch.plan import load_plan
-from launch.planned import local_endpoints
-from launch.prepare import prepare_plan
-from launch.supervisor import RunningGraph
+from launch.methods.machine import machine_name
+from launch.plans.plan import load_plan
+from launch.plans.planned import local_endpoints
+from launch.running.prepare import prepare_plan
+from launch.running.supervisor import RunningGraph
 from messages.base import Header
 from messages.bus import Subscriber
 from messages.topics import topic_named

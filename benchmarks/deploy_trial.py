@@ -29,7 +29,7 @@ from pathlib import Path
 
 import numpy as np
 
-from launch.runs import root as runs_root
+from launch.running.runs import root as runs_root
 from messages.bag import BagReader
 from messages.scene import Scene
 from messages.types import ArmState, SheetTarget, TwinFinger

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Scene
 from nodes.triangulator.fingertip import Eyesight, locate
 from nodes.triangulator.mark import MARK_METHODS, MarkLooks

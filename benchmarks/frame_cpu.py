@@ -25,7 +25,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Scene
 from messages.types import Display, Skin, SoftBody
 from nodes.fem_solver.mesh.from_scene import mesh_of_scene, world_from_mesh

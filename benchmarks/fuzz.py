@@ -31,9 +31,14 @@ TARGETS = ("wire", "bag", "launch", "scene", "mesh", "modbus", "mxt")
 MODULES = {
     "wire": ("messages.wire", "messages.bus", "messages.arrays"),
     "bag": ("messages.bag", "messages.migrations", "messages.wire"),
-    "launch": ("launch.documents", "launch.plan"),
-    "scene": ("launch.documents", "launch.meshes", "launch.textures", "messages.scene"),
-    "mesh": ("launch.meshes", "nodes.models.shapes.triangles"),
+    "launch": ("launch.plans.documents", "launch.plans.plan"),
+    "scene": (
+        "launch.plans.documents",
+        "launch.objects.meshes",
+        "launch.objects.textures",
+        "messages.scene",
+    ),
+    "mesh": ("launch.objects.meshes", "nodes.models.shapes.triangles"),
     "modbus": ("nodes.arm_bridge.modbus", "nodes.twin.arms", "pymodbus"),
     "mxt": ("nodes.arm_bridge.mxt", "nodes.twin.mxt_controller"),
 }

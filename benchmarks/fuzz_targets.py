@@ -35,9 +35,9 @@ import zstandard
 from pydantic import BaseModel
 from ruamel.yaml import YAML
 
-from launch.documents import BadInputError
-from launch.meshes import read_mesh
-from launch.plan import load_plan, load_scene
+from launch.objects.meshes import read_mesh
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan, load_scene
 from messages.arrays import ArraySpec
 from messages.bag import BagError, BagReader, BagWriter, join_frames, recover, split_frames
 from messages.base import Header, Message

@@ -30,9 +30,9 @@ from rich.table import Table
 from ruamel.yaml import YAML
 
 from launch.experiments.run import DEMO_FILE
-from launch.machine import machine_name
-from launch.plan import load_plan
-from launch.supervisor import RunningGraph
+from launch.methods.machine import machine_name
+from launch.plans.plan import load_plan
+from launch.running.supervisor import RunningGraph
 
 LEFT_OUT = ("twin_finger", "twin_eye")
 OUTSIDE = "twin_arms"

@@ -22,8 +22,8 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
-from launch.twin_sheet import true_sheet
+from launch.bench.twin_sheet import true_sheet
+from launch.plans.plan import load_scene
 from messages.scene import Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform

@@ -28,7 +28,7 @@ import uvloop
 
 from benchmarks import messaging
 from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Sender, percentile_us
-from launch.machine import machine_name
+from launch.methods.machine import machine_name
 from messages.base import Header
 from messages.bus import Publisher, Source, Subscriber
 from messages.security import KeyRing, new_key_pair, write_ring, write_secret

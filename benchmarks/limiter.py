@@ -33,7 +33,7 @@ from hypothesis import HealthCheck, Phase, given, settings, target
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Scene
 from messages.types import EStop, Side
 from nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience

@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from launch.meshes import read_mesh
-from launch.plan import load_scene
+from launch.objects.meshes import read_mesh
+from launch.plans.plan import load_scene
 from messages.scene import (
     Cylinder,
     Ellipsoid,

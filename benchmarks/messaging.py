@@ -38,7 +38,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from launch.machine import machine_name
+from launch.methods.machine import machine_name
 from messages.base import Header, Message
 from messages.bus import Publisher, Subscriber
 from messages.topics import TOPICS, Topic

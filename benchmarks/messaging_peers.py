@@ -39,7 +39,7 @@ from rich.progress import Progress
 
 from benchmarks import keys, messaging, peers
 from benchmarks.messaging import FLOOR, NODES_USE, PAYLOADS, BusLine, Design, Line, Payload, Sender
-from launch.machine import machine_name
+from launch.methods.machine import machine_name
 from messages.bus import Publisher
 from messages.security import KeyRing
 from messages.topics import Topic

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.meshes import read_mesh
-from launch.plan import load_scene
+from launch.objects.meshes import read_mesh
+from launch.plans.plan import load_scene
 from messages.scene import Mesh, Pose, Scene
 from messages.types import SoftBody
 from nodes.models.rigid import angle_between

@@ -20,8 +20,8 @@ from typing import Any
 from launch.experiments import stroke
 from launch.experiments.driver import Driver
 from launch.experiments.run import DEMO_FILE
-from launch.plan import load_plan
-from launch.supervisor import RunningGraph
+from launch.plans.plan import load_plan
+from launch.running.supervisor import RunningGraph
 from messages.bag import BagReader
 from messages.clock import SystemClock
 from messages.types import ArmState, TwinFinger

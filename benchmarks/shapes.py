@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.meshes import read_mesh
+from launch.objects.meshes import read_mesh
 from nodes.models.shapes import Shape, SmoothMeshShape, make_shape
 from nodes.models.shapes.smooth_mesh import usual_smoothing_m
 from nodes.models.shapes.triangles import Facets, triangle_normals, vertex_normals

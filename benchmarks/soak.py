@@ -44,11 +44,11 @@ from launch.experiments import image
 from launch.experiments.driver import Driver
 from launch.experiments.gestures import gesture_path
 from launch.experiments.run import DEMO_FILE, new_folder
-from launch.machine import machine_name
-from launch.plan import load_plan
-from launch.prepare import prepare_plan
-from launch.supervisor import NodeFailedError, RunningGraph
-from launch.tools import ToolsWriter, subscriber_to
+from launch.methods.machine import machine_name
+from launch.plans.plan import load_plan
+from launch.running.prepare import prepare_plan
+from launch.running.supervisor import NodeFailedError, RunningGraph
+from launch.running.tools import ToolsWriter, subscriber_to
 from messages.bag import BagError, BagReader, info
 from messages.base import Header
 from messages.scene import Scene

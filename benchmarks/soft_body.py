@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Scene, cylinder_of
 from nodes.cache import default_cache_dir
 from nodes.fem_solver import body, precompute, pushes

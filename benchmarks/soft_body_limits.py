@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Scene
 from nodes.fem_solver.body import SceneBody, scene_body, spec_of
 from nodes.fem_solver.contact import LinearSoftBody

@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.machine import machine_name
-from launch.plan import load_scene
-from launch.svg import COLOURS, drawn_for_pages, save_svg
+from launch.methods.machine import machine_name
+from launch.methods.svg import COLOURS, drawn_for_pages, save_svg
+from launch.plans.plan import load_scene
 from messages.scene import Scene, cylinder_of
 from nodes.fem_solver.body import spec_of
 from nodes.fem_solver.contact import LinearSoftBody, SkinResponse

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.base import Header, Message
 from messages.calibration import load_calibration
 from messages.clock import VirtualClock

@@ -1,8 +1,9 @@
 """The scene: what is shown, with which devices, over which range, and how well.
 
 A scene file (`launch/scenes/*.yaml`) holds exactly these fields (but a mesh is named by its file,
-see `launch/meshes.py`).  Lengths are metres, angles radians, stresses pascals.  The world frame has
-its origin at the centre of the imaginary screen, x to the right, y up, z towards the user.
+see `launch/objects/meshes.py`).  Lengths are metres, angles radians, stresses pascals.  The world
+frame has its origin at the centre of the imaginary screen, x to the right, y up, z towards the
+user.
 """
 
 from __future__ import annotations
@@ -95,7 +96,7 @@ class Mesh(Part):
     """The smooth solid that a closed triangle mesh stands for.
 
     It travels with the scene, so that every node on every host has the same.  A scene file names
-    the mesh's file instead, as `shape: mesh_file`; see `launch/meshes.py`.
+    the mesh's file instead, as `shape: mesh_file`; see `launch/objects/meshes.py`.
     """
 
     shape: Literal["mesh"] = "mesh"
@@ -169,7 +170,7 @@ class Appearance(Part):
     """How the object is painted; a texture moves with the skin and so shows how that is strained.
 
     `texture: image` needs an image; a scene file names its file instead, as `image_file`, see
-    `launch/textures.py`.
+    `launch/objects/textures.py`.
     """
 
     colour: tuple[Share, Share, Share] = Field(

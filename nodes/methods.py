@@ -1,8 +1,8 @@
 """Method families: interchangeable functions, one reference, errors in the scene's units.
 
 A node's folder holds its methods as plain functions and describes them in `FAMILY = Family(...)`.
-One harness (`launch.charts`) times every method, measures its error against the reference over the
-scene's working range, and draws speed against accuracy.
+One harness (`launch.methods.charts`) times every method, measures its error against the reference
+over the scene's working range, and draws speed against accuracy.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Appearance, Scene
 from messages.types import Display, StereoMode
 from nodes.models.rigid import rotation_from_vector, transform

@@ -22,11 +22,11 @@ import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
-from launch.estop_file import STATE_VARIABLE
-from launch.keys import KEYS_VARIABLE
-from launch.plan import load_plan
-from launch.planned import Plan
-from launch.runs import ROOT_VARIABLE
+from launch.plans.keys import KEYS_VARIABLE
+from launch.plans.plan import load_plan
+from launch.plans.planned import Plan
+from launch.running.estop_file import STATE_VARIABLE
+from launch.running.runs import ROOT_VARIABLE
 from messages.base import Header, Message
 from messages.bus import Subscriber
 from messages.security import new_key_pair, write_secret

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch.experiments.stroke import stroke_label, stroke_window_s
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.bag import BagWriter
 from messages.base import Header, Message
 from messages.scene import Scene

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from launch.plan import load_plan
+from launch.plans.plan import load_plan
 from messages.base import Header
 from messages.clock import VirtualClock
 from messages.types import Arming

@@ -17,8 +17,8 @@ from ruamel.yaml import YAML
 
 from launch import cli
 from launch.commands.capture import coverage_view, take_pairs
-from launch.documents import BadInputError
-from launch.plan import load_plan
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan
 from messages.calibration import Board, load_calibration
 from messages.scene import Scene, StereoCamera
 from nodes.camera.bundle import pose_vector

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
-from launch.plan import load_plan
+from launch.plans.plan import load_plan
 from messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
 from messages.scene import Lens, Scene, StereoCamera
 from nodes.camera import bundle

@@ -18,7 +18,8 @@ from typing import Any
 
 import pytest
 
-from launch import cli, runs
+from launch import cli
+from launch.running import runs
 from messages.bag import BagReader, BagWriter
 from messages.base import Header
 from messages.topics import TOPICS

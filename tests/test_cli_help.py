@@ -15,13 +15,13 @@ import pytest
 from typer.main import get_command
 
 from launch import cli
-from launch.cli_reference import commands
 from launch.commands import complete
 from launch.commands.experiment import DEMO_FILE
 from launch.commands.failures import LATE
 from launch.commands.output import FAILED, examples_in, print_json, print_json_line
-from launch.errors_reference import explained, undocumented
-from launch.plan import load_plan
+from launch.plans.plan import load_plan
+from launch.reference.cli import commands
+from launch.reference.errors import explained, undocumented
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -128,13 +128,14 @@ def test_looking_into_a_graph_loads_little() -> None:
     """What `topic echo` needs until it is subscribed: no YAML, no linear algebra, no supervisor."""
     code = (
         "import json, sys\n"
-        "import launch.cli, launch.commands.topic, launch.tools\n"
+        "import launch.cli, launch.commands.topic, launch.running.tools\n"
         "print(json.dumps(sorted(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True)
     heavy = {
         "cv2", "scipy", "matplotlib", "mcap", "moderngl", "pymodbus", "rich", "ruamel.yaml",
-        "structlog", "psutil", "launch.plan", "launch.supervisor", "nodes.node", "uvloop",
+        "structlog", "psutil", "launch.plans.plan", "launch.running.supervisor", "nodes.node",
+        "uvloop",
     }  # fmt: skip
     assert heavy & set(json.loads(done.stdout)) == set()
 

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from launch.documents import BadInputError
-from launch.plan import load_plan
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan
 from messages.base import Header, Message
 from messages.clock import VirtualClock
 from messages.clock_table import ClockTable

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
+from launch.bench.twin_sheet import twin_push
 from launch.cli import app
 from launch.commands.output import CommandError
-from launch.plan import load_scene
-from launch.twin_sheet import twin_push
+from launch.plans.plan import load_scene
 from messages.types import SoftBody
 from nodes.models.sheet.laws import CENTRE, ScaledLaw
 from nodes.models.sheet.table import TableLaw
@@ -271,7 +271,7 @@ def test_the_doctor_says_whether_a_scenes_object_can_be_presented(
 ) -> None:
     curve = soft_curve(scale)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
-    monkeypatch.setattr("launch.compliance.front_curve", lambda scene: rows)
+    monkeypatch.setattr("launch.health.compliance.front_curve", lambda scene: rows)
     command = ["doctor", "compliance", str(SCENE_FILE)]
     result = CliRunner().invoke(app, [*command, "--json"])
     assert result.exit_code == code, result.output

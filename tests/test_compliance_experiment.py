@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from launch.bench.twin_sheet import twin_force
 from launch.experiments import ExperimentError
 from launch.experiments.compliance import (
     DEPTH_SHARES,
@@ -23,8 +24,7 @@ from launch.experiments.compliance import (
 )
 from launch.experiments.pictures import draw_compliance
 from launch.experiments.stroke import Track
-from launch.plan import load_scene
-from launch.twin_sheet import twin_force
+from launch.plans.plan import load_scene
 from messages.bag import BagWriter
 from nodes.models.rigid import inverse, transform, transform_from_rpy
 from nodes.planner.compliance import FELT_N

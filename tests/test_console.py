@@ -15,7 +15,8 @@ from ruamel.yaml import YAML
 from websockets.datastructures import Headers
 from websockets.http11 import Request
 
-from launch.plan import BadInputError, load_plan
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan
 from messages.bag import BagError, BagReader, BagWriter
 from messages.base import Header, Message
 from messages.clock import VirtualClock

@@ -18,11 +18,11 @@ import pytest
 import websockets
 from playwright.async_api import Locator, Page, async_playwright, expect
 
-from launch import runs
-from launch.plan import load_plan
-from launch.planned import local_endpoints
-from launch.runs import Run
-from launch.supervisor import RunningGraph
+from launch.plans.plan import load_plan
+from launch.plans.planned import local_endpoints
+from launch.running import runs
+from launch.running.runs import Run
+from launch.running.supervisor import RunningGraph
 from messages.bag import BagReader
 from messages.base import Header, Message
 from messages.bus import Subscriber

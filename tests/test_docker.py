@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from launch.plan import load_plan
-from launch.service import files_of
+from launch.plans.plan import load_plan
+from launch.running.service import files_of
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCKER = ROOT / "docker"

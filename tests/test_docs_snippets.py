@@ -23,8 +23,9 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from launch import cli
-from launch.documents import read_document, validate
-from launch.plan import LaunchFile, load_plan, load_scene
+from launch.plans.documents import read_document, validate
+from launch.plans.launch_file import LaunchFile
+from launch.plans.plan import load_plan, load_scene
 from messages.scene import Scene
 from nodes import node_class
 from nodes.node import parameters_of

@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from launch import runs, visits
 from launch.commands.doctor_hosts import examine, host_here
 from launch.commands.output import CommandError
-from launch.doctor_hosts import (
+from launch.health import visits
+from launch.health.doctor_hosts import (
     SILENCES,
     WAYS,
     HostFinding,
@@ -26,11 +26,12 @@ from launch.doctor_hosts import (
     own_key_problem,
     rate_problem,
 )
-from launch.keys import KEYS_VARIABLE, secret_file
-from launch.plan import load_plan
-from launch.planned import MAIN, Plan
-from launch.supervisor import RunningGraph
-from launch.visits import Reach, Visit, way_to
+from launch.health.visits import Reach, Visit, way_to
+from launch.plans.keys import KEYS_VARIABLE, secret_file
+from launch.plans.plan import load_plan
+from launch.plans.planned import MAIN, Plan
+from launch.running import runs
+from launch.running.supervisor import RunningGraph
 from messages.bus import Publisher
 from messages.security import new_key_pair, write_secret
 from messages.topics import TOPICS
@@ -337,7 +338,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
 def test_own_keys_and_address_are_looked_at_before_the_start(
     folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch.doctor_hosts.opengl_problem", lambda: "no EGL")
+    monkeypatch.setattr("launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")
     assert "there is no key" in (own_key_problem(three, "main") or "")
     public, secret = new_key_pair()
     write_secret(secret_file("main"), secret)
@@ -353,9 +354,11 @@ def test_own_keys_and_address_are_looked_at_before_the_start(
 
 def test_which_host_this_is(folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     two = plan_of(folder)
-    monkeypatch.setattr("launch.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
+    monkeypatch.setattr("launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
     assert host_here(two, None, None) == "left"
-    monkeypatch.setattr("launch.doctor_hosts.own_addresses", lambda: {f"{NET}.1", f"{NET}.2"})
+    monkeypatch.setattr(
+        "launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.1", f"{NET}.2"}
+    )
     assert host_here(two, None, None) == MAIN
     assert host_here(two, None, "left") == "left"
     with pytest.raises(CommandError, match="none of the addresses"):

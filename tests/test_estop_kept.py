@@ -15,10 +15,10 @@ from typing import Self
 
 import pytest
 
-from launch.estop_file import STATE_VARIABLE, EStopFile
-from launch.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
-from launch.plan import load_plan
-from launch.planned import RUN_DIRECTORY, Plan
+from launch.plans.plan import load_plan
+from launch.plans.planned import RUN_DIRECTORY, Plan
+from launch.running.estop_file import STATE_VARIABLE, EStopFile
+from launch.running.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
 from messages.base import Header
 from messages.bus import Publisher, Source, Subscriber
 from messages.clock import SystemClock

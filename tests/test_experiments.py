@@ -13,7 +13,9 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from launch.charts import (
+from launch.cli import app
+from launch.experiments import ExperimentError, image, stroke
+from launch.methods.charts import (
     FAMILIES,
     UnknownFamilyError,
     chart_result,
@@ -21,9 +23,7 @@ from launch.charts import (
     finite,
     write_chart,
 )
-from launch.cli import app
-from launch.experiments import ExperimentError, image, stroke
-from launch.svg import INK
+from launch.methods.svg import INK
 from messages.scene import Scene
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from launch.bags.export import ExportError, export
 from launch.cli import main
-from launch.export import ExportError, export
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.bag import BagWriter
 from messages.base import Header, Message
 from messages.topics import TOPICS

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from launch.charts import write_overview
-from launch.compliance import SKIN_SPACING_M, front_curve
+from launch.health.compliance import SKIN_SPACING_M, front_curve
+from launch.methods.charts import write_overview
 from messages.scene import Scene
 from nodes.fem_solver import charted, peers, precompute, pushes
 from nodes.fem_solver.body import spec_of, table_spec_of

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.spatial import cKDTree
 
-from launch.meshes import read_mesh
+from launch.objects.meshes import read_mesh
 from messages.scene import Mesh, Scene
 from nodes.fem_solver.elasticity import (
     degrees_of_freedom,

@@ -18,8 +18,8 @@ from ruamel.yaml.error import YAMLError
 
 from benchmarks import fuzz
 from benchmarks.fuzz_targets import MAGIC, Record, example, joined, records_of
-from launch.documents import BadInputError, parse_value, read_document
-from launch.meshes import read_mesh
+from launch.objects.meshes import read_mesh
+from launch.plans.documents import BadInputError, parse_value, read_document
 from messages import wire
 from messages.bag import BagError, BagReader, BagWriter
 from messages.base import Header

@@ -22,9 +22,9 @@ import pytest
 from launch.experiments import stroke
 from launch.experiments.driver import Driver
 from launch.experiments.run import DEMO_FILE
-from launch.plan import load_plan
-from launch.runs import RUN_VARIABLE
-from launch.supervisor import RunningGraph
+from launch.plans.plan import load_plan
+from launch.running.runs import RUN_VARIABLE
+from launch.running.supervisor import RunningGraph
 from messages.bag import BagReader
 from messages.topics import TOPICS
 from messages.types import ArmState, Frame, Status, TwinFinger

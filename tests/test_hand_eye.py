@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from launch import cli
-from launch.arm_places import (
+from launch.bench.arm_places import (
     STILL_S,
     TABLE,
     PlacesError,
@@ -27,7 +27,7 @@ from launch.arm_places import (
     rig_of,
     true_base,
 )
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.arms_calibration import load_arms_calibration
 from messages.calibration import Board
 from messages.calibration_file import CalibrationFileError

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
-from launch.twin_sheet import true_sheet
+from launch.bench.twin_sheet import true_sheet
+from launch.plans.plan import load_scene
 from messages.types import Display
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses

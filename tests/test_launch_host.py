@@ -13,12 +13,13 @@ from typing import Any
 
 import pytest
 
-from launch import runs
-from launch.host import devices_of
-from launch.plan import launcher_on, load_plan
-from launch.planned import TOOLS, Plan
-from launch.supervisor import RunningGraph
-from launch.tools import ToolsWriter, subscriber_to
+from launch.plans.hosts import launcher_on
+from launch.plans.plan import load_plan
+from launch.plans.planned import TOOLS, Plan
+from launch.running import runs
+from launch.running.host import devices_of
+from launch.running.supervisor import RunningGraph
+from launch.running.tools import ToolsWriter, subscriber_to
 from messages.types import EStop, HostStatus
 
 DEADLINE_S = 30.0

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from launch.documents import BadInputError, parse_value
-from launch.plan import FIRST_PORT, PORTS, _ports, load_plan
-from launch.planned import Plan
+from launch.plans.documents import BadInputError, parse_value
+from launch.plans.plan import load_plan
+from launch.plans.planned import Plan
+from launch.plans.wires import FIRST_PORT, PORTS, _ports
 
 ROOT = Path(__file__).resolve().parent.parent
 BEACON = "tests.launch_nodes:Beacon"

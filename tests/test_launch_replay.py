@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from launch.plan import load_plan
-from launch.player import shifted
-from launch.replay import field_differences, replay, verify
+from launch.bags.player import shifted
+from launch.bags.replay import field_differences, replay, verify
+from launch.plans.plan import load_plan
 from messages.bag import BagError, BagWriter
 from messages.base import Header
 from messages.topics import TOPICS

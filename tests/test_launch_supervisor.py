@@ -22,11 +22,11 @@ import psutil
 import pytest
 import zmq
 
-from launch import runs, supervisor
-from launch.documents import BadInputError
-from launch.plan import load_plan
-from launch.planned import Plan
-from launch.supervisor import NodeFailedError, RunningGraph
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan
+from launch.plans.planned import Plan
+from launch.running import runs, supervisor
+from launch.running.supervisor import NodeFailedError, RunningGraph
 from messages.bag import BagReader
 
 pytestmark = pytest.mark.alone

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from launch.documents import BadInputError
-from launch.plan import load_scene
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_scene
 from messages.scene import Appearance, Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform

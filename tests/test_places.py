@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.types import Display
 from nodes.models.rigid import transform
 from nodes.models.sheet import edge_poses

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.meshes import read_mesh
+from launch.objects.meshes import read_mesh
 from messages.scene import Mesh
 from nodes.models.rigid import angle_between
 from nodes.models.shapes import EllipsoidShape, MeshError, Shape, SmoothMeshShape, make_shape

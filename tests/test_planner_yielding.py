@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.twin_sheet import twin_push
+from launch.bench.twin_sheet import twin_push
 from messages.types import SheetTarget, SoftBody
 from nodes.models.motion import SheetMotion
 from nodes.models.rigid import moved, twist_between

@@ -11,7 +11,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from launch import cli
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from nodes.fem_solver import body, precompute_table, pushes
 from nodes.fem_solver.mesh import cylinder
 from tests.soft_bodies import Here
@@ -29,7 +29,9 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(pushes, "STATIONS", (0.0,))
     monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
     monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
-    monkeypatch.setattr("launch.prepare.prepare_dents", lambda scene, cache, progress: cache)
+    monkeypatch.setattr(
+        "launch.running.prepare.prepare_dents", lambda scene, cache, progress: cache
+    )
     # other processes take seconds to start
     monkeypatch.setattr(precompute_table, "local_processes", lambda count: nullcontext(Here()))
     content = YAML(typ="safe").load(SCENE.read_text())

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-from launch.plan import load_scene
-from launch.twin_sheet import twin_points
+from launch.bench.twin_sheet import twin_points
+from launch.plans.plan import load_scene
 from messages.types import Correction, Display
 from nodes.models.rigid import apply, rotation_from_vector, transform
 from nodes.models.sheet import edge_poses

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from launch.cli import app
 from launch.commands.calibrate_projector import write_scene
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Lens, Projector, Scene, StereoCamera
 from nodes.renderer.gray_code import FINEST_PX, DecodeError, decoded, patterns, places
 from nodes.renderer.projector_calibration import (

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from launch import cli
-from launch.layout import (
+from launch.health.layout import (
     Layout,
     check_layout,
     draw_layout,
@@ -23,7 +23,7 @@ from launch.layout import (
     touches,
     with_base_moved,
 )
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.scene import Scene, cylinder_of
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.kinematics import CENTRE_RAD, WRIST_NEAR_RAD, branch_of, jacobian, next_joints

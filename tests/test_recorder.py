@@ -18,9 +18,9 @@ from typing import Any
 
 import pytest
 
-from launch import runs
-from launch.plan import load_plan
-from launch.supervisor import RunningGraph
+from launch.plans.plan import load_plan
+from launch.running import runs
+from launch.running.supervisor import RunningGraph
 from messages.bag import BagError, BagReader, BagWriter
 from messages.base import Header
 from messages.clock import VirtualClock

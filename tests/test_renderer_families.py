@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from launch.plan import load_scene
-from launch.twin_sheet import twin_errors
+from launch.bench.twin_sheet import twin_errors
+from launch.plans.plan import load_scene
 from nodes.methods import Point, measure, pareto_front
 from nodes.renderer import dent_cache, families
 from nodes.renderer.families import correction_family, covers, with_projector_of

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.base import Header, Message
 from messages.clock import VirtualClock
 from messages.scene import Scene

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from launch.experiments import ExperimentError
 from launch.experiments.gestures import gesture_path
-from launch.layout import check_layout
-from launch.organ import obj_text, organ_mesh
-from launch.plan import load_scene
+from launch.health.layout import check_layout
+from launch.objects.organ import obj_text, organ_mesh
+from launch.plans.plan import load_scene
 from messages.scene import Scene
 from nodes.models.rigid import angle_between, apply, inverse, transform_from_rpy
 from nodes.models.shapes import make_shape

@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
-from launch import runs
-from launch.documents import BadInputError
-from launch.keys import KEYS_VARIABLE, install
-from launch.plan import load_plan
-from launch.planned import Plan
-from launch.supervisor import RunningGraph
-from launch.tools import subscriber_to
+from launch.plans.documents import BadInputError
+from launch.plans.keys import KEYS_VARIABLE, install
+from launch.plans.plan import load_plan
+from launch.plans.planned import Plan
+from launch.running import runs
+from launch.running.supervisor import RunningGraph
+from launch.running.tools import subscriber_to
 from messages.security import (
     SecurityError,
     is_key,

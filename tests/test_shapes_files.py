@@ -10,9 +10,9 @@ import pytest
 import trimesh
 from ruamel.yaml import YAML
 
-from launch.documents import BadInputError
-from launch.meshes import MOST_BYTES, read_mesh
-from launch.plan import load_plan, load_scene
+from launch.objects.meshes import MOST_BYTES, read_mesh
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan, load_scene
 from messages.base import Header
 from messages.scene import Mesh, Scene, UnfitGeometryError, cylinder_of
 from messages.topics import TOPICS

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
-from launch.meshes import read_mesh
+from launch.objects.meshes import read_mesh
 from nodes.models.shapes import (
     EllipsoidShape,
     MeshError,

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from launch.bench.sheet_rows import read_rows, twin_rows
+from launch.bench.twin_sheet import twin_force
 from launch.cli import app
 from launch.commands.calibrate_sheet import fitted
 from launch.commands.output import CommandError
-from launch.documents import BadInputError
-from launch.plan import load_scene
-from launch.sheet_rows import read_rows, twin_rows
-from launch.twin_sheet import twin_force
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_scene
 from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 from messages.sheet_calibration import (
     SheetCalibration,

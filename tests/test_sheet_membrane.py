@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.twin_sheet import twin_push
+from launch.bench.twin_sheet import twin_push
 from messages.scene import SheetSpec
 from nodes.models.sheet import membrane
 from nodes.models.sheet.laws import MembraneLaw

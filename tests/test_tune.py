@@ -12,13 +12,13 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from launch import tune
 from launch.cli import app
 from launch.commands.output import CommandError
 from launch.commands.tune import NOT_MET
-from launch.documents import BadInputError
-from launch.plan import load_scene
-from launch.tune import Tunable, choose, tunables_named, verdicts, write_choices, written
+from launch.methods import tune
+from launch.methods.tune import Tunable, choose, tunables_named, verdicts, write_choices, written
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_scene
 from messages.base import Header
 from messages.clock import VirtualClock
 from messages.methods import Methods, SoftBodyChoice
@@ -175,11 +175,13 @@ def test_a_miss_is_said_with_how_far_it_misses() -> None:
 
 def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     there = {
-        "launch.families:QUICK_SHAPE": family("sheet-shape", ["flat", "four_triangles", "dents"]),
-        "launch.families:QUICK_CORRECTION": family(
+        "launch.methods.families:QUICK_SHAPE": family(
+            "sheet-shape", ["flat", "four_triangles", "dents"]
+        ),
+        "launch.methods.families:QUICK_CORRECTION": family(
             "correction", ["one_plane", "two_pass_triangles"]
         ),
-        "launch.families:CORRECTION": family("correction", ["two_pass"]),
+        "launch.methods.families:CORRECTION": family("correction", ["two_pass"]),
     }
     monkeypatch.setattr(tune, "family_at", there.__getitem__)
     errors = {"flat": 9.0, "four_triangles": 0.2, "dents": 0.1, "one_plane": 9.0}

@@ -10,9 +10,9 @@ import numpy as np
 import psutil
 import pytest
 
-from launch.plan import load_plan
-from launch.planned import Plan
-from launch.replay import Verification, refusal, verify
+from launch.bags.replay import Verification, refusal, verify
+from launch.plans.plan import load_plan
+from launch.plans.planned import Plan
 from messages.bag import BagError, BagReader, BagWriter
 from messages.base import Header, Message
 from messages.clock import VirtualClock

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from launch.experiments import stroke
-from launch.plan import load_scene
+from launch.plans.plan import load_scene
 from messages.types import Frame
 
 Floats = NDArray[np.float64]

@@ -22,9 +22,9 @@ from launch.commands.output import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from launch.planned import Plan
-    from launch.runs import Run
-    from launch.tools import ToolsWriter
+    from launch.plans.planned import Plan
+    from launch.running.runs import Run
+    from launch.running.tools import ToolsWriter
     from messages.base import Message
     from messages.types import ArmState
 
@@ -123,7 +123,7 @@ async def _say(
 
     It is said once only: a person means now, not when the network is back.
     """
-    from launch.tools import READER_RECONNECT_S, host_of, subscriber_to
+    from launch.running.tools import READER_RECONNECT_S, host_of, subscriber_to
     from messages.types import EStop
 
     plan, run = running_graph(run_directory)
@@ -177,7 +177,7 @@ async def _say(
 
 async def _writer(plan: Plan, run: Run, topic: str, *, insist: bool) -> ToolsWriter:
     """A tool's publisher of a topic; insist: wait for a tool that speaks there now to end."""
-    from launch.tools import ToolsWriter
+    from launch.running.tools import ToolsWriter
     from messages.bus import BusError
 
     for _ in range(ATTEMPTS if insist else 0):
@@ -189,7 +189,7 @@ async def _writer(plan: Plan, run: Run, topic: str, *, insist: bool) -> ToolsWri
 
 
 def _refuse_reset_from_elsewhere(plan: Plan, host: str, word: tuple[str, Message] | None) -> None:
-    from launch.planned import tools_on
+    from launch.plans.planned import tools_on
     from messages.types import EStop
 
     if word is None or not isinstance(word[1], EStop) or word[1].engaged:

@@ -25,9 +25,9 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.planned import Plan
-    from launch.replay import Verification
-    from launch.runs import Run
+    from launch.bags.replay import Verification
+    from launch.plans.planned import Plan
+    from launch.running.runs import Run
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Bags: recordings of topics (MCAP files)."
@@ -155,7 +155,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write what a bag holds for other tools: Foxglove and rerun open the file."""
-    from launch.export import export as export_bag
+    from launch.bags.export import export as export_bag
 
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
@@ -187,7 +187,7 @@ def verify(
     Exit code 3: they gave the same, but other numbers than the node published live: as from a node
     that reads the clock by itself, or from a bag of code that did not say what its nodes took.
     """
-    from launch.replay import verify as verify_node
+    from launch.bags.replay import verify as verify_node
 
     with words.status(f"stepping {node} through {bag}"):
         result = verify_node(bag, node, tolerance=tolerance)
@@ -221,8 +221,8 @@ def report(
     The page needs no network.  With --json the numbers are printed, and a page is written only
     where one is named.  A bag that was cut off is read as far as it goes.
     """
-    from launch.report.write import default_output
-    from launch.report.write import report as report_on
+    from launch.bags.report.write import default_output
+    from launch.bags.report.write import report as report_on
 
     page = output if as_json else output or default_output(bag)
     with progress_bar(f"reading {bag.name}") as progress:
@@ -275,9 +275,9 @@ async def _record(
     bag: Path, topics: list[str], plan: Plan, run: Run, duration_s: float | None
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
-    from launch.planned import RUN_DIRECTORY, local_sources
-    from launch.runs import ring_file
-    from launch.tools import host_of
+    from launch.plans.planned import RUN_DIRECTORY, local_sources
+    from launch.running.runs import ring_file
+    from launch.running.tools import host_of
     from messages.topics import TOPICS
     from nodes.recorder.node import Recorder
     from nodes.recorder.parameters import RUN_FILES, RecorderParameters
@@ -334,8 +334,8 @@ class Playing:
 
 
 async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> int:
-    from launch.plan import load_plan
-    from launch.supervisor import RunningGraph
+    from launch.plans.plan import load_plan
+    from launch.running.supervisor import RunningGraph
 
     if into is None:
         plan, run = running_graph(run_directory)
@@ -348,8 +348,8 @@ async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> 
 
 
 async def _play_into(how: Playing, plan: Plan, run: Run) -> int:
-    from launch.player import play as play_bag
-    from launch.player import select_topics
+    from launch.bags.player import play as play_bag
+    from launch.bags.player import select_topics
     from messages.bag import BagReader
 
     selection = select_topics(BagReader(how.bag).topics, plan, how.topics)

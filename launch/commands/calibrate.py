@@ -106,7 +106,7 @@ def stereo(
     From pictures (--left, --right), from a device (--device-source, --scene) or from the twin.
     """
     from launch.commands import capture
-    from launch.plan import load_scene
+    from launch.plans.plan import load_scene
     from messages.calibration import save_calibration
     from nodes.camera.calibration import calibrate_stereo
     from nodes.camera.capture import Capture

@@ -34,7 +34,7 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.arm_places import PlaceTaker
+    from launch.bench.arm_places import PlaceTaker
     from messages.arms_calibration import ArmBase, ArmsCalibration
     from messages.calibration import Board, StereoCalibration
     from messages.scene import Scene
@@ -111,7 +111,7 @@ def arms(
     The board is fast on the flange; the arm stands still at 15 to 20 places, its flange turned to
     all sides.  Give a folder for each arm (see docs/arms.md), or --twin.
     """
-    from launch.plan import load_scene
+    from launch.plans.plan import load_scene
     from messages.arms_calibration import save_arms_calibration
 
     if not output.resolve().parent.is_dir():
@@ -154,7 +154,7 @@ def write_scene(
     as_json: JsonOption = False,
 ) -> None:
     """Copy a scene with the bases of a calibration of the arms; all else stays as it is."""
-    from launch.plan import load_scene
+    from launch.plans.plan import load_scene
     from messages.arms_calibration import load_arms_calibration
     from messages.calibration_file import CalibrationFileError
 
@@ -191,8 +191,8 @@ def capture(
     Move the arm by its teach pendant.  A place is taken when the arm rests and the board is seen
     somewhere new; Ctrl-C ends.
     """
-    from launch.arm_places import PlaceTaker, rig_of
-    from launch.plan import load_scene
+    from launch.bench.arm_places import PlaceTaker, rig_of
+    from launch.plans.plan import load_scene
 
     if side not in SIDES:
         raise CommandError(f"--arm {side}: left or right", BAD_INPUT)
@@ -282,7 +282,7 @@ def _made_up(
     scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
 ) -> Path:
     """A folder with the twin's places."""
-    from launch.arm_places import twin_places
+    from launch.bench.arm_places import twin_places
     from nodes.twin.board import BoardError
 
     mine = folder / side
@@ -299,7 +299,7 @@ def _made_up(
 def _fit(
     folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
 ) -> tuple[BaseFit, list[tuple[str, str]]]:
-    from launch.arm_places import PlacesError, read_sightings, rig_of
+    from launch.bench.arm_places import PlacesError, read_sightings, rig_of
     from nodes.arm_bridge.hand_eye import HandEyeError, calibrate_base
     from nodes.camera.corners import CalibrationError
 
@@ -375,7 +375,7 @@ def _write_copy(scene_file: Path, found: ArmsCalibration, copy: Path) -> None:
     """Write the scene with the measured bases; comments and layout stay."""
     from ruamel.yaml import YAML
 
-    from launch.plan import load_scene
+    from launch.plans.plan import load_scene
 
     yaml = YAML(typ="rt", pure=True)
     yaml.width = 4096
@@ -404,7 +404,7 @@ def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str,
     """How far the found base of the twin is off, at the world's origin."""
     import numpy as np
 
-    from launch.arm_places import true_base
+    from launch.bench.arm_places import true_base
     from nodes.models.rigid import inverse, vector_from_rotation
 
     off = true_base(scene, side, seed=seed) @ inverse(fit.world_from_base)

@@ -83,7 +83,7 @@ def projector(
     From pictures of Gray code on the sheet, seen by the stereo camera in three poses or more
     (--pictures), from four corners found by hand (--corners), or in the twin (--twin).
     """
-    from launch.plan import load_scene
+    from launch.plans.plan import load_scene
     from nodes.renderer import gray_code
     from nodes.renderer.projector_calibration import ProjectorError, calibrated, measured
 
@@ -219,7 +219,7 @@ def write_scene(scene_file: Path, found: Projector, copy: Path) -> None:
     """Write the scene with this projector; comments and layout stay."""
     from ruamel.yaml import YAML
 
-    from launch.plan import load_scene
+    from launch.plans.plan import load_scene
 
     yaml = YAML(typ="rt", pure=True)
     yaml.width = 4096

@@ -68,8 +68,8 @@ def sheet(
 
     From measured rows of a CSV (--rows, --scene) or from the twin (--twin).
     """
-    from launch.plan import load_scene
-    from launch.sheet_rows import read_rows
+    from launch.bench.sheet_rows import read_rows
+    from launch.plans.plan import load_scene
     from messages.sheet_calibration import save_sheet_calibration
     from nodes.models.sheet.fit import FitError
 
@@ -167,7 +167,7 @@ def fitted(
 def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[Push]:
     from rich.progress import Progress
 
-    from launch.sheet_rows import twin_rows
+    from launch.bench.sheet_rows import twin_rows
 
     with Progress(console=words.console, transient=True) as bar:
         task = bar.add_task("pushing the twin's sheet", total=None)

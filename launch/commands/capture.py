@@ -31,7 +31,7 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
 
-    from launch.documents import parse_value
+    from launch.plans.documents import parse_value
     from nodes.camera.sources import AnySource
 
     try:

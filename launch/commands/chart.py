@@ -18,7 +18,7 @@ from launch.commands.output import (
     progress_words,
     words,
 )
-from launch.finite import finite
+from launch.methods.finite import finite
 
 app = typer.Typer(add_completion=False)
 
@@ -50,8 +50,8 @@ def chart(
     as_json: JsonOption = False,
 ) -> None:
     """Chart speed against accuracy of a family's methods, on this machine and one scene."""
-    from launch import charts
-    from launch.plan import load_scene
+    from launch.methods import charts
+    from launch.plans.plan import load_scene
 
     if redraw:
         results = charts.kept_charts(output)

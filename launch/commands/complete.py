@@ -22,7 +22,7 @@ def node_types(incomplete: str) -> list[str]:
 
 
 def families(incomplete: str) -> list[str]:
-    from launch.charts import FAMILIES
+    from launch.methods.charts import FAMILIES
 
     return _fitting(FAMILIES, incomplete)
 

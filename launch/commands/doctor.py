@@ -45,8 +45,8 @@ def doctor(
     if context.invoked_subcommand is not None:
         return
     from launch.commands.doctor_hosts import ask_running, print_findings
-    from launch.doctor import check_all
-    from launch.runs import sweep as sweep_leftovers
+    from launch.health.doctor import check_all
+    from launch.running.runs import sweep as sweep_leftovers
 
     if sweep:
         ended = sweep_leftovers()
@@ -90,8 +90,8 @@ def check_scene(
     Every contact within the scene's tilt, pushed up to its depth, at the least and the largest
     stretch.  Also said: how fast a finger may move for the arms to follow.
     """
-    from launch.layout import check_layout, draw_layout, layout_result
-    from launch.plan import load_scene
+    from launch.health.layout import check_layout, draw_layout, layout_result
+    from launch.plans.plan import load_scene
 
     if output is not None and not output.resolve().parent.is_dir():
         raise CommandError(

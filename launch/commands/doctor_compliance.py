@@ -40,8 +40,8 @@ def compliance(
 
     Pushed in the middle, by the planner's law: presented and wanted force to the scene's depth.
     """
-    from launch.compliance import compliance_result, front_curve
-    from launch.plan import load_scene
+    from launch.health.compliance import compliance_result, front_curve
+    from launch.plans.plan import load_scene
     from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
     from messages.scene import UnfitGeometryError
     from messages.sheet_calibration import load_sheet_calibration

@@ -21,9 +21,9 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.doctor_hosts import HostFinding
-    from launch.planned import Plan
-    from launch.runs import Run
+    from launch.health.doctor_hosts import HostFinding
+    from launch.plans.planned import Plan
+    from launch.running.runs import Run
 
 PATIENCE_S = 4.0
 
@@ -75,8 +75,8 @@ def hosts(
 
 def ask_running(patience_s: float = PATIENCE_S) -> list[HostFinding]:
     """Findings about all hosts of the graph that runs here; none where it has one alone."""
-    from launch.runs import live_runs
-    from launch.tools import host_of
+    from launch.running.runs import live_runs
+    from launch.running.tools import host_of
 
     if not any(run.plan_file.is_file() for run in live_runs()):
         return []
@@ -88,7 +88,7 @@ def ask_running(patience_s: float = PATIENCE_S) -> list[HostFinding]:
 
 def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
     """The plan, and the graph of that launch file that runs here."""
-    from launch.plan import load_plan
+    from launch.plans.plan import load_plan
 
     if launch_file is None:
         return running_graph(None)
@@ -103,10 +103,10 @@ def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
 
 def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
     """Which host of the plan this computer is; CommandError where that cannot be told."""
-    from launch.doctor_hosts import own_addresses
-    from launch.documents import did_you_mean
-    from launch.planned import MAIN
-    from launch.tools import host_of
+    from launch.health.doctor_hosts import own_addresses
+    from launch.plans.documents import did_you_mean
+    from launch.plans.planned import MAIN
+    from launch.running.tools import host_of
 
     if wanted is not None:
         if wanted not in plan.hosts:
@@ -132,9 +132,9 @@ async def examine(plan: Plan, here: str, run: Run | None, patience_s: float) -> 
     """All findings: what this computer sees, and what the others say."""
     import tempfile
 
-    from launch.doctor_hosts import before_start, judge, own_key_problem
-    from launch.keys import secret_file
-    from launch.visits import visit_all
+    from launch.health.doctor_hosts import before_start, judge, own_key_problem
+    from launch.health.visits import visit_all
+    from launch.plans.keys import secret_file
     from messages.security import KeyRing, write_ring
 
     key_problem = await asyncio.to_thread(own_key_problem, plan, here)

@@ -27,7 +27,7 @@ def explain(
     as_json: JsonOption = False,
 ) -> None:
     """Say what an error message means and what to do; all of them are in docs/errors.md."""
-    from launch.errors_reference import explained
+    from launch.reference.errors import explained
 
     found = explained(message)[:SHOWN]
     if as_json:

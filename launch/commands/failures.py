@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sys
 
-from launch.documents import BadInputError
+from launch.bags.export import ExportError
 from launch.experiments import ExperimentError
-from launch.export import ExportError
-from launch.runs import RunDirectoryError
-from launch.supervisor import NodeFailedError
+from launch.plans.documents import BadInputError
+from launch.running.runs import RunDirectoryError
+from launch.running.supervisor import NodeFailedError
 from messages.bag import BagError
 from messages.bus import BusError
 from messages.security import SecurityError

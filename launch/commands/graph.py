@@ -13,8 +13,8 @@ import typer
 from launch.commands.output import BAD_INPUT, CommandError
 
 if TYPE_CHECKING:
-    from launch.planned import Plan
-    from launch.runs import Run
+    from launch.plans.planned import Plan
+    from launch.running.runs import Run
 
 RunOption = Annotated[
     Path | None,
@@ -25,8 +25,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 def running_graph(directory: Path | None) -> tuple[Plan, Run]:
     """The Plan and the Run of the graph in `directory`, or of the newest that is alive."""
-    from launch.planned import Plan
-    from launch.runs import Run, live_runs
+    from launch.plans.planned import Plan
+    from launch.running.runs import Run, live_runs
 
     if directory is not None:
         run = Run(directory.resolve().name, directory.resolve())

@@ -23,8 +23,8 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.planned import Plan
-    from launch.runs import Run
+    from launch.plans.planned import Plan
+    from launch.running.runs import Run
 
 app = typer.Typer(add_completion=False)
 
@@ -69,7 +69,7 @@ def launch(
 
     Exit codes: 0 stopped as asked, 1 a node failed for good, 2 the input is wrong.
     """
-    from launch.plan import load_plan
+    from launch.plans.plan import load_plan
 
     plan = load_plan(file, settings=settings or (), record=record, console=console)
     if dry_run:
@@ -100,8 +100,8 @@ async def run_graph(
     when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
     """Run the plan's nodes until a signal, or `duration_s` after they are ready; the exit code."""
-    from launch.notify import keep_telling, tell
-    from launch.supervisor import NodeFailedError, RunningGraph
+    from launch.running.notify import keep_telling, tell
+    from launch.running.supervisor import NodeFailedError, RunningGraph
 
     asked_to_stop = asyncio.Event()
     graph = RunningGraph(plan, host=host, report=_say)

@@ -30,7 +30,7 @@ app = typer.Typer(
 )
 def list_nodes(as_json: JsonOption = False) -> None:
     """The node types that a launch file can name, and the nodes of the graph that runs."""
-    from launch.runs import live_runs
+    from launch.running.runs import live_runs
     from nodes import NODES
 
     running: dict[str, list[str]] = {}

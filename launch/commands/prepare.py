@@ -54,8 +54,8 @@ def prepare(
 
     Of a scene whose methods say sheet_force: table, that table as well: a minute or two.
     """
-    from launch.plan import load_scene
-    from launch.prepare import (
+    from launch.plans.plan import load_scene
+    from launch.running.prepare import (
         NoSoftBodyError,
         prepare_dents,
         prepare_force_table,

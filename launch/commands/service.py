@@ -39,8 +39,8 @@ def install(
     as_json: JsonOption = False,
 ) -> None:
     """Write the unit flexsheet@.service and the host's environment; start nothing."""
-    from launch.plan import load_plan
-    from launch.service import STATE, bags_of, files_of
+    from launch.plans.plan import load_plan
+    from launch.running.service import STATE, bags_of, files_of
 
     plan = load_plan(launch_file)
     if host not in plan.hosts:

@@ -326,7 +326,7 @@ def _field(message: Message, path: str | None, topic: str) -> Any:
     for name in path.split(".") if path else ():
         fields = getattr(type(value), "model_fields", {})
         if name not in fields:
-            from launch.documents import did_you_mean
+            from launch.plans.documents import did_you_mean
 
             raise CommandError(
                 f'--field {path}: topic "{topic}" has no field "{name}" there; '
@@ -373,7 +373,7 @@ def listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, unopened: bool = False
 ) -> Subscriber:
     """A subscriber to the topic in the graph that runs; CommandError when nothing writes it."""
-    from launch.tools import subscriber_to
+    from launch.running.tools import subscriber_to
 
     plan, run = running_graph(run_directory)
     if not plan.endpoints_to_read(topic.name):
@@ -392,7 +392,7 @@ def _parse_message(topic: Topic, text: str) -> Message:
     from pydantic import ValidationError
     from ruamel.yaml.error import YAMLError
 
-    from launch.documents import parse_json, parse_value
+    from launch.plans.documents import parse_json, parse_value
 
     source = "MESSAGE"
     if text.startswith("@"):
@@ -428,7 +428,7 @@ async def _publish(
     times: int | None,
     told: Callable[[int], None],
 ) -> int:
-    from launch.tools import READER_RECONNECT_S, ToolsWriter
+    from launch.running.tools import READER_RECONNECT_S, ToolsWriter
 
     plan, found = running_graph(run)
     writer = ToolsWriter(plan, found, [topic.name])

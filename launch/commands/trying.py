@@ -15,7 +15,7 @@ from launch.commands.launching import about_run, run_graph
 from launch.commands.output import examples, print_json_line, progress_words, words
 
 if TYPE_CHECKING:
-    from launch.runs import Run
+    from launch.running.runs import Run
 
 app = typer.Typer(add_completion=False)
 
@@ -44,8 +44,8 @@ def try_it(
     Starts the demo's graph with a console and prints its address; Ctrl-C ends it.  From another
     computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address there.
     """
-    from launch.plan import load_plan
-    from launch.prepare import prepare_plan
+    from launch.plans.plan import load_plan
+    from launch.running.prepare import prepare_plan
 
     page = [f"console.page_port={port}"]
     plan = load_plan(launch_file, settings=[*page, *(settings or ())], console=True)

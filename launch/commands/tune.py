@@ -20,7 +20,7 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.tune import Choice
+    from launch.methods.tune import Choice
 
 NOT_MET = 3
 """Exit code: for some family no method is good enough, and the nearest miss was taken."""
@@ -62,9 +62,9 @@ def tune(
     the first time.  Says why in a sentence per family.  Nodes whose parameters say `auto` take the
     choice up.  Exit code 3: for some family no method is good enough; the nearest miss is taken.
     """
-    from launch import charts, tune
-    from launch.machine import machine_name
-    from launch.plan import load_scene
+    from launch.methods import charts, tune
+    from launch.methods.machine import machine_name
+    from launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
     try:
@@ -100,7 +100,7 @@ def tune(
 
 
 def _print_choices(choices: Sequence[Choice]) -> None:
-    from launch.charts import duration
+    from launch.methods.charts import duration
 
     rows = [
         (

@@ -15,9 +15,9 @@ from typing import Self
 import numpy as np
 
 from launch.experiments import ExperimentError
-from launch.planned import TOOLS, Plan
-from launch.runs import Run
-from launch.tools import ToolsWriter, subscriber_to
+from launch.plans.planned import TOOLS, Plan
+from launch.running.runs import Run
+from launch.running.tools import ToolsWriter, subscriber_to
 from messages.base import Header, Message
 from messages.bus import Subscriber
 from messages.types import (

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from launch.documents import did_you_mean
 from launch.experiments import ExperimentError, stroke
 from launch.experiments.driver import Driver
 from launch.experiments.lag import lag_s
 from launch.experiments.run import Procedure, Progress
-from launch.plan import load_plan
+from launch.plans.documents import did_you_mean
+from launch.plans.plan import load_plan
 from messages.bag import BagReader
 from messages.scene import Scene, UnfitGeometryError
 from messages.types import FingerPath, Fingertip, TwinFinger

@@ -11,10 +11,10 @@ from typing import Any
 
 from launch.experiments import ExperimentError, image, stroke
 from launch.experiments.driver import Driver
-from launch.plan import load_plan
-from launch.planned import Plan
-from launch.prepare import prepare_plan
-from launch.supervisor import RunningGraph
+from launch.plans.plan import load_plan
+from launch.plans.planned import Plan
+from launch.running.prepare import prepare_plan
+from launch.running.supervisor import RunningGraph
 from messages.scene import Scene
 from messages.types import Correction, FingerPath, Shading
 

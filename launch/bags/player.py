@@ -1,0 +1,121 @@
+"""Plays a bag into a running graph, as the writer "tools"."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from launch.plans.planned import Plan
+from launch.running.runs import Run
+from launch.running.tools import READER_RECONNECT_S, ToolsWriter, topics_for_tools
+from messages.bag import BagError, BagReader
+from messages.base import Header, Message
+from messages.clock import SystemClock
+from messages.clock_table import shifted
+from messages.topics import Delivery, topic_named
+
+Progress = Callable[[float, float], None]
+"""Called with (seconds of the bag played, seconds in all)."""
+
+
+NOT_AGAIN = {
+    "status": "it tells of nodes that were",
+    "arming": "a person's word that arms may move is not said again",
+    "estop": "a person's word on an e-stop is not said again",
+    "recording": "what was recorded then is not recorded again",
+}
+"""Topics that are never played, and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """What of a bag can be played into a graph: the topics, and those left out with the reason."""
+
+    topics: tuple[str, ...]
+    left_out: dict[str, str]
+
+
+def select_topics(recorded: Collection[str], plan: Plan, wanted: Collection[str]) -> Selection:
+    """Topics of the bag that tools may write in the plan; BagError for wanted ones not so."""
+    writable = topics_for_tools(plan)
+    left_out = {}
+    chosen = []
+    for name in recorded:
+        if wanted and name not in wanted:
+            continue
+        if name in NOT_AGAIN:
+            left_out[name] = NOT_AGAIN[name]
+        elif name in writable:
+            chosen.append(name)
+        else:
+            owner = ", ".join(writer.name for writer in plan.writers.get(name, ()))
+            left_out[name] = f"written by {owner}" if owner else "not part of the graph"
+    for name in wanted:
+        if name not in chosen:
+            why = left_out.get(name, "not in the bag")
+            raise BagError(f'topic "{name}" cannot be played: {why}')
+    return Selection(tuple(chosen), left_out)
+
+
+async def play(
+    bag: Path,
+    plan: Plan,
+    run: Run,
+    *,
+    topics: Collection[str],
+    rate: float = 1.0,
+    start_s: float = 0.0,
+    progress: Progress = lambda played, total: None,
+) -> int:
+    """Play once, from `start_s` into the bag, `rate` times as fast; returns the messages sent.
+
+    The last value of every latched topic before the start comes first.  Stamps are moved so that a
+    message is as old when it is played as it was when it was recorded.
+    """
+    summary = BagReader(bag).info()
+    begin_ns = summary.start_ns + round(start_s * 1e9)
+    total_s = max(0.0, summary.duration_s - start_s)
+    clock = SystemClock()
+    recorded_clock = summary.metadata.get("recording", {}).get("clock_id")
+    writer = ToolsWriter(plan, run, topics)
+    sent = 0
+
+    def send(name: str, message: Message, header: Header, log_ns: int, due_ns: int) -> None:
+        nonlocal sent
+        same_clock = recorded_clock in (None, header.clock_id)
+        shift_ns = due_ns - log_ns
+        source_ns = header.source_ns + shift_ns if same_clock else due_ns
+        writer.publish(name, shifted(message, shift_ns), source_ns=max(0, source_ns))
+        sent += 1
+
+    try:
+        await asyncio.sleep(READER_RECONNECT_S)
+        now_ns = clock.now_ns()
+        for name, message, header, log_ns in latched_before(bag, topics, begin_ns):
+            send(name, message, header, log_ns, now_ns)
+        start_ns = clock.now_ns()
+        for name, message, header, log_ns in BagReader(bag, topics, start_ns=begin_ns):
+            played_ns = log_ns - begin_ns
+            due_ns = start_ns + round(played_ns / rate)
+            wait_s = (due_ns - clock.now_ns()) * 1e-9
+            if wait_s > 0:
+                await asyncio.sleep(wait_s)
+            send(name, message, header, log_ns, due_ns)
+            progress(played_ns * 1e-9, total_s)
+        await asyncio.sleep(READER_RECONNECT_S / 2)
+    finally:
+        writer.close()
+    return sent
+
+
+def latched_before(
+    bag: Path, topics: Collection[str], begin_ns: int
+) -> list[tuple[str, Message, Header, int]]:
+    """The last message of every latched topic before `begin_ns`."""
+    latched = [name for name in topics if topic_named(name).delivery is Delivery.LATCHED]
+    last = {}
+    for entry in BagReader(bag, latched, end_ns=begin_ns):
+        last[entry[0]] = entry
+    return list(last.values())

@@ -1,0 +1,469 @@
+"""Steps one node through its recorded inputs with a virtual clock, twice, and compares.
+
+The node is built from the plan in the bag.  It has said in its status which messages it took, in
+which order and when (`messages.types.Status.taken`); by that it is stepped again, so that what a
+late reader skipped live is skipped here.  Where the bag has no such word (as of earlier code), each
+recorded input is handed to it in the order in which the recorder got it, and timers that came due
+are called before.  The same bag must give the same bytes each time.  Against what the node sent
+live, fields are compared with a tolerance.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections import deque
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from launch.plans.documents import did_you_mean
+from launch.plans.planned import Plan, PlannedNode
+from messages.bag import BagError, BagReader
+from messages.base import Header, Message
+from messages.clock import VirtualClock
+from messages.topics import TOPICS, Delivery, Topic
+from messages.types import Clocks, Status
+from messages.wire import decode, encode
+from nodes import node_class
+from nodes.node import Node, parameters_of, timers_of
+
+REFUSALS = {
+    "camera": "it reads a device, which is not in the bag; with stereo recorded, "
+    "`bag verify triangulator` starts from what it read",
+    "arm_bridge": "it would command an arm, and what the arm answered is in the bag as this node's "
+    "output only; `bag verify planner` shows what it was told",
+    "twin_arms": "it answers the arms' bridges over TCP, and what they said there is not recorded",
+    "twin_finger": "it films by its own clock, and what it did is what the bag holds as "
+    "twin/finger",
+    "recorder": "it writes a bag, and what it wrote is this one",
+    "console": "it serves a page, and what people did there is in the bag as its outputs only",
+}
+"""Why nodes of a type are not stepped through a bag."""
+
+CLOCKS = "clocks"
+EPOCH = 0
+"""Of the replayed writers; a live one is random, a replay must not be."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """What a replayed node published, as bytes."""
+
+    topic: str
+    data: tuple[bytes, ...]
+
+
+@dataclass(slots=True)
+class Pass:
+    """One run through the bag.
+
+    as_taken: it took what the node said that it took; else all, in the recorder's order.
+    missing: messages that it took and the bag does not hold.
+    told_until_ns: of what it took later it could not say any more; its host's clock.
+    """
+
+    messages_in: int = 0
+    missing: int = 0
+    as_taken: bool = False
+    told_until_ns: int | None = None
+    sent: list[Sent] = field(default_factory=list)
+    errors: int = 0
+    last_error: str = ""
+
+    def digest(self) -> str:
+        """Of all bytes that the node published, in order."""
+        digest = hashlib.sha256()
+        for one in self.sent:
+            digest.update(one.topic.encode())
+            for part in one.data:
+                digest.update(len(part).to_bytes(8, "little"))
+                digest.update(part)
+        return digest.hexdigest()
+
+
+@dataclass(slots=True)
+class Comparison:
+    """Replayed against recorded messages of one topic, paired by their source stamps.
+
+    worst: largest difference per field that differs at all; anything but numbers counts 1.
+    """
+
+    recorded: int = 0
+    replayed: int = 0
+    compared: int = 0
+    beyond_tolerance: int = 0
+    worst: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What `bag verify` found; as_taken, missing: see `Pass`."""
+
+    node: str
+    bag: str
+    as_taken: bool
+    messages_in: int
+    missing: int
+    messages_out: int
+    same_bytes: bool
+    digest: str
+    errors: int
+    last_error: str
+    topics: dict[str, Comparison]
+    tolerance: float
+
+    @property
+    def repeatable(self) -> bool:
+        """Whether both passes gave the same bytes, without an error."""
+        return self.same_bytes and self.errors == 0
+
+    @property
+    def as_live(self) -> bool:
+        """Whether the outputs are those that the node published live, within the tolerance."""
+        return all(
+            one.beyond_tolerance == 0 and (one.compared > 0 or one.recorded == 0)
+            for one in self.topics.values()
+        )
+
+    @property
+    def ok(self) -> bool:
+        return self.repeatable and self.as_live
+
+
+def verify(bag: Path, name: str, *, tolerance: float = 1e-6) -> Verification:
+    """Replay node `name` of the bag's plan twice; BagError for a bag that does not allow it."""
+    reader = BagReader(bag)
+    plan = Plan.model_validate_json(reader.attachment("plan.json"))
+    if name not in plan.nodes:
+        raise BagError(
+            f'{bag}: no node "{name}" in its plan; {did_you_mean(name, list(plan.nodes))}'
+        )
+    node = plan.nodes[name]
+    if why := refusal(node):
+        raise BagError(f"{name} is not replayed: {why}")
+    _check_inputs(bag, reader, plan, node)
+    first, second = (asyncio.run(replay(bag, node)) for _ in range(2))
+    return Verification(
+        node=name,
+        bag=str(bag),
+        as_taken=first.as_taken,
+        messages_in=first.messages_in,
+        missing=first.missing,
+        messages_out=len(first.sent),
+        same_bytes=first.sent == second.sent,
+        digest=first.digest(),
+        errors=first.errors,
+        last_error=first.last_error,
+        topics=compare(bag, node, first, tolerance),
+        tolerance=tolerance,
+    )
+
+
+def refusal(node: PlannedNode) -> str:
+    """Why a node cannot be stepped through a bag, in a sentence; empty: it can."""
+    # Of any type of parameters: those of the node's own class.
+    parameters: Any = parameters_of(node_class(node.type)).model_validate(node.parameters)
+    if node.type == "camera" and parameters.source.kind == "twin":
+        return ""  # it hands on what came on twin/stereo, and reaches for nothing
+    if node.type == "renderer" and parameters.output == "window":
+        return (
+            "it shows its frames in a window; its drawing is verified with a bag of a headless run"
+        )
+    if node.type in REFUSALS:
+        return REFUSALS[node.type]
+    if node_class(node.type).opens_devices:
+        return "it reaches for devices of its own, which are not in the bag"
+    return ""
+
+
+async def replay(bag: Path, planned: PlannedNode) -> Pass:
+    """Step a node through its inputs in the bag."""
+    result = Pass()
+    lives = lives_in(bag, planned.name)
+    for life in lives:
+        result.as_taken, result.told_until_ns = True, int(life.steps[-1, 3])
+        await _replay_life(bag, planned, life, result)
+    if not lives:
+        await _replay_in_order(bag, planned, result)
+    return result
+
+
+def _node_of(planned: PlannedNode, clock: VirtualClock, result: Pass) -> Node:
+    """The node, built as a launcher would; what it sends is kept."""
+
+    def keep(topic: Topic, message: Message, header: Header) -> None:
+        result.sent.append(Sent(topic.name, tuple(bytes(one) for one in encode(message, header))))
+
+    class_ = node_class(planned.type)
+    return class_(
+        parameters_of(class_).model_validate(planned.parameters),
+        name=planned.name,
+        clock=clock,
+        send=keep,
+        topics={port.port: port.topic for port in (*planned.inputs, *planned.outputs)},
+        epoch=EPOCH,
+    )
+
+
+@asynccontextmanager
+async def _set_up(node: Node, result: Pass) -> AsyncIterator[None]:
+    try:
+        await node.setup()
+        yield
+        await node.settle()
+    finally:
+        node.stop_mailboxes()
+        await node.close()
+        result.errors += node.errors
+        result.last_error = node.last_error or result.last_error
+
+
+async def _replay_in_order(bag: Path, planned: PlannedNode, result: Pass) -> None:
+    """Hand it all its inputs, in the recorder's order."""
+    ports: dict[str, list[str]] = {}
+    for port in planned.inputs:
+        ports.setdefault(port.topic, []).append(port.port)
+    reader = BagReader(bag, {*ports, CLOCKS} & set(BagReader(bag).topics))
+    start_ns = reader.info().start_ns
+    clock_id = reader.metadata.get("recording", {}).get("clock_id", "recorded")
+    clock = VirtualClock(start_ns, clock_id=clock_id)
+    node = _node_of(planned, clock, result)
+    async with _set_up(node, result):
+        timers = Timers(node, start_ns)
+        for topic, message, header, log_ns in reader:
+            await timers.call_until(log_ns, clock)
+            clock.move_to(log_ns)
+            if isinstance(message, Clocks) and header.clock_id == clock.id:
+                node.clock_table.update(message)
+            result.messages_in += topic in ports
+            for port_name in ports.get(topic, ()):
+                await node.step(port_name, message, header)
+                await node.settle()
+
+
+async def _replay_life(bag: Path, planned: PlannedNode, life: Life, result: Pass) -> None:
+    """Hand it what it took, from one start of it to its end."""
+    clock = VirtualClock(int(life.steps[0, 3]), clock_id=life.clock_id)
+    node = _node_of(planned, clock, result)
+    names, timers = list(node.inputs), timers_of(type(node))
+    async with _set_up(node, result):
+        messages = Waiting(bag, node)
+        # What it was told before the bag began, it will not say that it took.
+        for port, message, header in messages.told_before(life):
+            result.messages_in += 1
+            await node.step(port, message, header)
+        for number, sequence, epoch, at_ns in life.steps.tolist():
+            if number < 0:
+                clock.move_to(at_ns)
+                await node.call_timer(-1 - number, timers[-1 - number])
+            else:
+                taken = messages.find(names[number], sequence, epoch)
+                if taken is None:
+                    result.missing += 1
+                    continue
+                clock.move_to(at_ns)
+                result.messages_in += 1
+                await node.step(names[number], *taken)
+            await node.settle()
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """What a node took between one start and the next: rows of `Status.taken`, its host's clock."""
+
+    clock_id: str
+    steps: NDArray[np.int64]
+
+
+def lives_in(bag: Path, name: str) -> list[Life]:
+    """What the node said that it took, per start of it; none in bags of earlier code."""
+    told: dict[int, list[NDArray[np.int64]]] = {}
+    clock_ids: dict[int, str] = {}
+    if "status" not in BagReader(bag).topics:
+        return []
+    for _, message, header, _ in BagReader(bag, ["status"]):
+        if isinstance(message, Status) and message.node == name and len(message.taken):
+            before = told.setdefault(header.epoch, [])
+            # A young node tells all from its start again.
+            if before and (before[0][0] == message.taken[0]).all():
+                before.clear()
+            before.append(message.taken)
+            clock_ids[header.epoch] = header.clock_id
+    return [Life(clock_ids[epoch], np.concatenate(parts)) for epoch, parts in told.items()]
+
+
+class Waiting:
+    """The recorded inputs of a node, read on as far as what it took needs it."""
+
+    LOOK_AHEAD = 5000
+    """Messages after which one that should be in the bag is taken to be missing."""
+
+    def __init__(self, bag: Path, node: Node) -> None:
+        self._bag, self._node = bag, node
+        self._ports: dict[str, list[str]] = {}
+        for port, source in node.inputs.items():
+            self._ports.setdefault(source.topic.name, []).append(port)
+        topics = {*self._ports, CLOCKS} & set(BagReader(bag).topics)
+        self._messages = iter(BagReader(bag, topics))
+        self._waiting: dict[str, deque[tuple[Message, Header]]] = {
+            port: deque() for port in node.inputs
+        }
+
+    def told_before(self, life: Life) -> list[tuple[str, Message, Header]]:
+        """Latched messages that came before the first step, in order."""
+        steps = {(names, *key) for names, *key in life.steps[:, :3].tolist()}
+        latched = {
+            source.topic.name
+            for source in self._node.inputs.values()
+            if source.topic.delivery is Delivery.LATCHED
+        }
+        recorded = BagReader(self._bag)
+        found: dict[str, tuple[Message, Header]] = {}
+        for topic, message, header, _ in BagReader(self._bag, latched & set(recorded.topics)):
+            for number, port in enumerate(self._node.inputs):
+                if port not in self._ports[topic]:
+                    continue
+                taken = (number, header.sequence, header.epoch) in steps
+                if not taken and header.publish_ns <= life.steps[0, 3]:
+                    found[port] = (message, header)
+        return [(port, *entry) for port, entry in found.items()]
+
+    def find(self, port: str, sequence: int, epoch: int) -> tuple[Message, Header] | None:
+        """That message; None where the bag does not have it."""
+        waiting = self._waiting[port]
+        latest = self._node.inputs[port].topic.delivery is Delivery.LATEST
+        read = seen = 0
+        while True:
+            for i in range(seen, len(waiting)):
+                message, header = waiting[i]
+                if header.epoch != epoch or header.sequence < sequence:
+                    continue
+                if header.sequence > sequence:
+                    return None
+                del waiting[i]
+                # What a reader of the newest has passed over, it never takes.
+                for _ in range(i if latest else 0):
+                    waiting.popleft()
+                return message, header
+            seen = len(waiting)
+            if read == self.LOOK_AHEAD or not self._read():
+                return None
+            read += 1
+
+    def _read(self) -> bool:
+        entry = next(self._messages, None)
+        if entry is None:
+            return False
+        topic, message, header, _ = entry
+        if isinstance(message, Clocks) and header.clock_id == self._node.clock.id:
+            self._node.clock_table.update(message)
+        for port in self._ports.get(topic, ()):
+            self._waiting[port].append((message, header))
+        return True
+
+
+class Timers:
+    """A node's periodic methods on a virtual clock."""
+
+    def __init__(self, node: Node, start_ns: int) -> None:
+        self._node = node
+        self._periods_ns = {
+            (number, timer): round(1e9 / float(getattr(node.parameters, timer.rate_parameter)))
+            for number, timer in enumerate(timers_of(type(node)))
+        }
+        self._due_ns = dict.fromkeys(self._periods_ns, start_ns)
+
+    async def call_until(self, now_ns: int, clock: VirtualClock) -> None:
+        """Call all that comes due up to `now_ns`, in the order of time."""
+        while self._due_ns:
+            next_one = min(self._due_ns, key=lambda one: (self._due_ns[one], one[1].method))
+            due_ns = self._due_ns[next_one]
+            if due_ns > now_ns:
+                return
+            clock.move_to(due_ns)
+            await self._node.call_timer(*next_one)
+            self._due_ns[next_one] = due_ns + self._periods_ns[next_one]
+
+
+def compare(
+    bag: Path, node: PlannedNode, replayed: Pass, tolerance: float
+) -> dict[str, Comparison]:
+    """What the node published live against what it publishes now, for all its recorded outputs."""
+    outputs = {port.topic for port in node.outputs} - {"status"}
+    recorded: dict[str, dict[int, Message]] = {topic: {} for topic in outputs}
+    comparisons = {topic: Comparison() for topic in sorted(outputs)}
+    for topic, message, header, _ in BagReader(bag, outputs & set(BagReader(bag).topics)):
+        untold = replayed.told_until_ns is not None and header.source_ns > replayed.told_until_ns
+        if header.writer == node.name and not untold:
+            recorded[topic][header.source_ns] = message
+            comparisons[topic].recorded += 1
+    for one in replayed.sent:
+        if one.topic not in comparisons:
+            continue
+        comparison = comparisons[one.topic]
+        message, header = decode(one.data, TOPICS[one.topic])
+        comparison.replayed += 1
+        live = recorded[one.topic].get(header.source_ns)
+        if live is None:
+            continue
+        comparison.compared += 1
+        differences = field_differences(live, message)
+        comparison.beyond_tolerance += any(size > tolerance for size in differences.values())
+        for name, size in differences.items():
+            comparison.worst[name] = max(size, comparison.worst.get(name, 0.0))
+    return comparisons
+
+
+def field_differences(one: BaseModel, other: BaseModel, prefix: str = "") -> dict[str, float]:
+    """Fields that differ, and by how much; see `Comparison.worst`."""
+    found: dict[str, float] = {}
+    for name in type(one).model_fields:
+        a, b = getattr(one, name), getattr(other, name)
+        if isinstance(a, BaseModel) and isinstance(b, BaseModel):
+            found |= field_differences(a, b, f"{prefix}{name}.")
+            continue
+        size = _difference(a, b)
+        if size > 0:
+            found[f"{prefix}{name}"] = size
+    return found
+
+
+def _difference(a: Any, b: Any) -> float:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        if a.shape != b.shape:
+            return float("inf")
+        return _distance(a.astype(float), b.astype(float))
+    if isinstance(a, float | int) and isinstance(b, float | int):
+        return _distance(np.array(a, float), np.array(b, float))
+    return 0.0 if a == b else 1.0
+
+
+def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    """The greatest difference; infinite where one is no number and the other is another thing."""
+    same = (a == b) | (np.isnan(a) & np.isnan(b))
+    with np.errstate(invalid="ignore"):
+        apart = np.where(same, 0.0, np.abs(a - b))
+    return float(np.where(np.isnan(apart), np.inf, apart).max(initial=0.0))
+
+
+def _check_inputs(bag: Path, reader: BagReader, plan: Plan, node: PlannedNode) -> None:
+    """Every input must have been recorded (an input on which nothing came is no lack)."""
+    recorded = set(reader.topics)
+    for other in plan.nodes.values():
+        if other.type == "recorder":
+            recorded |= {port.topic for port in other.inputs}
+    lacking = [port.topic for port in node.inputs if port.topic not in recorded]
+    if lacking:
+        raise BagError(
+            f"{bag}: {node.name} reads {', '.join(lacking)}, which was not recorded; "
+            f"record anew with: --set recorder.also='[{', '.join(lacking)}]'"
+        )
+    if not {port.topic for port in node.inputs} & set(reader.topics):
+        raise BagError(f"{bag}: holds no input of {node.name}: nothing to replay")

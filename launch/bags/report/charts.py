@@ -1,0 +1,361 @@
+"""The report's charts: SVG that follows light and dark, each with a text of what it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.bags.report.series import Grid, Spread, States
+from launch.bags.report.session import Session
+from launch.methods.svg import COLOURS, INK, drawn_for_pages, svg_of
+from nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+WIDTH_IN = 9.0
+GOOD, MIDDLE, DOUBTFUL, BAD = "#7fa99b", "#0072b2", "#e69f00", "#c0392b"
+STATE_COLOURS = {
+    "wait": "#9aa5ad", "approach": "#56b4e9", "contact": MIDDLE, "hold": DOUBTFUL,
+    "idle": "#9aa5ad", "follow": MIDDLE, "relax": DOUBTFUL, "disconnected": BAD,
+    "stopping": BAD, "fault": BAD, "estop": BAD,
+    "tracking": MIDDLE, "acquiring": "#56b4e9", "coasting": DOUBTFUL, "lost": BAD,
+    "released": "#9aa5ad", "engaged": BAD,
+}  # fmt: skip
+HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop": "xx",
+           "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
+"""So that states which call for attention are told apart without colours."""
+
+MARKS = {"moment": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
+         "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
+EVENTS = ("fingertip", "sheet target", "left arm command", "right arm command", "soft body",
+          "frame drawn")  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """svg: the picture.  text: what it shows, for who cannot see it.  caption: how to read it."""
+
+    svg: str
+    text: str
+    caption: str
+
+
+def charts_of(session: Session) -> dict[str, Chart]:
+    """The charts that the bag has data for, by name."""
+    makers: dict[str, Callable[[Session], Chart | None]] = {
+        "timeline": timeline,
+        "latency": latencies,
+        "path": paths,
+        "errors": sheet_errors,
+        "joints": joint_speeds,
+        "force": forces,
+    }
+    found = {}
+    with drawn_for_pages():
+        for name, make in makers.items():
+            chart = make(session)
+            if chart is not None:
+                found[name] = chart
+    return found
+
+
+def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[np.object_]]:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _over_time(axes: Axes, session: Session) -> None:
+    axes.set_xlim(0.0, session.info.duration_s)
+    axes.grid(visible=True, alpha=0.2)
+
+
+def timeline(session: Session) -> Chart | None:
+    """Strips of states over time, and above them what happened."""
+    strips = [
+        (name, states)
+        for name, states in (
+            ("sheet", session.phases),
+            ("left arm", session.arms["left"].modes),
+            ("right arm", session.arms["right"].modes),
+            ("finger", session.finger),
+            ("e-stop", session.estop),
+        )
+        if states.state is not None
+    ]
+    kinds = [kind for kind in MARKS if kind in session.events.counts]
+    if not strips and not kinds:
+        return None
+    from matplotlib.patches import Patch
+
+    rows = len(strips) + bool(kinds)
+    figure, grid = _figure(1, 1, 0.5 * rows + 1.5)
+    axes: Axes = grid[0][0]
+    axes.set_axisbelow(True)
+    looks: dict[tuple[str, str | None], list[str]] = {}
+    for row, (name, states) in enumerate(strips):
+        lasting = name == "e-stop"
+        for state, begin_s, end_s in stretches_of(states, session.fine, lasting=lasting):
+            colour, hatch = look = STATE_COLOURS.get(state, MIDDLE), HATCHES.get(state)
+            axes.barh(
+                row, end_s - begin_s, left=begin_s, height=0.7, color=colour, hatch=hatch,
+                edgecolor="#ffffff" if hatch else colour, linewidth=0.0,
+            )  # fmt: skip
+            told = looks.setdefault(look, [])
+            if state not in told:
+                told.append(state)
+    for kind in kinds:
+        marker, colour = MARKS[kind]
+        at = [seconds for seconds, _ in session.events.of(kind)]
+        axes.plot(at, [len(strips)] * len(at), marker, color=colour, label=kind, markersize=8)
+    names = [name for name, _ in strips] + (["events"] if kinds else [])
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    _over_time(axes, session)
+    axes.set_xlabel("time in the bag, s")
+    patches = [
+        Patch(facecolor=colour, hatch=hatch, edgecolor="#ffffff", label=", ".join(told))
+        for (colour, hatch), told in looks.items()
+    ]
+    handles, _ = axes.get_legend_handles_labels()
+    figure.legend(handles=[*patches, *handles], ncols=5, fontsize=8, loc="outside lower center")
+    spent = [
+        f"{name}: " + ", ".join(f"{state} {seconds:.1f} s" for state, seconds in spent_in(states))
+        for name, states in strips
+    ]
+    counts = [f"{session.events.counts[kind]} × {kind}" for kind in kinds]
+    return Chart(
+        svg_of(figure),
+        "Timeline. " + "; ".join([*spent, *counts]) + ".",
+        "What the sheet, the arms and the finger's tracker did; white: nothing was recorded. Of "
+        "states that share a stretch of the picture the gravest is drawn.",
+    )
+
+
+def spent_in(states: States) -> list[tuple[str, float]]:
+    """The states that lasted, the longest first."""
+    lasted = [(state, seconds) for state, seconds in states.seconds.items() if seconds > 0.05]
+    return sorted(lasted, key=lambda one: -one[1])
+
+
+def stretches_of(
+    states: States, grid: Grid, *, lasting: bool = False
+) -> Iterator[tuple[str, float, float]]:
+    """Runs of one state: (state, from s, to s).  lasting: until another one, not until silence."""
+    width_s = grid.duration_s / grid.count
+    # A message every second leaves holes in a fine grid, which are none in what it says.
+    holes = max(int(0.5 / width_s), 1)
+    codes = states.codes.tolist()
+    begin, code, last = 0, States.NOTHING, -1
+    for i, one in enumerate([*codes, States.NOTHING]):
+        if one == States.NOTHING:
+            if code != States.NOTHING and (i == len(codes) or (i - last > holes and not lasting)):
+                end = len(codes) if lasting else last + 1
+                yield states.names[code], begin * width_s, end * width_s
+                code = States.NOTHING
+            continue
+        if one != code:
+            if code != States.NOTHING:
+                yield states.names[code], begin * width_s, i * width_s
+            begin, code = i, one
+        last = i
+
+
+def latencies(session: Session) -> Chart | None:
+    """Median and 99 % of each step after the exposure, over time."""
+    events = [event for event in EVENTS if event in session.latencies]
+    if not events:
+        return None
+    rows = (len(events) + 1) // 2
+    figure, grid = _figure(rows, 2, 1.9 * rows + 0.4)
+    seconds = session.grid.seconds()
+    told = []
+    for i, event in enumerate(events):
+        axes: Axes = grid[i // 2][i % 2]
+        spread: Spread = session.latencies[event]
+        p50, p99 = 1e3 * spread.quantiles_s(0.5), 1e3 * spread.quantiles_s(0.99)
+        axes.plot(seconds, p99, "-", linewidth=0.9, color=COLOURS[4], label="99 %")
+        axes.plot(seconds, p50, "-", linewidth=1.4, color=COLOURS[0], label="median")
+        if session.scene is not None and "arm" in event:
+            allowed_ms = 1e3 * session.scene.tolerances.latency_s
+            axes.axhline(allowed_ms, linestyle="--", color=INK, linewidth=1.0, label="tolerance")
+        axes.set_ylim(0.0, 1.15 * float(np.nanquantile(p99, 0.98)))
+        axes.set_title(event, fontsize=10)
+        _over_time(axes, session)
+        axes.set_ylabel("ms")
+        whole = [spread.quantile_s(share) or 0.0 for share in (0.5, 0.99)]
+        told.append(f"{event} {1e3 * whole[0]:.1f} and {1e3 * whole[1]:.1f} ms")
+    grid[0][0].legend(fontsize=8)
+    for axes in grid[-1]:
+        axes.set_xlabel("time in the bag, s")
+    for i in range(len(events), grid.size):
+        grid[i // 2][i % 2].set_visible(False)
+    return Chart(
+        svg_of(figure),
+        "From the exposure to each step, over the whole bag, median and 99 %: "
+        + "; ".join(told)
+        + ".",
+        "From the middle of the exposure until the message was sent, the command written, the "
+        "frame drawn.",
+    )
+
+
+def paths(session: Session) -> Chart | None:
+    """Where the finger and the sheet's middle were, from the front and from the side."""
+    finger, true = 1e3 * session.finger_place.points, 1e3 * session.true_place.points
+    sheet = 1e3 * session.sheet_place.points
+    known = [points for points in (finger, true, sheet) if np.isfinite(points).any()]
+    if not known:
+        return None
+    figure, grid = _figure(1, 2, 4.2)
+    views = (("from the front", 0, "x (right), mm"), ("from the side", 2, "z (to the user), mm"))
+    for axes, (title, across, label) in zip(grid[0], views, strict=True):
+        for points, name, style, colour in (
+            (sheet, "sheet's middle, as planned", "-", COLOURS[4]),
+            (true, "true finger", "-", COLOURS[2]),
+            (finger, "measured finger", ".", COLOURS[0]),
+        ):
+            shown = points[np.isfinite(points[:, 0])]
+            if len(shown):
+                axes.plot(
+                    shown[:, across], shown[:, 1], style, color=colour, label=name,
+                    linewidth=1.0, markersize=2.5,
+                )  # fmt: skip
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel(label)
+        axes.set_ylabel("y (up), mm")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(visible=True, alpha=0.2)
+    grid[0][0].legend(fontsize=8)
+    all_points = np.concatenate(known)
+    low, high = np.nanmin(all_points, axis=0), np.nanmax(all_points, axis=0)
+    spans = ", ".join(
+        f"{axis} from {a:.0f} to {b:.0f} mm" for axis, a, b in zip("xyz", low, high, strict=True)
+    )
+    return Chart(
+        svg_of(figure),
+        f"Paths of finger and sheet in the world: {spans}.",
+        "In the world's frame, its origin in the middle of the imaginary screen.",
+    )
+
+
+def sheet_errors(session: Session) -> Chart | None:
+    """Greatest position and angle error of each stretch, while the sheet touches."""
+    errors = session.errors
+    shown = [
+        (name, label)
+        for name, label in (("true", "true finger"), ("measured", "measured finger"))
+        if errors.distance[name].overall() is not None
+    ]
+    if not shown:
+        return None
+    figure, grid = _figure(2, 1, 4.2)
+    seconds = session.grid.seconds()
+    for axes, values, scale, label in (
+        (grid[0][0], errors.distance, 1e3, "Δd, mm"),
+        (grid[1][0], errors.angle, float(np.degrees(1.0)), "Δθ, degrees"),
+    ):
+        for i, (name, told) in enumerate(shown):
+            axes.plot(
+                seconds, scale * values[name].most, color=COLOURS[4 * i], linewidth=1.0,
+                linestyle=("-", "--")[i], label=f"against the {told}",
+            )  # fmt: skip
+        axes.set_ylabel(label)
+        axes.set_ylim(bottom=0.0)
+        _over_time(axes, session)
+    if session.scene is not None:
+        allowed_mm = 1e3 * session.scene.tolerances.sheet_position_m
+        grid[0][0].axhline(allowed_mm, linestyle="--", color=INK, linewidth=1.0, label="tolerance")
+    grid[0][0].legend(fontsize=8)
+    grid[1][0].set_xlabel("time in the bag, s")
+    worst = [
+        f"against the {label} {1e3 * overall[1]:.2f} mm"
+        for name, label in shown
+        if (overall := errors.distance[name].overall())
+    ]
+    return Chart(
+        svg_of(figure),
+        "Errors of the sheet in contact, as the paper defines them; greatest: "
+        + ", ".join(worst)
+        + ".",
+        f"The greatest of each {session.grid.duration_s / session.grid.count:.2g} s while the "
+        "sheet is in contact, less what it is meant to yield.",
+    )
+
+
+def joint_speeds(session: Session) -> Chart | None:
+    """Each joint's greatest speed as a share of what it can do."""
+    arms = {side: arm for side, arm in session.arms.items() if arm.joint_speed[0].overall()}
+    if not arms:
+        return None
+    figure, grid = _figure(len(arms), 1, 2.3 * len(arms) + 0.3)
+    seconds = session.grid.seconds()
+    told = []
+    for axes, (side, arm) in zip(grid[:, 0], arms.items(), strict=True):
+        for i, (range_, limit) in enumerate(
+            zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
+        ):
+            share = 100.0 * range_.most / limit
+            axes.plot(seconds, share, linewidth=1.0, color=COLOURS[i], label=f"J{i + 1}")
+        axes.axhline(100.0, linestyle="--", color=INK, linewidth=1.0, label="limit")
+        axes.set_title(f"{side} arm", fontsize=10)
+        axes.set_ylabel("% of the limit")
+        axes.set_ylim(bottom=0.0)
+        _over_time(axes, session)
+        shares = [
+            100.0 * overall[1] / limit
+            for range_, limit in zip(arm.joint_speed, JOINT_SPEED_RAD_PER_S.tolist(), strict=True)
+            if (overall := range_.overall())
+        ]
+        told.append(f"{side} arm at most {max(shares):.0f} %")
+    grid[0][0].legend(fontsize=8, ncols=7, loc="upper right")
+    grid[-1][0].set_xlabel("time in the bag, s")
+    return Chart(
+        svg_of(figure),
+        f"Joint speeds as shares of their limits: {', '.join(told)}.",
+        "The greatest of each stretch of time, from the measured joints over 25 ms.",
+    )
+
+
+def forces(session: Session) -> Chart | None:
+    """The pull at the sheet's edges, the object's force, and how deep the finger pushes."""
+    arms = {side: arm for side, arm in session.arms.items() if arm.edge_force.overall()}
+    if not arms:
+        return None
+    figure, grid = _figure(2, 1, 4.4)
+    seconds = session.grid.seconds()
+    upper, lower = grid[0][0], grid[1][0]
+    told = []
+    for i, (side, arm) in enumerate(arms.items()):
+        upper.plot(seconds, arm.edge_force.most, color=COLOURS[4 * i], linewidth=1.2,
+                   linestyle=("-", "--")[i], label=f"{side} edge")  # fmt: skip
+        overall = arm.edge_force.overall()
+        told.append(f"{side} edge at most {overall[1]:.1f} N" if overall else side)
+    if session.scene is not None:
+        most_n = session.scene.sheet.max_edge_force_n
+        upper.axhline(most_n, linestyle="--", color=INK, linewidth=1.0, label="limit")
+    upper.set_ylabel("edge force, N")
+    lower.plot(seconds, 1e3 * session.push.most, color=COLOURS[2], label="push, mm")
+    lower.plot(seconds, session.force.most, color=COLOURS[4], linestyle="--", label="force, N")
+    lower.set_ylabel("push, mm; force, N")
+    for axes in (upper, lower):
+        # Room for the legend.
+        axes.set_ylim(0.0, 1.3 * axes.get_ylim()[1])
+        axes.legend(fontsize=8, ncols=3, loc="upper right")
+        _over_time(axes, session)
+    lower.set_xlabel("time in the bag, s")
+    return Chart(
+        svg_of(figure),
+        f"Forces: {', '.join(told)}.",
+        "Above, the pull of the sheet at its edges, by the bridges; below, how deep the finger is "
+        "in the object, and the object's force on it by the solver.",
+    )

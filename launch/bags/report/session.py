@@ -1,0 +1,415 @@
+"""Reads a bag once, from its beginning to its end, and keeps what the report tells."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from launch.bags.report.album import Album
+from launch.bags.report.series import Events, Grid, Moments, Places, Range, Spread, States
+from launch.bags.report.strokes import SheetErrors
+from launch.experiments.stroke import events_of
+from launch.plans.planned import Plan
+from messages.bag import BagError, BagInfo, BagReader
+from messages.base import Header, Message
+from messages.clock_table import ClockTable
+from messages.scene import Scene
+from messages.topics import TOPICS
+from messages.types import (
+    ArmState,
+    Clocks,
+    EStop,
+    Fingertip,
+    Frame,
+    HostStatus,
+    Moment,
+    PortStatus,
+    SheetTarget,
+    SoftBody,
+    Status,
+    StereoPair,
+    TwinEye,
+    TwinFinger,
+)
+
+Floats = NDArray[np.float64]
+Progress = Callable[[float, float], None]
+
+STRETCHES, FINE_STRETCHES = 240, 1200
+SHORTEST_STRETCH_S = 0.25
+STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
+NOTES_KEPT = 8
+SILENT_PERIODS, SHORTEST_SILENCE_S = 10.0, 0.5
+SPEED_OVER_NS = 25_000_000
+"""Joint and tool speeds are taken over so long: single stamps are not even enough."""
+
+PHASES = ("wait", "approach", "contact", "hold")
+MODES = ("idle", "follow", "hold", "relax", "disconnected", "stopping", "fault", "estop")
+FINGER_STATES = ("tracking", "acquiring", "coasting", "lost")
+FAULTY = ("fault", "estop", "disconnected", "stopping")
+
+
+@dataclass(slots=True)
+class Flow:
+    """What the bag holds of a topic: how evenly it came and what is missing in its numbering.
+
+    messages: that the bag holds.  lost: by gaps in the writers' numbering.  silences: longer than
+    ten of the slowest expected period.  age: from the source stamp to the recorder.
+    """
+
+    age: Spread
+    messages: int = 0
+    lost: int = 0
+    silences: int = 0
+    longest_silence_s: float = 0.0
+    last_ns: int | None = None
+    sequences: dict[str, tuple[int, int]] = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class Port:
+    """What the readers of a topic said of it; `was` holds what earlier starts of a node counted."""
+
+    age: Spread
+    newest: dict[str, tuple[int, PortStatus]] = field(default_factory=dict)
+    skipped: int = 0
+    lost: int = 0
+    refused: int = 0
+
+    def take(self, node: str, epoch: int, port: PortStatus) -> None:
+        before = self.newest.get(node)
+        if before is not None and before[0] != epoch:
+            self._add(before[1])
+        self.newest[node] = (epoch, port)
+        if port.age_s is not None:
+            self.age.take(0, port.age_s)
+
+    def _add(self, port: PortStatus) -> None:
+        self.skipped += port.dropped
+        self.lost += port.gaps
+        self.refused += port.rejected
+
+    def totals(self) -> tuple[int, int, int]:
+        """Skipped, lost and refused messages of all readers."""
+        now = [port for _, port in self.newest.values()]
+        return (
+            self.skipped + sum(port.dropped for port in now),
+            self.lost + sum(port.gaps for port in now),
+            self.refused + sum(port.rejected for port in now),
+        )
+
+
+@dataclass(slots=True)
+class NodeSaid:
+    """What a node's status messages said."""
+
+    cpu: Moments = field(default_factory=Moments)
+    resident_bytes: int = 0
+    starts: int = 0
+    epoch: int | None = None
+    degraded: int = 0
+    errors: int = 0
+    last_error: str = ""
+    note: str = ""
+    notes: list[str] = field(default_factory=list)
+
+    def take(self, status: Status, epoch: int) -> bool:
+        """Heed a status; says whether there is an error that was not there before."""
+        self.cpu.take(np.array([status.cpu_ratio]))
+        self.resident_bytes = max(self.resident_bytes, status.resident_bytes)
+        if epoch != self.epoch:
+            self.epoch, self.starts = epoch, self.starts + 1
+        self.degraded += status.state == "degraded"
+        news = bool(status.last_error) and status.last_error != self.last_error
+        self.errors = max(self.errors, status.errors)
+        self.last_error = status.last_error or self.last_error
+        self.note = status.note
+        head = "".join("#" if one.isdigit() else one for one in status.note)
+        if head and head not in self.notes and len(self.notes) < NOTES_KEPT:
+            self.notes.append(head)
+        return news
+
+
+class Arm:
+    """One arm over time: its mode, its speeds over the limits, the pull at its edge."""
+
+    def __init__(self, grid: Grid, fine: Grid) -> None:
+        self.modes = States(fine, MODES)
+        self.joint_speed = [Range(grid) for _ in range(6)]
+        self.tool_speed, self.edge_force = Range(grid), Range(grid)
+        self.cycle = Spread(Grid(0, 1.0, 1))
+        self.faults: tuple[str, ...] = ()
+        self._lately: deque[tuple[int, Floats, Floats]] = deque()
+
+    def take(self, arm: ArmState, source_ns: int, index: int) -> None:
+        """Heed a state whose joints were measured at `source_ns`."""
+        self.cycle.take(0, arm.cycle_s)
+        if arm.edge_force_n is not None:
+            self.edge_force.take(index, arm.edge_force_n)
+        lately = self._lately
+        if lately and not 0 < source_ns - lately[-1][0] < 4 * SPEED_OVER_NS:
+            if source_ns == lately[-1][0]:
+                return
+            lately.clear()
+        lately.append((source_ns, arm.joints_rad, arm.world_from_flange[:3, 3]))
+        while len(lately) > 2 and source_ns - lately[1][0] >= SPEED_OVER_NS:
+            lately.popleft()
+        passed_s = (source_ns - lately[0][0]) * 1e-9
+        if passed_s * 1e9 < SPEED_OVER_NS:
+            return
+        speeds = np.abs(arm.joints_rad - lately[0][1]) / passed_s
+        for range_, speed in zip(self.joint_speed, speeds.tolist(), strict=True):
+            range_.take(index, speed)
+        way_m = float(np.linalg.norm(lately[-1][2] - lately[0][2]))
+        self.tool_speed.take(index, way_m / passed_s)
+
+
+class Session:
+    """All that is kept of a bag.  `scene`: the last that it holds."""
+
+    def __init__(self, reader: BagReader, info: BagInfo, moments: list[tuple[float, str]]) -> None:
+        self.info, self.metadata = info, reader.metadata
+        self.plan, self.git = _plan_of(reader), _json_of(reader, "git.json")
+        length_s = max(info.duration_s, 1e-3)
+        stretches = int(np.clip(length_s / SHORTEST_STRETCH_S, 1, STRETCHES))
+        self.grid = Grid(info.start_ns, length_s, stretches)
+        self.fine = Grid(info.start_ns, length_s, FINE_STRETCHES)
+        self.clock_id = reader.metadata.get("recording", {}).get("clock_id", "")
+        self.scene: Scene | None = None
+        self.scenes: list[str] = []
+        self.events = Events()
+        self.flows: dict[str, Flow] = {}
+        self.ports: dict[str, Port] = {}
+        self.nodes: dict[str, NodeSaid] = {}
+        self.hosts: dict[str, HostStatus] = {}
+        self.latencies: dict[str, Spread] = {}
+        self.phases, self.finger = States(self.fine, PHASES), States(self.fine, FINGER_STATES)
+        self.estop = States(self.fine, ("released", "engaged"))
+        self.arms = {side: Arm(self.grid, self.fine) for side in ("left", "right")}
+        self.reasons: dict[str, int] = {}
+        self.finger_place, self.true_place = Places(self.fine), Places(self.fine)
+        self.sheet_place = Places(self.fine)
+        self.push, self.force = Range(self.grid), Range(self.grid)
+        self.body_methods: dict[str, int] = {}
+        self.out_of_range = 0
+        self.corrections: dict[str, int] = {}
+        self.draw = Spread(Grid(0, 1.0, 1))
+        self.frames = self.late_frames = 0
+        self.errors = SheetErrors(self.grid)
+        self.moments = moments
+        self.stereo = Album(STEREO_SHOTS, moments)
+        self.eye, self.drawn = Album(EYE_SHOTS, moments), Album(FRAME_SHOTS, moments)
+        self._table = ClockTable(self.clock_id)
+        self._exposures: dict[str, int] = {}
+        self._restarts: dict[str, int] = {}
+        self._finger_said = ""
+        self._late_before: int | None = None
+
+    def take(self, topic: str, message: Message, header: Header, log_ns: int) -> None:
+        """Heed one message of the bag."""
+        self._take_flow(topic, header, log_ns)
+        if isinstance(message, Clocks) and header.clock_id == self.clock_id:
+            self._table.update(message)
+        # What a message says of durations stands on its own writer's clock alone; only what is
+        # brought together with others must be put into the recorder's.
+        seconds, index = self.seconds(log_ns), self.grid.index(log_ns)
+        for event, exposure_ns, at_ns in events_of(message, header):
+            if self._exposures.get(event) != exposure_ns:
+                self._exposures[event] = exposure_ns
+                if event not in self.latencies:
+                    self.latencies[event] = Spread(self.grid)
+                self.latencies[event].take(index, (at_ns - exposure_ns) * 1e-9)
+        if header.clock_id != self.clock_id:
+            message, header, _ = self._table.localised(message, header, log_ns)
+        self.errors.take(message, header.source_ns)
+        match message:
+            case ArmState():
+                self._take_arm(message, header.source_ns, log_ns)
+            case SheetTarget():
+                self._take_target(message, log_ns)
+            case Fingertip():
+                self._take_fingertip(message, log_ns)
+            case TwinFinger():
+                self.true_place.take(self.fine.index(log_ns), message.position_world_m)
+            case Status():
+                self._take_status(message, header, seconds)
+            case SoftBody():
+                self.body_methods[message.method] = self.body_methods.get(message.method, 0) + 1
+                self.out_of_range += not message.in_range
+                self.force.take(index, float(np.linalg.norm(message.force_world_n)))
+            case Frame() | StereoPair() | TwinEye():
+                self._take_picture(message, seconds)
+            case _:
+                self._take_rare(message, header, log_ns)
+
+    def seconds(self, at_ns: int) -> float:
+        """Since the bag began."""
+        return (at_ns - self.info.start_ns) * 1e-9
+
+    def _take_flow(self, topic: str, header: Header, log_ns: int) -> None:
+        flow = self.flows.get(topic)
+        if flow is None:
+            flow = self.flows[topic] = Flow(Spread(Grid(0, 1.0, 1)))
+        flow.messages += 1
+        before = flow.sequences.get(header.writer)
+        if before is not None and before[0] == header.epoch and header.sequence > before[1] + 1:
+            flow.lost += header.sequence - before[1] - 1
+        flow.sequences[header.writer] = (header.epoch, header.sequence)
+        if header.clock_id == self.clock_id:
+            flow.age.take(0, (log_ns - header.source_ns) * 1e-9)
+        if flow.last_ns is not None and topic in silent_after_s:
+            silence_s = (log_ns - flow.last_ns) * 1e-9
+            flow.longest_silence_s = max(flow.longest_silence_s, silence_s)
+            if silence_s > silent_after_s[topic]:
+                flow.silences += 1
+                text = f"{topic} silent for {silence_s:.2f} s"
+                self.events.add(self.seconds(flow.last_ns), "gap", text)
+        flow.last_ns = log_ns
+
+    def _take_arm(self, arm: ArmState, source_ns: int, log_ns: int) -> None:
+        mine = self.arms[arm.side]
+        if mine.modes.take(self.fine.index(log_ns), log_ns, arm.mode) and arm.mode in FAULTY:
+            text = f"{arm.side} arm: {arm.mode}" + (f", {arm.reason}" if arm.reason else "")
+            self.events.add(self.seconds(log_ns), "arm", text)
+        for fault in arm.faults:
+            if fault not in mine.faults:
+                self.events.add(self.seconds(log_ns), "fault", f"{arm.side} arm: {fault}")
+        mine.faults = arm.faults
+        mine.take(arm, source_ns, self.grid.index(log_ns))
+
+    def _take_target(self, target: SheetTarget, log_ns: int) -> None:
+        fine = self.fine.index(log_ns)
+        self.phases.take(fine, log_ns, target.phase)
+        self.sheet_place.take(fine, target.world_from_sheet[:3, 3])
+        self.push.take(self.grid.index(log_ns), target.push_depth_m)
+
+    def _take_fingertip(self, finger: Fingertip, log_ns: int) -> None:
+        fine = self.fine.index(log_ns)
+        self.finger.take(fine, log_ns, finger.state)
+        self.reasons[finger.reason] = self.reasons.get(finger.reason, 0) + 1
+        self._finger_said = f"finger {finger.state}" + (
+            "" if finger.reason == "ok" else f" ({finger.reason})"
+        )
+        if finger.valid:
+            self.finger_place.take(fine, finger.position_world_m)
+
+    def _take_status(self, status: Status, header: Header, seconds: float) -> None:
+        said = self.nodes.setdefault(status.node, NodeSaid())
+        starts = said.starts
+        if said.take(status, header.epoch):
+            self.events.add(seconds, "error", f"{status.node}: {status.last_error}")
+        if starts and said.starts > starts:
+            self.events.add(seconds, "restart", f"{status.node} was started again")
+        for port in status.inputs:
+            if port.topic not in self.ports:
+                self.ports[port.topic] = Port(Spread(Grid(0, 1.0, 1)))
+            self.ports[port.topic].take(status.node, header.epoch, port)
+
+    def _take_picture(self, message: Frame | StereoPair | TwinEye, seconds: float) -> None:
+        match message:
+            case StereoPair():
+                pair = (("left camera", message.left), ("right camera", message.right))
+                self.stereo.take(seconds, self._finger_said, pair)
+            case TwinEye():
+                pair = (("what the eye sees", message.seen), ("what it should see", message.proper))
+                self.eye.take(seconds, named(message.label, message.correction), pair)
+            case Frame():
+                self.frames += 1
+                if self._late_before is None:
+                    self._late_before = message.late_frames
+                late = message.late_frames - self._late_before
+                self.late_frames = max(self.late_frames, late)
+                name = message.correction
+                self.corrections[name] = self.corrections.get(name, 0) + 1
+                self.draw.take(0, message.draw_s)
+                if message.pixels:
+                    shown = f"{named(message.label, message.correction)}, {message.stereo}"
+                    self.drawn.take(seconds, shown, (("projector", message.pixels[0]),))
+
+    def _take_rare(self, message: Message, header: Header, log_ns: int) -> None:
+        seconds = self.seconds(log_ns)
+        match message:
+            case Scene():
+                self.scene = message
+                if not self.scenes or self.scenes[-1] != message.name:
+                    self.scenes.append(message.name)
+                    self.events.add(seconds, "scene", f'scene "{message.name}"')
+            case EStop():
+                state = "engaged" if message.engaged else "released"
+                # A latched word is said again for those who come late.
+                if self.estop.take(self.fine.index(log_ns), log_ns, state) or (
+                    message.engaged and "estop" not in self.events.counts
+                ):
+                    text = f"e-stop {state} by {header.writer}: {message.reason}"
+                    self.events.add(seconds, "estop", text)
+            case Moment():
+                self.events.add(seconds, "moment", message.label)
+            case HostStatus():
+                self.hosts[message.host] = message
+                for node in message.nodes:
+                    key = f"{message.run} {node.name}"
+                    if node.restarts > self._restarts.get(key, 0):
+                        why = "it hung" if node.hangs else "it had ended"
+                        text = f"{node.name} started again on {message.host}: {why}"
+                        self.events.add(seconds, "restart", text)
+                    self._restarts[key] = node.restarts
+
+
+def named(label: str, correction: str) -> str:
+    """A picture's label with the correction, where it does not say so itself."""
+    return label if correction in label else ", ".join(filter(None, (label, correction)))
+
+
+def _silent_after_s() -> dict[str, float]:
+    """After how long a topic counts as silent, for those with a rate and one writer."""
+    return {
+        topic.name: max(SILENT_PERIODS / topic.rate_hz[0], SHORTEST_SILENCE_S)
+        for topic in TOPICS.values()
+        if topic.rate_hz is not None and not topic.many_writers
+    }
+
+
+silent_after_s = _silent_after_s()
+
+
+def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -> Session:
+    """Read what of a bag can be read, cut or whole; BagError where nothing can be."""
+    reader = BagReader(bag)
+    info = reader.info()
+    readable = {one.name for one in info.topics if one.readable}
+    moments = [
+        ((log_ns - info.start_ns) * 1e-9, message.label)
+        for _, message, _, log_ns in BagReader(bag, {"moment"} & readable)
+        if isinstance(message, Moment)
+    ]
+    session = Session(reader, info, moments)
+    selected = BagReader(bag, readable)
+    for number, (topic, message, header, log_ns) in enumerate(selected):
+        session.take(topic, message, header, log_ns)
+        if number % 200 == 0:
+            progress(session.seconds(log_ns), info.duration_s)
+    session.errors.finish()
+    return session
+
+
+def _plan_of(reader: BagReader) -> Plan | None:
+    try:
+        return Plan.model_validate_json(reader.attachment("plan.json"))
+    except (BagError, ValidationError):
+        return None  # a bag of one's own making, or of other code: the page says that it is missing
+
+
+def _json_of(reader: BagReader, name: str) -> dict[str, Any]:
+    try:
+        found = json.loads(reader.attachment(name))
+    except (BagError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}

@@ -1,0 +1,78 @@
+"""From a bag to the report's file and numbers."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from launch.bags.report.findings import findings_of
+from launch.bags.report.numbers import numbers_of
+from launch.bags.report.page import MARK, page_of
+from launch.bags.report.session import Progress, Session, read_session
+from messages.bag import BagError
+
+
+def default_output(bag: Path) -> Path:
+    """Beside the bag, named after it."""
+    return bag.with_suffix(".html")
+
+
+def report(bag: Path, output: Path | None, progress: Progress) -> dict[str, Any]:
+    """Read the bag, write its page to `output` (None: no page), and return the numbers.
+
+    Raises BagError for a bag of which nothing can be read, and for a file that cannot be written or
+    is something else than an earlier report.
+    """
+    if output is not None:
+        _check(output)
+    session = read_session(bag, progress)
+    if output is not None:
+        page, draft = page_of(session), _draft_of(output)
+        try:
+            draft.write_text(page, encoding="utf-8")
+            draft.replace(output.resolve())
+        except OSError as error:
+            raise _unwritable(output, error) from error
+        finally:
+            draft.unlink(missing_ok=True)
+    return result_of(session)
+
+
+def result_of(session: Session) -> dict[str, Any]:
+    """The numbers, with what was found in them."""
+    numbers = numbers_of(session)
+    return {"findings": [asdict(one) for one in findings_of(numbers)], **numbers}
+
+
+def _draft_of(output: Path) -> Path:
+    """Where the page is written before it takes its place: a reader sees the old or the new."""
+    place = output.resolve()
+    return place.with_name(f".{place.name}.{os.getpid()}.tmp")
+
+
+def _check(output: Path) -> None:
+    """Can the page go there, which is known only after the whole bag has been read?"""
+    draft = _draft_of(output)
+    try:
+        draft.touch()
+        draft.unlink()
+        if not output.exists():
+            return
+        with output.open(encoding="utf-8", errors="replace") as file:
+            head = file.read(200)
+    except OSError as error:
+        raise _unwritable(output, error) from error
+    if MARK not in head:
+        raise BagError(
+            f"{output}: exists already and is no report, so it is not written over; name another "
+            "file with -o"
+        )
+
+
+def _unwritable(output: Path, error: OSError) -> BagError:
+    return BagError(
+        f"{output}: cannot be written: {error.strerror or error}; name a file with -o in a folder "
+        "that is there and may be written to"
+    )

@@ -1,0 +1,1 @@
+"""Whether computers, devices, reach and sheet are fit for a scene, and what to do about it."""

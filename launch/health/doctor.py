@@ -1,0 +1,163 @@
+"""Checks of the machine that flexsheet is to run on, each with what to do about it."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Literal
+
+from launch.health.system import MANUAL, opengl_problem
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan
+from launch.running.runs import is_free, live_runs, orphans, root
+
+DEMO = Path(__file__).parent.parent / "demo.yaml"
+CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
+QUICK_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "xen")
+LEAST_DISK_BYTES = 2 << 30
+LEAST_CORES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One check's outcome; `remedy` says what to do where it is not ok."""
+
+    check: str
+    state: Literal["ok", "warning", "failed"]
+    what: str
+    remedy: str = ""
+
+
+def check_all() -> Iterator[Finding]:
+    """All checks, one after another."""
+    checks: tuple[Callable[[], Finding], ...] = (
+        check_python,
+        check_libraries,
+        check_opencv,
+        check_opengl,
+        check_cores,
+        check_disk,
+        check_clock,
+        check_sockets,
+        check_leftovers,
+        check_demo,
+    )
+    for check in checks:
+        yield check()
+
+
+def check_python() -> Finding:
+    """Which Python this is; an older one than the project needs does not come this far."""
+    return Finding("python", "ok", f"{sys.version.split()[0]} at {sys.executable}")
+
+
+def check_libraries() -> Finding:
+    """Every requirement of the distribution is installed."""
+    try:
+        wanted = requires("flexsheet") or []
+    except PackageNotFoundError:
+        return Finding("libraries", "warning", "flexsheet itself is not installed", "make setup")
+    missing = []
+    names = [
+        match[0]
+        for line in wanted
+        if "extra ==" not in line and (match := re.match(r"[A-Za-z0-9._-]+", line))
+    ]
+    for name in names:
+        try:
+            version(name)
+        except PackageNotFoundError:
+            missing.append(name)
+    if missing:
+        return Finding("libraries", "failed", f"missing: {', '.join(missing)}", "make setup")
+    return Finding("libraries", "ok", f"all {len(names)} are installed")
+
+
+def check_opencv() -> Finding:
+    try:
+        import cv2
+    except ImportError as error:
+        return Finding("opencv", "failed", str(error), "make setup")
+    registry = cv2.videoio_registry
+    names = dict.fromkeys(registry.getBackendName(one) for one in registry.getBackends())
+    return Finding("opencv", "ok", f"{cv2.__version__}, cameras and files by {', '.join(names)}")
+
+
+def check_opengl() -> Finding:
+    problem = opengl_problem()
+    if problem is None:
+        return Finding("opengl", "ok", "a headless context can be made (EGL)")
+    return Finding("opengl", "failed", problem, f"on Debian: {MANUAL}")
+
+
+def check_cores() -> Finding:
+    cores = len(os.sched_getaffinity(0))
+    if cores < LEAST_CORES:
+        return Finding("cores", "warning", str(cores), f"the demo wants {LEAST_CORES}")
+    return Finding("cores", "ok", str(cores))
+
+
+def check_disk() -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free
+    text = f"{free / 2**30:.1f} GiB free at {Path.cwd()}"
+    if free < LEAST_DISK_BYTES:
+        return Finding("disk", "warning", text, "bags need room: 37 MB a second with pictures")
+    return Finding("disk", "ok", text)
+
+
+def check_clock() -> Finding:
+    """The clock that stamps everything: quick to read, and fine enough."""
+    try:
+        source = (CLOCK_SOURCES / "current_clocksource").read_text().strip()
+    except OSError:
+        source = "unknown"
+    resolution_ns = time.get_clock_info("monotonic").resolution * 1e9
+    text = f"{source}, resolution {resolution_ns:g} ns"
+    if source not in (*QUICK_CLOCKS, "unknown"):
+        return Finding("clock", "warning", text, "a slow source; see dmesg on why tsc is not used")
+    return Finding("clock", "ok", text)
+
+
+def check_sockets() -> Finding:
+    directory = root()
+    if not directory.exists():
+        return Finding("sockets", "ok", f"{directory} will be made")
+    status = directory.lstat()
+    if status.st_uid != os.getuid() or not os.access(directory, os.W_OK | os.X_OK):
+        return Finding(
+            "sockets", "failed", f"{directory} is not ours", "set FLEXSHEET_RUNS to another folder"
+        )
+    return Finding("sockets", "ok", f"{directory}, {len(live_runs())} graphs are running")
+
+
+def check_leftovers() -> Finding:
+    found = orphans()
+    if found:
+        pids = ", ".join(str(process.pid) for process in found)
+        return Finding(
+            "leftovers",
+            "warning",
+            f"{len(found)} processes of launchers that are gone: {pids}",
+            "flexsheet doctor --sweep",
+        )
+    return Finding("leftovers", "ok", "none")
+
+
+def check_demo() -> Finding:
+    """The demo's launch file resolves, and the ports that its nodes listen on are free."""
+    try:
+        plan = load_plan(DEMO)
+    except BadInputError as error:
+        return Finding("demo", "failed", str(error))
+    taken = [port for _, port in plan.ports_of_its_own(None) if not is_free("127.0.0.1", port)]
+    if taken:
+        what = f"ports in use: {', '.join(map(str, taken))}"
+        return Finding("demo", "warning", what, "is a graph running? else change them with --set")
+    return Finding("demo", "ok", f"{len(plan.nodes)} nodes, plan {plan.hash}, its ports are free")

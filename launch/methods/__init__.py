@@ -1,0 +1,1 @@
+"""Speed against accuracy of method families: measured, charted, and chosen for a scene."""

@@ -1,0 +1,341 @@
+"""Speed against accuracy: measures a method family on this machine and this scene, and draws it."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
+from difflib import get_close_matches
+from importlib import import_module
+from pathlib import Path
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
+
+from launch.methods.finite import finite
+from launch.methods.machine import machine_name
+from launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
+from launch.running.supervisor import git_state
+from messages.scene import Scene
+from nodes.methods import Family, Point, Trial, measure, pareto_front
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FAMILIES: dict[str, str] = {
+    "mark": "nodes.triangulator.families:MARK",
+    "triangulation": "nodes.triangulator.families:TRIANGULATION",
+    "tracking": "launch.methods.families:TRACKING",
+    "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
+    "soft-body": "nodes.fem_solver.families:SOFT_BODY",
+    "correction": "launch.methods.families:CORRECTION",
+    "sheet-force": "launch.methods.families:SHEET_FORCE",
+    "sheet-shape": "launch.methods.families:SHEET_SHAPE",
+    "mesh-normal": "nodes.planner.families:MESH_NORMAL",
+    "rolling": "nodes.planner.families:ROLLING",
+}
+"""Families by their name on the command line; each node's folder describes its own."""
+
+REPEATS = 30
+ROOT = Path(__file__).resolve().parents[2]
+OVERVIEW = "README.md"
+TITLE_WIDTH = 95
+
+
+class UnknownFamilyError(KeyError):
+    """A family name that is not in the table; the message suggests one that is."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+def family_named(name: str) -> Family:
+    """The family of that name; raises UnknownFamilyError with the nearest name."""
+    if name not in FAMILIES:
+        near = get_close_matches(name, FAMILIES, n=1)
+        hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(FAMILIES)}"
+        raise UnknownFamilyError(f'unknown family "{name}"{hint}')
+    return family_at(FAMILIES[name])
+
+
+def family_at(place: str) -> Family:
+    """The family that `module:NAME` describes."""
+    module_name, _, attribute = place.partition(":")
+    family = getattr(import_module(module_name), attribute)
+    assert isinstance(family, Family)
+    return family
+
+
+def git_commit() -> str | None:
+    """The commit of this code; None where nobody knows it."""
+    commit: str | None = json.loads(git_state(ROOT))["commit"]
+    return commit
+
+
+def measure_family(
+    family: Family,
+    scene: Scene,
+    *,
+    repeats: int = REPEATS,
+    progress: Callable[[str], None] = lambda text: None,
+    wanted: Callable[[Trial], bool] = lambda trial: True,
+) -> list[Point]:
+    """Measure every trial of the family that is wanted; `progress` is told of each, and what is
+    left of what has to be worked out before."""
+    begun, last = time.monotonic(), -1
+
+    def told(done: int, total: int) -> None:
+        nonlocal last
+        if done == last:
+            return
+        last, left = done, ""
+        if 0 < done < total:
+            left_s = (time.monotonic() - begun) / done * (total - done)
+            left = f", about {left_s:.0f} s left"
+        progress(f"working out what it takes to judge: {done} of {total}{left}")
+
+    family.prepare(scene, told)
+    points = []
+    for trial in filter(wanted, family.trials(scene)):
+        progress(f"{trial.method} {trial.case}")
+        points.append(measure(trial, repeats=repeats))
+    return points
+
+
+def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
+    """What `chart FAMILY --json` prints."""
+    return {
+        "family": family.name,
+        "unit": family.unit,
+        "reference": family.reference,
+        "scene": scene.name,
+        "tolerance": family.tolerance(scene),
+        "along": family.along,
+        "machine": machine_name(),
+        "code": json.loads(git_state(ROOT)),
+        "points": [asdict(point) for point in points],
+        "front": pareto_front(points),
+    }
+
+
+def draw_chart(result: dict[str, Any], path: Path) -> None:
+    """Draw the result: log time across, error up; a line is the front of one case.
+
+    A family that says so gets its errors along the case, too, and further figures: with the
+    reference's own doubt, a band below which nothing can be told.
+    """
+    from matplotlib.figure import Figure
+
+    also = (
+        [] if result["along"] is None else sorted({k for p in result["points"] for k in p["also"]})
+    )
+    panels = 1 if result["along"] is None else 2 + len(also)
+    with drawn_for_pages():
+        columns = min(panels, 2)
+        rows = math.ceil(panels / columns)
+        figure = Figure(figsize=(8, 5.5) if rows == 1 else (14, 5.5 * rows), layout="constrained")
+        first, *others = figure.subplots(rows, columns, squeeze=False).flat
+        for unused in others[panels - 1 :]:
+            unused.remove()
+        _draw_time(first, result)
+        for axes, name in zip(others, ["error", *also], strict=False):
+            _draw_along(axes, result, name)
+        save_svg(figure, path)
+
+
+def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
+    """Errors below a ten-thousandth of the scene's tolerance (dashed) are drawn there: they are
+    rounding, and would press all the rest into a corner."""
+    methods = list(dict.fromkeys(point["method"] for point in result["points"]))
+    least = 1e-4 * result["tolerance"]
+    for index, method in enumerate(methods):
+        mine = [point for point in result["points"] if point["method"] == method]
+        for in_range, marker in ((True, "o"), (False, "x")):
+            shown = [point for point in mine if point["in_range"] == in_range and _judged(point)]
+            if shown:
+                front = "" if method not in result["front"] else ", on the front"
+                axes.plot(
+                    [point["median_s"] * 1e6 for point in shown],
+                    [max(point["error"], least) for point in shown],
+                    marker,
+                    color=COLOURS[index % len(COLOURS)],
+                    alpha=0.7,
+                    label=f"{method}{front if in_range else ' (out of its range)'}",
+                )
+    for case in unique_cases(result["points"]):
+        usable = [
+            point
+            for point in result["points"]
+            if point["in_range"] and point["case"] == case and _judged(point)
+        ]
+        steps = sorted((point["median_s"] * 1e6, max(point["error"], least)) for point in usable)
+        best = [
+            step
+            for i, step in enumerate(steps)
+            if all(step[1] < earlier[1] for earlier in steps[:i])
+        ]
+        if len(best) > 1:
+            axes.step(*zip(*best, strict=True), where="post", color=INK, alpha=0.4, linewidth=0.8)
+    axes.axhline(result["tolerance"], linestyle="--", color=INK, label="the scene's tolerance")
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel("time per call, µs (median)")
+    axes.set_ylabel(f"error, {result['unit']}")
+    title = f"{result['family']} — scene {result['scene']}, against {result['reference']}"
+    axes.set_title("\n".join(wrap(title, TITLE_WIDTH)), fontsize=10)
+    axes.grid(visible=True, which="both", alpha=0.2)
+    axes.legend(fontsize=8)
+
+
+def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
+    """One figure over the case, a line for each method, hollow out of its range; grey: what the
+    reference itself does not know."""
+    along, points = result["along"], result["points"]
+
+    def value(point: dict[str, Any]) -> float | None:
+        found: float | None = point["error"] if name == "error" else point["also"].get(name)
+        return found
+
+    doubts = sorted(
+        {p["case"][along]: p["doubts"][name] for p in points if name in p["doubts"]}.items()
+    )
+    if doubts:
+        at, doubt = zip(*doubts, strict=True)
+        low = [0.0 if name == "error" else -each for each in doubt]
+        label = "the reference's own doubt"
+        axes.fill_between(at, low, doubt, color=INK, alpha=0.12, linewidth=0, label=label)
+    methods = list(dict.fromkeys(point["method"] for point in points))
+    for index, method in enumerate(methods):
+        shown = [
+            (point["case"][along], value(point), point["in_range"])
+            for point in points
+            if point["method"] == method and _number(value(point))
+        ]
+        if not shown:
+            continue
+        at, values, sure = zip(*sorted(shown), strict=True)
+        color = COLOURS[index % len(COLOURS)]
+        axes.plot(at, values, "-", color=color, alpha=0.6, label=method)
+        for x, y, inside in zip(at, values, sure, strict=True):
+            axes.plot(x, y, "o", color=color, markerfacecolor=color if inside else "none")
+    if name == "error":
+        axes.axhline(result["tolerance"], linestyle="--", color=INK)
+        axes.set_yscale("symlog", linthresh=result["tolerance"])
+        axes.set_ylim(bottom=0.0)
+        axes.set_ylabel(f"error, {result['unit']}")
+    else:
+        axes.axhline(0.0, color=INK, linewidth=0.8)
+        axes.set_ylabel(name.replace("_", " "))
+    axes.set_xlabel(f"{along.replace('_', ' ')} (hollow: out of the method's range)")
+    axes.grid(visible=True, alpha=0.2)
+    axes.legend(fontsize=8)
+
+
+def _number(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _judged(point: dict[str, Any]) -> bool:
+    """Whether there was a reference to judge a point by."""
+    return _number(point["error"])
+
+
+def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The cases of points, each once, in their order."""
+    cases: list[dict[str, Any]] = []
+    for point in points:
+        if point["case"] not in cases:
+            cases.append(point["case"])
+    return cases
+
+
+def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
+    """Write the picture and the numbers of a chart; returns both paths."""
+    folder.mkdir(parents=True, exist_ok=True)
+    picture, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
+    draw_chart(result, picture)
+    numbers.write_text(json.dumps(finite(result), indent=1) + "\n")
+    return picture, numbers
+
+
+def kept_charts(folder: Path) -> list[dict[str, Any]]:
+    """The charts whose numbers lie in the folder, in the order of the table of families."""
+    kept = [folder / f"{name}.json" for name in FAMILIES]
+    return [_as_today(json.loads(path.read_text())) for path in kept if path.exists()]
+
+
+def _as_today(result: dict[str, Any]) -> dict[str, Any]:
+    """Numbers of earlier code, with what they did not have yet."""
+    points = [{"also": {}, "doubts": {}, **point} for point in result["points"]]
+    return {"along": None, "code": None, **result, "points": points}
+
+
+def write_overview(folder: Path) -> Path:
+    """One page of all the charts that lie in the folder; returns its path."""
+    path = folder / OVERVIEW
+    path.write_text("\n".join(_overview_lines(folder)) + "\n", encoding="utf-8")
+    return path
+
+
+def _overview_lines(folder: Path) -> Iterator[str]:
+    yield "# Speed against accuracy\n"
+    yield (
+        "Every method of every family, timed and judged on one machine and one scene by "
+        "`flexsheet chart --output docs/charts`. *In range* are the cases that a method says it is "
+        "good for; the front has those that no other method beats in both. The numbers of each "
+        "picture stand beside it as JSON.\n"
+    )
+    for result in kept_charts(folder):
+        name, unit = result["family"], result["unit"]
+        commit = (result.get("code") or {}).get("commit") or "unknown"
+        yield f"## {name}\n"
+        yield (
+            f"Against {result['reference']}; scene {result['scene']}, tolerance "
+            f"{result['tolerance']:.3g} {unit}. {result['machine']}; code {commit[:10]}. "
+            f"[Numbers]({name}.json).\n"
+        )
+        yield f"![{name}: time against error of each method]({name}.svg)\n"
+        yield f"| method | time, median | largest error in range, {unit} | cases in range | front |"
+        yield "|---|---|---|---|---|"
+        yield from map(_overview_row, methods_of(result["points"]))
+        yield ""
+        # benchmarks of the same methods leave theirs as FAMILY-WHAT
+        for more in sorted(folder.glob(f"{name}-*.svg")):
+            if more.stem not in FAMILIES:
+                yield f"![{more.stem}]({more.name})\n\n[Numbers]({more.stem}.json).\n"
+
+
+def methods_of(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Per method: the slowest median, the largest error and the count of its cases in range."""
+    rows = []
+    front = pareto_front([Point(**point) for point in points if _judged(point)])
+    for method in dict.fromkeys(point["method"] for point in points):
+        mine = [point for point in points if point["method"] == method]
+        inside = [point for point in mine if point["in_range"] and _judged(point)]
+        rows.append(
+            {
+                "method": method,
+                "median_s": max(point["median_s"] for point in inside or mine),
+                "error": max((point["error"] for point in inside), default=None),
+                "cases": len(mine),
+                "inside": len(inside),
+                "front": method in front,
+            }
+        )
+    return rows
+
+
+def _overview_row(row: dict[str, Any]) -> str:
+    error = "–" if row["error"] is None else f"{row['error']:.3g}"
+    cases = f"{row['inside']} of {row['cases']}"
+    front = "yes" if row["front"] else ""
+    return f"| {row['method']} | {duration(row['median_s'])} | {error} | {cases} | {front} |"
+
+
+def duration(seconds: float) -> str:
+    """A duration for people: 12 µs, 3.4 ms, 1.2 s."""
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.3g} {unit}"
+    return f"{seconds * 1e9:.3g} ns"

@@ -1,0 +1,61 @@
+"""Method families that one node offers and another judges: only here may both be known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+
+import numpy as np
+
+from launch.bench.twin_sheet import twin_errors, twin_force, twin_points
+from launch.experiments.stroke import stroke_path
+from messages.scene import Cylinder, Scene
+from messages.types import FingerPath
+from nodes.planner import force_table
+from nodes.planner.sheet_force import sheet_force_family
+from nodes.renderer.families import correction_family
+from nodes.renderer.shape_families import sheet_shape_family
+from nodes.triangulator.tracking_family import Motion, tracking_family
+from nodes.twin.finger import FingerMotion
+from nodes.twin.gestures import GESTURES
+
+CORRECTION = correction_family(twin_errors)
+QUICK_CORRECTION = correction_family(twin_errors, solved=False)
+
+TRACKED_GESTURES = ("hold", "reach", "tap", "stop", "stroke-push")
+RESTING = ("hold",)
+
+
+def finger_motions(scene: Scene) -> Mapping[str, Motion]:
+    """The paper's stroke, where the object is its cylinder, and some gestures, as the twin's finger
+    makes them."""
+    paths: dict[str, FingerPath] = {}
+    if isinstance(scene.object.geometry, Cylinder):
+        paths["stroke"] = stroke_path(scene, 10.0)
+    paths |= {name: GESTURES[name](scene) for name in TRACKED_GESTURES}
+    return {name: _motion(scene, path, resting=name in RESTING) for name, path in paths.items()}
+
+
+def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
+    """The path with its unsteadiness, once the reach to its start is over."""
+    start = np.asarray(path.positions_world_m[0])
+    motion = FingerMotion.resting(start, seed=1).followed_by(
+        0.0,
+        times_s=path.times_s,
+        points=path.positions_world_m,
+        wander_m=path.wander_m,
+        tremor_m=path.tremor_m,
+        max_speed_m_per_s=scene.finger.max_speed_m_per_s,
+        joined_by=path.joined_by,
+    )
+    duration_s = float(path.times_s[-1] - path.times_s[0])
+    return Motion(lambda time_s: motion.at(motion.ease_s + time_s).position, duration_s, resting)
+
+
+TRACKING = tracking_family(finger_motions)
+true_force = lru_cache(maxsize=1024)(twin_force)
+SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_make(scene, None))
+SHEET_LAWS = sheet_force_family(true_force, None)
+"""Those that are at hand at once."""
+SHEET_SHAPE = sheet_shape_family(twin_points)
+QUICK_SHAPE = sheet_shape_family(twin_points, solved=False)

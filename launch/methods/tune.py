@@ -1,0 +1,575 @@
+"""The cheapest methods that are good enough for a scene: measured, chosen, and written into it.
+
+Each family that nodes take up is measured on this machine over the scene's working range.  Of the
+methods whose stated range holds all of it and whose largest error keeps a margin to the scene's
+tolerance, the one that takes least time is chosen.  Where there is none, the nearest miss is, and
+that is said.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import math
+import os
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
+
+from launch.methods.charts import duration, family_at, git_commit, measure_family
+from launch.methods.machine import machine_name
+from launch.plans.documents import BadInputError, Problem, did_you_mean
+from launch.plans.plan import load_scene
+from messages.scene import Scene
+from nodes.methods import Family, Point, Trial
+
+REPEATS = 10
+MARGIN = 0.2
+"""Share of a tolerance that must be left over: what no chart has comes on top."""
+TIE_RATIO = 1.1
+"""Methods that take no longer than this times the quickest take the same time, as far as a machine
+with other work can tell; the more exact is taken."""
+
+Measure = Callable[[Family, Scene, Callable[[Trial], bool]], Sequence[Point]]
+Setting = str | dict[str, Any]
+
+
+class UnknownTunableError(KeyError):
+    """A family that no node takes a choice of; the message says which there are."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Tunable:
+    """A family that nodes take up.
+
+    key: in a scene's `methods`.  families: where they are described, to be measured in turn; what
+    takes minutes to make comes in a later one, which is asked only where nothing before it is good
+    enough.  settings: for each method that a node offers, by its name in the chart, what the scene
+    then says.
+    """
+
+    name: str
+    key: str
+    families: tuple[str, ...]
+    settings: Mapping[str, Setting]
+
+
+def _by_name(*names: str) -> dict[str, Setting]:
+    return {name: name for name in names}
+
+
+def _soft_body(method: str, skin_spacing_m: float) -> Setting:
+    return {"method": method, "skin_spacing_m": skin_spacing_m}
+
+
+TUNABLES = (
+    Tunable(
+        "mark",
+        "mark",
+        ("nodes.triangulator.families:MARK",),
+        _by_name("moments", "weighted_centroid", "subpixel_fit"),
+    ),
+    Tunable(
+        "triangulation",
+        "triangulation",
+        ("nodes.triangulator.families:TRIANGULATION",),
+        _by_name("midpoint", "dlt", "optimal"),
+    ),
+    Tunable(
+        "tracking",
+        "tracking",
+        ("launch.methods.families:TRACKING",),
+        _by_name(
+            "none", "exponential", "one_euro", "constant_velocity", "constant_acceleration", "hand"
+        ),
+    ),
+    Tunable(
+        "kinematics",
+        "kinematics",
+        ("nodes.arm_bridge.kinematics:KINEMATICS",),
+        _by_name("closed_form_continuous"),
+    ),
+    Tunable(
+        "sheet-force",
+        "sheet_force",
+        ("launch.methods.families:SHEET_LAWS", "launch.methods.families:SHEET_FORCE"),
+        _by_name("linear", "cubic", "scaled", "table"),
+    ),
+    Tunable(
+        "sheet-shape",
+        "sheet_shape",
+        ("launch.methods.families:QUICK_SHAPE", "launch.methods.families:SHEET_SHAPE"),
+        _by_name("flat", "four_triangles", "dents"),
+    ),
+    Tunable(
+        "correction",
+        "correction",
+        ("launch.methods.families:QUICK_CORRECTION", "launch.methods.families:CORRECTION"),
+        _by_name("none", "one_plane", "four_triangles", "two_pass"),
+    ),
+    Tunable(
+        "soft-body",
+        "soft_body",
+        (
+            "nodes.fem_solver.families:SOFT_BODY_LINEAR",
+            "nodes.fem_solver.families:SOFT_BODY_TABLES",
+        ),
+        {
+            "linear, coarse": _soft_body("linear", 0.006),
+            "linear, medium": _soft_body("linear", 0.0045),
+            "linear, fine": _soft_body("linear", 0.003),
+            "nonlinear table, medium": _soft_body("nonlinear_table", 0.0045),
+        },
+    ),
+)
+"""In the order in which they are tuned: the correction asks which shape two passes go onto."""
+
+TWO_PASS_ONTO = {
+    "flat": "two_pass_flat",
+    "four_triangles": "two_pass_triangles",
+    "dents": "two_pass",
+}
+"""What the chart calls two passes, by the sheet's shape."""
+
+
+def tunables_named(names: Sequence[str]) -> list[Tunable]:
+    """Those of the names, in the order of `TUNABLES`, or all; UnknownTunableError."""
+    known = [one.name for one in TUNABLES]
+    for name in names:
+        if name not in known:
+            raise UnknownTunableError(
+                f'no node takes a choice of "{name}"; {did_you_mean(name, known)}'
+            )
+    return [one for one in TUNABLES if not names or one.name in names]
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """One method over a scene's working range.
+
+    median_s: of a call, in the middle of the cases.  slowest_s: of the slowest case.  error: the
+    largest within the method's range, at `worst_case`; infinite where it has none.  outside: the
+    cases that it does not claim.  wrong: those where its error takes more than the tolerance less
+    its margin, or nothing could judge it.
+    """
+
+    method: str
+    setting: Setting
+    median_s: float
+    slowest_s: float
+    error: float
+    worst_case: Mapping[str, Any]
+    cases: int
+    outside: tuple[Mapping[str, Any], ...]
+    wrong: tuple[Mapping[str, Any], ...]
+
+    @property
+    def meets(self) -> bool:
+        return not self.outside and not self.wrong
+
+    @property
+    def missed(self) -> int:
+        return len(self.outside) + len(self.wrong)
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What a family comes to: the chosen method, whether it meets the tolerance, and all judged."""
+
+    family: str
+    key: str
+    unit: str
+    tolerance: float
+    chosen: Verdict
+    judged: tuple[Verdict, ...]
+
+    @property
+    def met(self) -> bool:
+        return self.chosen.meets
+
+    @property
+    def spare_ratio(self) -> float:
+        """Share of the tolerance that is left over; negative where it is exceeded."""
+        return 1.0 - self.chosen.error / self.tolerance
+
+    def sentence(self) -> str:
+        """Why, in a sentence."""
+        one, unit = self.chosen, self.unit
+        allowed = f"{_figure(self.tolerance)} {unit}"
+        took = duration(one.median_s)
+        if not self.met:
+            near = f"the nearest is {one.method} ({took}): {one.missed} of {one.cases} cases missed"
+            return f"{self.family}: no method keeps {allowed}; {near}, {self._shortfall(one)}"
+        cheaper = [other for other in self.judged if other.median_s * TIE_RATIO < one.median_s]
+        rest = "nothing is cheaper"
+        if cheaper:
+            nearest = min(cheaper, key=_miss)
+            rest = f"{nearest.method} is cheaper ({duration(nearest.median_s)}), but "
+            rest += self._shortfall(nearest)
+        left = f"{one.method} ({took}) leaves {_figure(one.error)} of {allowed} allowed"
+        return f"{self.family}: {left}; {rest}"
+
+    def _shortfall(self, one: Verdict) -> str:
+        """Why a method does not do."""
+        parts = []
+        if one.wrong:
+            error = f"{_figure(one.error)} {self.unit} at {_case(one.worst_case)}"
+            parts.append(f"leaves {error}" if math.isfinite(one.error) else "nothing can judge it")
+        if one.outside:
+            parts.append(f"is not meant for {_case(one.outside[0])}")
+        return " and ".join(parts)
+
+    def report(self) -> dict[str, Any]:
+        """For `--json`."""
+        return {
+            "family": self.family,
+            "key": self.key,
+            "unit": self.unit,
+            "tolerance": self.tolerance,
+            "chosen": self.chosen.method,
+            "setting": self.chosen.setting,
+            "met": self.met,
+            "error": self.chosen.error,
+            "spare_ratio": self.spare_ratio,
+            "sentence": self.sentence(),
+            "judged": [asdict(one) for one in self.judged],
+        }
+
+
+def _figure(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _case(case: Mapping[str, Any]) -> str:
+    parts = (
+        f"{name} {_figure(value) if isinstance(value, float) else value}"
+        for name, value in case.items()
+        if name not in ("width_px", "height_px")
+    )
+    return ", ".join(parts)
+
+
+def verdicts(
+    points: Sequence[Point],
+    settings: Mapping[str, Setting],
+    *,
+    tolerance: float,
+    margin: float = MARGIN,
+) -> list[Verdict]:
+    """How each method of `settings` does over the cases that the scene asks for."""
+    allowed, found = (1.0 - margin) * tolerance, []
+    for method, setting in settings.items():
+        mine = [point for point in points if point.method == method and point.in_scene]
+        if not mine:
+            continue
+        inside = [point for point in mine if point.in_range]
+        sure = [point for point in inside if math.isfinite(point.error)]
+        worst = max(sure, key=lambda point: point.error, default=mine[0])
+        times = sorted(point.median_s for point in mine)
+        found.append(
+            Verdict(
+                method=method,
+                setting=setting,
+                median_s=times[len(times) // 2],
+                slowest_s=times[-1],
+                error=worst.error if sure else math.inf,
+                worst_case=worst.case,
+                cases=len(mine),
+                outside=tuple(point.case for point in mine if not point.in_range),
+                wrong=tuple(point.case for point in inside if not point.error <= allowed),
+            )
+        )
+    return found
+
+
+def choose(judged: Sequence[Verdict]) -> Verdict:
+    """The cheapest that meets the tolerance everywhere, else the nearest miss."""
+    enough = [one for one in judged if one.meets]
+    if not enough:
+        return min(judged, key=_miss)
+    quickest = min(one.median_s for one in enough)
+    same = [one for one in enough if one.median_s <= TIE_RATIO * quickest]
+    return min(same, key=lambda one: (one.error, one.median_s))
+
+
+def _miss(one: Verdict) -> tuple[int, int, float, float]:
+    """By how much a method misses.
+
+    What it is not meant for comes first: there it gives no answer that could be near.
+    """
+    return len(one.outside), one.missed, one.error, one.median_s
+
+
+def tune(
+    scene: Scene,
+    tunables: Sequence[Tunable],
+    *,
+    margin: float = MARGIN,
+    measured: Measure | None = None,
+    progress: Callable[[str], None] = lambda text: None,
+) -> list[Choice]:
+    """Measure and choose, family by family; `measured` stands in for the measuring.
+
+    Errors of a family whose shape, mesh or sheet cannot be worked with come through.
+    """
+    choices: list[Choice] = []
+    shape: str = scene.methods.sheet_shape or "dents"
+    for number, tunable in enumerate(tunables, start=1):
+        told = partial(_told, progress, f"{tunable.name} ({number} of {len(tunables)})")
+        settings = dict(tunable.settings)
+        if tunable.name == "correction":
+            settings.pop("two_pass")
+            settings[TWO_PASS_ONTO[shape]] = "two_pass"
+        choice = _tuned(scene, tunable, settings, margin=margin, measured=measured, progress=told)
+        if tunable.name == "sheet-shape":
+            shape = choice.chosen.method
+        choices.append(choice)
+    return choices
+
+
+def _told(progress: Callable[[str], None], where: str, text: str) -> None:
+    progress(f"{where}: {text}")
+
+
+def _tuned(
+    scene: Scene,
+    tunable: Tunable,
+    settings: Mapping[str, Setting],
+    *,
+    margin: float,
+    measured: Measure | None,
+    progress: Callable[[str], None],
+) -> Choice:
+    judged: list[Verdict] = []
+    for place in tunable.families:
+        family = family_at(place)
+        known = {one.method for one in judged}
+        left = {
+            name: setting
+            for name, setting in settings.items()
+            if name in family.methods and name not in known
+        }
+        if not left:
+            continue
+        progress(f"{', '.join(left)}; what that needs is worked out, minutes the first time")
+        wanted = partial(_is_wanted, left)
+        if measured is not None:
+            points = measured(family, scene, wanted)
+        else:
+            points = measure_family(
+                family, scene, repeats=REPEATS, progress=progress, wanted=wanted
+            )
+        judged += verdicts(points, left, tolerance=family.tolerance(scene), margin=margin)
+        if any(one.meets for one in judged):
+            break
+    tolerance = family.tolerance(scene)
+    return Choice(tunable.name, tunable.key, family.unit, tolerance, choose(judged), tuple(judged))
+
+
+def _is_wanted(methods: Mapping[str, Setting], trial: Trial) -> bool:
+    return trial.in_scene and trial.method in methods
+
+
+METHODS = "methods"
+
+
+def written(
+    text: str, choices: Sequence[Choice], *, today: str, machine: str, commit: str | None
+) -> str:
+    """A scene file's text with these choices in its `methods`.  All else stays as it is, to the
+    byte, and so do the methods of other families; a `methods` on one line is unfolded."""
+    lines = text.splitlines(keepends=True)
+    ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
+    block = _block(text, lines)
+    chosen = {choice.key: choice for choice in choices}
+    code = "" if commit is None else f"; code {commit[:10]}"
+    head = f"# Chosen by `flexsheet tune` on {today}; {machine}{code}.{ending}"
+    new = [head, block.header or f"{METHODS}:{ending}"]
+    for key, own in block.parts:
+        if key in chosen:
+            new.append(_line(chosen.pop(key), block.indent) + ending)
+        else:
+            new += [line if line.endswith("\n") else line + ending for line in own]
+    new += [_line(chosen[one.key], block.indent) + ending for one in TUNABLES if one.key in chosen]
+    before, after = lines[: block.start], lines[block.end :]
+    if before and not before[-1].endswith("\n"):
+        before[-1] += ending
+    if block.start == len(lines) and before and before[-1].strip():
+        before.append(ending)
+    return "".join([*before, *new, *after])
+
+
+def _line(choice: Choice, indent: str) -> str:
+    setting = choice.chosen.setting
+    took, allowed = duration(choice.chosen.median_s), f"{_figure(choice.tolerance)} {choice.unit}"
+    told = f"{took}, leaves {_figure(choice.chosen.error)} of {allowed}"
+    if not choice.met:
+        missed = f"{choice.chosen.missed} of {choice.chosen.cases} cases missed"
+        told = f"NOT GOOD ENOUGH, the nearest miss: {told}; {missed}"
+    return f"{indent}{choice.key}: {_flow(setting)}  # {told}"
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """The `methods` of a scene file's lines.
+
+    start: its first line, with the comment above that was written along.  end: the line after it;
+    both are the file's end where there are none.  header: the line of `methods:`, where it can
+    stay.  parts: what comes after it, in order: a family's key and its lines; and comments, without
+    a key.
+    """
+
+    start: int
+    end: int
+    header: str = ""
+    indent: str = "  "
+    parts: tuple[tuple[str, list[str]], ...] = ()
+
+
+def _block(text: str, lines: Sequence[str]) -> _Block:
+    tree = YAML(typ="rt", pure=True).load(text)
+    names = list(tree)
+    if METHODS not in names:
+        return _Block(len(lines), len(lines))
+    start = first = tree.lc.data[METHODS][0]
+    later = [tree.lc.data[name][0] for name in names if tree.lc.data[name][0] > start]
+    end = min(later, default=len(lines))
+    while end > start + 1 and (not lines[end - 1].strip() or lines[end - 1].startswith("#")):
+        end -= 1
+    if start > 0 and lines[start - 1].startswith("# Chosen by `flexsheet tune`"):
+        start -= 1
+    inner = tree[METHODS]
+    if not isinstance(inner, CommentedMap):
+        return _Block(start, end, parts=(("", list(lines[first + 1 : end])),))
+    if inner.fa.flow_style():
+        unfolded = ((name, [f"  {name}: {_flow(item)}"]) for name, item in inner.items())
+        return _Block(start, end, parts=tuple(unfolded))
+    at = {name: tuple(inner.lc.data[name][:2]) for name in inner}
+    starts = sorted(line for line, _ in at.values())
+    parts = [("", list(lines[first + 1 : starts[0]]))]
+    for name, (line, _) in sorted(at.items(), key=lambda item: item[1]):
+        own = list(lines[line : min((one for one in starts if one > line), default=end)])
+        behind: list[str] = []
+        while len(own) > 1 and (not own[-1].strip() or own[-1].lstrip().startswith("#")):
+            behind.insert(0, own.pop())
+        parts += [(name, own), ("", behind)]
+    indent = " " * min(column for _, column in at.values())
+    return _Block(start, end, lines[first], indent, tuple(parts))
+
+
+def _flow(item: Any) -> str:
+    if isinstance(item, Mapping):
+        return "{" + ", ".join(f"{name}: {_flow(value)}" for name, value in item.items()) + "}"
+    return "null" if item is None else str(item)
+
+
+FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
+"""Keys of a scene file that name a file relative to it."""
+
+
+def moved(text: str, source: Path, target: Path) -> str:
+    """A scene file's text as it must read in the target's folder: files that it names relative to
+    itself are named from there.  BadInputError where a name cannot be put in."""
+    here, there = source.absolute().parent.resolve(), target.resolve().parent
+    if here == there or source.resolve() == target.resolve():
+        return text
+    tree = YAML(typ="rt", pure=True).load(text)
+    lines = text.splitlines(keepends=True)
+    for key in FILES:
+        holder: Any = tree
+        for part in key[:-1]:
+            holder = holder.get(part) if isinstance(holder, CommentedMap) else None
+        name = holder.get(key[-1]) if isinstance(holder, CommentedMap) else None
+        if not isinstance(name, str) or os.path.isabs(name):
+            continue
+        line, column = holder.lc.value(key[-1])
+        rest = lines[line][column:]
+        old = next((one for one in (f'"{name}"', f"'{name}'", name) if rest.startswith(one)), None)
+        if old is None:
+            what = f'names "{name}", which is not to be found from {there}'
+            remedy = "give the file's whole path, or --output a file beside the scene"
+            raise BadInputError([Problem(f"{source}:{line + 1}", key, what, remedy)])
+        new = json.dumps(os.path.relpath(here / name, there), ensure_ascii=False)
+        lines[line] = lines[line][:column] + new + rest[len(old) :]
+    return "".join(lines)
+
+
+def check_target(source: Path, target: Path) -> None:
+    """Before anything is measured: can a scene be written there?  BadInputError where not."""
+    moved(_read(source), source, target)
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(errno.EISDIR, "it is a folder")
+        draft = _draft_of(target.resolve())
+        draft.touch()
+        draft.unlink()
+    except OSError as error:
+        raise _unwritable(target, error) from error
+
+
+def _unwritable(target: Path, error: OSError) -> BadInputError:
+    what = f"cannot be written: {error.strerror or error}"
+    remedy = "give --output FILE, in a folder that is there and may be written to"
+    return BadInputError([Problem(str(target), (), what, remedy)])
+
+
+def _read(source: Path) -> str:
+    return source.read_bytes().decode("utf-8")  # read_text would change how lines end
+
+
+def _draft_of(target: Path) -> Path:
+    return target.with_name(f".{target.stem}.{os.getpid()}.yaml")
+
+
+def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None:
+    """Put the choices into a scene file, or into a copy of it; a reader sees the old or the new.
+
+    A link stays one: what it leads to is written.  BadInputError where the result would be no
+    scene, or another one, and where the target cannot be written.
+    """
+    text = written(
+        moved(_read(source), source, target),
+        choices,
+        today=datetime.now(UTC).date().isoformat(),
+        machine=machine_name(),
+        commit=git_commit(),
+    )
+    before = load_scene(source)
+    # In the target's folder, as a scene names its mesh from there.
+    place = target.resolve()
+    draft = _draft_of(place)
+    try:
+        draft.write_bytes(text.encode())
+        after = _loaded(draft, source)
+        same = {"methods": before.methods}
+        if after.model_copy(update=same).model_dump_json() != before.model_dump_json():
+            problem = Problem(str(source), (METHODS,), "cannot be put in without a change", "")
+            raise BadInputError([problem])
+        shutil.copymode(place if place.exists() else source, draft)
+        draft.replace(place)
+    except OSError as error:
+        raise _unwritable(target, error) from error
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _loaded(draft: Path, source: Path) -> Scene:
+    """The scene of the draft; what is wrong with it is said of the source."""
+    try:
+        return load_scene(draft)
+    except BadInputError as error:
+        what = "with the choices put in, "
+        problems = [
+            Problem(str(source), one.key, what + one.what, one.remedy) for one in error.problems
+        ]
+        raise BadInputError(problems) from error

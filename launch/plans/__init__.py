@@ -1,0 +1,1 @@
+"""Launch files and scenes: read, checked, and resolved into what runs where."""

@@ -1,0 +1,109 @@
+"""Where key pairs lie, how they come into a launch file, and what a run's processes are told.
+
+A host's secret key is a file of its name in `directory()`; its public key is `hosts.NAME.key` of
+the launch file.  A run's directory has, for each host of it that runs there, a file from which the
+host's processes take both.
+"""
+
+from __future__ import annotations
+
+import os
+from io import StringIO
+from pathlib import Path
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap
+from ruamel.yaml.scalarstring import SingleQuotedScalarString
+
+from launch.plans.documents import BadInputError, Problem, did_you_mean, read_document
+from launch.plans.hosts import load_keys
+from launch.plans.planned import Plan
+from launch.running.runs import Run, ring_file
+from messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
+
+KEYS_VARIABLE = "FLEXSHEET_KEYS"
+"""Environment variable that moves the directory of secret keys."""
+
+
+def directory() -> Path:
+    """Where this user's secret keys are."""
+    given = os.environ.get(KEYS_VARIABLE)
+    if given:
+        return Path(given)
+    return Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config") / "flexsheet" / "keys"
+
+
+def secret_file(host: str) -> Path:
+    return directory() / f"{host}.secret"
+
+
+def make_rings(plan: Plan, run: Run, host: str | None) -> dict[str, KeyRing]:
+    """The keys of one host of a plan, or of all, checked; BadInputError."""
+    rings = {}
+    problems = []
+    for name in plan.hosts if host is None else [host]:
+        file = ring_file(run, name)
+        write_ring(file, host=name, secret_file=secret_file(name), public=plan.keys)
+        try:
+            rings[name] = KeyRing(file)
+        except SecurityError as error:
+            problems.append(Problem(plan.launch_file, ("hosts", name, "key"), str(error)))
+    if problems:
+        raise BadInputError(problems)
+    return rings
+
+
+class KeyWatch:
+    """Passes on to a run's processes what changes about the keys in its launch file."""
+
+    def __init__(self, plan: Plan, run: Run, rings: dict[str, KeyRing]) -> None:
+        self._launch_file, self._run, self._rings = Path(plan.launch_file), run, rings
+        self._public = plan.keys
+        self._read_ns = 0
+
+    def look(self) -> dict[str, KeyChange]:
+        """What has changed since the last look, by host; BadInputError, SecurityError, OSError."""
+        changed_ns = self._launch_file.stat().st_mtime_ns
+        if changed_ns != self._read_ns:
+            public = load_keys(self._launch_file)
+            if public != self._public:
+                for name in self._rings:
+                    file = ring_file(self._run, name)
+                    write_ring(file, host=name, secret_file=secret_file(name), public=public)
+            self._public, self._read_ns = public, changed_ns
+        changes = {name: ring.reload() for name, ring in self._rings.items()}
+        return {name: change for name, change in changes.items() if change is not None}
+
+
+def install(launch_file: Path, host: str, key: str) -> None:
+    """Put a host's public key into a launch file, and change nothing else; BadInputError."""
+    document = read_document(launch_file)
+    hosts = document.values.get("hosts")
+    if not isinstance(hosts, dict) or not isinstance(hosts.get(host), dict):
+        names = list(hosts) if isinstance(hosts, dict) else []
+        raise BadInputError(
+            [document.problem(("hosts",), f'there is no host "{host}"', did_you_mean(host, names))]
+        )
+    if not is_key(key):
+        raise BadInputError(
+            [
+                Problem(
+                    "KEY",
+                    (),
+                    f'"{key}" is no public key',
+                    f"40 characters, as this prints on that host: flexsheet keys show {host}",
+                )
+            ]
+        )
+    yaml = YAML(typ="rt")
+    yaml.preserve_quotes = True
+    yaml.width = 1 << 16
+    tree: CommentedMap = yaml.load(document.text)
+    # Plain, a key that begins with "?" would make no YAML.
+    tree["hosts"][host]["key"] = SingleQuotedScalarString(key)
+    text = StringIO()
+    yaml.dump(tree, text)
+    part = launch_file.with_suffix(".part")
+    part.write_text(text.getvalue(), encoding="utf-8")
+    part.chmod(launch_file.stat().st_mode & 0o777)
+    part.rename(launch_file)

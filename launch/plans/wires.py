@@ -1,0 +1,174 @@
+"""Who writes which topic, who reads it, and at which endpoint."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from itertools import product
+
+from launch.plans.documents import Document, Problem, did_you_mean
+from launch.plans.hosts import launcher_on
+from launch.plans.launch_file import LaunchFile
+from launch.plans.members import Member
+from launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
+from messages.topics import TOPICS
+
+SAID_FROM_ANYWHERE = ("estop",)
+"""What tools on the other hosts may write too: a stop, by whoever stands beside the arm."""
+
+LAUNCHERS_TOPICS = ("host", "estop")
+"""What the launcher of each host writes: how the host is, and an e-stop that it keeps."""
+
+FIRST_PORT, PORTS = 20_000, 10_000
+"""TCP ports lie below the range that Linux gives to outgoing connections (32768 and up)."""
+
+
+def writers_of(
+    spec: LaunchFile,
+    members: list[Member],
+    document: Document,
+    problems: list[Problem],
+    *,
+    has_scene: bool,
+) -> dict[str, list[tuple[str, str]]]:
+    """(writer, host) of every topic, in the order of the file."""
+    writers: dict[str, list[tuple[str, str]]] = {}
+    has_editor = any(topic.name == "scene" for one in members for _, topic in one.topics("output"))
+    if has_scene and not has_editor:
+        writers["scene"] = [(LAUNCHER, MAIN)]
+    for member in members:
+        for port_name, topic in member.topics("output"):
+            others = [name for name, _ in writers.get(topic.name, [])]
+            if others and (not topic.many_writers or member.name in others):
+                problems.append(
+                    document.problem(
+                        (*member.key, "topics", port_name),
+                        f'topic "{topic.name}" is written by "{others[0]}" already',
+                        "a topic has one writer",
+                    )
+                )
+            else:
+                writers.setdefault(topic.name, []).append((member.name, member.spec.host))
+    for i, name in enumerate(spec.from_tools):
+        if name not in TOPICS:
+            problems.append(
+                document.problem(
+                    ("from_tools", i), f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
+                )
+            )
+        elif name in writers and not TOPICS[name].many_writers:
+            problems.append(
+                document.problem(
+                    ("from_tools", i),
+                    f'topic "{name}" is written by "{writers[name][0][0]}" already',
+                    "a topic has one writer",
+                )
+            )
+        elif not TOPICS[name].many_writers:
+            writers[name] = [(TOOLS, MAIN)]
+    for name, host in product(LAUNCHERS_TOPICS, spec.hosts):
+        writers.setdefault(name, []).append((launcher_on(host), host))
+    for topic in TOPICS.values():
+        if topic.many_writers and topic.open_to_tools:
+            writers.setdefault(topic.name, []).append((TOOLS, MAIN))
+    for name, host in product(SAID_FROM_ANYWHERE, spec.hosts):
+        if host != MAIN:
+            writers.setdefault(name, []).append((tools_on(host), host))
+    return writers
+
+
+def resolve_further_inputs(
+    members: list[Member],
+    writers: dict[str, list[tuple[str, str]]],
+    document: Document,
+    problems: list[Problem],
+) -> None:
+    """Ask the members that subscribe by their parameters (the recorder) which topics they want."""
+    written = [topic for topic in TOPICS.values() if topic.name in writers]
+    for member in members:
+        if member.type is None or member.parameters is None:
+            continue
+        for name in member.type.further_inputs(member.parameters, written):
+            if name in TOPICS:
+                member.further_inputs.append(TOPICS[name])
+            else:
+                problems.append(
+                    document.problem(
+                        member.key, f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
+                    )
+                )
+
+
+def check_inputs(
+    members: list[Member],
+    writers: dict[str, list[tuple[str, str]]],
+    document: Document,
+    problems: list[Problem],
+) -> None:
+    for member in members:
+        for port_name, topic in member.topics("input"):
+            if topic.name not in writers:
+                remedy = (
+                    'name a scene file in "scene"'
+                    if topic.name == "scene"
+                    else 'add the node that does, list it in "from_tools" for a tool to write, '
+                    f"or leave the port out with topics: {{{port_name}: null}}"
+                )
+                problems.append(
+                    document.problem(
+                        (*member.key, "topics", port_name),
+                        f'nobody writes topic "{topic.name}"',
+                        remedy,
+                    )
+                )
+
+
+def endpoints_of(
+    writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
+) -> dict[str, tuple[Writer, ...]]:
+    """The endpoints of every writer: ipc for its host, tcp where there are others.
+
+    Each topic can be read on each host, for the tools there; nothing is sent to who does not ask.
+    """
+    far = sorted(
+        (host, writer, topic)
+        for topic, entries in writers.items()
+        for writer, host in entries
+        if addresses.keys() - {host}
+    )
+    ports = _ports(far)
+    return {
+        topic: tuple(
+            Writer(
+                name=writer,
+                host=host,
+                ipc=f"ipc://{RUN_DIRECTORY}/{writer}.{topic.replace('/', '.')}",
+                tcp=_tcp(addresses[host], ports.get((host, writer, topic))),
+            )
+            for writer, host in entries
+        )
+        for topic, entries in writers.items()
+    }
+
+
+def _tcp(address: str, port: int | None) -> str | None:
+    if port is None:
+        return None
+    return f"tcp://[{address}]:{port}" if ":" in address else f"tcp://{address}:{port}"
+
+
+def _ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
+    """A TCP port for each (host, writer, topic), from the hash of its name.
+
+    Two that fall on one port are told apart in the order of their names, so that adding a topic
+    moves no other's port unless they meet.  Ports are unique over all hosts: hosts may share a
+    machine.
+    """
+    taken: dict[int, tuple[str, str, str]] = {}
+    for link in links:
+        digest = hashlib.sha256("/".join(link).encode()).digest()
+        offset = int.from_bytes(digest[:4], "big") % PORTS
+        while FIRST_PORT + offset in taken:
+            offset = (offset + 1) % PORTS
+        taken[FIRST_PORT + offset] = link
+    return {link: port for port, link in taken.items()}

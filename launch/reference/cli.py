@@ -1,0 +1,89 @@
+"""Writes docs/cli.md: every command with its arguments, options and examples.
+
+python -m launch.reference.cli > docs/cli.md
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from typing import Any
+
+from typer.main import get_command
+
+from launch.cli import app
+from launch.commands.output import examples_in
+
+INTRODUCTION = """\
+# Command line
+
+<!-- Written by `python -m launch.reference.cli > docs/cli.md`; a test compares. -->
+
+Data goes to stdout, words to stderr; `--json` makes the data JSON.  Exit codes: 0 done, 1 failed,
+2 the input is wrong, 3 a replay differs from what was live, or `tune` found no method good enough.
+Colours and progress bars are for terminals; NO_COLOR takes the colours away.  `flexsheet
+--install-completion` teaches your shell to complete commands, options, topics, nodes, families and
+files.  What a message means: [errors.md](errors.md).
+"""
+
+
+def commands(group: Any = None, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """All commands that do something, by what is typed."""
+    group = group or get_command(app)
+    for name, command in group.commands.items():
+        path = (*words, name)
+        if not hasattr(command, "commands"):
+            yield " ".join(path), command
+            continue
+        if command.invoke_without_command:
+            yield " ".join(path), command
+        yield from commands(command, path)
+
+
+def reference() -> str:
+    """The whole page."""
+    known = dict(commands())
+    links = "\n".join(f"- [`flexsheet {name}`](#flexsheet-{anchor(name)})" for name in known)
+    sections = [INTRODUCTION, links + "\n"]
+    return "\n".join([*sections, *(_section(name, one) for name, one in known.items())])
+
+
+def anchor(name: str) -> str:
+    return name.replace(" ", "-")
+
+
+def _section(name: str, command: Any) -> str:
+    calls = "\n".join(examples_in(command.epilog))
+    rows = [
+        f"| {_name(parameter)} | {_words(parameter)} |"
+        for parameter in command.params
+        if "completion" not in parameter.name
+    ]
+    table = "\n".join(["| argument or option | what |", "| --- | --- |", *rows])
+    text = inspect.cleandoc(command.help or "")
+    return f"## flexsheet {name}\n\n{text}\n\n```sh\n{calls}\n```\n\n{table}\n"
+
+
+def _name(parameter: Any) -> str:
+    if parameter.param_type_name == "argument":
+        return f"`{(parameter.metavar or parameter.name).upper()}`"
+    options = ", ".join([*parameter.opts, *parameter.secondary_opts])
+    metavar = f" {parameter.metavar}" if parameter.metavar else ""
+    return f"`{options}{metavar}`"
+
+
+def _words(parameter: Any) -> str:
+    words = (parameter.help or "").replace("|", r"\|")
+    if parameter.required:
+        return f"{words} Required."
+    if parameter.default in (None, False, "") or callable(parameter.default):
+        return words
+    # A file of the package lies elsewhere on each computer.
+    default = str(parameter.default)
+    if "/launch/" in default:
+        default = "launch/" + default.rpartition("/launch/")[2]
+    return f"{words} Default: `{default}`."
+
+
+if __name__ == "__main__":
+    print(reference(), end="")

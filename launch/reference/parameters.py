@@ -1,0 +1,73 @@
+"""Writes docs/parameters.md: what can be set of each node in a launch file.
+
+python -m launch.reference.parameters > docs/parameters.md
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from messages.reference import field_type, parts_of, type_section
+from nodes import NODES, node_class
+from nodes.node import parameters_of
+
+ROOT = Path(__file__).resolve().parents[2]
+UNITS = {
+    "_m_per_s3": "m/s³", "_rad_per_s3": "rad/s³", "_per_s3": "1/s³", "_m_per_s2": "m/s²",
+    "_rad_per_s2": "rad/s²", "_per_s2": "1/s²", "_m_per_s": "m/s", "_rad_per_s": "rad/s",
+    "_per_s": "1/s", "_n_per_m": "N/m", "_m2": "m²", "_hz": "Hz", "_rad": "rad", "_px": "px",
+    "_kg": "kg", "_pa": "Pa", "_bytes": "bytes", "_ratio": "1", "_n": "N", "_m": "m", "_s": "s",
+}  # fmt: skip
+"""Units by the ends of names, the longer ones first."""
+
+INTRODUCTION = """\
+# Parameters
+
+<!-- Written by `python -m launch.reference.parameters > docs/parameters.md`; a test compares. -->
+
+What can be set of each node: in a launch file under `nodes: NAME: parameters:`, or on the command
+line by `--set NAME.PARAMETER=VALUE`.  Units are in the names.  `flexsheet node describe NODE`
+prints the same with ports and timers.
+"""
+
+
+def reference() -> str:
+    """The whole page."""
+    kinds = [parameters_of(node_class(name)) for name in NODES]
+    parts = dict.fromkeys(part for kind in kinds for part in parts_of(kind))
+    sections = [INTRODUCTION, *(_section(name) for name in NODES)]
+    return "\n".join([*sections, "## Parts\n", *(type_section(part) for part in parts)])
+
+
+def unit(name: str) -> str:
+    """The unit that a parameter's name ends in; empty where it has none."""
+    return next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
+
+
+def _section(name: str) -> str:
+    kind = node_class(name)
+    about = (kind.__doc__ or "").strip().split("\n\n")[0].replace("\n", " ")
+    rows = [
+        f"| `{key}` | {field_type(field)} | {unit(key)} | {_default(field)} | "
+        f"{field.description or ''} |"
+        for key, field in parameters_of(kind).model_fields.items()
+    ]
+    table = ["| parameter | type | unit | default | what |", "| --- | --- | --- | --- | --- |"]
+    return f"## {name}\n\n{' '.join(about.split())}\n\n" + "\n".join([*table, *rows]) + "\n"
+
+
+def _default(field: Any) -> str:
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    if isinstance(value, BaseModel):
+        value = value.model_dump(mode="json")
+    text = "null" if value is None else str(value)
+    return f"`{text.replace(f'{ROOT}/', '')}`"
+
+
+if __name__ == "__main__":
+    print(reference(), end="")

@@ -1,0 +1,188 @@
+"""What to do about each kind of error; the words for docs/errors.md and `flexsheet explain`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Area:
+    """A part of the system as its user sees it, and the files whose messages belong to it."""
+
+    title: str
+    about: str
+    paths: tuple[str, ...]
+
+
+AREAS = (
+    Area(
+        "Command line",
+        "What a command says before it does anything, or because it cannot. "
+        "All commands and options: [cli.md](cli.md).",
+        ("launch/",),
+    ),
+    Area(
+        "Launch files and scenes",
+        "Mistakes in YAML files, all of them at once, each with file, line, key and remedy. "
+        "The keys: [launch-files.md](launch-files.md); parameters: [parameters.md](parameters.md).",
+        ("launch/plans/", "launch/objects/", "messages/scene.py", "nodes/__init__.py",
+         "nodes/node.py", "launch/experiments/"),
+    ),
+    Area(
+        "Graph and processes",
+        "Starting nodes and keeping them running, on one computer or on several: "
+        "[architecture.md](architecture.md), [clocks.md](clocks.md), [deploy.md](deploy.md).",
+        ("launch/running/", "launch/health/doctor", "launch/health/system.py", "nodes/runner.py",
+         "nodes/clock/", "nodes/cache.py", "nodes/methods.py"),
+    ),
+    Area(
+        "Topics and messages",
+        "What does not fit on the wire is refused and counted, and never reaches a node: "
+        "[messages.md](messages.md).",
+        ("messages/", "launch/running/tools.py"),
+    ),
+    Area(
+        "Keys",
+        "Between hosts only who has the right key is heard: [security.md](security.md).",
+        ("messages/security.py", "launch/plans/keys.py"),
+    ),
+    Area(
+        "Bags",
+        "Recordings, what is in them, and what can be done with them.",
+        ("messages/bag.py", "messages/migrations.py", "launch/bags/", "nodes/recorder/"),
+    ),
+    Area(
+        "Camera and calibration",
+        "Devices, files, boards: [camera.md](camera.md), [calibration.md](calibration.md).",
+        ("nodes/camera/", "messages/calibration", "messages/sheet_calibration.py",
+         "messages/arms_calibration.py", "launch/bench/", "nodes/triangulator/pairs.py",
+         "nodes/twin/board.py", "nodes/models/sheet/"),
+    ),
+    Area(
+        "Fingertip",
+        "A fingertip that is not valid says why in its `reason`; the sheet holds meanwhile. "
+        "How it is tracked: [tracking.md](tracking.md).",
+        ("nodes/triangulator/",),
+    ),
+    Area(
+        "Planner",
+        "Why the sheet waits or holds is in `reason` of the topic `sheet_target`: "
+        "[planner.md](planner.md).",
+        ("nodes/planner/", "nodes/models/"),
+    ),
+    Area(
+        "Arms",
+        "Why an arm does not move is in `reason` and `faults` of its topic, and in "
+        "`flexsheet arms status`.  Faults latch: put right what they say, then "
+        "`flexsheet arms reset`. [arms.md](arms.md), [modbus.md](modbus.md), [mxt.md](mxt.md).",
+        ("nodes/arm_bridge/",),
+    ),
+    Area(
+        "Shapes and meshes",
+        "The object's surface and the solid made of it: [shapes.md](shapes.md), "
+        "[meshing.md](meshing.md).",
+        ("nodes/models/shapes/", "nodes/fem_solver/mesh/"),
+    ),
+    Area(
+        "Soft body",
+        "FEM of the object: [soft-body.md](soft-body.md).",
+        ("nodes/fem_solver/",),
+    ),
+    Area(
+        "Renderer and projector",
+        "OpenGL, windows, the projector's calibration: [renderer.md](renderer.md), "
+        "[projector.md](projector.md).",
+        ("nodes/renderer/",),
+    ),
+    Area("Console", "The page in the browser: [console.md](console.md).", ("nodes/console/",)),
+    Area(
+        "Twin",
+        "The simulated finger, camera, arms, sheet and eye.",
+        ("nodes/twin/", "launch/bench/twin_sheet.py"),
+    ),
+)  # fmt: skip
+
+REMEDIES = {
+    "CommandError": "the sentence names the option or file, and what to give instead.",
+    "BadInputError": "open the file at the line that is named; check with "
+    "`flexsheet launch FILE --dry-run`.",
+    "Finding": "of `flexsheet doctor` or `flexsheet bag report`; what to do stands beside it.",
+    "Log": "a node goes on, but says this in its log; the words after it name the cause.",
+    "Reason": "it is a state, not a breakdown: put right what it names, or wait.",
+    "Value": "follows `does not fit` of a file, or refuses a message: give a value that it allows.",
+    "BoundError": "bring the mark into both pictures, or choose another pose.",
+    "BagError": "`flexsheet bag info BAG` says how much can be read, `flexsheet bag recover` "
+    "makes a whole bag of it.",
+    "ExportError": "install what it names, or choose another output file.",
+    "ExperimentError": "run it on `launch/demo.yaml` first; for a bag, record it by the same "
+    "experiment.",
+    "NodeFailedError": "read the node's log above the sentence, or in the run's folder `logs`; "
+    "its first error is the cause.",
+    "RunDirectoryError": "set `FLEXSHEET_RUNS` to a folder of your own.",
+    "UnknownFamilyError": "take one of the names it lists (`flexsheet chart --help`).",
+    "UnknownTunableError": "take one of the names it lists (docs/tune.md).",
+    "UnknownTopicError": "`flexsheet topic list` has all names.",
+    "UnknownNodeError": "`flexsheet node list` has all names.",
+    "BusError": "another graph holds the endpoint: end it, or `flexsheet doctor --sweep`.",
+    "SecurityError": "make a pair with `flexsheet keys new HOST` on that host and install its "
+    "public half in the launch file on every host.",
+    "WireError": "run the same version of flexsheet on all hosts; the count is in `status`.",
+    "CalibrationFileError": "calibrate again, or name the file that was meant.",
+    "CalibrationMismatchError": "name the calibration of the scene's own device, or the scene "
+    "that it was made for.",
+    "CalibrationError": "take pictures of the whole board, sharp, in many tilts; check `--board` "
+    "(inner corners) and `--square-mm`.",
+    "NotDeterminedError": "add pairs that differ in tilt and distance.",
+    "DeviceError": "check the plug, the device's name and `flexsheet calibrate`'s file; another "
+    "program may hold the camera.",
+    "ForeignPicturesError": "let the scene name the camera that the pictures are from.",
+    "PlacesError": "correct the row that is named in joints.csv, or take the place again.",
+    "HandEyeError": "take more places, with the board turned about at least two axes.",
+    "FitError": "add pushes at other stretches and depths.",
+    "BoardError": "choose a board that fits into the pictures: fewer or smaller squares.",
+    "UnfitGeometryError": "choose an object whose shape that command can handle.",
+    "UnfitCurveError": "give force over depth from zero, rising, without repeats.",
+    "UnpresentableError": "make the object larger or smoother, or the sheet wider.",
+    "NoEquilibriumError": "the push or tilt is beyond the sheet's range; lessen it.",
+    "UnreachableError": "`flexsheet doctor scene SCENE` says what is out of reach and what would "
+    "help.",
+    "PathError": "bring the arms nearer to the sheet by hand, then `flexsheet arms ready` again.",
+    "ArmSilentError": "check the arm's address, power and cable, and that its program runs.",
+    "ArmRefusedError": "the controller says why on its teach pendant: enabled, no alarm, in remote "
+    "mode?",
+    "ArmAnswerError": "another program may speak to the same arm, or its program is of another "
+    "version.",
+    "MeshError": "repair the mesh (closed, outward, no elements inside out); see meshing.md.",
+    "TextureError": "name a PNG or JPEG, and a mesh with texture coordinates.",
+    "UnfitMeshError": "use a coarser or finer spacing, or repair the surface.",
+    "InvertedError": "smaller load steps help; a push beyond the object's range has no answer.",
+    "StuckError": "lessen the push, refine the mesh, or choose the linear method.",
+    "IndefiniteError": "hold the body at its base; check Poisson's ratio below 0.5.",
+    "LabError": "check the scheduler's address and that its workers run the same version.",
+    "LostWorkersError": "start the workers again and repeat: what was solved is kept.",
+    "NoOpenGLError": "`flexsheet doctor` names the packages for EGL.",
+    "WindowError": "set the monitor to one that it lists, or run headless.",
+    "ProjectorError": "take pictures in more poses, with all of the pattern on the sheet.",
+    "DecodeError": "take all pictures in order, exposed neither too dark nor too bright.",
+    "ConsoleError": "choose another port, or give a token where the page is open to the network.",
+    "SceneChoiceError": "choose a scene of the same devices as the one that runs.",
+    "FingerPathError": "slow the path down or correct the row that is named.",
+    "MxtError": "a fault of the simulated controller; its program starts anew.",
+    "NotConvergedError": "the push is beyond the membrane's range; lessen it.",
+    "NotMeasurableError": "photograph a nearer pose: what is to be measured must be in view.",
+}
+"""By class of error, or by how it is said: a finding of the doctor, a log line, a reason."""
+
+FINGERTIP = {
+    "no_mark": "no mark in either picture: finger out of view, mark lost, exposure too dark.",
+    "mark_in_one_view": "one camera is blocked or does not see as far: move the finger or camera.",
+    "two_marks": "a second bright spot: cover reflections, one marked finger only.",
+    "merged": "the mark touches another bright spot: remove it from behind the finger.",
+    "blurred": "the finger is too fast for the exposure: shorten it, with more light.",
+    "saturated": "the mark is overexposed: shorten the exposure.",
+    "outside_volume": "the finger is outside the working range of the scene.",
+    "inconsistent": "both views do not meet in a point: calibrate the camera anew.",
+    "too_fast": "a jump beyond a finger's speed: usually a reflection.",
+    "unconfirmed": "a new mark is believed after a few pictures; nothing to do.",
+}
+"""By `reason` of the topic `fingertip`."""

@@ -1,0 +1,1 @@
+"""A plan's processes on one host: started, watched, spoken to, ended."""

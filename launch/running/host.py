@@ -1,0 +1,337 @@
+"""What a launcher says of its host, and the e-stop that it keeps for nodes that come late.
+
+An e-stop is said by whoever sees the danger, and he may be gone when a bridge is started anew: a
+tool, a node that has crashed.  Each launcher therefore repeats the last one to its host's nodes, as
+a writer of its own, until one who may resets it.  Where arms wait for a person's word it is written
+down too, for the case that all launchers end.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import sys
+from collections.abc import Callable
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import psutil
+import zmq
+
+from launch.plans.hosts import clock_node, launcher_on
+from launch.plans.planned import Plan, PlannedNode
+from launch.running.estop_file import EStopFile
+from messages.base import Header, Message
+from messages.bus import Handler, Publisher, Source, Subscriber
+from messages.clock import SystemClock
+from messages.clock_table import ClockTable
+from messages.security import KeyChange, KeyRing
+from messages.topics import topic_named
+from messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
+from nodes.node import PortCounts
+
+PERIOD_S = 1.0
+DEVICES = "/dev/"
+REASON_LENGTH = 1000
+"""What is longer is cut: an e-stop must fit into every message that repeats it."""
+
+RESET_WITHIN_S = 5.0
+"""How long the arms have to say that a reset has been taken."""
+
+ARMS = ("arm_left", "arm_right")
+
+Processes = Callable[[], tuple[NodeProcess, ...]]
+Endpoints = Callable[[tuple[str, ...]], tuple[str, ...]]
+Sources = Callable[[list[Source]], tuple[Source, ...]]
+
+
+class HostVoice:
+    """The launcher's part in the graph, for one host; use between `start` and `close`.
+
+    endpoints, sources: fill in the run's directory.  code: the commit, for `HostStatus`.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        host: str,
+        *,
+        run_id: str,
+        code: str,
+        processes: Processes,
+        endpoints: Endpoints,
+        sources: Sources,
+        keys: KeyRing | None,
+        on_problem: Callable[[str], None],
+    ) -> None:
+        self._plan, self._host, self._run_id, self._code = plan, host, run_id, code
+        self._processes, self._keys, self._on_problem = processes, keys, on_problem
+        self._sources = sources
+        self._clock = SystemClock()
+        self._name, self._epoch = launcher_on(host), self._clock.now_ns()
+        # Started anew, it learns from the others; what it knows already is no news from them.
+        self._launchers = {launcher_on(name) for name in plan.hosts}
+        self._sequence = {"host": 0, "estop": 0}
+        self.publishers: dict[str, Publisher] = {}
+        for topic in self._sequence:
+            writer = plan.writer(topic, self._name)
+            if writer is not None:
+                self.publishers[topic] = Publisher(
+                    topic_named(topic),
+                    endpoints(writer.endpoints),
+                    keys=keys,
+                    on_refused=on_problem,
+                )
+        self._clock_table = ClockTable(self._clock.id)
+        self._heard: list[Subscriber] = []
+        self._task: asyncio.Task[None] | None = None
+        self._kept: EStop | None = None
+        self._engaged_ns = 0
+        self._resetting: asyncio.Task[None] | None = None
+        self._file = EStopFile(host, arms_of(plan)) if waits_for_a_person(plan) else None
+        self._unwritten = False
+        self._untold = ""
+        nodes = plan.nodes_on(host)
+        self._devices, self._folder = devices_of(nodes), folder_of(nodes)
+
+    def start(self) -> None:
+        """Begin to listen and to speak; needs a running loop."""
+        remembered = None if self._file is None else self._file.read()
+        if remembered is not None:
+            self._on_problem(
+                f"e-stop from before this start: {remembered.reason}; the arms stand until it is "
+                "reset: flexsheet arms reset"
+            )
+            self._engage(remembered, self._clock.now_ns())
+        others = [
+            source
+            for source in self._plan.sources_to_read("estop", self._host)
+            if source.writer != self._name
+        ]
+        self._heard.append(self._hear("estop", others, self._keep))
+        measured = self._plan.writer("clocks", clock_node(self._host))
+        if measured is not None:
+            source = measured.source_for(self._host)
+            take = self._clock_table.update
+            self._heard.append(self._hear("clocks", [source], lambda clocks, _: take(clocks)))
+        self._task = asyncio.create_task(self._speak(), name=f"host {self._host}")
+
+    def _hear(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
+        subscriber = Subscriber(
+            topic_named(topic),
+            self._sources(sources),
+            handler,
+            PortCounts(),
+            on_problem=self._on_problem,
+            keys=self._keys,
+            plan=self._plan.hash,
+        )
+        subscriber.start()
+        return subscriber
+
+    def renew_keys(self, change: KeyChange) -> None:
+        """Take over keys that have been read anew."""
+        for publisher in self.publishers.values():
+            publisher.renew_keys(change)
+        for subscriber in self._heard:
+            subscriber.renew_keys(change)
+
+    async def close(self) -> None:
+        """Fall silent; may be called twice."""
+        for task in (self._task, self._resetting):
+            if task is not None:
+                task.cancel()
+                await asyncio.gather(task, return_exceptions=True)
+        for subscriber in self._heard:
+            subscriber.close()
+        for publisher in self.publishers.values():
+            publisher.close()
+
+    def _keep(self, estop: EStop, header: Header) -> None:
+        now_ns = self._clock.now_ns()
+        _, header, clock_trouble = self._clock_table.localised(estop, header, now_ns)
+        if estop.engaged:
+            if self._kept is not None and header.writer in self._launchers:
+                return
+            if self._kept is None:
+                self._on_problem(f"e-stop of {header.writer}, kept until it is reset")
+            # A stamp from the future would bar every reset to come.
+            self._engage(estop, now_ns if clock_trouble else min(header.source_ns, now_ns))
+        elif header.writer in self._plan.may_reset_estop() and self._kept is not None:
+            # A late reader is given each writer's last word: a reset may be older than the stop.
+            if header.source_ns < self._engaged_ns:
+                return
+            if clock_trouble:
+                self._on_problem(f"e-stop not reset: by {header.writer}, {clock_trouble}")
+            elif self._resetting is None or self._resetting.done():
+                self._resetting = asyncio.create_task(self._reset(header.writer, self._kept))
+
+    def _engage(self, estop: EStop, at_ns: int) -> None:
+        known = self._kept
+        self._kept = EStop(engaged=True, reason=estop.reason[:REASON_LENGTH])
+        self._engaged_ns = max(self._engaged_ns, at_ns)
+        self._publish("estop", self._kept)
+        if known != self._kept:
+            self._write_down()
+
+    async def _reset(self, writer: str, kept: EStop) -> None:
+        """Forget the e-stop once all arms say that they have: they refuse while they move."""
+        stopped = {topic for topic in ARMS if self._plan.writers.get(topic)}
+        all_clear = asyncio.Event()
+
+        def take(state: ArmState, _: Header) -> None:
+            if not shows_estop(state):
+                stopped.discard(f"arm_{state.side}")
+            if not stopped:
+                all_clear.set()
+
+        arms = [
+            self._hear(topic, list(self._plan.sources_to_read(topic, self._host)), take)
+            for topic in stopped
+        ]
+        begun_ns = self._engaged_ns
+        try:
+            if stopped:
+                await asyncio.wait([asyncio.create_task(all_clear.wait())], timeout=RESET_WITHIN_S)
+        finally:
+            for subscriber in arms:
+                subscriber.close()
+        if self._kept is not kept or self._engaged_ns != begun_ns:
+            self._on_problem(f"e-stop not reset by {writer}: it was engaged again meanwhile")
+        elif stopped:
+            self._on_problem(
+                f"e-stop kept: {', '.join(sorted(stopped))} did not say within "
+                f"{RESET_WITHIN_S:g} s that {writer}'s reset was taken; once their bridges run and "
+                "the arms rest: flexsheet arms reset"
+            )
+        else:
+            self._on_problem(f"e-stop reset by {writer}")
+            self._kept = None
+            self.publishers["estop"].forget()
+            self._write_down()
+
+    def _write_down(self) -> None:
+        """Let the file be as what is kept; what fails is tried again."""
+        if self._file is None:
+            return
+        try:
+            if self._kept is None:
+                self._file.remove()
+            else:
+                self._file.write(self._kept)
+        except OSError as error:
+            if not self._unwritten:
+                after = (
+                    "stands though it was reset" if self._kept is None else "knows nothing of it"
+                )
+                self._on_problem(
+                    f"e-stop: {self._file.path} cannot be written ({error.strerror}); should all "
+                    f"launchers end, the next start {after}"
+                )
+            self._unwritten = True
+        else:
+            self._unwritten = False
+
+    def _publish(self, topic: str, message: Message) -> None:
+        if topic not in self.publishers:
+            return
+        self._sequence[topic] += 1
+        now_ns = self._clock.now_ns()
+        header = Header(
+            sequence=self._sequence[topic],
+            source_ns=now_ns,
+            publish_ns=now_ns,
+            clock_id=self._clock.id,
+            writer=self._name,
+            epoch=self._epoch,
+            plan=self._plan.hash,
+        )
+        self.publishers[topic].send(message, header)
+
+    async def _speak(self) -> None:
+        while True:
+            try:
+                self._publish("host", self._status())
+            except OSError as error:
+                untold = f"how this host is cannot be told: {error}"
+                if untold != self._untold:
+                    self._on_problem(untold)
+                self._untold = untold
+            if self._unwritten:
+                self._write_down()
+            await asyncio.sleep(PERIOD_S)
+
+    def _status(self) -> HostStatus:
+        disk = os.statvfs(self._folder)
+        return HostStatus(
+            host=self._host,
+            run=self._run_id,
+            plan_hash=self._plan.hash,
+            code=self._code,
+            python=python_version(),
+            uptime_s=(self._clock.now_ns() - self._epoch) * 1e-9,
+            load_ratio=os.getloadavg()[0] / (os.cpu_count() or 1),
+            disk_free_bytes=disk.f_bavail * disk.f_frsize,
+            memory_free_bytes=psutil.virtual_memory().available,
+            nodes=self._processes(),
+            missing_devices=tuple(one for one in self._devices if not os.path.exists(one)),
+            software=software(),
+            keys=()
+            if self._keys is None
+            else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
+            estop=None if self._kept is None else self._kept.reason,
+        )
+
+
+def shows_estop(state: ArmState) -> bool:
+    """Whether an arm's bridge still holds an e-stop."""
+    return state.mode == "estop" or any(fault.startswith("e-stop: ") for fault in state.faults)
+
+
+def arms_of(plan: Plan) -> list[str]:
+    """Where the plan's arms are reached."""
+    bridges = [node.parameters for node in plan.nodes.values() if node.type == "arm_bridge"]
+    return [f"{one.get('host')}:{one.get('port')}" for one in bridges]
+
+
+def waits_for_a_person(plan: Plan) -> bool:
+    """Whether arms move at a person's word only; those that go by themselves are simulated."""
+    return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
+
+
+def python_version() -> str:
+    return ".".join(map(str, sys.version_info[:3]))
+
+
+def software() -> str:
+    """Versions of what all hosts should have alike."""
+    try:
+        own = version("flexsheet")
+    except PackageNotFoundError:
+        own = "not installed"
+    return f"flexsheet {own}, pyzmq {zmq.pyzmq_version()}, libzmq {zmq.zmq_version()}"
+
+
+def devices_of(nodes: list[PlannedNode]) -> list[str]:
+    """Device files that the nodes' parameters name."""
+
+    def texts(value: Any) -> list[str]:
+        if isinstance(value, str):
+            return [value]
+        if isinstance(value, dict):
+            value = list(value.values())
+        return [text for one in value for text in texts(one)] if isinstance(value, list) else []
+
+    found = [text for node in nodes for text in texts(node.parameters)]
+    return sorted({text for text in found if text.startswith(DEVICES)})
+
+
+def folder_of(nodes: list[PlannedNode]) -> Path:
+    """Where the host's recorder writes; the working folder where there is none, or not yet."""
+    for node in nodes:
+        if node.type == "recorder":
+            folder = Path(str(node.parameters["bag"])).parent
+            if folder.is_dir():
+                return folder
+    return Path.cwd()

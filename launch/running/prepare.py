@@ -1,0 +1,112 @@
+"""What is worked out before a graph starts, so that no node has to do without it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from launch.plans.planned import Plan
+from messages.methods import SheetShapeMethod, chosen
+from messages.scene import Scene
+from nodes.cache import default_cache_dir
+from nodes.models.sheet.membrane import NoEquilibriumError
+from nodes.renderer import dent_cache
+
+Progress = Callable[[str], None]
+
+TOLD_SHARE = 0.25
+"""Progress is told in such steps."""
+
+
+class NoSoftBodyError(RuntimeError):
+    """A scene whose soft body cannot be made; the text says why, and a remedy."""
+
+
+def prepare_plan(plan: Plan, progress: Progress) -> None:
+    """The dent shapes of the plan's scene, for each of its renderers."""
+    scene = plan.scene_message()
+    if scene is None:
+        return
+    for node in plan.nodes.values():
+        if node.type == "renderer" and _takes_dents(scene, node.parameters["sheet_shape"]):
+            prepare_dents(scene, node.parameters["cache_dir"], progress)
+
+
+def _takes_dents(scene: Scene, asked: SheetShapeMethod | Literal["auto"]) -> bool:
+    """Whether a renderer takes a pushed sheet for what the membrane makes of it."""
+    shape: SheetShapeMethod = chosen(asked, scene.methods.sheet_shape, "dents")
+    return shape == "dents"
+
+
+def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress) -> Path:
+    """The file with the dent shapes of a scene's sheet, worked out if it is not there.
+
+    Where the membrane finds no equilibrium that is said, and the renderer does with four triangles.
+    """
+    folder = None if cache_dir is None else Path(cache_dir)
+    told = 0.0
+
+    def solved(done: int, total: int) -> None:
+        nonlocal told
+        if done / total >= told:
+            progress(f"working out how the sheet dents: {100 * done // total} %")
+            told += TOLD_SHARE
+
+    try:
+        dent_cache.load_or_solve(scene, folder, solved)
+    except NoEquilibriumError as error:
+        progress(f"no dent shapes for this sheet: {error}")
+    return dent_cache.file_of(scene, folder)
+
+
+def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
+    """The file with the table of a scene's sheet's force, made if it is not there.
+
+    NoEquilibriumError for a sheet of which the membrane finds none.
+    """
+    from nodes.planner import force_table
+
+    def made(done: int, total: int) -> None:
+        progress(f"working out how the sheet pushes back: {100 * done // total} %")
+
+    force_table.load_or_make(scene, cache_dir, made)
+    return force_table.file_of(scene, cache_dir)
+
+
+def prepare_soft_body(
+    scene: Scene,
+    skin_spacing_m: float,
+    cache_dir: Path | None,
+    scheduler: str | None,
+    progress: Progress,
+) -> Path:
+    """The file with the nonlinear table of a scene's soft body, made if it is not there.
+
+    scheduler: as the fem_solver node's parameter.  NoSoftBodyError where that is of no use, the
+    body cannot be meshed, or memory is too little for it.
+    """
+    from nodes.fem_solver import body, precompute_table
+    from nodes.fem_solver.making import Maker
+    from nodes.fem_solver.precompute import Need
+    from nodes.fem_solver.remaining import Remaining
+
+    folder = cache_dir or default_cache_dir()
+    remaining, told = Remaining(), -1
+
+    def made(done: int, total: int, need: Need) -> None:
+        nonlocal told
+        far = remaining.text(done, total, time.monotonic())
+        if 100 * done // total != told:
+            progress(f"making the soft body: {far} ({need.text()})")
+            told = 100 * done // total
+
+    maker = Maker(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
+    try:
+        bodies = maker.bodies(scene, "auto", made)
+        if len(bodies) == 1:
+            maker.tabulated(scene, bodies[0], made)
+    except (ValueError, MemoryError, precompute_table.WorkersError) as error:
+        raise NoSoftBodyError(str(error)) from error
+    return precompute_table.table_path(body.table_spec_of(scene, bodies[0].spec), folder)

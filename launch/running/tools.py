@@ -1,0 +1,138 @@
+"""Reading a graph and writing into it from outside, on any of its hosts.
+
+Each plan foresees the tools as writers: those of the main host write what no node does, those of
+the other hosts e-stops alone.  They speak with the keys of the host where they run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from launch.plans.planned import MAIN, Plan, local_endpoints, local_sources, tools_on
+from launch.running.runs import Run, ring_file
+from messages.base import Header, Message
+from messages.bus import Handler, Problem, Publisher, Subscriber
+from messages.clock import SystemClock
+from messages.security import KeyRing
+from messages.topics import topic_named
+from messages.types import HostStatus, Status
+
+if TYPE_CHECKING:
+    from launch.plans.documents import BadInputError
+
+READER_RECONNECT_S = 1.0
+"""Readers look for a writer that was not there at most every half second."""
+
+
+@dataclass(slots=True)
+class Counts:
+    """What a tool's subscriber has lost or refused."""
+
+    dropped: int = 0
+    gaps: int = 0
+    rejected: int = 0
+
+
+def host_of(run: Run) -> str:
+    """The host whose tools we are."""
+    return run.host or MAIN
+
+
+def topics_for_tools(plan: Plan, host: str = MAIN) -> list[str]:
+    """Topics that a tool on a host may write in this plan."""
+    return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
+
+
+def keys_of(plan: Plan, run: Run) -> KeyRing | None:
+    """The keys of the host where we are; None where the plan has none."""
+    return KeyRing(ring_file(run, host_of(run))) if plan.keys else None
+
+
+def subscriber_to(
+    topic: str,
+    plan: Plan,
+    run: Run,
+    on_message: Handler,
+    *,
+    on_problem: Problem,
+    unopened: bool = False,
+) -> Subscriber:
+    """A subscriber, not yet started, to all writers of a topic in a running graph."""
+    wanted = topic_named(topic)
+    return Subscriber(
+        wanted,
+        local_sources(run, plan.sources_to_read(topic, host_of(run))),
+        on_message,
+        Counts(),
+        on_problem=on_problem,
+        unopened=unopened,
+        keys=keys_of(plan, run),
+        # Who does not run our plan must be seen most of all.
+        plan=None if wanted.message in (Status, HostStatus) else plan.hash,
+    )
+
+
+class ToolsWriter:
+    """Publishers for some topics of a running graph; needs a running loop.
+
+    Raises BadInputError for a topic that is a node's, BusError when another tool writes it now.
+    """
+
+    def __init__(self, plan: Plan, run: Run, topics: Iterable[str]) -> None:
+        self._clock = SystemClock()
+        self._epoch, self._plan = self._clock.now_ns(), plan.hash
+        keys = keys_of(plan, run)
+        self._sequences: dict[str, int] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._name, host = tools_on(host_of(run)), host_of(run)
+        try:
+            for name in topics:
+                writer = plan.writer(name, self._name)
+                if writer is None:
+                    raise _refusal(plan, name, host)
+                endpoints = local_endpoints(run, writer.endpoints)
+                self._publishers[name] = Publisher(topic_named(name), endpoints, keys=keys)
+        except BaseException:
+            self.close()
+            raise
+
+    def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
+        """Send a message with the next sequence number, stamped now (or as `source_ns` says)."""
+        self._sequences[topic] = self._sequences.get(topic, 0) + 1
+        now_ns = self._clock.now_ns()
+        self._publishers[topic].send(
+            message,
+            Header(
+                sequence=self._sequences[topic],
+                source_ns=now_ns if source_ns is None else source_ns,
+                publish_ns=now_ns,
+                clock_id=self._clock.id,
+                writer=self._name,
+                epoch=self._epoch,
+                plan=self._plan,
+            ),
+        )
+
+    def close(self) -> None:
+        for publisher in self._publishers.values():
+            publisher.close()
+
+
+def _refusal(plan: Plan, topic: str, host: str) -> BadInputError:
+    """Why tools on a host do not write a topic, and who may."""
+    from launch.plans import documents
+
+    may = ", ".join(topics_for_tools(plan, host))
+    if topic in topics_for_tools(plan):
+        key: tuple[str, ...] = ("hosts", host)
+        what = f'topic "{topic}" is not for tools on this computer, host "{host}"'
+        remedy = f'say it on host "{MAIN}" ({plan.hosts[MAIN]}); from here: {may}'
+    else:
+        key = ("from_tools",)
+        owners = ", ".join(one.name for one in plan.writers.get(topic, ()))
+        what = f'topic "{topic}" '
+        what += f"is written by {owners}" if owners else "is not part of the graph"
+        remedy = f'list it in "from_tools"; open are: {may}'
+    return documents.BadInputError([documents.Problem(plan.launch_file, key, what, remedy)])
