@@ -35,6 +35,7 @@ import zstandard
 from pydantic import BaseModel
 from ruamel.yaml import YAML
 
+import launch
 from launch.objects.meshes import read_mesh
 from launch.plans.documents import BadInputError
 from launch.plans.plan import load_plan, load_scene
@@ -54,7 +55,7 @@ from nodes.node import PortCounts
 from nodes.twin.arms import RANGE_RAD, Controller
 from nodes.twin.mxt_controller import FILTER_S, MxtController
 
-LAUNCH = Path(load_plan.__code__.co_filename).parent
+LAUNCH = Path(launch.__file__).parent
 AT_REST_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 MEMORY_BYTES = 256 << 20
 """What one input may take beside what is there before."""

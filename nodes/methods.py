@@ -111,8 +111,8 @@ def measure(trial: Trial, *, repeats: int) -> Point:
         median_s=float(np.median(durations)),
         p99_s=float(np.quantile(durations, 0.99)),
         error=float(trial.error(result)),
-        in_range=trial.in_range,
-        in_scene=trial.in_scene,
+        in_range=bool(trial.in_range),
+        in_scene=bool(trial.in_scene),
         also=dict(trial.also(result)),
         doubts=dict(trial.doubts),
     )

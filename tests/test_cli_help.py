@@ -94,8 +94,8 @@ def test_what_cannot_be_worked_with_is_a_failure_and_no_error_of_ours(module: st
 @pytest.mark.parametrize("page", ["cli", "errors", "parameters"])
 def test_the_generated_pages_are_up_to_date(page: str) -> None:
     written = (ROOT / "docs" / f"{page}.md").read_text()
-    made = import_module(f"launch.{page}_reference").reference()
-    assert written == made, f"python -m launch.{page}_reference > docs/{page}.md"
+    made = import_module(f"launch.reference.{page}").reference()
+    assert written == made, f"python -m launch.reference.{page} > docs/{page}.md"
 
 
 def test_every_kind_of_error_has_a_remedy_and_no_remedy_is_of_nothing() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -24,10 +25,21 @@ from launch.methods.charts import (
     write_chart,
 )
 from launch.methods.svg import INK
+from messages.methods import (
+    Correction,
+    KinematicsMethod,
+    MarkMethod,
+    SheetForceMethod,
+    SheetShapeMethod,
+    SoftBodyMethod,
+    TrackingMethod,
+    TriangulationMethod,
+)
 from messages.scene import Scene
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 
 ROOT = Path(__file__).resolve().parent.parent
+CHARTS = ROOT / "docs" / "charts"
 SCENE = Scene.model_validate(YAML(typ="safe").load(ROOT / "launch" / "scenes" / "cylinder.yaml"))
 RADIUS = SCENE.object.geometry.radius_m
 AXIS = SCENE.object.world_from_object.position_m
@@ -186,6 +198,34 @@ def test_a_chart_is_measured_drawn_and_written(tmp_path: Path) -> None:
     assert "prefers-color-scheme: dark" in drawn
     write_chart(result, tmp_path / "charts")
     assert picture.read_text() == drawn, "the same numbers give the same picture"
+
+
+def test_what_numpy_answers_can_be_written(tmp_path: Path) -> None:
+    family = make_family()
+    trial = next(iter(family.trials(SCENE)))
+    whether = np.array([1.0])[0] > 0.5
+    points = [measure(replace(trial, in_range=whether, in_scene=whether), repeats=3)]
+    _, numbers = write_chart(chart_result(family, SCENE, points), tmp_path)
+    assert json.loads(numbers.read_text())["points"][0]["in_range"] is True
+
+
+CHOICES = {
+    "mark": MarkMethod,
+    "triangulation": TriangulationMethod,
+    "tracking": TrackingMethod,
+    "kinematics": KinematicsMethod,
+    "sheet-force": SheetForceMethod,
+    "sheet-shape": SheetShapeMethod,
+    "correction": Correction,
+    "soft-body": SoftBodyMethod,
+}
+
+
+@pytest.mark.parametrize("family", CHOICES)
+def test_the_pages_chart_shows_every_method_that_can_be_chosen(family: str) -> None:
+    points = json.loads((CHARTS / f"{family}.json").read_text())["points"]
+    shown = {point["method"].partition(",")[0].replace(" ", "_") for point in points}
+    assert set(get_args(CHOICES[family])) <= shown, f"flexsheet chart {family} -o docs/charts"
 
 
 def test_charts_are_gathered_on_a_page_and_drawn_anew(
