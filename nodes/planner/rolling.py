@@ -23,6 +23,10 @@ Floats = NDArray[np.float64]
 FINEST = 1.0 / 512.0
 """Share of the way to which the last place within the tilt is found."""
 
+FINEST_INSIDE, NEAR_THE_TILT_RAD = FINEST / 4.0**5, np.radians(1.0)
+"""Where the way passes what is far inside, a step along it is many degrees on the surface: to this
+share then, until the tilt is near."""
+
 RIM_RADIUS_M = 0.03
 """So far around it is looked whether the object rises above its own tangent plane."""
 
@@ -159,12 +163,12 @@ def within_tilt(
     line from there, in steps that grow, so that the side is kept on which the sheet is; a sheet
     that is at the tilt already learns so from the first.
     """
-    most = np.cos(tilt_rad)
+    most, near = np.cos(tilt_rad), np.cos(max(tilt_rad - NEAR_THE_TILT_RAD, 0.0))
     if found.normal @ front >= most:
         return found, False
     reached, step = 0.0, FINEST
     best, way = start, found.point - start.point
-    while step >= FINEST:
+    while step >= FINEST or (step >= FINEST_INSIDE and best.normal @ front > near):
         there = shape.closest(start.point + (reached + step) * way, previous=start.point)
         if there.normal @ front >= most:
             best, reached = there, reached + step
