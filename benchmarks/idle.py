@@ -1,12 +1,13 @@
 """What the graph costs while nothing happens: CPU time of each process, in % of one core.
 
-    python -m benchmarks.idle [--seconds 30] [--case standing watching] [--json FILE]
+    python -m benchmarks.idle [--seconds 30] [--case waiting standing watching] [--json FILE]
 
-The nodes of `launch/demo.yaml` without twin_finger and twin_eye.  The arms are ready and stand;
-twin_arms plays their controllers, which a lab has outside its computers, and is not in the sum.
+The nodes of `launch/demo.yaml` without twin_finger and twin_eye.  twin_arms plays the arms'
+controllers, which a lab has outside its computers, and is not in the sum.
 
-standing   the camera gives no pictures
-watching   the camera gives 60 pairs a second, from files, without a finger in them
+waiting    nobody has said that the arms may move; the camera gives no pictures
+standing   the arms are ready, hear from their bridges in every cycle, and stand
+watching   the same, and the camera gives 60 pairs a second, from files, without a finger in them
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import socket
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -78,13 +80,22 @@ def empty_pictures(folder: Path) -> dict[str, Any]:
     }
 
 
-CASES: dict[str, Callable[[Path], dict[str, Any]]] = {
-    "standing": no_pictures,
-    "watching": empty_pictures,
+@dataclass(frozen=True)
+class Case:
+    """camera: its entry in the launch file, given a folder for pictures."""
+
+    camera: Callable[[Path], dict[str, Any]]
+    arming: str
+
+
+CASES = {
+    "waiting": Case(no_pictures, "by_command"),
+    "standing": Case(no_pictures, "by_itself"),
+    "watching": Case(empty_pictures, "by_itself"),
 }
 
 
-def launch_file(folder: Path, camera: dict[str, Any]) -> Path:
+def launch_file(folder: Path, case: Case) -> Path:
     """The demo's graph without what plays finger and eye."""
     yaml = YAML()
     values = yaml.load(DEMO_FILE)
@@ -92,13 +103,13 @@ def launch_file(folder: Path, camera: dict[str, Any]) -> Path:
     nodes = values["nodes"]
     for name in LEFT_OUT:
         del nodes[name]
-    nodes["camera"] = camera
+    nodes["camera"] = case.camera(folder)
     calibration = nodes["triangulator"]["parameters"]["calibration"]
     nodes["triangulator"]["parameters"]["calibration"] = str(DEMO_FILE.parent / calibration)
     ports = dict(zip(("left", "right"), free_ports(2), strict=True))
     nodes[OUTSIDE]["parameters"] = {f"{side}_port": port for side, port in ports.items()}
     for side, port in ports.items():
-        nodes[f"arm_{side}_bridge"]["parameters"]["port"] = port
+        nodes[f"arm_{side}_bridge"]["parameters"] |= {"port": port, "arming": case.arming}
     path = folder / "idle.yaml"
     yaml.dump(values, path)
     return path
@@ -112,7 +123,7 @@ def cpu_s(pids: dict[str, int]) -> dict[str, float]:
 async def measure(case: str, seconds: float) -> dict[str, Any]:
     """CPU time over wall time, per process and of the graph's own processes together."""
     with tempfile.TemporaryDirectory() as folder:
-        plan = load_plan(launch_file(Path(folder), CASES[case](Path(folder))))
+        plan = load_plan(launch_file(Path(folder), CASES[case]))
         async with RunningGraph(plan) as graph:
             await graph.wait_ready()
             await asyncio.sleep(SETTLING_S)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from nodes.arm_bridge.pacing import Pace
 
-PACE = Pace(period_s=1 / 140, target_period_s=1 / 60)
+PACE = Pace(period_s=1 / 140, target_period_s=1 / 60, resting_period_s=1 / 40)
 MS = 1_000_000
 
 
@@ -54,3 +54,14 @@ def test_in_steady_state_an_arm_hears_at_least_every_ten_milliseconds() -> None:
     gaps_ms = [(b - a) / MS for a, b in itertools.pairwise(sent[1:])]
     assert max(gaps_ms) < 13.0
     assert min(gaps_ms) >= 3.5
+
+
+@given(beat_ms=st.floats(1.0, 14.0))
+def test_an_arm_that_rests_hears_often_enough_for_its_watchdog(beat_ms: float) -> None:
+    sent = [0]
+    for now_ns in range(1, 2_000 * MS, round(beat_ms * MS)):
+        if PACE.is_resting_beat(now_ns, sent[-1]):
+            sent.append(now_ns)
+    gaps_ms = [(b - a) / MS for a, b in itertools.pairwise(sent[1:])]
+    assert min(gaps_ms) >= 25.0
+    assert max(gaps_ms) < 25.0 + beat_ms + 0.1

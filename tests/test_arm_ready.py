@@ -11,13 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from launch.plans.plan import load_plan
+from launch.plans.plan import load_plan, load_scene
 from messages.base import Header
 from messages.clock import VirtualClock
-from messages.types import Arming
+from messages.types import Arming, EStop
 from nodes.arm_bridge.control import LET_GO_AFTER_S, OLDEST_ARMING_S, READY_TOGETHER_S
 from nodes.arm_bridge.goal import Goal
+from nodes.arm_bridge.link import ArmStatus, Floats
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from tests.arm_states import arm_state
 from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
 from tests.test_arm_loop import SCENE_FILE
 
@@ -224,6 +226,56 @@ def test_whatever_happens_an_arm_that_is_not_ready_begins_no_motion(events: list
                 if begins and not was_ready:
                     assert arm.control.mode == "relax", (event, arm.control.mode)
                     assert arm.control._has_pulled
+
+
+class CountingLink:
+    """An arm that stays where it is, and what it was told."""
+
+    def __init__(self) -> None:
+        self.modes: list[str] = []
+
+    def due(self, now_ns: int) -> bool:
+        return True
+
+    async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ArmStatus:
+        self.modes.append(mode)
+        return ArmStatus(np.zeros(6), ())
+
+    def close(self) -> None:
+        self.modes.append("closed")
+
+
+async def test_an_arm_that_nobody_made_ready_hears_less_until_something_happens() -> None:
+    clock, link = VirtualClock(10**9, clock_id="here"), CountingLink()
+    node = ArmBridge(
+        ArmBridgeParameters(side="left"),
+        name="bridge",
+        clock=clock,
+        send=lambda topic, message, header: None,
+        topics={"arm": "arm_left", "other_arm": "arm_right"},
+    )
+    await node.setup()
+    node._link = link
+
+    def header() -> Header:
+        return Header(1, clock.now_ns(), clock.now_ns(), "here", "tools", 1)
+
+    async def asked_within_a_second() -> int:
+        before = len(link.modes)
+        for _ in range(140):
+            clock.move_to(clock.now_ns() + round(1e9 / 140))
+            await node.step("other_arm", arm_state("right"), header())
+            await node.cycle()
+        return len(link.modes) - before
+
+    await node.step("scene", load_scene(SCENE_FILE), header())
+    await asked_within_a_second()
+    assert node._control.mode == "idle"
+    assert 34 <= await asked_within_a_second() <= 41
+    await node.step("estop", EStop(engaged=True, reason="button"), header())
+    assert await asked_within_a_second() >= 138
+    assert set(link.modes) <= {"idle", "stop"}
+    await node.close()
 
 
 async def test_the_node_hears_the_word_and_says_what_it_is() -> None:

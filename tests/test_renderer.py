@@ -424,10 +424,10 @@ async def test_while_nothing_moves_few_frames_are_drawn(bench: Bench) -> None:
     await bench.step("scene", bench.scene)
     await bench.arms(np.eye(4))
     _, body = skin_and_body(0.0)
-    for _ in range(60):  # one second, nobody there
+    for _ in range(180):  # three seconds, nobody there
         bench.forward(1000 / 60)
         await bench.step("soft_body", body)
-    assert 5 <= len(bench.sent) <= 6
+    assert 3 <= len(bench.sent) <= 4
     begun = len(bench.sent)
     while len(bench.sent) == begun:
         bench.forward(10)

@@ -202,6 +202,11 @@ class ArmControl:
     def at_rest(self) -> bool:
         return float(np.abs(self._velocity).max()) <= REST_RAD_PER_S
 
+    @property
+    def resting(self) -> bool:
+        """Whether nothing will move before somebody says so; then the arm needs to hear less."""
+        return self.mode == "idle" and not self.ready and not self._has_pulled and self.at_rest
+
     def miss_answer(self, text: str) -> bool:
         """One exchange without an answer is forgiven while moving; False for a second in a row.
 

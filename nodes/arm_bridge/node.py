@@ -71,7 +71,7 @@ class ArmBridge(Node):
         self._lookout = Lookout(self._geometry, ArmGeometry(scene, other_side))
         due_s = given.target_period_s or 1.0 / scene.camera.rate_hz
         self._timing = Timing(given.servo_lag_s, due_s, given.furthest_extrapolation_s)
-        self._pace = Pace(1.0 / given.rate_hz, due_s)
+        self._pace = Pace(1.0 / given.rate_hz, due_s, 1.0 / given.resting_rate_hz)
 
     def on_estop(self, estop: EStop, header: Header) -> None:
         stamp_ns, now_ns = header.source_ns, self.clock.now_ns()
@@ -85,6 +85,8 @@ class ArmBridge(Node):
 
     async def on_sheet_target(self, target: SheetTarget, header: Header) -> None:
         """A target is passed on when it comes: at the next beat it would be 7 ms older."""
+        if self._control.resting:
+            return
         async with self._cycling:
             if self._geometry is not None and self._newest.target is not header:
                 await asyncio.sleep(self._pace.wait_s(self.clock.now_ns(), self._cycle_ns))
@@ -97,7 +99,11 @@ class ArmBridge(Node):
             self.note = "waits for a scene"
             return
         now_ns, target_ns = self.clock.now_ns(), self.sheet_target.received_ns
-        if self._pace.is_beat(now_ns, self._cycle_ns, target_ns) and not self._cycling.locked():
+        if self._control.resting:
+            due = self._pace.is_resting_beat(now_ns, self._cycle_ns)
+        else:
+            due = self._pace.is_beat(now_ns, self._cycle_ns, target_ns)
+        if due and not self._cycling.locked():
             async with self._cycling:
                 await self._serve(self._geometry)
 

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 @dataclass(frozen=True, slots=True)
 class Pace:
     """period_s: of the beat.  target_period_s: after which the next target is due.
+    resting_period_s: of the beat of an arm that is not to move, in time for its watchdog.
 
     sent_ns, in all that follows: when the last command was sent; 0: none was.
     """
 
     period_s: float
     target_period_s: float
+    resting_period_s: float
 
     def wait_s(self, now_ns: int, sent_ns: int) -> float:
         """How long until half a period has passed since the last command; zero when it has.
@@ -35,3 +37,7 @@ class Pace:
         """
         due_s = self.target_period_s - (now_ns - target_ns) * 1e-9
         return self.wait_s(now_ns, sent_ns) == 0.0 and abs(due_s) > 0.5 * self.period_s
+
+    def is_resting_beat(self, now_ns: int, sent_ns: int) -> bool:
+        """Whether an arm that is not to move is sent a command now: no target is waited for."""
+        return not sent_ns or (now_ns - sent_ns) * 1e-9 >= self.resting_period_s

@@ -18,6 +18,9 @@ class ArmBridgeParameters(NodeParameters):
     host: str = "127.0.0.1"
     port: int = Field(default=5020, ge=1, le=65535)
     rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0)
+    resting_rate_hz: float = Field(
+        default=40.0, ge=20.0, le=1000.0, description="while idle, until it is made ready"
+    )
     driver: Driver = "modbus"
     timeout_s: Positive | None = Field(default=None, description="null: the driver's own")
     servo_lag_s: NonNegative = Field(

@@ -17,7 +17,7 @@ from nodes.renderer.gl import SAMPLES
 class RendererParameters(NodeParameters):
     rate_hz: Positive = Field(default=30.0, description="most frames a second")
     still_rate_hz: Positive = Field(
-        default=5.0, description="of frames while nobody touches and nothing moves"
+        default=1.0, description="of frames while nobody touches and nothing moves"
     )
     output: Literal["headless", "window"] = "headless"
     monitor: str | int | None = Field(

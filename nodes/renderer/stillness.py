@@ -7,7 +7,7 @@ import numpy as np
 from messages.types import ArmState, Fingertip, SoftBody
 
 SEEN_M = 1e-4
-"""A fifth of a pixel that is half a millimetre wide; it is shown a fifth of a second late."""
+"""A fifth of a pixel that is half a millimetre wide; it is shown a second late."""
 
 REACH_M = 0.15
 """How far the sheet's points lie from the flange that holds its edge."""
