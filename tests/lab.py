@@ -35,6 +35,7 @@ from messages.types import ArmState, HostStatus
 from nodes.node import PortCounts
 
 ROOT = Path(__file__).resolve().parent.parent
+SETTINGS = ROOT / "launch" / "systemd" / "90-flexsheet.conf"
 HOSTS = ("main", "left", "right")
 ADDRESS = {name: f"10.77.0.{number}" for number, name in enumerate(HOSTS, start=1)}
 LIGHT = ("fem_solver", "renderer")
@@ -80,6 +81,8 @@ class Network:
             _ip("-n", space, "link", "set", "lo", "up")
             _ip("-n", space, "addr", "add", f"{address}/24", "dev", "eth")
             _ip("-n", space, "link", "set", "eth", "up")
+            # As docs/deploy.md has it for real ones.
+            _ip("netns", "exec", space, "sysctl", "-q", "-e", "-p", str(SETTINGS))
         return self
 
     async def __aexit__(self, *_: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
@@ -10,7 +11,9 @@ from typing import Any
 
 import pytest
 from ruamel.yaml import YAML
+from typer.testing import CliRunner
 
+from launch.cli import app
 from launch.plans.plan import load_plan
 from launch.running.service import files_of
 
@@ -74,3 +77,17 @@ def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_is_told_as_json_is_installed_too(tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        app,
+        ["service", "install", str(ROOT / "launch" / "three.yaml"), "--host", "left",
+         "--root", str(tmp_path), "--json"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    told = {Path(one["path"]): one["text"] for one in json.loads(done.stdout)}
+    assert {path.name for path in told} == {
+        "flexsheet@.service", "90-flexsheet.conf", "left.env"
+    }  # fmt: skip
+    assert {path: path.read_text() for path in told} == told

@@ -38,7 +38,7 @@ def install(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print, write nothing.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the unit flexsheet@.service and the host's environment; start nothing."""
+    """Write flexsheet@.service, the host's environment and settings for TCP; start nothing."""
     from launch.plans.plan import load_plan
     from launch.running.service import STATE, bags_of, files_of
 
@@ -57,7 +57,7 @@ def install(
                 "launch file",
                 markup=False, style="yellow",
             )  # fmt: skip
-    files = files_of(launch_file=launch_file, host=host, user=user, root=root)
+    files = list(files_of(launch_file=launch_file, host=host, user=user, root=root))
     if as_json:
         print_json([{"path": str(file.path), "text": file.text} for file in files])
     for file in files:
@@ -76,7 +76,8 @@ def install(
         words.print(f"wrote {file.path}", markup=False)
     if not dry_run:
         words.print(
-            f"next: systemctl daemon-reload && systemctl enable --now flexsheet@{host}; "
+            f"next: sysctl -e -p /etc/sysctl.d/90-flexsheet.conf && systemctl daemon-reload && "
+            f"systemctl enable --now flexsheet@{host}; "
             f"its words: journalctl -fu flexsheet@{host}",
             markup=False,
         )

@@ -10,6 +10,7 @@ from pathlib import Path
 from launch.plans.planned import Plan
 
 TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
+NETWORK = TEMPLATE.with_name("90-flexsheet.conf")
 SOFTWARE = Path(__file__).resolve().parents[2]
 
 
@@ -36,8 +37,9 @@ class Installed:
 def files_of(
     *, launch_file: Path, host: str, user: str, root: Path, flexsheet: Path | None = None
 ) -> Iterator[Installed]:
-    """The unit and the host's environment file, under `root` ("/" on a real computer).
+    """The unit, settings for TCP and the host's environment.
 
+    root: where the system lies, "/" on a real computer.
     flexsheet: the command; default: the one beside this Python.
     """
     command = flexsheet or Path(sys.executable).parent / "flexsheet"
@@ -49,6 +51,7 @@ def files_of(
     ):
         unit = unit.replace(key, value)
     yield Installed(root / "etc/systemd/system/flexsheet@.service", unit)
+    yield Installed(root / "etc/sysctl.d/90-flexsheet.conf", NETWORK.read_text())
     yield Installed(
         root / f"etc/flexsheet/{host}.env",
         f"# What flexsheet@{host}.service runs; the file must be the same on all hosts.\n"
