@@ -40,8 +40,8 @@ SCENE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 OURS = {"flexsheet", "make", "python", "pytest"}
 OTHERS = {
     ".", "cd", "chmod", "chown", "cp", "dask", "docker", "docker/keys.sh", "git", "install",
-    "ip", "journalctl", "mkdir", "nano", "pip-compile", "scp", "sleep", "ssh", "sysctl", "systemctl",
-    "systemd-analyze", "useradd", "^C",
+    "ip", "journalctl", "mkdir", "nano", "pip-compile", "scp", "sleep", "ssh", "sysctl",
+    "systemctl", "systemd-analyze", "useradd", "^C",
 }  # fmt: skip
 """Programs of others that pages may call."""
 
