@@ -327,11 +327,19 @@ class Sender:
             args=(design, payload.topic, line.endpoint, childs_end, prepare),
             daemon=True,
         )
-        self._child.start()
+        try:
+            self._child.start()
+            self._warm_up()
+        except BaseException:
+            line.close()
+            raise
+
+    def _warm_up(self) -> None:
+        """Send until the child has heard enough."""
         patience_ends = time.monotonic() + PATIENCE_S
         while not self.results.poll(0.01):
             if not self._child.is_alive() or time.monotonic() > patience_ends:
-                raise RuntimeError(f"{design.name}: nothing arrives")
+                raise RuntimeError(f"{self.design.name}: nothing arrives")
             self.send(WARM_UP)
         time.sleep(0.05)
         while self.results.poll(0):
@@ -490,16 +498,16 @@ CODEC_HEADS = ("message", "frames", "bytes", "construct µs", "encode µs", "dec
 
 def latency_cells(row: dict[str, Any]) -> tuple[str, ...]:
     low, high = row["p50_ratio_range"]
-    return (
-        row["design"],
-        row["about"],
+    figures: tuple[str, ...] = (
         f"{row['p50_us']:.0f}",
         f"{row['p99_us']:.0f}",
         f"{row['p50_ratio']:.2f}",
         f"{low:.2f}-{high:.2f}",
         f"{row['p99_ratio']:.2f}",
-        f"{row['superseded']}",
     )
+    if np.isnan(row["p50_us"]):
+        figures = ("-",) * len(figures)
+    return row["design"], row["about"], *figures, f"{row['superseded']}"
 
 
 def codec_cells(row: dict[str, Any]) -> tuple[str, ...]:

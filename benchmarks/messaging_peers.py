@@ -7,8 +7,9 @@
 As `benchmarks.messaging`: one process publishes at a steady rate, one process per library receives;
 the latency is one way, from before a typed message is made to the handler that has it.  All take
 turns in random order in every round, and what counts is the ratio to blocking ZeroMQ within the
-round.  zenoh carries as many bytes, untyped; Cyclone DDS and LCM carry types of their own with the
-same fields, which nobody validates.  dora is not asked: its nodes run under a daemon of its own.
+round.  zenoh and dora carry as many bytes, untyped; Cyclone DDS and LCM carry types of their own
+with the same fields, which nobody validates.  dora's nodes find one another by a daemon, which is
+there on their own computer; between two it is not asked.
 
 As root, everything happens in a network of its own, where loopback has the multicast that LCM
 needs, and a second one is reached by a pair of virtual Ethernet devices ("veth").  There flexsheet
@@ -58,11 +59,12 @@ OVER = {
 
 @dataclass(frozen=True)
 class Peer:
-    """A library that is asked: its package, and a place for each transport."""
+    """A library that is asked: its package, a place for each transport, and over which it is."""
 
     package: str
     design: Design
     place: Callable[[str, Path], str]
+    over: tuple[str, ...] = ("ipc", "tcp", "veth")
 
 
 def zenoh_place(over: str, folder: Path) -> str:
@@ -81,7 +83,17 @@ def lcm_place(over: str, folder: Path) -> str:
     return f"udpm://239.255.76.67:{next(PORTS)}?ttl={1 if over == 'veth' else 0}"
 
 
+def dora_place(over: str, folder: Path) -> str:
+    return str(folder / f"dora{next(PORTS)}")
+
+
 PEERS = (
+    Peer(
+        "dora-rs",
+        Design("dora", "raw bytes, event loop", False, peers.receive_dora, open=peers.DoraLine),
+        dora_place,
+        over=("ipc",),
+    ),
     Peer(
         "eclipse-zenoh",
         Design("zenoh", "raw bytes, callback", False, peers.receive_zenoh, open=peers.ZenohLine),
@@ -183,7 +195,8 @@ def measure_over(
 ) -> list[dict[str, Any]]:
     """The rows of one way to be connected."""
     ours = OURS_KEYED if over == "veth" else OURS
-    places = {one.design.name: one.place for one in found}
+    asked = [one for one in found if over in one.over]
+    places = {one.design.name: one.place for one in asked}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         prepare = None
@@ -211,7 +224,7 @@ def measure_over(
         for payload in PAYLOADS:
             rows += messaging.measure(
                 payload,
-                (RAW, ours, *(one.design for one in found)),
+                (RAW, ours, *(one.design for one in asked)),
                 rounds=options.rounds,
                 seconds=options.seconds,
                 open_sender=lambda design, payload, number: Sender(
@@ -283,7 +296,8 @@ def main() -> None:
     load_before = os.getloadavg()[0]
     latency = []
     with Progress(console=words) as progress:
-        total = len(over) * len(PAYLOADS) * options.rounds * (2 + len(found))
+        designs = sum(2 + sum(way in one.over for one in found) for way in over)
+        total = designs * len(PAYLOADS) * options.rounds
         task = progress.add_task("measuring", total=total)
         for one in over:
             latency += measure_over(one, found, options, lambda: progress.advance(task))

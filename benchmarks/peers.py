@@ -3,18 +3,24 @@
 Each has a line, the sending end, and a function that receives, in the way its own manual begins
 with.  All are told where the other is: nothing is looked for beyond the interface that is named.
 
-zenoh carries bytes, Cyclone DDS and LCM messages of their own types, with the same fields.  LCM's
-are written as its generator writes them.  DDS's pictures are arrays of octets, their size part of
-the type, which its Python binding copies at once; a sequence it packs number by number, for 25 ms.
+zenoh and dora carry bytes, Cyclone DDS and LCM messages of their own types, with the same fields.
+LCM's are written as its generator writes them.  DDS's pictures are arrays of octets, their size
+part of the type, which its Python binding copies at once; a sequence it packs number by number, for
+25 ms.
 """
 
 from __future__ import annotations
 
+import signal
 import struct
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
+from pathlib import Path
 from threading import Event
 from typing import Any
 
@@ -29,6 +35,7 @@ from messages.wire import encode
 Arrived = Callable[[int, int], bool]
 PICTURE_BYTES = 480 * 640
 STAMPS = struct.Struct("<QQ")
+DORA_STARTS_S, DORA_ENDS_S = 20.0, 5.0
 
 
 def raw_bytes(payload: Payload) -> bytearray:
@@ -97,6 +104,69 @@ def receive_zenoh(topic: Topic, endpoint: str, arrived: Arrived) -> None:
     session.declare_subscriber("bench", on_sample)
     ended.wait()
     session.close()
+
+
+DORA_DATAFLOW = """\
+nodes:
+  - {id: sender, path: dynamic, outputs: [message]}
+  - {id: receiver, path: dynamic, inputs: {message: {source: sender/message, queue_size: 1000}}}
+"""
+"""Its nodes are our processes: dynamic ones, which come to the daemon by themselves."""
+
+
+def dora_node(name: str) -> Any:
+    """A node of the dataflow; until its daemon knows of that it is asked again."""
+    from dora import Node
+
+    patience_ends = time.monotonic() + DORA_STARTS_S
+    while True:
+        try:
+            return Node(name)
+        except RuntimeError:
+            if time.monotonic() > patience_ends:
+                raise
+            time.sleep(0.1)
+
+
+class DoraLine:
+    """A dataflow under a daemon of its own, which `dora run` starts; place: a folder for it."""
+
+    def __init__(self, payload: Payload, place: str) -> None:
+        self.endpoint = "receiver"
+        self._raw = raw_bytes(payload)
+        self._octets = np.frombuffer(self._raw, dtype=np.uint8)
+        self._node: Any = None
+        folder = Path(place)
+        folder.mkdir()
+        (folder / "dataflow.yml").write_text(DORA_DATAFLOW)
+        with open(folder / "dora.log", "wb") as log:
+            command = [str(Path(sys.executable).parent / "dora"), "run", "dataflow.yml"]
+            self._daemon = subprocess.Popen(command, cwd=folder, stdout=log, stderr=log)
+
+    def send(self, sequence: int, stamp_ns: int) -> None:
+        import pyarrow
+
+        # It waits until the receiver has come to the daemon too.
+        self._node = self._node or dora_node("sender")
+        STAMPS.pack_into(self._raw, 0, sequence, stamp_ns)
+        self._node.send_output("message", pyarrow.array(self._octets))
+
+    def close(self) -> None:
+        self._node = None
+        self._daemon.send_signal(signal.SIGINT)
+        try:
+            self._daemon.wait(DORA_ENDS_S)
+        except subprocess.TimeoutExpired:
+            self._daemon.kill()
+            self._daemon.wait()
+
+
+def receive_dora(topic: Topic, endpoint: str, arrived: Arrived) -> None:
+    for event in dora_node(endpoint):
+        if event["type"] == "INPUT":
+            octets = event["value"].to_numpy()
+            if not arrived(*STAMPS.unpack_from(octets)):
+                return
 
 
 @cache
