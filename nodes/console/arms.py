@@ -50,6 +50,9 @@ PIECES = (
     Piece(6, (0.044, 0.044, 0.012), (0.0, 0.0, -0.006), dark=True),
 )
 
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+"""Of a box, (8, 3): x is bit 4 of the index, y bit 2, z bit 1."""
+
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
 """Of the bar that holds the sheet: across, along the edge as a share of it, through."""
 
@@ -72,18 +75,35 @@ def rounded_box(
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()
-    signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-    # Three vertices at each corner, each on one of its faces.
-    vertices = np.concatenate([signs * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)])
-    triangles = _hull(vertices)
-    return vertices + np.array(middle_m), triangles
+    # Three vertices at each corner, each on one of its faces: index 8 * axis + corner.
+    vertices = np.concatenate(
+        [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
+    )
+    return vertices + np.array(middle_m), _wound_outwards(vertices, _box_triangles())
 
 
-def _hull(vertices: Floats) -> NDArray[np.int32]:
-    """Triangles of the convex hull, wound so that normals point outwards."""
-    from scipy.spatial import ConvexHull  # only where something is drawn
+def _box_triangles() -> NDArray[np.int32]:
+    """Vertices (44, 3) of the triangles: of the corners, of the edges' strips, of the faces."""
+    corner = np.arange(8)
+    triangles = [np.stack([corner, 8 + corner, 16 + corner], axis=1)]
+    for axis in range(3):
+        bit = 4 >> axis
+        low = corner[corner & bit == 0]
+        # The edges along this axis join the faces of the other two; its own faces are their ends.
+        first, second = (8 * other for other in range(3) if other != axis)
+        near, far = low, low | bit
+        triangles += [
+            np.stack([first + near, first + far, second + far], axis=1),
+            np.stack([first + near, second + far, second + near], axis=1),
+        ]
+        for side in (0, bit):
+            a, b, c, d = 8 * axis + (low | side)
+            triangles.append(np.array([(a, b, d), (a, d, c)]))
+    return np.concatenate(triangles).astype(np.int32)
 
-    triangles: NDArray[np.int32] = ConvexHull(vertices).simplices.astype(np.int32)
+
+def _wound_outwards(vertices: Floats, triangles: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The same triangles of a convex body about the origin, counter-clockwise from outside."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) < 0.0
     triangles[inward] = triangles[inward][:, ::-1]

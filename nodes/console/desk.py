@@ -219,6 +219,12 @@ class Replay:
         if self.timeline is not None:
             self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
 
+    def play_or_pause(self) -> None:
+        """Play from here, at the end from the beginning; or stay where it is."""
+        if self.timeline is not None and self.timeline.seconds >= self.timeline.duration_s:
+            self.seek(0.0)
+        self.playing = not self.playing
+
     def advance(self, duration_s: float) -> None:
         """Play on; stops at the end."""
         if self.timeline is None or not self.playing:

@@ -34,6 +34,11 @@ class Finger:
         """Point at this object from now on; None while there is none."""
         self._aim, self._target, self._meant = aim, None, None
 
+    @property
+    def target(self) -> Floats | None:
+        """Where (3,) it is to go; None: it is there."""
+        return self._target
+
     def touch(self, origin: Floats, direction: Floats) -> None:
         """Go where a ray from the viewer's eye meets the object, and as deep as is set."""
         self._mean(lambda aim: aim.under_ray(origin, direction, self.depth_m))

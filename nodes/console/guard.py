@@ -23,6 +23,8 @@ import websockets.asyncio.server
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from nodes.console.dress import dressed
+
 LEAST_TOKEN = 16
 COOKIE = "flexsheet-token"
 
@@ -156,7 +158,10 @@ def _guarding(guard: Guard) -> Iterator[list[PageRequest]]:
 
     def answer(ask_viser: PageRequest, connection: Any, request: Request) -> Response | None:
         refused = guard.refusal(request)
-        return ask_viser(connection, request) if refused is None else refused
+        if refused is not None:
+            return refused
+        answered = ask_viser(connection, request)
+        return None if answered is None else dressed(answered)
 
     def serve_guarded(*arguments: Any, process_request: PageRequest, **rest: Any) -> Any:
         guarded.append(process_request)

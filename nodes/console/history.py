@@ -37,10 +37,13 @@ class History:
         values = np.array([values for _, values in self._samples])
         return (times, *values.T)
 
-    def newest(self) -> dict[str, float]:
-        """The last sample by series; NaN where nothing has come."""
-        values = self._samples[-1][1] if self._samples else (float("nan"),) * len(SERIES)
-        return dict(zip(SERIES, values, strict=True))
+    def newest_and_worst(self) -> dict[str, tuple[float, float]]:
+        """The last sample (ms) and the greatest by series; NaN where nothing has come."""
+        found = {}
+        for name, values in zip(SERIES, self.columns()[1:], strict=True):
+            known = values[np.isfinite(values)]
+            found[name] = float(values[-1]), float(known.max()) if len(known) else float("nan")
+        return found
 
 
 def latencies_ms(source: Source) -> tuple[float, ...]:

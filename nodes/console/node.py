@@ -44,7 +44,7 @@ class ConsoleParameters(NodeParameters):
     bags: Path = Field(default=Path("runs"), description="folder whose bags can be replayed")
     plan: Path = Field(default=Path("@run/plan.json"), description="holds the first scene")
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
-    kept: Path = Field(default=Path("@run/console.json"), description="what it takes up again")
+    kept: Path = Field(default=Path("@run/console-kept.json"), description="what it takes up again")
 
     @field_validator("address")
     @classmethod
@@ -102,9 +102,8 @@ class Console(Node):
         finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
         files = Files(given.plan, given.scenes, given.bags, given.kept)
         desk = Desk(self._publish, files, finger, self.log.warning)
-        self.operator = Operator(
-            self._server, self._newest, desk, self._ask, with_finger=given.drives_finger
-        )
+        has = {"with_finger": given.drives_finger, "with_eye": "in/twin/eye" in self.inputs}
+        self.operator = Operator(self._server, self._newest, desk, self._ask, **has)
         desk.begin()
         self.note = f"{self.url}, nobody looks"
 

@@ -19,16 +19,19 @@ from messages.types import (
     EStop,
     Fingertip,
     Frame,
+    SheetTarget,
     Skin,
     Status,
     TwinEye,
 )
 from nodes.console import panels
+from nodes.console.controls import Ask
 from nodes.console.desk import Desk
 from nodes.console.history import History
 from nodes.console.newest import Newest, Source
-from nodes.console.page import NO_BAG, Ask, Page
+from nodes.console.page import Page
 from nodes.console.picture import picture_of
+from nodes.console.record_tab import NO_BAG
 from nodes.console.view import LAYERS
 
 Floats = NDArray[np.float64]
@@ -41,7 +44,13 @@ LONGEST_STEP_S = 0.2
 """After a pause the finger and the replay go on from where they were."""
 
 SIDES = ("left", "right")
+MARKS_SHOWN = 5
+SOLVER, PRECOMPUTING = "fem_solver", "precomputing"
 RECORDER = "recorder"
+REPLAYED = (
+    "what you see is a replay, and the finger is that of the running graph: press "
+    '"Back to the running graph" in Record first'
+)
 NO_RECORDER = (
     "there is no recorder in this graph that waits to be told: start it with --console, or give "
     "its recorder the parameter waits: true"
@@ -52,21 +61,31 @@ class Operator:
     """Runs on the node's own loop, but for the page's callbacks."""
 
     def __init__(
-        self, server: viser.ViserServer, live: Newest, desk: Desk, ask: Ask, *, with_finger: bool
+        self,
+        server: viser.ViserServer,
+        live: Newest,
+        desk: Desk,
+        ask: Ask,
+        *,
+        with_finger: bool,
+        with_eye: bool,
     ) -> None:
-        self._live, self.desk = live, desk
+        """with_finger: the twin's, which the mouse moves.  with_eye: the twin's, which looks."""
+        self._live, self.desk, self._with_eye = live, desk, with_eye
         self._page = Page(server, ask, with_finger=with_finger)
         self._history = History()
         self._statuses: dict[str, tuple[Status, float]] = {}
         self._drawn_scene: Scene | None = None
         self._drawn_skin: Skin | None = None
         self._pictured: Frame | None = None
-        self._now_s = 0.0
+        self._now_s, self._sent_ns = 0.0, 0
         self._bags_s = -BAGS_EVERY_S
+        self._looked_s: float | None = None
+        self._marked: tuple[str, ...] = ()
         self._take_up_scene()
         self._asked: dict[str, Callable[..., None]] = {
-            "touch": desk.finger.touch,
-            "place": desk.finger.place,
+            "touch": self._touch,
+            "place": self._place,
             "push": desk.finger.push,
             "lift": desk.finger.lift,
             "stop": desk.stop,
@@ -113,8 +132,9 @@ class Operator:
         elif isinstance(message, Display):
             self.desk.look.heed(message)
         elif isinstance(message, TwinEye) and self.desk.look.got(message, now_s):
+            self._looked_s = now_s
             for name, image in (("seen", message.seen), ("proper", message.proper)):
-                self._page.show_picture(name, smaller(image))
+                self._page.eye.show_picture(name, smaller(image))
 
     def advance(self, now_s: float, looking: bool) -> None:
         """Go on with what moves by itself, and draw it where somebody looks."""
@@ -141,7 +161,7 @@ class Operator:
             self._page.view.draw(picture_of(self._drawn_scene, self.source))
         self._show_frame()
         if replay.timeline is not None:
-            self._page.show_replay(self.desk)
+            self._page.record.show_replay(replay)
 
     def _follow_scene(self) -> None:
         """Draw what the scene holds anew when it is another one."""
@@ -151,13 +171,13 @@ class Operator:
         scene = self.desk.scenes.scene if recorded is None else recorded[0]
         if scene is not self._drawn_scene:
             self._drawn_scene, self._drawn_skin = scene, None
-            scenes = self.desk.scenes
-            self._page.show_scene(scene, scenes.names, scenes.sliders)
-            self._page.show_correction(self.desk.look.correction)
+            self._page.show_scene(scene, self.desk)
 
     def _follow_skin(self) -> None:
         skin = self.source.newest("skin", Skin)
-        if skin is not None and skin[0] is not self._drawn_skin:
+        if skin is None or (self.source is self._live and skin[1].source_ns < self._sent_ns):
+            return  # still that of the scene before
+        if skin[0] is not self._drawn_skin:
             self._drawn_skin = skin[0]
             rest = np.asarray(skin[0].vertices_world_m, dtype=np.float64)
             self._page.view.set_skin(rest, skin[0].triangles)
@@ -167,18 +187,22 @@ class Operator:
         if entry is None or entry[0] is self._pictured or not entry[0].pixels:
             return
         self._pictured = entry[0]
-        self._page.show_picture("frame", smaller(entry[0].pixels[0]))
+        self._page.eye.show_picture("frame", smaller(entry[0].pixels[0]))
 
     def tell(self, now_s: float) -> None:
         """Tables, charts, banner."""
         ages = {name: (status, now_s - at_s) for name, (status, at_s) in self._statuses.items()}
         self._history.take(now_s, self._live)
-        tables = panels.topics_table(ages) + panels.nodes_table(ages)
-        self._page.show_graph(tables, self._history.columns())
+        latencies = panels.latency_table(self._history.newest_and_worst())
+        tables = latencies + panels.topics_table(ages) + panels.nodes_table(ages)
+        self._page.graph.show(tables, self._history.columns())
         self._show_state()
+        self._tell_eye(now_s)
+        finger = self.source.newest("fingertip", Fingertip)
+        self._page.touch.show_finger(panels.finger(None if finger is None else finger[0]))
         if now_s >= self._bags_s + BAGS_EVERY_S:
             self._bags_s = now_s
-            self._page.show_bags(self.desk.replay.bags())
+            self._page.record.show_bags(self.desk.replay.bags())
 
     def _show_state(self) -> None:
         desk, arms = self.desk, {}
@@ -189,13 +213,47 @@ class Operator:
         stopped = desk.stopped
         if stopped is None and any(arm.mode == "estop" for arm in arms.values()):
             stopped = "the arms are still stopped"
-        timeline = desk.replay.timeline
-        where = "Live" if timeline is None else f"REPLAY of {timeline.path.name}"
+        timeline, sheet = desk.replay.timeline, self._live.newest("sheet_target", SheetTarget)
         shown = desk.scenes.scene if self._drawn_scene is None else self._drawn_scene
-        html = panels.banner(shown.name, arms, stopped, where)
-        self._page.show_state(html, stopped=stopped is not None, recording=desk.recording)
+        html = panels.banner(
+            shown.name,
+            arms,
+            stopped,
+            sheet=None if sheet is None else sheet[0],
+            busy=self._busy(),
+            replay=None if timeline is None else timeline.path.name,
+        )
+        self._page.show_state(html, stopped=stopped is not None)
+        recorder = self._statuses.get(RECORDER)
+        note = None if recorder is None else recorder[0].note
+        self._page.record.show_state(panels.recorder(note, self._marked), recording=desk.recording)
+
+    def _busy(self) -> str:
+        """What the soft body's solver says while it works one out."""
+        solver = self._statuses.get(SOLVER)
+        working = solver is not None and solver[0].note.startswith(PRECOMPUTING)
+        return solver[0].note if solver is not None and working else ""
+
+    def _tell_eye(self, now_s: float) -> None:
+        ago_s = None if self._looked_s is None else now_s - self._looked_s
+        wanted = self.desk.look.wanted
+        self._page.eye.show_words(panels.eye(wanted=wanted, possible=self._with_eye, ago_s=ago_s))
+
+    def _touch(self, origin: Floats, direction: Floats) -> None:
+        if self.desk.replay.timeline is not None:
+            raise ValueError(REPLAYED)
+        self.desk.finger.touch(origin, direction)
+        if (target := self.desk.finger.target) is not None:
+            self._page.touch.show_aim(float(target[0]), float(target[1]))
+
+    def _place(self, x_m: float, y_m: float) -> None:
+        if self.desk.replay.timeline is not None:
+            raise ValueError(REPLAYED)
+        self.desk.finger.place(x_m, y_m)
 
     def _take_up_scene(self) -> None:
+        """A scene was sent since the last picture."""
+        self._sent_ns = round(1e9 * self._now_s)
         self.desk.scenes.make_aim(self.desk.finger, self._page.show_problem)
 
     def _choose(self, name: str) -> None:
@@ -226,6 +284,7 @@ class Operator:
     def _record(self) -> None:
         if self._recorder_waits() is None:
             raise ValueError(NO_RECORDER)
+        self._marked = () if not self.desk.recording else self._marked
         self.desk.record(not self.desk.recording)
 
     def _mark(self, label: str) -> None:
@@ -236,19 +295,20 @@ class Operator:
                 "nothing is recorded now, so there is nothing to mark: start recording"
             )
         self.desk.mark(label)
+        self._marked = (*self._marked, label.strip() or "moment")[-MARKS_SHOWN:]
 
     def _open_bag(self, name: str) -> None:
         if name == NO_BAG:
             raise ValueError("there is no bag to show yet: record one first")
         self.desk.replay.open(name)
-        self._page.show_replay(self.desk, opened=True)
+        self._page.record.show_replay(self.desk.replay, opened=True)
 
     def _leave(self) -> None:
         self.desk.replay.leave()
-        self._page.show_replay(self.desk, opened=True)
+        self._page.record.show_replay(self.desk.replay, opened=True)
 
     def _play(self) -> None:
-        self.desk.replay.playing = not self.desk.replay.playing
+        self.desk.replay.play_or_pause()
 
     def _set_rate(self, rate: float) -> None:
         self.desk.replay.rate = rate

@@ -1,15 +1,19 @@
-"""The page's tables, as HTML that a screen reader can read; colours never stand alone."""
+"""The page's words and tables, as HTML that a screen reader can read; colours never stand alone.
+
+The classes are those of page.css.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from html import escape
+from math import isnan
 
 from messages.topics import TOPICS
-from messages.types import ArmState, PortStatus, Status
+from messages.types import ArmState, Fingertip, PortStatus, SheetTarget, Status
 
-GOOD, WARN, BAD = ("#166534", "●"), ("#92400e", "▲"), ("#b91c1c", "✕")
-TEXT, QUIET = "#1f2937", "#4b5563"
+GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_SHARE = 0.5
 """Of the least rate that the table of topics expects: below it a topic is called slow."""
 
@@ -17,29 +21,80 @@ STALE_S = 3.0
 """A node that has not said how it is for so long is called silent."""
 
 FAULTY_MODES = ("fault", "estop", "disconnected", "stopping")
+MODES = {
+    "disconnected": "not connected",
+    "idle": "at rest",
+    "follow": "following the finger",
+    "hold": "holding still",
+    "stopping": "stopping",
+    "fault": "at fault",
+    "relax": "relaxing the sheet",
+    "estop": "stopped",
+}
+"""What an arm is, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """How a series is drawn: its colour, readable on light and dark, and its dashes (px)."""
+
+    color: str
+    dash: tuple[int, ...] = ()
+
+
+LINES = (
+    Line("#2485b5"),
+    Line("#c26a00", (8, 4)),
+    Line("#cc4b37", (2, 3)),
+    Line("#3d8f4f", (12, 3, 2, 3)),
+    Line("#8d6bd6", (5, 2)),
+)
 
 
 def _mark(kind: tuple[str, str], text: str) -> str:
-    return f'<span style="color:{kind[0]};font-weight:600">{kind[1]} {escape(text)}</span>'
+    return f'<span class="{kind[0]}">{kind[1]} {escape(text)}</span>'
 
 
-def _table(caption: str, head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+def _table(
+    caption: str, head: Iterable[str], rows: Iterable[Iterable[str]], *, numbers: Iterable[int] = ()
+) -> str:
+    """numbers: which columns are flushed right."""
+    flushed = dict.fromkeys(numbers, ' class="fs-number"')
     heads = "".join(
-        f'<th scope="col" style="text-align:left;padding:2px 6px 2px 0;color:{QUIET};'
-        f'font-weight:600">{escape(one)}</th>'
-        for one in head
+        f'<th scope="col"{flushed.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)
     )
-    cell = '<td style="padding:2px 6px 2px 0;vertical-align:top;border-top:1px solid #e5e7eb">'
     body = "".join(
-        "<tr>" + "".join(f"{cell}{value}</td>" for value in row) + "</tr>" for row in rows
+        "<tr>"
+        + "".join(f"<td{flushed.get(i, '')}>{value}</td>" for i, value in enumerate(row))
+        + "</tr>"
+        for row in rows
     )
     return (
-        '<table style="width:94%;margin:0 10px 10px;border-collapse:collapse;font-size:12px;'
-        f'color:{TEXT};font-variant-numeric:tabular-nums">'
-        '<caption style="text-align:left;font-weight:700;padding:4px 0">'
-        f"{escape(caption)}</caption>"
+        f'<table class="fs-table"><caption>{escape(caption)}</caption>'
         f"<thead><tr>{heads}</tr></thead><tbody>{body}</tbody></table>"
     )
+
+
+def _words(html: str) -> str:
+    return f'<p class="fs-words">{html}</p>'
+
+
+def latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
+    """The chart's legend, with numbers.
+
+    latencies: by series, the newest and the worst (ms); NaN where nothing has come.
+    """
+    rows = []
+    for line, (name, (newest, worst)) in zip(LINES, latencies.items(), strict=True):
+        dashes = f' stroke-dasharray="{" ".join(map(str, line.dash))}"' if line.dash else ""
+        drawn = (
+            '<svg width="34" height="8" aria-hidden="true"><line x1="0" y1="4" x2="30" y2="4" '
+            f'stroke="{line.color}" stroke-width="2.5"{dashes}/></svg>'
+        )
+        told = ["–" if isnan(value) else f"{value:.0f}" for value in (newest, worst)]
+        rows.append((f"{drawn} {escape(name)}", *told))
+    head = ("from the exposure until", "now, ms", "worst, ms")
+    return _table("Latency in numbers", head, rows, numbers=(1, 2))
 
 
 def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
@@ -61,8 +116,8 @@ def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
         if status.errors:
             count = f"{status.errors} error{'s' if status.errors > 1 else ''}"
             said += f"<br>{_mark(BAD, f'{count}: {status.last_error}')}"
-        rows.append((escape(name), state, f"{100 * status.cpu_ratio:.0f} %", said))
-    return _table("Nodes", ("node", "state", "CPU", "says"), rows)
+        rows.append((escape(name), state, f"{100 * status.cpu_ratio:.0f}", said))
+    return _table("Nodes", ("node", "state", "CPU, %", "says"), rows, numbers=(2,))
 
 
 def topics_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
@@ -91,7 +146,7 @@ def topics_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
         if rejected:
             state = _mark(BAD, f"{rejected} refused")
         elif topic.rate_hz is None:
-            state = _mark(GOOD, "on change")
+            state = _mark(GOOD, "on\N{NO-BREAK SPACE}change")
         elif rate_hz == 0.0:
             state = _mark(WARN, "silent")
         elif rate_hz < SLOW_SHARE * topic.rate_hz[0]:
@@ -101,40 +156,111 @@ def topics_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
         rate = "" if topic.rate_hz is None else f"{rate_hz:.0f}"
         rows.append((escape(name), state, rate, oldest, str(dropped), str(lost)))
     head = ("topic", "state", "Hz", "age, ms", "skipped", "lost")
-    return _table("Topics", head, rows)
-
-
-def banner(scene: str, arms: Mapping[str, ArmState], stopped: str | None, where: str) -> str:
-    """What the arms do, over everything else.  stopped: the reason of an e-stop, or None."""
-    if stopped is not None:
-        text, ground = f"E-STOP is engaged: {stopped}", "#b91c1c"
-    elif any(arm.mode in FAULTY_MODES for arm in arms.values()):
-        ground = "#92400e"
-        text = "; ".join(
-            f"{side} arm: {arm.mode}" + (f" ({', '.join(arm.faults)})" if arm.faults else "")
-            for side, arm in arms.items()
-        )
-    elif arms:
-        modes = sorted({arm.mode for arm in arms.values()})
-        text, ground = f"Arms: {' / '.join(modes)}", "#166534"
-    else:
-        text, ground = "Waiting for the arms", "#374151"
-    forces = [arm.edge_force_n for arm in arms.values() if arm.edge_force_n is not None]
-    force = f", the sheet pulls with {max(forces):.1f} N" if forces else ""
-    return (
-        f'<div role="status" aria-live="polite" style="background:{ground};color:#ffffff;'
-        'padding:6px 10px;border-radius:6px;font-size:13px;font-weight:600">'
-        f"{escape(text)}</div>"
-        f'<div style="color:{TEXT};font-size:12px;padding:4px 2px">{escape(where)}, scene '
-        f"<b>{escape(scene)}</b>{escape(force)}</div>"
+    return _table("Topics", head, rows, numbers=(2, 3, 4, 5)) + _words(
+        "Age: of the message that the slowest reader has, from its exposure. Skipped: a newer one "
+        "was there already. Lost: on the way. Both since the start."
     )
+
+
+def banner(
+    scene: str,
+    arms: Mapping[str, ArmState],
+    stopped: str | None,
+    *,
+    sheet: SheetTarget | None = None,
+    busy: str = "",
+    replay: str | None = None,
+) -> str:
+    """What the arms do, over everything else.
+
+    stopped: the reason of an e-stop, or None.  busy: what the object waits for.  replay: name of
+    the bag that is shown.
+    """
+    if stopped is not None:
+        text, ground = f"E-STOP is engaged: {stopped}", "bad"
+    elif any(arm.mode in FAULTY_MODES for arm in arms.values()):
+        text, ground = "; ".join(_arm(side, arm) for side, arm in arms.items()), "warn"
+    elif arms:
+        modes = sorted({MODES[arm.mode] for arm in arms.values()})
+        text, ground = f"Arms: {' / '.join(modes)}", "good"
+    else:
+        text, ground = "Waiting for the arms", "quiet"
+    said = [_arms_hold(arms, sheet)] if stopped is None else []
+    forces = [arm.edge_force_n for arm in arms.values() if arm.edge_force_n is not None]
+    if forces:
+        said.append(f"The sheet pulls with {max(forces):.1f} N.")
+    if busy:
+        said.append(f"The object appears when its soft body is there: {busy}.")
+    shown = (
+        f"Scene <b>{escape(scene)}</b>, live."
+        if replay is None
+        else f"<b>REPLAY</b> of {escape(replay)}, scene <b>{escape(scene)}</b>: the 3D view shows "
+        "what was, this window what is."
+    )
+    words = " ".join([shown, *(escape(one) for one in said if one)])
+    return (
+        '<div class="fs-state"><div role="status" aria-live="polite" '
+        f'class="fs-banner fs-ground-{ground}">{escape(text)}</div>{_words(words)}</div>'
+    )
+
+
+def _arm(side: str, arm: ArmState) -> str:
+    faults = f" ({', '.join(arm.faults)})" if arm.faults else ""
+    return f"{side} arm: {MODES[arm.mode]}{faults}"
+
+
+def _arms_hold(arms: Mapping[str, ArmState], sheet: SheetTarget | None) -> str:
+    """Why arms that are well do not follow, or what the sheet does."""
+    for side, arm in arms.items():
+        if arm.mode not in ("follow", *FAULTY_MODES) and arm.reason:
+            return f"The {side} arm says: {arm.reason}."
+    if sheet is None or not arms:
+        return ""
+    match sheet.phase:
+        case "contact":
+            return f"The finger pushes {1e3 * sheet.push_depth_m:.1f} mm deep."
+        case "approach":
+            return "The sheet waits in front of the finger."
+        case _:
+            return f"The sheet holds: {sheet.reason}." if sheet.reason else "The sheet holds."
+
+
+def finger(fingertip: Fingertip | None) -> str:
+    """Where the fingertip is, or why that is not known."""
+    if fingertip is None:
+        return _words("No fingertip has come yet.")
+    if not fingertip.valid:
+        return _words(_mark(WARN, f"not tracked: {fingertip.reason.replace('_', ' ')}"))
+    x, y, z = (round(1e3 * metres) for metres in fingertip.position_world_m.tolist())
+    return _words(
+        f"{_mark(GOOD, 'tracked')} {abs(x)} mm {'left' if x < 0 else 'right'} and {abs(y)} mm "
+        f"{'below' if y < 0 else 'above'} the screen's middle, {abs(z)} mm "
+        f"{'behind' if z < 0 else 'before'} it"
+    )
+
+
+def eye(*, wanted: bool, possible: bool, ago_s: float | None) -> str:
+    """What to expect of the eye's pictures.  ago_s: since the newest; None: there is none."""
+    if not possible:
+        return _words("Nothing in this graph looks at the sheet; the twin's eye (twin_eye) would.")
+    if not wanted:
+        return _words("Tick the box to see what the user's eye sees.")
+    if ago_s is None:
+        return _words("The first picture takes some seconds.")
+    return _words(f"Taken {ago_s:.0f} s ago, one every six seconds.")
+
+
+def recorder(note: str | None, marked: tuple[str, ...]) -> str:
+    """What the recorder says of itself, and the moments that were marked; None: there is none."""
+    if note is None:
+        return _words(_mark(WARN, "this graph has no recorder"))
+    moments = f"<br>Marked: {escape(', '.join(marked))}." if marked else ""
+    return _words(f"Recorder: {escape(note)}.{moments}")
 
 
 def problem(text: str) -> str:
     """An error of what was asked for, or nothing."""
     if not text:
         return ""
-    return (
-        '<div role="alert" style="background:#fef2f2;color:#991b1b;border:1px solid #991b1b;'
-        f'padding:6px 10px;border-radius:6px;font-size:12px">{escape(text)}</div>'
-    )
+    said = escape(text[:1].upper() + text[1:])
+    return f'<div role="alert" class="fs-banner fs-ground-bad fs-problem">{said}</div>'

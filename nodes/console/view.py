@@ -13,7 +13,7 @@ from messages.scene import Scene
 from nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
 from nodes.console.picture import Picture, ray_vertices, rays, transform_of
 from nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
-from nodes.models.rigid import quaternion_from_rotation, transform
+from nodes.models.rigid import apply, quaternion_from_rotation, transform
 
 Floats = NDArray[np.float64]
 Color = tuple[int, int, int]
@@ -29,13 +29,25 @@ TO_EYE: Color = (196, 110, 0)
 FROM_PROJECTOR: Color = (0, 108, 148)
 EYE: Color = (250, 250, 250)
 
+GRID: Color = (176, 181, 189)
+GRID_SECTION: Color = (128, 135, 146)
+"""Seen on a light and on a dark page."""
+
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
 FINGER_TILT_RAD = 0.6
+NAME_ABOVE_M = np.array([0.0, 0.05, 0.0])
 FLOOR_M = 0.02
 """Below the arms' bases."""
 
-LAYERS = ("Arms", "Sheet", "Object", "Finger", "Rays", "Devices")
+LAYERS = ("Arms", "Sheet", "Object", "Finger", "Rays", "Devices", "Names")
+EYE_VIEW = "the eye"
+VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
+    "afar": ((0.5, 0.34, 1.3), (0.0, -0.13, 0.0)),
+    "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
+    EYE_VIEW: None,
+}
+"""Where a view is from and what it looks at (world, m); None: from between the user's eyes."""
 
 Drag = Callable[[Floats, Floats], None]
 """Gets a ray (origin and direction, world) from the viewer's eye through the mouse."""
@@ -56,9 +68,22 @@ class View:
         self._scene.set_up_direction("+y")
         # Without a graphics card shadows would take most of a frame's time.
         self._scene.configure_default_lights(cast_shadow=False)
-        server.initial_camera.position = (0.5, 0.34, 1.3)
-        server.initial_camera.look_at = (0.0, -0.13, 0.0)
+        first = next(iter(VIEWPOINTS.values()))
+        assert first is not None  # which needs no scene
+        server.initial_camera.position, server.initial_camera.look_at = first
         server.initial_camera.fov = 0.75
+
+    def look_from(self, client: viser.ClientHandle, name: str) -> None:
+        """Turn one viewer's view."""
+        viewpoint, scene = VIEWPOINTS[name], self._of_scene
+        if viewpoint is None:
+            if scene is None:
+                return
+            viewpoint = scene.eyes.centre_world_m, np.zeros(3)
+        place, towards = viewpoint
+        with client.atomic():
+            client.camera.up_direction = (0.0, 1.0, 0.0)
+            client.camera.position, client.camera.look_at = place, towards
 
     def show_layer(self, layer: str, shown: bool) -> None:
         self._shown[layer] = shown
@@ -82,6 +107,7 @@ class View:
         self._add_sheet(scene)
         self._add_finger(scene.finger.radius_m)
         self._add_devices(scene)
+        self._add_names(scene)
         ends = np.zeros((1, 2, 3))
         self._rays = [
             self._add("Rays", self._lines("/rays/eye", ends, TO_EYE, 1.6)),
@@ -152,8 +178,8 @@ class View:
             plane="xz",
             cell_size=0.1,
             section_size=0.6,
-            cell_color=(214, 218, 224),
-            section_color=(176, 184, 196),
+            cell_color=GRID,
+            section_color=GRID_SECTION,
             position=(0.0, lowest - FLOOR_M, 0.0),
         )
 
@@ -247,6 +273,29 @@ class View:
             self._scene.add_icosphere(
                 f"/devices/eye_{name}/pupil", radius=0.006, color=TO_EYE, position=(0, 0, -0.0065)
             )
+
+    def _add_names(self, scene: Scene) -> None:
+        """What the bodies are, in words above them."""
+        camera, projector = scene.camera, scene.projector.world_from_projector
+        baseline_m = -float(camera.right_from_left[0, 3])
+        middle = apply(transform_of(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))
+        places = {
+            "stereo camera": middle + NAME_ABOVE_M,
+            "projector": np.asarray(projector.position_m) + NAME_ABOVE_M,
+            "user's eyes": scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M,
+            "left arm": np.asarray(scene.arms.left.world_from_base.position_m),
+            "right arm": np.asarray(scene.arms.right.world_from_base.position_m),
+        }
+        for i, (text, place) in enumerate(places.items()):
+            label = self._scene.add_label(
+                f"/names/{i}",
+                text,
+                position=place,
+                font_screen_scale=0.9,
+                anchor="bottom-center",
+                depth_test=False,
+            )
+            self._add("Names", label)
 
     def _add_device(
         self,

@@ -1,0 +1,43 @@
+"""viser's page with the console's own style and script in its head.
+
+viser serves one finished page, in which sliders have no names, folders cannot be opened by keys,
+labels are too light to read, and a lost connection is a red dot.  What our two files add is plain
+HTML beside it; a viser whose page has no head is served as it is.
+"""
+
+from __future__ import annotations
+
+import gzip
+from functools import lru_cache
+from pathlib import Path
+
+from websockets.datastructures import Headers
+from websockets.http11 import Response
+
+HERE = Path(__file__).resolve().parent
+HEAD_END = b"</head>"
+
+
+def dressed(response: Response) -> Response:
+    """The answer with our style and script, where it is an HTML page; else the same answer."""
+    kind = response.headers.get("Content-Type", "")
+    if response.status_code != 200 or not kind.startswith("text/html"):
+        return response
+    packed = response.headers.get("Content-Encoding") == "gzip"
+    body = _with_head(bytes(response.body), packed)
+    headers = Headers(response.headers)
+    del headers["Content-Length"]
+    headers["Content-Length"] = str(len(body))
+    return Response(response.status_code, response.reason_phrase, headers, body)
+
+
+@lru_cache(maxsize=4)
+def _with_head(body: bytes, packed: bool) -> bytes:
+    page = gzip.decompress(body) if packed else body
+    before, end, after = page.rpartition(HEAD_END)
+    if not end:
+        return body
+    style, script = ((HERE / name).read_bytes() for name in ("page.css", "page.js"))
+    ours = b"<style>" + style + b"</style><script>" + script + b"</script>"
+    page = before + ours + end + after
+    return gzip.compress(page) if packed else page

@@ -1,0 +1,44 @@
+"""The tab that tells how the graph is: a strip chart of the latencies, and tables."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.console import panels
+from nodes.console.controls import Html
+from nodes.console.history import SERIES, WINDOW_S
+
+Floats = NDArray[np.float64]
+
+
+class GraphTab:
+    """A chart whose lines differ by colour and by dashes, and the tables under it."""
+
+    def __init__(self, gui: Any) -> None:
+        gui.add_html(
+            '<p class="fs-words"><b>Latency, ms</b>, over the last half minute, s, as drawn</p>'
+        )
+        lines = tuple(
+            {"label": name, "stroke": line.color, "width": 2, "dash": line.dash, "spanGaps": False}
+            for name, line in zip(SERIES, panels.LINES, strict=True)
+        )
+        self._chart = gui.add_uplot(
+            (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES)),
+            ({"label": "s"}, *lines),
+            scales={
+                "x": {"time": False, "range": (-WINDOW_S, 0.0)},
+                "y": {"auto": True},
+            },
+            axes=({}, {}),
+            legend={"show": False},
+            height=180,
+            padding=(10, 24, 0, 0),
+        )
+        self._tables = Html(gui)
+
+    def show(self, tables: str, columns: tuple[Floats, ...]) -> None:
+        self._tables.show(tables)
+        self._chart.data = columns

@@ -1,0 +1,127 @@
+// What viser's page leaves out: names of its controls, keys where it has none, the browser's choice
+// of dark, and a word when the connection is lost.  It runs before viser's own script.
+(() => {
+  "use strict";
+
+  const STOP = "E-STOP";
+  const LOST =
+    "No connection to the console. What is shown is old, and the e-stop of this page does nothing: " +
+    "use the arms' own.";
+
+  const VIEW =
+    "3D view of arms, sheet, object and finger. Arrow keys turn it, W, A, S, D, Q, E move it; the " +
+    "sliders under Touch move the finger.";
+
+  // viser is dark where its address says so, not where the browser does.
+  const asked = new URLSearchParams(location.search);
+  const wantsDark = matchMedia("(prefers-color-scheme: dark)").matches;
+  if (wantsDark && !asked.has("darkMode") && !asked.has("token")) {
+    asked.set("darkMode", "");
+    history.replaceState(null, "", `?${asked}`);
+  }
+
+  const stopButton = () =>
+    [...document.querySelectorAll("button")].find((one) => one.textContent.startsWith(STOP));
+
+  // viser heeds no hotkey while a text box has the focus; the e-stop must always be heeded.
+  addEventListener(
+    "keydown",
+    (event) => {
+      if (event.key === "Escape" && event.target.matches("input, textarea, select"))
+        stopButton()?.click();
+    },
+    true,
+  );
+
+  // Arrows that move a slider or go on to the next tab must not turn the 3D view too.
+  document.addEventListener("keydown", (event) => {
+    if (event.key.startsWith("Arrow") && event.target.closest("[role=slider], [role=tab]"))
+      event.stopPropagation();
+  });
+
+  const name = (element, text) => {
+    if (element && text && element.getAttribute("aria-label") !== text)
+      element.setAttribute("aria-label", text);
+  };
+
+  // The nearest box around a label that also holds what is labelled.
+  const controlsOf = (label) => {
+    for (let box = label.parentElement; box; box = box.parentElement) {
+      const found = box.querySelectorAll("input:not([type=hidden]), [role=slider]");
+      if (found.length) return found;
+    }
+    return [];
+  };
+
+  const ICONS = {
+    "list-search": "Commands and keys (Ctrl+K)",
+    adjustments: "viser's own settings",
+    "arrow-back": "Back to the console",
+    maximize: "Show larger",
+  };
+
+  function mend() {
+    for (const label of document.querySelectorAll("label[for]"))
+      for (const control of controlsOf(label)) name(control, label.textContent);
+    for (const [icon, text] of Object.entries(ICONS))
+      for (const drawn of document.querySelectorAll(`button svg.tabler-icon-${icon}`))
+        name(drawn.closest("button"), text);
+    for (const image of document.querySelectorAll("img:not([alt])"))
+      image.alt = image.parentElement.parentElement.textContent;
+    for (const canvas of document.querySelectorAll("canvas[data-engine]")) {
+      canvas.setAttribute("role", "img");
+      name(canvas, VIEW);
+    }
+    for (const icon of document.querySelectorAll(
+      ".mantine-Paper-root > svg.tabler-icon-chevron-up, " +
+        ".mantine-Paper-root > svg.tabler-icon-chevron-down",
+    )) {
+      const heading = icon.parentElement;
+      heading.setAttribute("role", "button");
+      heading.setAttribute("tabindex", "0");
+      const opened = icon.classList.contains("tabler-icon-chevron-up");
+      heading.setAttribute("aria-expanded", String(opened));
+    }
+  }
+
+  document.addEventListener("keydown", (event) => {
+    const heading = event.target.closest(".mantine-Paper-root[role=button]");
+    if (heading !== event.target || !["Enter", " "].includes(event.key)) return;
+    event.preventDefault();
+    heading.click();
+  });
+
+  // viser takes the mouse from its panels while it has no connection.
+  const lost = document.createElement("p");
+  lost.id = "fs-lost";
+  lost.className = "fs-banner fs-ground-bad";
+  lost.setAttribute("role", "alert");
+  lost.hidden = true;
+  let seen = false;
+  setInterval(() => {
+    const button = stopButton();
+    seen ||= Boolean(button);
+    const gone = seen && (!button || getComputedStyle(button).pointerEvents === "none");
+    if (lost.hidden === !gone) return;
+    lost.hidden = !gone;
+    lost.textContent = gone ? LOST : "";
+  }, 500);
+
+  document.addEventListener("DOMContentLoaded", () => {
+    const heading = document.createElement("h1");
+    heading.className = "fs-unseen";
+    heading.textContent = "flexsheet console";
+    const root = document.getElementById("root");
+    root.setAttribute("role", "main");
+    root.before(heading, lost);
+    let due = false;
+    new MutationObserver(() => {
+      if (due) return;
+      due = true;
+      setTimeout(() => {
+        due = false;
+        mend();
+      }, 100);
+    }).observe(document.body, { childList: true, subtree: true });
+  });
+})();

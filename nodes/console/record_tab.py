@@ -1,0 +1,82 @@
+"""The tab to record, to mark moments, and to replay what was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import viser
+
+from nodes.console.controls import Ask, Html, handing, on_value
+from nodes.console.desk import Replay
+
+PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
+NO_BAG = "(no bag)"
+NO_MOMENT = "-"
+RECORDING_COLOR = (146, 64, 14)
+"""Not the e-stop's."""
+
+
+class RecordTab:
+    """Its timeline is there while a bag is shown."""
+
+    def __init__(self, gui: Any, ask: Ask) -> None:
+        self._ask = ask
+        with gui.add_folder("Record"):
+            self._record = gui.add_button("Start recording", icon=viser.Icon.PLAYER_RECORD)
+            self._label = gui.add_text("Name", "", hint="What to call the moment")
+            mark = gui.add_button("Mark this moment (M)", hint="Key: M")
+            self._words = Html(gui)
+        with gui.add_folder("Replay"):
+            self._bag = gui.add_dropdown("Bag", (NO_BAG,), hint="The newest first")
+            opened = gui.add_button("Show the bag")
+            self._play = gui.add_button("Play", visible=False)
+            self._time = gui.add_slider("Time, s", 0.0, 1.0, 0.05, 0.0, visible=False)
+            self._rate = gui.add_dropdown(
+                "Speed, times", PLAY_RATES, initial_value="1", visible=False
+            )
+            self._moments = gui.add_dropdown("Go to", (NO_MOMENT,), visible=False)
+            self._live = gui.add_button("Back to the running graph", visible=False)
+        self._record.on_click(handing(ask, "record"))
+        mark.on_click(lambda _: ask("mark", self._label.value))
+        opened.on_click(lambda _: ask("open_bag", self._bag.value))
+        self._play.on_click(handing(ask, "play"))
+        self._live.on_click(handing(ask, "leave"))
+        on_value(self._time, lambda seconds: ask("seek", seconds))
+        on_value(self._rate, lambda rate: ask("replay_rate", float(rate)))
+        on_value(self._moments, self._go_to_moment)
+        command = gui.add_command("Mark this moment", hotkey="M")
+        command.on_trigger(lambda _: ask("mark", self._label.value))
+
+    def _go_to_moment(self, told: str) -> None:
+        seconds, _, rest = told.partition(" s")
+        if rest:
+            self._ask("seek", float(seconds))
+            # So that the same can be chosen again.
+            self._moments.value = NO_MOMENT
+
+    def show_state(self, html: str, *, recording: bool) -> None:
+        """What the recorder does."""
+        self._words.show(html)
+        self._record.label = "Stop recording" if recording else "Start recording"
+        self._record.color = RECORDING_COLOR if recording else None
+
+    def show_bags(self, names: Sequence[str]) -> None:
+        options = tuple(names) or (NO_BAG,)
+        if self._bag.options != options:
+            self._bag.options = options
+
+    def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
+        """The timeline's place; `opened`: it is another bag's, or none any more."""
+        timeline = replay.timeline
+        if opened:
+            for handle in (self._play, self._time, self._rate, self._moments, self._live):
+                handle.visible = timeline is not None
+            if timeline is not None:
+                self._time.max = max(round(timeline.duration_s, 1), 0.1)
+                marked = [f"{seconds:.2f} s {label}" for seconds, label in timeline.moments]
+                self._moments.options = (NO_MOMENT, *marked)
+                self._moments.visible = bool(marked)
+        if timeline is not None:
+            self._time.value = round(timeline.seconds, 2)
+            self._play.label = "Pause" if replay.playing else "Play"

@@ -1,0 +1,102 @@
+"""The tab to touch the object with, and to choose what it is and from where it is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from messages.scene import Scene
+from nodes.console.controls import Ask, Html, handing, on_value
+from nodes.console.desk import Sliders
+from nodes.console.view import LAYERS, VIEWPOINTS, View
+
+REACH_MM = 80.0
+
+
+class TouchTab:
+    """Finger, scene and view."""
+
+    def __init__(self, gui: Any, ask: Ask, view: View, *, with_finger: bool) -> None:
+        self._gui, self._ask, self._view = gui, ask, view
+        gui.add_markdown(
+            "**Drag on the sheet** to stroke the object. Drag beside it to turn the view, scroll "
+            "to come nearer."
+            if with_finger
+            else "The finger is measured; it cannot be moved from here."
+        )
+        with gui.add_folder("Finger"):
+            if with_finger:
+                self._add_finger()
+            self._finger = Html(gui)
+        with gui.add_folder("Object and sheet"):
+            self._add_scene()
+        with gui.add_folder("View"):
+            self._add_view()
+
+    def _add_finger(self) -> None:
+        gui, ask = self._gui, self._ask
+        depth = gui.add_slider(
+            "Push, mm", 0.0, 50.0, 0.5, 4.0, hint="How deep the finger goes into the object"
+        )
+        self._across = gui.add_slider(
+            "Across, mm", -REACH_MM, REACH_MM, 1.0, 0.0, hint="To the right of the screen's middle"
+        )
+        self._up = gui.add_slider(
+            "Up, mm", -REACH_MM, REACH_MM, 1.0, 0.0, hint="Above the screen's middle"
+        )
+        lift = gui.add_button("Lift the finger (L)", hint="Off the object. Key: L")
+        on_value(depth, lambda value: ask("push", 1e-3 * value))
+        for slider in (self._across, self._up):
+            on_value(
+                slider, lambda _: ask("place", 1e-3 * self._across.value, 1e-3 * self._up.value)
+            )
+        lift.on_click(handing(ask, "lift"))
+        gui.add_command("Lift the finger", hotkey="L").on_trigger(handing(ask, "lift"))
+
+    def _add_scene(self) -> None:
+        gui, ask = self._gui, self._ask
+        self._scene = gui.add_dropdown("Scene", ("-",), hint="Object, sheet and their sizes")
+        self._stiffness = gui.add_slider(
+            "Stiffness, kPa", 0.5, 30.0, 0.1, 4.0, hint="Young's modulus of the object"
+        )
+        self._tension = gui.add_slider(
+            "Tension, %",
+            *(0.5, 12.0, 0.1, 2.0),
+            hint="How much longer than slack the sheet is drawn, at least",
+        )
+        self._size = gui.add_slider(
+            "Size, %", 50, 150, 1, 100, hint="Of the object; its front stays where it is"
+        )
+        on_value(self._scene, lambda name: ask("choose", name))
+        on_value(self._stiffness, lambda value: ask("slide", "young_modulus_pa", 1e3 * value))
+        on_value(self._tension, lambda value: ask("slide", "stretch_ratio", 1.0 + 0.01 * value))
+        on_value(self._size, lambda value: ask("slide", "size_ratio", 0.01 * value))
+
+    def _add_view(self) -> None:
+        seen_from = self._gui.add_button_group(
+            "Seen from", tuple(VIEWPOINTS), hint="Turns your own view only"
+        )
+        seen_from.on_click(lambda event: self._view.look_from(event.client, event.target.value))
+        with self._gui.add_folder("Show", expand_by_default=False):
+            for layer in LAYERS:
+                box = self._gui.add_checkbox(layer, True)
+                on_value(box, partial(self._ask, "show_layer", layer))
+
+    def show_scene(self, scene: Scene, names: Sequence[str], sliders: Sliders) -> None:
+        """A scene that the graph now works with."""
+        if names:
+            self._scene.options = tuple(names)
+            if scene.name in names:
+                self._scene.value = scene.name
+        self._stiffness.value = 1e-3 * sliders.young_modulus_pa
+        self._tension.value = 100.0 * (sliders.stretch_ratio - 1.0)
+        self._size.value = round(100.0 * sliders.size_ratio)
+
+    def show_aim(self, across_m: float, up_m: float) -> None:
+        """Where the mouse has led the finger; beyond the sliders: their nearest end."""
+        for slider, value_m in ((self._across, across_m), (self._up, up_m)):
+            slider.value = float(round(min(max(1e3 * value_m, -REACH_MM), REACH_MM)))
+
+    def show_finger(self, html: str) -> None:
+        self._finger.show(html)

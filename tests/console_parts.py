@@ -1,0 +1,38 @@
+"""What the tests of the console share: a scene, messages as a source holds them, and as frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+
+from messages.base import Header, Message
+from messages.scene import Scene
+from messages.wire import encode
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def cylinder() -> Scene:
+    """The first scene of the demo."""
+    text = (ROOT / "launch" / "scenes" / "cylinder.yaml").read_text()
+    return Scene.model_validate(YAML(typ="safe").load(text))
+
+
+class Shelf:
+    """A source that holds what the test puts on it."""
+
+    def __init__(self, **messages: Message) -> None:
+        self.held = {
+            name.replace("__", "/"): (message, Header(1, 10_000_000, 13_000_000, "c", "w", 1))
+            for name, message in messages.items()
+        }
+
+    def newest(self, name: str, kind: Any) -> Any:
+        return self.held.get(name)
+
+
+def frames_of(message: Message, sequence: int = 1) -> tuple[list[Any], Header]:
+    header = Header(sequence, 5, 6, "clock", "writer", 3)
+    return encode(message, header), header

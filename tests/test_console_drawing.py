@@ -1,0 +1,125 @@
+"""What the console draws: arms, sheet, rays, and the picture of a moment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from nodes.arm_bridge import kinematics
+from nodes.console.arms import PIECES, link_poses, rounded_box
+from nodes.console.picture import picture_of, ray_vertices, rays
+from nodes.console.sheet import COLUMNS, ROWS, film, hit_by_ray, sheet_points
+from nodes.console.view import finger_mesh, line_segments
+from nodes.models.rigid import rotation_from_vector, transform
+from tests.arm_states import arm_state
+from tests.console_parts import Shelf, cylinder
+from tests.fingertips import fingertip
+
+Floats = NDArray[np.float64]
+WIDTH_M = HEIGHT_M = 0.24
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return cylinder()
+
+
+def edges(width_m: float = WIDTH_M) -> tuple[Floats, Floats]:
+    half = 0.5 * width_m
+    return transform(np.eye(3), (-half, 0, 0)), transform(np.eye(3), (half, 0, 0))
+
+
+def sheet(fingertip: Floats | None = None) -> Floats:
+    points = sheet_points(*edges(), height_m=HEIGHT_M, fingertip=fingertip, finger_radius_m=0.007)
+    assert points is not None
+    return points
+
+
+@given(st.lists(st.floats(-2.0, 2.0), min_size=6, max_size=6))
+def test_the_drawn_flange_is_where_the_kinematics_have_it(joints: list[float]) -> None:
+    base = transform(rotation_from_vector(np.array([0.3, -0.2, 0.5])), (0.1, -0.4, 0.2))
+    poses = link_poses(base, np.array(joints))
+    assert poses.shape == (7, 4, 4)
+    np.testing.assert_allclose(poses[-1], base @ kinematics.forward(joints), atol=1e-12)
+
+
+@pytest.mark.parametrize("piece", PIECES)
+def test_boxes_are_closed_and_wound_outwards(piece: Any) -> None:
+    vertices, triangles = rounded_box(piece.size_m, (0.0, 0.0, 0.0))
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    volume = float(np.einsum("ij,ij->", a, np.cross(b, c))) / 6.0
+    assert 0.8 * np.prod(piece.size_m) < volume < np.prod(piece.size_m)
+    tip, faces = finger_mesh(0.007)
+    a, b, c = (tip[faces[:, i]] for i in range(3))
+    assert float(np.einsum("ij,ij->", a, np.cross(b, c))) > 0.0
+
+
+@given(st.floats(-0.115, 0.115), st.floats(-0.12, 0.12))
+def test_the_film_is_held_at_its_edges_and_as_deep_as_the_finger(x: float, y: float) -> None:
+    ends, up = np.array([-0.12, 0.12]), np.linspace(-0.12, 0.12, 9)
+    places = [film(np.full(9, end), up, (x, y), (WIDTH_M, HEIGHT_M), 0.007) for end in ends]
+    np.testing.assert_allclose(places, 0.0, atol=1e-9)
+    at_finger = film(np.array([x]), np.array([y]), (x, y), (WIDTH_M, HEIGHT_M), 0.007)
+    assert at_finger[0] == 1.0
+    anywhere = film(np.linspace(-0.12, 0.12, 9), up, (x, y), (WIDTH_M, HEIGHT_M), 0.007)
+    assert ((anywhere >= -1e-12) & (anywhere <= 1.0)).all()
+
+
+def test_the_film_is_free_at_top_and_bottom() -> None:
+    near = np.array([0.12 - 1e-5, 0.12])
+    one, other = film(np.full(2, 0.02), near, (0.0, 0.08), (WIDTH_M, HEIGHT_M), 0.007)
+    assert abs(one - other) < 1e-7
+
+
+def test_a_sheet_that_is_not_there_or_not_pushed() -> None:
+    assert sheet_points(*edges(0.01), height_m=1.0, fingertip=None, finger_radius_m=1.0) is None
+    nan = np.full((4, 4), np.nan)
+    assert sheet_points(nan, nan, height_m=1.0, fingertip=None, finger_radius_m=1.0) is None
+    assert np.ptp(sheet()[:, 2]) == 0.0
+    assert np.ptp(sheet(np.array([0.0, 0.0, 0.01]))[:, 2]) == 0.0, "a finger before the sheet"
+    dented = sheet(np.array([0.02, 0.01, -0.03]))
+    assert dented[:, 2].min() == pytest.approx(-0.03, abs=1e-3)
+    assert line_segments(dented).shape == (2 * 9 * (ROWS - 1), 2, 3)
+
+
+@given(st.floats(-0.11, 0.11), st.floats(-0.11, 0.11))
+def test_rays_meet_the_flat_sheet_where_the_plane_is(x: float, y: float) -> None:
+    eye = np.array([0.03, 0.05, 0.4])
+    towards = np.array([[x, y, 0.0]]) + 0.3 * (np.array([[x, y, 0.0]]) - eye)
+    np.testing.assert_allclose(hit_by_ray(sheet(), eye, towards), [[x, y, 0.0]], atol=1e-9)
+
+
+def test_rays_that_miss_have_no_segments(scene: Scene) -> None:
+    eye = scene.eyes.centre_world_m
+    points = np.array([[0.0, 0.0, -0.1], [5.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    hits = hit_by_ray(sheet(), eye, points)
+    assert np.isfinite(hits).all(axis=1).tolist() == [True, False, False]
+    to_eye, from_projector = rays(scene, sheet(), points)
+    assert to_eye.shape == from_projector.shape == (1, 2, 3)
+    np.testing.assert_allclose(to_eye[0, 1], from_projector[0, 0])
+
+
+def test_a_picture_of_what_is_known(scene: Scene) -> None:
+    nothing = picture_of(scene, Shelf())
+    assert (nothing.links, nothing.sheet, nothing.finger) == ({}, None, None)
+    left, right = edges()
+    both = picture_of(
+        scene,
+        Shelf(
+            arm_left=arm_state("left", world_from_flange=left),
+            arm_right=arm_state("right", world_from_flange=right),
+            fingertip=fingertip(np.array([0.0, 0.0, -0.01])),
+        ),
+    )
+    assert both.links["left"].shape == (7, 4, 4)
+    assert both.sheet is not None
+    assert both.sheet.shape == (ROWS * COLUMNS, 3)
+    assert both.finger_valid
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 5)] * 3), axis=-1).reshape(-1, 3)
+    assert len(set(ray_vertices(grid).tolist())) == 9

@@ -1,0 +1,98 @@
+"""Looking through the user's eye, and what is put back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from messages.base import Message
+from messages.methods import Methods
+from messages.scene import Scene
+from messages.types import (
+    Correction,
+    Display,
+    TwinEye,
+)
+from nodes.console.desk import Desk, Files, Look
+from nodes.console.finger import Finger
+from tests.console_parts import cylinder
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return cylinder()
+
+
+def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
+    sent: list[Display] = []
+
+    def publish(message: Message) -> None:
+        assert isinstance(message, Display)
+        sent.append(message)
+
+    look = Look(publish, scene)
+    look.advance(1.0)
+    assert not sent, "nobody wants to look"
+    anothers = Display(correction="one_plane", stereo="anaglyph", label="mine")
+    look.heed(anothers)
+    look.wanted = True
+    look.advance(2.0)
+    asked = sent[0]
+    assert (asked.stereo, asked.pixels_every > 0) == ("mono", True)
+    look.heed(asked)
+    pixel = np.zeros((2, 2, 3), np.uint8)
+    eye = TwinEye(label="x", correction="none", metres_per_px=1e-3, seen=pixel, proper=pixel)
+    assert not look.got(eye, 2.5)
+    assert look.got(eye.model_copy(update={"label": asked.label}), 3.0)
+    assert sent[-1] is anothers
+    look.advance(3.1)
+    assert len(sent) == 2, "not at once again"
+    look.again()
+    look.advance(3.2)
+    look.advance(60.0)
+    assert sent[-1] is anothers, "a picture that never comes is given up"
+    look.follow(scene)
+    assert len(sent) == 4, "a scene changes nothing of what another has set"
+
+
+def test_after_a_look_each_scene_has_its_own_correction_until_one_is_picked(
+    scene: Scene, tmp_path: Path
+) -> None:
+    def corrected_by(correction: Correction | None) -> Scene:
+        return scene.model_copy(update={"methods": Methods(correction=correction)})
+
+    (tmp_path / "plan.json").write_text(
+        f'{{"scene": {corrected_by("four_triangles").model_dump_json()}}}'
+    )
+    for name, correction in (("flat", "one_plane"), ("silent", None)):
+        (tmp_path / f"{name}.json").write_text(corrected_by(correction).model_dump_json())
+    sent: list[Message] = []
+    files = Files(tmp_path / "plan.json", tmp_path, tmp_path, tmp_path / "console.json")
+    desk = Desk(sent.append, files, Finger(sent.append, speed_m_per_s=0.1), print)
+
+    def corrections() -> list[str]:
+        return [message.correction for message in sent if isinstance(message, Display)]
+
+    desk.begin()
+    desk.scenes.choose("flat")
+    assert corrections() == [], "the renderer follows the scene by itself"
+    desk.scenes.choose("silent")
+    desk.look.follow(corrected_by("four_triangles"))
+    desk.look.wanted = True
+    desk.look.advance(1.0)
+    desk.look.advance(60.0)
+    rested = sent[-1]
+    assert isinstance(rested, Display)
+    desk.look.heed(rested)  # a console hears what it says
+    assert corrections() == ["four_triangles", "four_triangles"]
+    desk.scenes.choose("flat")
+    desk.scenes.choose("silent")
+    assert corrections()[2:] == ["one_plane", "two_pass"]
+    desk.look.picked = "none"
+    desk.scenes.choose("flat")
+    assert corrections()[4:] == ["none"]

@@ -1,0 +1,61 @@
+"""What a plan makes of a console."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from launch.plans.documents import BadInputError
+from launch.plans.plan import load_plan
+from tests.console_parts import ROOT
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    file = tmp_path / "graph.yaml"
+    file.write_text(
+        f"scene: {ROOT / 'launch/scenes/cylinder.yaml'}\n"
+        "nodes:\n  twin_finger: {type: twin_finger}\n"
+    )
+    return file
+
+
+def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
+    plan = load_plan(graph, console=True, settings=["console.page_port=8123"])
+    assert [writer.name for writer in plan.writers["scene"]] == ["console"]
+    assert plan.nodes["console"].nice > 0
+    assert plan.nodes["console"].parameters["page_port"] == 8123
+    assert plan.ports_of_its_own(None) == [("console", 8123)]
+    assert plan.nodes["console"].parameters["drives_finger"]
+    assert plan.nodes["recorder"].parameters["waits"]
+    # In the run's directory NAME.json is what the launcher tells the node of that name.
+    assert plan.nodes["console"].parameters["kept"].removeprefix("@run/") not in {
+        f"{name}.json" for name in plan.nodes
+    }
+    read = {port.topic for port in plan.nodes["console"].inputs}
+    assert {"status", "estop", "display"} <= read
+    assert "arm_left" not in read, "which nobody writes here"
+    assert "recording" in {port.topic for port in plan.nodes["recorder"].inputs}
+    without = load_plan(graph)
+    assert [writer.name for writer in without.writers["scene"]] == ["launch"]
+
+
+def test_what_the_file_says_of_console_and_recorder_stays(graph: Path, tmp_path: Path) -> None:
+    text = graph.read_text()
+    graph.write_text(text + "  page: {type: console, parameters: {page_port: 9}}\n")
+    plan = load_plan(graph, console=True, record=tmp_path / "a.mcap")
+    assert "console" not in plan.nodes
+    assert plan.nodes["page"].parameters["page_port"] == 9
+    assert not plan.nodes["recorder"].parameters["waits"]
+    graph.write_text(text.replace("twin_finger: {type: twin_finger}", "fem_solver: {type: x:Y}"))
+    with pytest.raises(BadInputError):
+        load_plan(graph, console=True)
+    open_page = "console.address=192.0.2.1"
+    graph.write_text(text)
+    with pytest.raises(BadInputError, match="token_file"):
+        load_plan(graph, console=True, settings=[open_page])

@@ -1,0 +1,130 @@
+"""Scenes that are chosen, changed by sliders, and taken up again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from messages.base import Message
+from messages.scene import Scene
+from messages.types import (
+    Recording,
+)
+from nodes.console import scenes
+from nodes.console.aim import Aim
+from nodes.console.desk import SETTLE_S, Desk, Files, SceneDesk
+from nodes.console.finger import Finger
+from tests.console_parts import cylinder
+from tests.plans import scene_with
+
+Floats = NDArray[np.float64]
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return cylinder()
+
+
+SOLIDS: list[dict[str, Any]] = [
+    {"shape": "cylinder", "radius_m": 0.05, "length_m": 0.2},
+    {"shape": "sphere", "radius_m": 0.05},
+    {"shape": "ellipsoid", "semi_axes_m": [0.05, 0.04, 0.03]},
+    {"shape": "rounded_box", "size_m": [0.1, 0.08, 0.06], "edge_radius_m": 0.01},
+    {"shape": "plane", "width_m": 0.2, "height_m": 0.2},
+]
+
+
+@pytest.mark.parametrize("geometry", SOLIDS, ids=lambda one: str(one["shape"]))
+def test_a_larger_object_keeps_its_front(geometry: dict[str, Any]) -> None:
+    first = scene_with(geometry, (0.0, 0.0, -0.05), (0.2, 0.0, 0.0))
+    grown = scenes.edited(first, young_modulus_pa=9e3, stretch_ratio=1.05, size_ratio=1.3)
+    assert grown.object.material.young_modulus_pa == 9e3
+    assert grown.sheet.min_stretch_ratio == 1.05
+
+    def front(scene: Scene) -> float:
+        shape = Aim(scene)
+        seen = shape.under_ray(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, -1.0]), 0.0)
+        return float(seen[2])
+
+    if geometry["shape"] in ("sphere", "plane"):
+        assert front(grown) == pytest.approx(front(first), abs=3e-4)
+    assert grown.object.world_from_object.position_m[2] <= -0.05
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("young_modulus_pa", -1.0),
+        ("young_modulus_pa", np.nan),
+        ("stretch_ratio", 0.9),
+        ("size_ratio", 0.0),
+        ("size_ratio", np.inf),
+    ],
+)
+def test_values_that_make_no_scene_are_refused(scene: Scene, name: str, value: float) -> None:
+    good = {"young_modulus_pa": 4e3, "stretch_ratio": 1.02, "size_ratio": 1.0}
+    with pytest.raises(scenes.SceneChoiceError):
+        scenes.edited(scene, **good | {name: value})
+
+
+async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text(scene.model_dump_json())
+    sent: list[Message] = []
+    desk = SceneDesk(sent.append, tmp_path, scene)
+    desk.slide(10.0, young_modulus_pa=5e3)
+    desk.slide(10.3, young_modulus_pa=6e3)
+    assert not desk.settle(10.3 + 0.9 * SETTLE_S)
+    assert desk.settle(10.3 + SETTLE_S)
+    assert not desk.settle(20.0)
+    assert [one.object.material.young_modulus_pa for one in sent if isinstance(one, Scene)] == [6e3]
+    desk.choose("other")
+    assert desk.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
+    with pytest.raises(scenes.SceneChoiceError, match='no scene "none"; there are: other'):
+        desk.choose("none")
+    desk.slide(30.0, size_ratio=-1.0)
+    with pytest.raises(scenes.SceneChoiceError):
+        desk.settle(31.0)
+    assert len(sent) == 2
+
+
+def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "plan.json").write_text(f'{{"scene": {scene.model_dump_json()}}}')
+    other = scene.model_copy(update={"name": "other"})
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "other.json").write_text(other.model_dump_json())
+    files = Files(tmp_path / "plan.json", tmp_path / "scenes", tmp_path, tmp_path / "console.json")
+    warnings: list[str] = []
+
+    def desk() -> tuple[Desk, list[Message]]:
+        sent: list[Message] = []
+        made = Desk(sent.append, files, Finger(sent.append, speed_m_per_s=0.1), warnings.append)
+        made.begin()
+        return made, sent
+
+    first, sent = desk()
+    assert [one.name for one in sent if isinstance(one, Scene)] == [scene.name]
+    first.scenes.choose("other")
+    first.scenes.slide(1.0, young_modulus_pa=9e3)
+    first.scenes.settle(2.0)
+    first.record(True)
+    again, sent = desk()
+    assert again.scenes.sliders == first.scenes.sliders
+    taken_up, recording = sent
+    assert isinstance(taken_up, Scene)
+    assert (taken_up.name, taken_up.object.material.young_modulus_pa) == ("other", 9e3)
+    assert recording == Recording(running=True)
+    again.record(False)
+    again.scenes.choose("other")
+    third, sent = desk()
+    assert [type(message) for message in sent] == [Scene], "nothing is being recorded"
+    assert third.scenes.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
+    assert warnings == []
+    files.kept.write_text("{")
+    (begun,) = desk()[1]
+    assert isinstance(begun, Scene)
+    assert begun.name == scene.name
+    assert "cannot be taken up again" in warnings[0]
