@@ -108,12 +108,12 @@
   }, 500);
 
   document.addEventListener("DOMContentLoaded", () => {
-    const heading = document.createElement("h1");
-    heading.className = "fs-unseen";
-    heading.textContent = "flexsheet console";
+    const header = document.createElement("header");
+    header.className = "fs-unseen";
+    header.innerHTML = "<h1>flexsheet console</h1>";
     const root = document.getElementById("root");
     root.setAttribute("role", "main");
-    root.before(heading, lost);
+    root.before(header, lost);
     let due = false;
     new MutationObserver(() => {
       if (due) return;
