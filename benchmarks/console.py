@@ -28,8 +28,8 @@ from playwright.async_api import Page, WebSocket, async_playwright
 
 from launch.methods.machine import machine_name
 from launch.plans.plan import load_plan
-from launch.plans.planned import local_endpoints
 from launch.running.prepare import prepare_plan
+from launch.running.runs import local_endpoints
 from launch.running.supervisor import RunningGraph
 from messages.base import Header
 from messages.bus import Subscriber

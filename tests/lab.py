@@ -22,10 +22,10 @@ import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
-from launch.plans.keys import KEYS_VARIABLE
 from launch.plans.plan import load_plan
 from launch.plans.planned import Plan
 from launch.running.estop_file import STATE_VARIABLE
+from launch.running.keys import KEYS_VARIABLE
 from launch.running.runs import ROOT_VARIABLE
 from messages.base import Header, Message
 from messages.bus import Subscriber

@@ -19,9 +19,8 @@ import websockets
 from playwright.async_api import Page, async_playwright, expect
 
 from launch.plans.plan import load_plan
-from launch.plans.planned import local_endpoints
 from launch.running import runs
-from launch.running.runs import Run
+from launch.running.runs import Run, local_endpoints
 from launch.running.supervisor import RunningGraph
 from messages.bag import BagReader
 from messages.base import Header, Message

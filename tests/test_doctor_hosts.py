@@ -27,10 +27,10 @@ from launch.health.doctor_hosts import (
     rate_problem,
 )
 from launch.health.visits import Reach, Visit, way_to
-from launch.plans.keys import KEYS_VARIABLE, secret_file
 from launch.plans.plan import load_plan
 from launch.plans.planned import MAIN, Plan
 from launch.running import runs
+from launch.running.keys import KEYS_VARIABLE, secret_file
 from launch.running.supervisor import RunningGraph
 from messages.bus import Publisher
 from messages.security import new_key_pair, write_secret

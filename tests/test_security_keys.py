@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 
 from launch.plans.documents import BadInputError
-from launch.plans.keys import KEYS_VARIABLE, install
 from launch.plans.plan import load_plan
 from launch.plans.planned import Plan
 from launch.running import runs
+from launch.running.keys import KEYS_VARIABLE, install
 from launch.running.supervisor import RunningGraph
 from launch.running.tools import subscriber_to
 from messages.security import (

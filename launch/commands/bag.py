@@ -275,8 +275,8 @@ async def _record(
     bag: Path, topics: list[str], plan: Plan, run: Run, duration_s: float | None
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
-    from launch.plans.planned import RUN_DIRECTORY, local_sources
-    from launch.running.runs import ring_file
+    from launch.plans.planned import RUN_DIRECTORY
+    from launch.running.runs import local_sources, ring_file
     from launch.running.tools import host_of
     from messages.topics import TOPICS
     from nodes.recorder.node import Recorder

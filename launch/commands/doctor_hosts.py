@@ -134,7 +134,7 @@ async def examine(plan: Plan, here: str, run: Run | None, patience_s: float) -> 
 
     from launch.health.doctor_hosts import before_start, judge, own_key_problem
     from launch.health.visits import visit_all
-    from launch.plans.keys import secret_file
+    from launch.running.keys import secret_file
     from messages.security import KeyRing, write_ring
 
     key_problem = await asyncio.to_thread(own_key_problem, plan, here)

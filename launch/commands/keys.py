@@ -39,7 +39,7 @@ def new(
     """
     import re
 
-    from launch.plans.keys import secret_file
+    from launch.running.keys import secret_file
     from messages.security import SecurityError, new_key_pair, write_secret
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
@@ -66,7 +66,7 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Print the public keys whose secret halves are here; exit code 1 where one cannot be used."""
-    from launch.plans.keys import directory, secret_file
+    from launch.running.keys import directory, secret_file
     from messages.security import SecurityError, public_of, read_secret
 
     files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
@@ -110,8 +110,8 @@ def install(
 
     A graph that runs from that file takes it over within two seconds, without a restart.
     """
-    from launch.plans.keys import install as install_key
-    from launch.plans.keys import secret_file
+    from launch.running.keys import install as install_key
+    from launch.running.keys import secret_file
     from messages.security import SecurityError, public_of, read_secret
 
     if key is None:

@@ -20,10 +20,10 @@ from launch.health.doctor import LEAST_DISK_BYTES, check_libraries
 from launch.health.system import MANUAL, opengl_problem
 from launch.health.visits import Reach, Visit
 from launch.plans.hosts import is_loopback
-from launch.plans.keys import secret_file
 from launch.plans.planned import Plan, PlannedNode
 from launch.plans.wires import FIRST_PORT, PORTS
 from launch.running.host import devices_of, folder_of, python_version, software
+from launch.running.keys import secret_file
 from launch.running.runs import is_free
 from messages.security import SecurityError, public_of, read_secret
 from messages.topics import TOPICS

@@ -18,8 +18,8 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from launch.plans.hosts import is_loopback, launcher_on
-from launch.plans.planned import Plan, Writer, local_sources
-from launch.running.runs import Run
+from launch.plans.planned import Plan, Writer
+from launch.running.runs import Run, local_sources
 from messages.base import Header
 from messages.bus import Source, Subscriber
 from messages.security import KeyRing

@@ -6,13 +6,10 @@ need no more than this, and start at once.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from launch.running.runs import Run
 from messages.bus import Source
 from messages.scene import Scene
 
@@ -145,16 +142,3 @@ class Plan(Strict):
 def tools_on(host: str) -> str:
     """The command-line tools of a host, as a writer."""
     return TOOLS if host == MAIN else f"{TOOLS}_{host}"
-
-
-def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """Endpoints of a plan with the run's directory filled in."""
-    return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
-
-
-def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Sources of a plan with the run's directory filled in."""
-    return tuple(
-        replace(one, endpoint=one.endpoint.replace(RUN_DIRECTORY, str(run.directory)))
-        for one in sources
-    )

@@ -44,7 +44,7 @@ AREAS = (
     Area(
         "Keys",
         "Between hosts only who has the right key is heard: [security.md](security.md).",
-        ("messages/security.py", "launch/plans/keys.py"),
+        ("messages/security.py", "launch/running/keys.py"),
     ),
     Area(
         "Bags",

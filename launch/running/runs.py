@@ -14,12 +14,16 @@ import signal
 import socket
 import stat
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from launch.plans.planned import RUN_DIRECTORY
+
 if TYPE_CHECKING:
     import psutil
+
+    from messages.bus import Source
 
 RUN_VARIABLE = "FLEXSHEET_RUN"
 """Environment variable that tags every process of a run."""
@@ -76,6 +80,19 @@ class Run:
 def ring_file(run: Run, host: str) -> Path:
     """What processes of `host` in a run read their keys from."""
     return run.directory / f"keys-{host}.json"
+
+
+def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
+    """Endpoints of a plan with the run's directory filled in."""
+    return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
+
+
+def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
+    """Sources of a plan with the run's directory filled in."""
+    return tuple(
+        replace(one, endpoint=one.endpoint.replace(RUN_DIRECTORY, str(run.directory)))
+        for one in sources
+    )
 
 
 def root() -> Path:

@@ -26,21 +26,22 @@ from typing import Any, Self
 
 from launch.plans.documents import BadInputError, Problem, read_document
 from launch.plans.hosts import clock_node, is_loopback
-from launch.plans.keys import KeyWatch, make_rings
 from launch.plans.plan import load_scene
-from launch.plans.planned import (
-    LAUNCHER,
-    MAIN,
-    RUN_DIRECTORY,
-    Plan,
-    PlannedNode,
-    PlannedPort,
-    local_endpoints,
-    local_sources,
-)
+from launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort
 from launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from launch.running.host import HostVoice
-from launch.running.runs import HOST_FILE, RUN_VARIABLE, Run, create_run, is_free, ring_file, sweep
+from launch.running.keys import KeyWatch, make_rings
+from launch.running.runs import (
+    HOST_FILE,
+    RUN_VARIABLE,
+    Run,
+    create_run,
+    is_free,
+    local_endpoints,
+    local_sources,
+    ring_file,
+    sweep,
+)
 from messages.base import Header
 from messages.bus import Publisher
 from messages.clock import SystemClock

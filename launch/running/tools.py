@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from launch.plans.planned import MAIN, Plan, local_endpoints, local_sources, tools_on
-from launch.running.runs import Run, ring_file
+from launch.plans.planned import MAIN, Plan, tools_on
+from launch.running.runs import Run, local_endpoints, local_sources, ring_file
 from messages.base import Header, Message
 from messages.bus import Handler, Problem, Publisher, Subscriber
 from messages.clock import SystemClock
