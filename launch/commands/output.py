@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -42,6 +43,10 @@ class Words:
     def is_terminal(self) -> bool:
         return self.console.is_terminal
 
+    @property
+    def in_colour(self) -> bool:
+        return self.console.color_system is not None and not self.console.no_color
+
     def print(self, text: str, *, markup: bool = True, style: str | None = None) -> None:
         self.console.print(text, markup=markup, style=style)
 
@@ -77,19 +82,30 @@ def print_json_line(data: Any) -> None:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """A table on stdout; as wide as it needs to be where stdout is no terminal."""
+    """A table on stdout; cells are folded only where it would be wider than the terminal."""
+    cells = [[str(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
+    in_terminal = sys.stdout.isatty()
+    if in_terminal and sum(widths) + 2 * len(widths) - 2 > shutil.get_terminal_size().columns:
+        _print_folded(columns, cells)
+        return
+    for number, row in enumerate((columns, *cells)):
+        padded = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        line = "  ".join(padded).rstrip()
+        print(f"\x1b[1m{line}\x1b[0m" if in_terminal and number == 0 else line)
+
+
+def _print_folded(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in columns:
         table.add_column(column, overflow="fold")
     for row in rows:
-        table.add_row(*(str(cell) for cell in row))
-    console = Console(highlight=False)
-    if not sys.stdout.isatty():
-        console = Console(highlight=False, width=200)
-    console.print(table)
+        table.add_row(*(Text(cell) for cell in row))
+    Console(highlight=False).print(table)
 
 
 def print_fields(rows: Iterable[tuple[str, object]]) -> None:
@@ -97,7 +113,7 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
     pairs = [(name, str(value)) for name, value in rows]
     width = max(len(name) for name, _ in pairs)
     for name, value in pairs:
-        print(f"{name:<{width}}  {value}")
+        print(f"{name:<{width}}  {value}".rstrip())
 
 
 @contextmanager
@@ -116,9 +132,45 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float, float], None]]:
-    """A bar on stderr that is told (done, total); nothing where it is no terminal."""
-    from rich.progress import Progress
+    """A bar on stderr that is told (done, total), with the time left; only in a terminal."""
+    if not words.is_terminal:
+        yield lambda done, total: None
+        return
+    from rich.progress import (
+        BarColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeRemainingColumn,
+    )
 
-    with Progress(console=words.console, transient=True) as bar:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+    )
+    with Progress(*columns, console=words.console, transient=True) as bar:
         task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def logs_on_stderr() -> None:
+    """What nodes and caches inside a command log goes to stderr, from warnings on.
+
+    To be called before they are made: stdout is for what the command prints.
+    """
+    import logging
+
+    import structlog
+
+    structlog.configure(
+        wrapper_class=structlog.make_filtering_bound_logger(logging.WARNING),
+        processors=[
+            structlog.processors.add_log_level,
+            structlog.processors.format_exc_info,
+            structlog.dev.ConsoleRenderer(colors=words.in_colour),
+        ],
+        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+    )
