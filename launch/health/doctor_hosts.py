@@ -25,6 +25,7 @@ from launch.plans.wires import FIRST_PORT, PORTS
 from launch.running.host import devices_of, folder_of, python_version, software
 from launch.running.keys import secret_file
 from launch.running.runs import is_free
+from messages.bus import HANDSHAKE_FAILED
 from messages.security import SecurityError, public_of, read_secret
 from messages.topics import TOPICS
 from messages.types import PortStatus
@@ -172,6 +173,10 @@ def _way(plan: Plan, here: str, visit: Visit, *, running: bool) -> Iterator[Host
         yield HostFinding(host, check, state, what.format(**words), remedy.format(**words))
         yield HostFinding(host, "all else", "not asked", "its launcher would say")
     for text in visit.refused[:NAMES_SHOWN]:
+        if text.endswith(tuple(HANDSHAKE_FAILED.values())):
+            # Its keys were right when it was asked first.
+            yield HostFinding(host, "keys", "warning", text, "it is very busy, or far: ask again")
+            continue
         yield HostFinding(
             host,
             "messages",
