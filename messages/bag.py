@@ -22,7 +22,7 @@ import os
 import struct
 import threading
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from heapq import heappop, heappush
@@ -617,10 +617,16 @@ class RecoverReport:
     orphan_messages: int
 
 
-def recover(path_in: Path | str, path_out: Path | str) -> RecoverReport:
+def recover(
+    path_in: Path | str,
+    path_out: Path | str,
+    *,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RecoverReport:
     """Write a whole bag from what can be read of a cut or damaged one; the original stays.
 
-    Raises BagError where nothing can be read, or the new file cannot be written or exists.
+    `progress` is told how many chunks are done, and of how many.  Raises BagError where nothing can
+    be read, or the new file cannot be written or exists.
     """
     reader = BagReader(path_in)
     path_out = Path(path_out)
@@ -638,7 +644,8 @@ def recover(path_in: Path | str, path_out: Path | str) -> RecoverReport:
                 )
             schemas: dict[int, int] = {}
             channels: dict[int, int] = {}
-            for chunk in reader.chunks:
+            for number, chunk in enumerate(reader.chunks):
+                progress(number, len(reader.chunks))
                 try:
                     records = reader.read_chunk(file, chunk)
                 except BagError:

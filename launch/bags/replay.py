@@ -13,9 +13,10 @@ from __future__ import annotations
 import asyncio
 import hashlib
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,11 @@ REFUSALS = {
 CLOCKS = "clocks"
 EPOCH = 0
 """Of the replayed writers; a live one is random, a replay must not be."""
+
+TOLD_EVERY = 100
+"""Steps after which it is said how far a pass is."""
+
+Progress = Callable[[float, float], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +143,13 @@ class Verification:
         return self.repeatable and self.as_live
 
 
-def verify(bag: Path, name: str, *, tolerance: float = 1e-6) -> Verification:
+def _untold(done: float, total: float) -> None:
+    """Nobody asks how far it is."""
+
+
+def verify(
+    bag: Path, name: str, *, tolerance: float = 1e-6, progress: Progress = _untold
+) -> Verification:
     """Replay node `name` of the bag's plan twice; BagError for a bag that does not allow it."""
     reader = BagReader(bag)
     plan = Plan.model_validate_json(reader.attachment("plan.json"))
@@ -149,7 +161,8 @@ def verify(bag: Path, name: str, *, tolerance: float = 1e-6) -> Verification:
     if why := refusal(node):
         raise BagError(f"{name} is not replayed: {why}")
     _check_inputs(bag, reader, plan, node)
-    first, second = (asyncio.run(replay(bag, node)) for _ in range(2))
+    first = asyncio.run(replay(bag, node, lambda done, total: progress(done, 2 * total)))
+    second = asyncio.run(replay(bag, node, lambda done, total: progress(total + done, 2 * total)))
     return Verification(
         node=name,
         bag=str(bag),
@@ -183,16 +196,24 @@ def refusal(node: PlannedNode) -> str:
     return ""
 
 
-async def replay(bag: Path, planned: PlannedNode) -> Pass:
+async def replay(bag: Path, planned: PlannedNode, progress: Progress = _untold) -> Pass:
     """Step a node through its inputs in the bag."""
     result = Pass()
     lives = lives_in(bag, planned.name)
+    before, total = 0, sum(len(life.steps) for life in lives)
     for life in lives:
         result.as_taken, result.told_until_ns = True, int(life.steps[-1, 3])
-        await _replay_life(bag, planned, life, result)
+        told = partial(_told_with, progress, before, total)
+        await _replay_life(bag, planned, life, result, told)
+        before += len(life.steps)
     if not lives:
-        await _replay_in_order(bag, planned, result)
+        await _replay_in_order(bag, planned, result, progress)
     return result
+
+
+def _told_with(progress: Progress, before: int, total: int, step: int) -> None:
+    if step % TOLD_EVERY == 0:
+        progress(before + step, total)
 
 
 def _node_of(planned: PlannedNode, clock: VirtualClock, result: Pass) -> Node:
@@ -225,19 +246,24 @@ async def _set_up(node: Node, result: Pass) -> AsyncIterator[None]:
         result.last_error = node.last_error or result.last_error
 
 
-async def _replay_in_order(bag: Path, planned: PlannedNode, result: Pass) -> None:
+async def _replay_in_order(
+    bag: Path, planned: PlannedNode, result: Pass, progress: Progress
+) -> None:
     """Hand it all its inputs, in the recorder's order."""
     ports: dict[str, list[str]] = {}
     for port in planned.inputs:
         ports.setdefault(port.topic, []).append(port.port)
     reader = BagReader(bag, {*ports, CLOCKS} & set(BagReader(bag).topics))
-    start_ns = reader.info().start_ns
+    info = reader.info()
+    start_ns = info.start_ns
     clock_id = reader.metadata.get("recording", {}).get("clock_id", "recorded")
     clock = VirtualClock(start_ns, clock_id=clock_id)
     node = _node_of(planned, clock, result)
     async with _set_up(node, result):
         timers = Timers(node, start_ns)
-        for topic, message, header, log_ns in reader:
+        for number, (topic, message, header, log_ns) in enumerate(reader):
+            if number % TOLD_EVERY == 0:
+                progress(number, info.count)
             await timers.call_until(log_ns, clock)
             clock.move_to(log_ns)
             if isinstance(message, Clocks) and header.clock_id == clock.id:
@@ -248,7 +274,9 @@ async def _replay_in_order(bag: Path, planned: PlannedNode, result: Pass) -> Non
                 await node.settle()
 
 
-async def _replay_life(bag: Path, planned: PlannedNode, life: Life, result: Pass) -> None:
+async def _replay_life(
+    bag: Path, planned: PlannedNode, life: Life, result: Pass, told: Callable[[int], None]
+) -> None:
     """Hand it what it took, from one start of it to its end."""
     clock = VirtualClock(int(life.steps[0, 3]), clock_id=life.clock_id)
     node = _node_of(planned, clock, result)
@@ -259,7 +287,8 @@ async def _replay_life(bag: Path, planned: PlannedNode, life: Life, result: Pass
         for port, message, header in messages.told_before(life):
             result.messages_in += 1
             await node.step(port, message, header)
-        for number, sequence, epoch, at_ns in life.steps.tolist():
+        for step, (number, sequence, epoch, at_ns) in enumerate(life.steps.tolist()):
+            told(step)
             if number < 0:
                 clock.move_to(at_ns)
                 await node.call_timer(-1 - number, timers[-1 - number])
@@ -461,9 +490,10 @@ def _check_inputs(bag: Path, reader: BagReader, plan: Plan, node: PlannedNode) -
             recorded |= {port.topic for port in other.inputs}
     lacking = [port.topic for port in node.inputs if port.topic not in recorded]
     if lacking:
+        also = " ".join(f"--also {topic}" for topic in lacking)
         raise BagError(
             f"{bag}: {node.name} reads {', '.join(lacking)}, which was not recorded; "
-            f"record anew with: --set recorder.also='[{', '.join(lacking)}]'"
+            f"record anew with: flexsheet bag record BAG {also}"
         )
     if not {port.topic for port in node.inputs} & set(reader.topics):
         raise BagError(f"{bag}: holds no input of {node.name}: nothing to replay")

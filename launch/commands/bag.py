@@ -17,6 +17,7 @@ from launch.commands.output import (
     OTHER_THAN_LIVE,
     CommandError,
     examples,
+    logs_on_stderr,
     print_fields,
     print_json,
     print_table,
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from launch.bags.replay import Verification
     from launch.plans.planned import Plan
     from launch.running.runs import Run
+
+SHOWN_EVERY_S = 0.2
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Bags: recordings of topics (MCAP files)."
@@ -48,11 +51,22 @@ TopicsOption = Annotated[
     epilog=examples(
         "flexsheet bag record session.mcap",
         "flexsheet bag record fingers.mcap --topic fingertip --duration 10",
+        "flexsheet bag record with-pictures.mcap --also stereo",
     )
 )
 def record(
+    *,
     bag: BagArgument,
     topics: TopicsOption = None,
+    also: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--also",
+            metavar="TOPIC",
+            help="Beside what is logged by default, as stereo; may be given again.",
+            autocompletion=complete.topics,
+        ),
+    ] = None,
     duration: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Stop by itself.")
     ] = None,
@@ -60,10 +74,13 @@ def record(
     as_json: JsonOption = False,
 ) -> None:
     """Record the graph that runs, until Ctrl-C; without --topic all that is logged by default."""
-    plan, found = running_graph(run)
+    running = running_graph(run)
     if bag.exists():
         raise CommandError(f"{bag}: exists already; a bag is never written over", BAD_INPUT)
-    run_interruptible(_record(bag, topics or [], plan, found, duration))
+    logs_on_stderr()
+    run_interruptible(
+        _record(bag, topics=topics or [], also=also or [], running=running, seconds=duration)
+    )
     if as_json:
         print_json({"bag": str(bag)})
     else:
@@ -85,7 +102,11 @@ def play(
     topics: TopicsOption = None,
     into: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Start this launch file for the time of playing."),
+        typer.Option(
+            metavar="FILE",
+            help="Start this launch file for the time of playing.",
+            autocompletion=complete.yaml_files,
+        ),
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
@@ -134,12 +155,23 @@ def recover(
     """Write a whole bag from what can be read of a cut or damaged one; the original stays."""
     from messages.bag import recover as recover_bag
 
-    with words.status(f"reading {bag}"):
-        report = recover_bag(bag, output)
+    with progress_bar(f"recovering {bag.name}") as progress:
+        report = recover_bag(bag, output, progress=progress)
     if as_json:
         print_json({**asdict(report), "output": str(output)})
-    else:
-        print_fields([*asdict(report).items(), ("output", output)])
+        return
+    print_fields(
+        [
+            ("bag", output),
+            ("from", f"{bag}, {'complete' if report.was_complete else report.problem}"),
+            ("saved", f"{report.messages} messages, {report.attachments} attachments"),
+            (
+                "lost",
+                f"{report.damaged_chunks} damaged chunks, "
+                f"{report.orphan_messages} messages of unknown topics",
+            ),
+        ]
+    )
 
 
 @app.command(
@@ -174,7 +206,13 @@ def export(
     )
 )
 def verify(
-    node: Annotated[str, typer.Argument(help="Name of the node in the bag's launch file.")],
+    node: Annotated[
+        str,
+        typer.Argument(
+            help="Name of the node in the bag's launch file.",
+            autocompletion=complete.replayed_nodes,
+        ),
+    ],
     bag: BagArgument,
     tolerance: Annotated[
         float, typer.Option(help="Between replayed and recorded numbers.", min=0.0)
@@ -189,12 +227,14 @@ def verify(
     """
     from launch.bags.replay import verify as verify_node
 
-    with words.status(f"stepping {node} through {bag}"):
-        result = verify_node(bag, node, tolerance=tolerance)
+    logs_on_stderr()
+    with progress_bar(f"stepping {node} through {bag.name}, twice") as progress:
+        result = verify_node(bag, node, tolerance=tolerance, progress=progress)
     if as_json:
         print_json({**asdict(result), "ok": result.ok})
     else:
         _print_verification(result)
+        words.print(_verdict(result), markup=False)
     if not result.repeatable:
         raise typer.Exit(FAILED)
     if not result.as_live:
@@ -244,7 +284,10 @@ def _print_verification(result: Verification) -> None:
             ("messages out", result.messages_out),
             ("same bytes twice", "yes" if result.same_bytes else "NO"),
             ("sha256 of them", result.digest),
-            ("errors", f"{result.errors} {result.last_error}"),
+            (
+                "errors",
+                f"{result.errors}{result.last_error and f', the last: {result.last_error}'}",
+            ),
         ]
     )
     print()
@@ -264,6 +307,25 @@ def _print_verification(result: Verification) -> None:
     )
 
 
+def _verdict(result: Verification) -> str:
+    """What it comes to, and where to read on."""
+    if result.errors:
+        return "the node failed; its last error is above"
+    if not result.same_bytes:
+        return (
+            "not repeatable: the node goes by something that is not in the bag, as the real time "
+            "or the order of a set (docs/replay.md)"
+        )
+    if result.as_live:
+        return "repeatable, and as it was live"
+    why = (
+        f"{result.missing} messages that it took live are not in the bag"
+        if result.missing
+        else "the code has changed, or the recording began when the node had something to remember"
+    )
+    return f"repeatable, but other than live: {why} (docs/replay.md)"
+
+
 def _worst(fields: dict[str, float]) -> str:
     if not fields:
         return "all equal"
@@ -272,7 +334,12 @@ def _worst(fields: dict[str, float]) -> str:
 
 
 async def _record(
-    bag: Path, topics: list[str], plan: Plan, run: Run, duration_s: float | None
+    bag: Path,
+    *,
+    topics: list[str],
+    also: list[str],
+    running: tuple[Plan, Run],
+    seconds: float | None,
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
     from launch.plans.planned import RUN_DIRECTORY
@@ -283,16 +350,19 @@ async def _record(
     from nodes.recorder.parameters import RUN_FILES, RecorderParameters
     from nodes.runner import NodeConfig, PortConfig, run_node
 
+    plan, run = running
     parameters = RecorderParameters(
         bag=bag,
         topics=tuple(topics),
+        also=tuple(also),
         attach=tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES),
     )
     written = [topic for topic in TOPICS.values() if topic.name in plan.writers]
     wanted = Recorder.further_inputs(parameters, written)
     for name in wanted:
         if name not in plan.writers:
-            raise CommandError(f"--topic {name}: nobody writes it in the running graph", BAD_INPUT)
+            option = "--also" if name in also else "--topic"
+            raise CommandError(f"{option} {name}: nobody writes it in the running graph", BAD_INPUT)
     config = NodeConfig(
         name="bag_record",
         type="recorder",
@@ -310,15 +380,30 @@ async def _record(
         keys_file=ring_file(run, host_of(run)) if plan.keys else None,
         run_dir=str(run.directory),
     )
+    words.print(f"recording {len(wanted)} topics; Ctrl-C ends", markup=False)
     stop = asyncio.Event()
     work = asyncio.create_task(run_node(config, stop))
+    counting = asyncio.create_task(_count_down(bag.name, seconds))
     try:
-        await asyncio.wait((work,), timeout=duration_s)
+        await asyncio.wait((work,), timeout=seconds)
     finally:
         # Also when interrupted: the bag is closed in order.
+        counting.cancel()
         stop.set()
         await work
     return 0
+
+
+async def _count_down(what: str, duration_s: float | None) -> None:
+    """Shows how much of a recording is left, where that is known."""
+    if duration_s is None:
+        return
+    loop = asyncio.get_running_loop()
+    begun_s = loop.time()
+    with progress_bar(what) as progress:
+        while True:
+            progress(min(loop.time() - begun_s, duration_s), duration_s)
+            await asyncio.sleep(SHOWN_EVERY_S)
 
 
 @dataclass(frozen=True, slots=True)

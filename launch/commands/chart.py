@@ -39,7 +39,13 @@ def chart(
         typer.Argument(help="Method family; without it, all.", autocompletion=complete.families),
     ] = None,
     scene_file: Annotated[
-        Path, typer.Option("--scene", metavar="FILE", help="Scene to measure on.")
+        Path,
+        typer.Option(
+            "--scene",
+            metavar="FILE",
+            help="Scene to measure on.",
+            autocompletion=complete.yaml_files,
+        ),
     ] = SCENE_FILE,
     output: Annotated[
         Path, typer.Option("--output", metavar="FOLDER", help="For pictures and numbers.")

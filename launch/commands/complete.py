@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+import typer
+
 
 def topics(incomplete: str) -> list[str]:
     from messages.topics import TOPICS
@@ -19,6 +21,47 @@ def node_types(incomplete: str) -> list[str]:
     from nodes import NODES
 
     return _fitting(NODES, incomplete)
+
+
+def replayed_nodes(incomplete: str) -> list[str]:
+    """What `bag verify` steps: types, after which launch files mostly name their nodes.
+
+    The shell does not say what stands behind the cursor, where the bag will be."""
+    from launch.bags.replay import REFUSALS
+    from nodes import NODES
+
+    return _fitting((name for name in NODES if name not in REFUSALS), incomplete)
+
+
+def hosts(context: typer.Context, incomplete: str) -> list[str]:
+    """Hosts of the launch file that is named already."""
+    from launch.plans.documents import BadInputError
+    from launch.plans.plan import load_plan
+
+    file = next((word for word in context.args if word.endswith((".yaml", ".yml"))), None)
+    try:
+        return [] if file is None else _fitting(load_plan(Path(file)).hosts, incomplete)
+    except BadInputError:
+        return []
+
+
+def tuned_families(incomplete: str) -> list[str]:
+    from launch.methods.tune import TUNABLES
+
+    return _fitting((one.name for one in TUNABLES), incomplete)
+
+
+def gestures(incomplete: str) -> list[str]:
+    from launch.experiments.gestures import GESTURES
+
+    return _fitting(GESTURES, incomplete) or files(".csv")(incomplete)
+
+
+def runs(incomplete: str) -> list[str]:
+    """Directories of the graphs that run."""
+    from launch.running.runs import live_runs
+
+    return _fitting((str(run.directory) for run in live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.experiment import (
     DEMO_FILE,
     LaunchOption,
@@ -33,6 +34,7 @@ def demo(
             metavar="NAME_OR_FILE",
             help="A gesture by name, or a recorded finger (CSV with t_s,x_mm,y_mm,z_mm), instead "
             "of the strokes.",
+            autocompletion=complete.gestures,
         ),
     ] = None,
     output: OutputOption = None,

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
@@ -78,7 +79,12 @@ def doctor(
     epilog=examples("flexsheet doctor scene launch/scenes/cylinder.yaml -o reach.png"),
 )
 def check_scene(
-    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to check.")],
+    scene_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SCENE", help="Scene file to check.", autocompletion=complete.yaml_files
+        ),
+    ],
     output: Annotated[
         Path | None,
         typer.Option("-o", "--output", metavar="PICTURE", help="Draw what is out of reach there."),

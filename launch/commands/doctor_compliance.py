@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
@@ -29,7 +30,12 @@ def register(app: typer.Typer) -> None:
 
 
 def compliance(
-    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file to check.")],
+    scene_file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SCENE", help="Scene file to check.", autocompletion=complete.yaml_files
+        ),
+    ],
     calibration: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Of the sheet, by `flexsheet calibrate sheet`."),

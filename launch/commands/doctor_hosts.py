@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption, running_graph
 from launch.commands.output import (
     BAD_INPUT,
@@ -43,11 +44,18 @@ def register(app: typer.Typer) -> None:
 def hosts(
     launch_file: Annotated[
         Path | None,
-        typer.Argument(metavar="LAUNCH_FILE", help="Without it: that of the graph that runs here."),
+        typer.Argument(
+            metavar="LAUNCH_FILE",
+            help="Without it: that of the graph that runs here.",
+            autocompletion=complete.yaml_files,
+        ),
     ] = None,
     host: Annotated[
         str | None,
-        typer.Option(help="Which of its hosts this computer is; default: by its address."),
+        typer.Option(
+            help="Which of its hosts this computer is; default: by its address.",
+            autocompletion=complete.hosts,
+        ),
     ] = None,
     patience: Annotated[
         float, typer.Option(metavar="SECONDS", help="How long to wait for answers.", min=1.5)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import examples, print_json, print_table, progress_words, words
 
@@ -24,7 +25,12 @@ DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 
 LaunchOption = Annotated[
     Path,
-    typer.Option("--launch", metavar="FILE", help="The graph to experiment on."),
+    typer.Option(
+        "--launch",
+        metavar="FILE",
+        help="The graph to experiment on.",
+        autocompletion=complete.yaml_files,
+    ),
 ]
 OutputOption = Annotated[
     Path | None,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from launch.commands import complete
 from launch.commands.output import BAD_INPUT, CommandError
 
 if TYPE_CHECKING:
@@ -18,7 +19,11 @@ if TYPE_CHECKING:
 
 RunOption = Annotated[
     Path | None,
-    typer.Option("--run", help="Directory of the run; without it the newest that is alive."),
+    typer.Option(
+        "--run",
+        help="Directory of the run; without it the newest that is alive.",
+        autocompletion=complete.runs,
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
@@ -99,7 +100,14 @@ def show(
     )
 )
 def install(
-    file: Annotated[Path, typer.Argument(metavar="LAUNCH_FILE", help="The same on every host.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LAUNCH_FILE",
+            help="The same on every host.",
+            autocompletion=complete.yaml_files,
+        ),
+    ],
     host: HostArgument,
     key: Annotated[
         str | None, typer.Argument(metavar="KEY", help="Without it: the one made here.")

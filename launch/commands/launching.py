@@ -43,7 +43,11 @@ def launch(
     *,
     file: Annotated[Path, typer.Argument(help="Launch file.", autocompletion=complete.yaml_files)],
     host: Annotated[
-        str | None, typer.Option(help="Start only this host's nodes; all of them without it.")
+        str | None,
+        typer.Option(
+            help="Start only this host's nodes; all of them without it.",
+            autocompletion=complete.hosts,
+        ),
     ] = None,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check the file, print the plan, start nothing.")

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
@@ -27,7 +28,10 @@ app = typer.Typer(add_completion=False)
     )
 )
 def prepare(
-    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file.")],
+    scene_file: Annotated[
+        Path,
+        typer.Argument(metavar="SCENE", help="Scene file.", autocompletion=complete.yaml_files),
+    ],
     cache: Annotated[
         Path | None,
         typer.Option("--cache", metavar="FOLDER", help="Where to keep it; default: the user's."),

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
 
@@ -30,7 +31,12 @@ def service() -> None:
 def install(
     *,
     launch_file: Annotated[
-        Path, typer.Argument(metavar="LAUNCH_FILE", help="The same on every host.")
+        Path,
+        typer.Argument(
+            metavar="LAUNCH_FILE",
+            help="The same on every host.",
+            autocompletion=complete.yaml_files,
+        ),
     ],
     host: Annotated[str, typer.Option(help="Which of its hosts this computer is.")],
     user: Annotated[str, typer.Option(help="Who runs it; must exist.")] = "flexsheet",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.launching import about_run, run_graph
 from launch.commands.output import examples, print_json_line, progress_words, words
@@ -26,7 +27,10 @@ DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 def try_it(
     *,
     launch_file: Annotated[
-        Path, typer.Option("--launch", metavar="FILE", help="Another graph.")
+        Path,
+        typer.Option(
+            "--launch", metavar="FILE", help="Another graph.", autocompletion=complete.yaml_files
+        ),
     ] = DEMO_FILE,
     port: Annotated[int, typer.Option(help="Of the page.", min=1, max=65535)] = 8080,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import (
     BAD_INPUT,
@@ -37,11 +38,19 @@ app = typer.Typer(add_completion=False)
     )
 )
 def tune(
-    scene_file: Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file.")],
+    scene_file: Annotated[
+        Path,
+        typer.Argument(metavar="SCENE", help="Scene file.", autocompletion=complete.yaml_files),
+    ],
     *,
     family: Annotated[
         list[str] | None,
-        typer.Option("--family", metavar="NAME", help="Only this one; may be given repeatedly."),
+        typer.Option(
+            "--family",
+            metavar="NAME",
+            help="Only this one; may be given repeatedly.",
+            autocompletion=complete.tuned_families,
+        ),
     ] = None,
     output: Annotated[
         Path | None,

@@ -398,7 +398,7 @@ def _nodes(numbers: Mapping[str, Any]) -> Iterator[str]:
 def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
     albums = (
         ("What the camera saw", session.stereo, "stereo",
-         "Stereo pictures are not recorded unless asked for: --set recorder.also='[stereo]'."),
+         "Stereo pictures are recorded where asked for: flexsheet bag record BAG --also stereo."),
         ("Through the user's eye", session.eye, "eye", "The twin's eye took no picture."),
         ("What the projector was given", session.drawn, "frame",
          "No frame was recorded with its pixels."),
