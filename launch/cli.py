@@ -98,7 +98,19 @@ def main() -> None:
         if code is None:
             raise
         words.print(f"flexsheet: {error}", markup=False)
+        if "--json" not in sys.argv and (more := explained_by(error)):
+            words.print(f"what that means: {more}", markup=False, style="dim")
         sys.exit(code)
+
+
+def explained_by(error: Exception) -> str | None:
+    """The command that says more about an error; None where its sentence has the remedy in it."""
+    # Imported only now: a command that goes well should not wait for it.
+    from launch.commands.failures import FAILURES
+
+    if not isinstance(error, FAILURES) or isinstance(error.__cause__, FileNotFoundError):
+        return None
+    return f"flexsheet explain {type(error).__name__}"
 
 
 def exit_code(error: Exception) -> int | None:

@@ -255,7 +255,7 @@ def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> No
         (("echo", "fingertip"), 1, 'nobody writes "fingertip"'),
         (("echo", "display", "--once", "--timeout", "0.2"), 1, 'nothing came on "display"'),
         (("hz", "display", "--duration", "0.2"), 1, 'nothing came on "display"'),
-        (("pub", "estop", "{engaged: maybe}"), 2, "is no EStop: engaged"),
+        (("pub", "estop", "{engaged: maybe}"), 2, "MESSAGE (EStop): engaged"),
         (("pub", "estop", "{engaged: ["), 2, "neither YAML nor JSON"),
         (("pub", "estop", "@nowhere.yaml"), 2, "cannot be read"),
         (("echo", "estop", "--run", "/nowhere"), 2, "no plan.json"),
@@ -283,7 +283,7 @@ def test_a_message_of_any_size_is_taken_as_json(
     assert 'topic "skin" is not part of the graph' in said.err, "it was read, and whole"
     for text, word in (
         ('{"engaged": true, "engaged": false, "reason": ""}', "duplicate key"),
-        ('{"engaged": NaN, "reason": ""}', "is no EStop: engaged"),
+        ('{"engaged": NaN, "reason": ""}', "MESSAGE (EStop): engaged"),
         ("[" * 100_000, "brackets are open at once"),
     ):
         said = flexsheet("topic", "pub", "estop", text)
@@ -510,3 +510,13 @@ def test_calibrating_with_real_pictures(flexsheet: Command, tmp_path: Path) -> N
     assert {
         "pairs", "square_rms_mm", "diagonal_rms_mm", "rigid_fit_rms_mm", "reprojection_rms_px",
     } <= checked.json().keys()  # fmt: skip
+
+
+def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
+    """All of it, for the quickest family: measured, drawn, written, printed."""
+    said = flexsheet("chart", "rolling", "--output", tmp_path)
+    assert said.code == 0
+    assert [line.split()[0] for line in said.out.splitlines()][:2] == ["method", "as_a_cylinder"]
+    assert {"rolling.svg", "rolling.json", "README.md"} == {one.name for one in tmp_path.iterdir()}
+    again = flexsheet("chart", "--redraw", "--output", tmp_path, "--json").json()
+    assert [one["family"] for one in again] == ["rolling"]

@@ -216,3 +216,16 @@ def test_colours_are_for_terminals_and_no_color_takes_them_away() -> None:
     assert b"\x1b[31m" in said(True)
     assert b"\x1b" not in said(True, NO_COLOR="1")
     assert b"\x1b" not in said(False)
+
+
+def test_an_error_points_to_its_explanation_but_not_for_scripts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "no.mcap"
+    bag.write_bytes(b"no bag")
+    for further, pointed in (([], True), (["--json"], False)):
+        monkeypatch.setattr(sys, "argv", ["flexsheet", "bag", "info", str(bag), *further])
+        with pytest.raises(SystemExit):
+            cli.main()
+        assert ("flexsheet explain BagError" in capsys.readouterr().err) == pointed
+    assert explained("BagError")[0]["kind"] == "BagError"

@@ -110,7 +110,10 @@ def reset(
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and not any(arm.faults for arm in arms.values())
 
-    raise typer.Exit(run_interruptible(_say(run, ("estop", message), done, as_json)))
+    code = run_interruptible(_say(run, ("estop", message), done, as_json))
+    if code == 0:
+        words.print("reset; the arms move again only after: flexsheet arms ready")
+    raise typer.Exit(code)
 
 
 async def _say(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,6 +15,7 @@ from launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
+    logs_on_stderr,
     print_json,
     print_table,
     progress_words,
@@ -28,6 +31,7 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 @app.command(
     epilog=examples(
         "flexsheet chart tracking",
+        "flexsheet chart triangulation --cases",
         "flexsheet chart kinematics --scene lab.yaml --json",
         "flexsheet chart --output docs/charts --redraw",
     )
@@ -53,9 +57,17 @@ def chart(
     redraw: Annotated[
         bool, typer.Option("--redraw", help="Measure nothing: draw the numbers in --output anew.")
     ] = False,
+    cases: Annotated[
+        bool, typer.Option("--cases", help="Print every case, and not each method alone.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Chart speed against accuracy of a family's methods, on this machine and one scene."""
+    """Chart speed against accuracy of a family's methods, on this machine and one scene.
+
+    Printed is for each method its slowest median and its largest error over the cases that it says
+    it is good for; the front has those that no other method beats in both.
+    """
+    logs_on_stderr()
     from launch.methods import charts
     from launch.plans.plan import load_scene
 
@@ -77,16 +89,37 @@ def chart(
     results = []
     for each in families:
         with progress_words() as progress:
-            points = charts.measure_family(each, scene, progress=progress)
+            told = partial(_told, progress, each.name)
+            points = charts.measure_family(each, scene, progress=told)
         result = finite(charts.chart_result(each, scene, points))
         picture, _ = charts.write_chart(result, output)
         words.print(f"chart: {picture}")
         results.append(result)
         if not as_json:
-            _print_points(result)
+            (_print_points if cases else _print_methods)(result)
     words.print(f"charts: {charts.write_overview(output)}")
     if as_json:
         print_json(results[0] if family else results)
+
+
+def _told(progress: Callable[[str], None], family: str, text: str) -> None:
+    progress(f"{family}: {text}")
+
+
+def _print_methods(result: dict[str, Any]) -> None:
+    from launch.methods.charts import duration, methods_of
+
+    rows = [
+        (
+            one["method"],
+            duration(one["median_s"]),
+            "-" if one["error"] is None else f"{one['error']:.3g}",
+            f"{one['inside']} of {one['cases']}",
+            "front" if one["front"] else "",
+        )
+        for one in methods_of(result["points"])
+    ]
+    print_table(("method", "median", f"error, {result['unit']}", "cases in range", ""), rows)
 
 
 def _print_points(result: dict[str, Any]) -> None:

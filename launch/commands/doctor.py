@@ -144,21 +144,20 @@ def _print_layout(result: dict[str, Any], asked_m_per_s: float) -> None:
         ]
     )
     print()
-    print_table(
-        ("arm", "what binds", "share", "first at tilt", "depth"),
-        [
-            (
-                side,
-                one["limit"],
-                f"{100 * one['share']:.1f} %",
-                f"{math.degrees(one['first_tilt_rad']):.1f}°",
-                f"{1e3 * one['first_depth_m']:.0f} mm",
-            )
-            for side, arm in arms.items()
-            for one in arm["binding"]
-        ],
-    )
-    print()
+    binding = [
+        (
+            side,
+            one["limit"],
+            f"{100 * one['share']:.1f} %",
+            f"{math.degrees(one['first_tilt_rad']):.1f}°",
+            f"{1e3 * one['first_depth_m']:.0f} mm",
+        )
+        for side, arm in arms.items()
+        for one in arm["binding"]
+    ]
+    if binding:
+        print_table(("arm", "what binds", "share", "first at tilt", "depth"), binding)
+        print()
     print_table(
         ("arm", "least margin of", "which", "margin", "at tilt", "depth"),
         [

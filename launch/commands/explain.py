@@ -22,7 +22,10 @@ SHOWN = 3
 )
 def explain(
     message: Annotated[
-        str, typer.Argument(help="As it was said, or 8 letters of it; a fingertip's reason.")
+        str,
+        typer.Argument(
+            help="As it was said, or 8 letters of it; a kind, as BagError; a fingertip's reason."
+        ),
     ],
     as_json: JsonOption = False,
 ) -> None:
@@ -32,9 +35,10 @@ def explain(
     found = explained(message)[:SHOWN]
     if as_json:
         print_json(found)
-    for one in found if not as_json else ():
+    for number, one in enumerate(() if as_json else found):
+        if number:
+            print()
         print_fields(one.items())
-        print()
     if not found:
         raise CommandError(
             f'"{message}" is no message that is known; give more of it, or look into docs/errors.md'

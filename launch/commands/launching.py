@@ -23,7 +23,7 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.plans.planned import Plan
+    from launch.plans.planned import Plan, PlannedNode
     from launch.running.runs import Run
 
 app = typer.Typer(add_completion=False)
@@ -173,21 +173,49 @@ def _say(node: str, line: str) -> None:
     words.print(f"{node:>16} | {text}", style=style, markup=False)
 
 
+def _settings(node: PlannedNode) -> str:
+    """The parameters that are not what they would be without the launch file."""
+    from pydantic_core import to_jsonable_python
+
+    from nodes import node_class
+    from nodes.node import parameters_of
+
+    fields = parameters_of(node_class(node.type)).model_fields
+    # As they are written into a plan; a default that is made anew each time is no default here.
+    defaults = {
+        name: to_jsonable_python(field.default)
+        for name, field in fields.items()
+        if field.default_factory is None and not field.is_required()
+    }
+    return " ".join(
+        f"{name}={value}"
+        for name, value in node.parameters.items()
+        if name not in defaults or value != defaults[name]
+    )
+
+
 def _print_plan(plan: Plan, host: str | None) -> None:
     words.print(f"plan {plan.hash} of {plan.launch_file}, scene {plan.scene_file or 'none'}")
     print_table(
-        ("node", "type", "host", "restart", "parameters"),
+        (
+            "node",
+            "type",
+            "host",
+            "restart",
+            "parameters",
+        ),
         [
             (
                 node.name,
                 node.type,
                 f"{node.host} ({plan.hosts[node.host]})",
                 node.restart.policy,
-                " ".join(f"{key}={value}" for key, value in node.parameters.items()),
+                _settings(node),
             )
             for node in plan.nodes_on(host)
         ],
     )
+    words.print("parameters that are not shown: flexsheet node describe TYPE", style="dim")
     print()
     print_table(
         ("topic", "from", "endpoints", "to"),

@@ -40,6 +40,9 @@ app = typer.Typer(
 TopicArgument = Annotated[
     str, typer.Argument(help="Name of the topic, as twin/finger.", autocompletion=complete.topics)
 ]
+PATIENCE_S = 3.0
+"""After which it is said that nothing came yet."""
+
 SHORT_ARRAY = 36
 """Arrays of more elements than a 6x6 matrix are abbreviated."""
 
@@ -337,22 +340,30 @@ def _field(message: Message, path: str | None, topic: str) -> Any:
     return value
 
 
+def _still_waits(topic: Topic) -> None:
+    when = "it is sent on change" if topic.rate_hz is None else "see: flexsheet topic echo status"
+    words.print(f'nothing on "{topic.name}" yet ({when}); Ctrl-C ends', markup=False, style="dim")
+
+
 async def _read(
     topic: Topic, run: Path | None, show: Any, wanted: int | None, timeout_s: float | None
 ) -> int:
     arrived: asyncio.Queue[tuple[Any, Any]] = asyncio.Queue()
     subscriber = listener(topic, run, lambda message, header: arrived.put_nowait((message, header)))
+    waiting = asyncio.get_running_loop().call_later(PATIENCE_S, _still_waits, topic)
     subscriber.start()
     try:
         shown = 0
         while wanted is None or shown < wanted:
             async with asyncio.timeout(timeout_s):
                 message, header = await arrived.get()
+            waiting.cancel()
             show(message, header)
             shown += 1
     except TimeoutError:
         raise silence(topic.name, timeout_s or 0.0) from None
     finally:
+        waiting.cancel()
         subscriber.close()
     return 0
 
@@ -389,10 +400,9 @@ def listener(
 
 
 def _parse_message(topic: Topic, text: str) -> Message:
-    from pydantic import ValidationError
     from ruamel.yaml.error import YAMLError
 
-    from launch.plans.documents import parse_json, parse_value
+    from launch.plans.documents import Document, parse_json, parse_value, validate
 
     source = "MESSAGE"
     if text.startswith("@"):
@@ -406,17 +416,13 @@ def _parse_message(topic: Topic, text: str) -> Message:
             value = parse_json(text)
         except ValueError:  # YAML's own errors say what is wrong with either
             value = parse_value(text)
-        return topic.message.model_validate(value)
     except YAMLError as error:
         raise CommandError(f"{source}: neither YAML nor JSON: {error}", BAD_INPUT) from error
-    except ValidationError as error:
-        problems = "; ".join(
-            f"{'.'.join(str(part) for part in item['loc'])}: {item['msg']}"
-            for item in error.errors()
-        )
-        raise CommandError(
-            f"{source} is no {topic.message.__name__}: {problems}", BAD_INPUT
-        ) from error
+    if not isinstance(value, dict):
+        raise CommandError(f"{source}: holds no fields of {topic.message.__name__}", BAD_INPUT)
+    return validate(
+        topic.message, Document(Path(f"{source} ({topic.message.__name__})"), value, text, {})
+    )
 
 
 async def _publish(

@@ -14,6 +14,7 @@ from launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
+    logs_on_stderr,
     print_json,
     print_table,
     progress_words,
@@ -71,6 +72,7 @@ def tune(
     the first time.  Says why in a sentence per family.  Nodes whose parameters say `auto` take the
     choice up.  Exit code 3: for some family no method is good enough; the nearest miss is taken.
     """
+    logs_on_stderr()
     from launch.methods import charts, tune
     from launch.methods.machine import machine_name
     from launch.plans.plan import load_scene

@@ -8,6 +8,7 @@ nodes were.
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self
@@ -44,6 +45,8 @@ SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 WAIT_S = 20.0
 PICTURE_WAIT_S = 40.0
+BUSY = 3.0
+"""Load per core; the demo itself makes less."""
 
 
 class Driver:
@@ -127,9 +130,10 @@ class Driver:
             async with asyncio.timeout(seconds):
                 await future
         except TimeoutError:
-            notes = "; ".join(f"{node}: {note}" for node, note in self._notes.items() if note)
+            notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
             raise ExperimentError(
-                f"waited {seconds:g} s in vain for {what} (the nodes say: {notes or 'nothing'})"
+                f"waited {seconds:g} s in vain for {what}{_busy()}; the nodes say:"
+                f"{notes or ' nothing'}"
             ) from None
         finally:
             self._waiters.remove(entry)
@@ -210,6 +214,17 @@ class Driver:
         eye = self._newest["twin/eye"]
         assert isinstance(eye, TwinEye)
         return eye
+
+
+def _busy() -> str:
+    """Said where this computer has far more to do than it can: the likeliest cause of waiting."""
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    if load <= BUSY * cores:
+        return ""
+    return (
+        f"; this computer is busy (load {load:.0f} on {cores} cores): try again when it has less "
+        "to do"
+    )
 
 
 def is_settled(arm: ArmState, target: SheetTarget) -> bool:

@@ -84,7 +84,12 @@ def run_experiment(
     """Run a procedure on a launch file's graph and record it to `bag`."""
     plan = load_plan(launch_file, settings=settings, record=bag)
     prepare_plan(plan, progress)
-    asyncio.run(_interruptible(drive(plan, procedure, progress)))
+    try:
+        asyncio.run(_interruptible(drive(plan, procedure, progress)))
+    except ExperimentError as error:
+        if not bag.exists():
+            raise
+        raise ExperimentError(f"{error}\nrecorded until then: {bag}") from error
 
 
 async def _interruptible(work: Coroutine[Any, Any, None]) -> None:

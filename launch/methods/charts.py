@@ -38,6 +38,7 @@ FAMILIES: dict[str, str] = {
 """Families by their name on the command line; each node's folder describes its own."""
 
 REPEATS = 30
+TOLD_EVERY_S = 1.0
 ROOT = Path(__file__).resolve().parents[2]
 OVERVIEW = "README.md"
 TITLE_WIDTH = 95
@@ -81,26 +82,34 @@ def measure_family(
     progress: Callable[[str], None] = lambda text: None,
     wanted: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure every trial of the family that is wanted; `progress` is told of each, and what is
-    left of what has to be worked out before."""
-    begun, last = time.monotonic(), -1
-
-    def told(done: int, total: int) -> None:
-        nonlocal last
-        if done == last:
-            return
-        last, left = done, ""
-        if 0 < done < total:
-            left_s = (time.monotonic() - begun) / done * (total - done)
-            left = f", about {left_s:.0f} s left"
-        progress(f"working out what it takes to judge: {done} of {total}{left}")
-
-    family.prepare(scene, told)
+    """Measure every trial of the family that is wanted; `progress` is told how much is left of
+    that, and of what has to be worked out before."""
+    family.prepare(scene, _with_time_left("working out what it takes to judge:", progress))
     points = []
-    for trial in filter(wanted, family.trials(scene)):
-        progress(f"{trial.method} {trial.case}")
+    trials = list(filter(wanted, family.trials(scene)))
+    told = _with_time_left("measuring", progress)
+    for number, trial in enumerate(trials):
+        told(number, len(trials))
         points.append(measure(trial, repeats=repeats))
     return points
+
+
+def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
+    """Says (done, total) in words, not more often than `TOLD_EVERY_S`, with the time left."""
+    begun_s, last_s = time.monotonic(), -math.inf
+
+    def told(done: int, total: int) -> None:
+        nonlocal last_s
+        now_s = time.monotonic()
+        if now_s - last_s < TOLD_EVERY_S:
+            return
+        last_s, left = now_s, ""
+        if 0 < done < total:
+            left_s = (now_s - begun_s) / done * (total - done)
+            left = f", about {left_s:.0f} s left"
+        progress(f"{what} {done} of {total}{left}")
+
+    return told
 
 
 def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:

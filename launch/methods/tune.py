@@ -361,7 +361,7 @@ def _tuned(
         }
         if not left:
             continue
-        progress(f"{', '.join(left)}; what that needs is worked out, minutes the first time")
+        progress(", ".join(left))
         wanted = partial(_is_wanted, left)
         if measured is not None:
             points = measured(family, scene, wanted)

@@ -116,20 +116,44 @@ def _letters(template: str) -> int:
 
 
 def explained(message: str) -> list[dict[str, str]]:
-    """What there is to say of a message, or of a fingertip's reason: the best first."""
+    """What there is to say of a message, of a kind of error, or of a fingertip's reason: the best
+    first."""
     if message in FINGERTIP:
         return [{"message": message, "what to do": FINGERTIP[message], "page": _page("Fingertip")}]
-    return [
-        {
-            "message": one.template,
-            "kind": one.kind,
-            "means": meaning(one.kind, area_of(one.file)),
-            "what to do": one.remedy or REMEDIES.get(one.kind, ""),
-            "page": _page(area_of(one.file).title),
-            "said in": one.file,
-        }
-        for one in explain(message)
-    ]
+    if message in REMEDIES:
+        return [_of_kind(message)]
+    found: dict[tuple[str, str], dict[str, str]] = {}
+    for one in explain(message):
+        known = found.setdefault((one.template, one.kind), _told(one))
+        if one.file not in known["said in"].split(", "):
+            known["said in"] += f", {one.file}"
+    return list(found.values())
+
+
+def _told(one: Said) -> dict[str, str]:
+    told = {
+        "message": one.template,
+        "kind": one.kind,
+        "means": meaning(one.kind, area_of(one.file)),
+        "what to do": one.remedy or REMEDIES.get(one.kind, ""),
+        "page": _page(area_of(one.file).title),
+        "said in": one.file,
+    }
+    return {name: text for name, text in told.items() if text}
+
+
+def _of_kind(kind: str) -> dict[str, str]:
+    """What there is to say of all messages of a kind."""
+    files = list(dict.fromkeys(one.file for one in messages() if one.kind == kind))
+    area = area_of(files[0])
+    told = {
+        "kind": kind,
+        "means": meaning(kind, area),
+        "what to do": REMEDIES[kind],
+        "page": _page(area.title),
+        "said in": ", ".join(files),
+    }
+    return {name: text for name, text in told.items() if text}
 
 
 def _page(title: str) -> str:
@@ -252,7 +276,7 @@ def _filled_in(node: ast.AST) -> str:
             return _filled_in(inner)
         case ast.GeneratorExp(elt=inner) | ast.Subscript(value=inner):
             return _filled_in(inner)
-    return _name(node) or "more"
+    return _name(node).lstrip("_") or "more"
 
 
 def undocumented() -> list[str]:
