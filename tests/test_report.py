@@ -23,13 +23,14 @@ from launch.bags.report.findings import findings_of
 from launch.bags.report.numbers import methods_of
 from launch.bags.report.page import COLOURS, MARK, SECTIONS, page_of
 from launch.bags.report.series import Events, Grid, Moments, Range, Spread, States
-from launch.bags.report.session import read_session
+from launch.bags.report.session import Port, read_session
 from launch.bags.report.strokes import seconds_of
 from launch.bags.report.write import report, result_of
 from launch.cli import main
 from launch.experiments.stroke import read_recording, stroke_errors, summary
 from messages.bag import BagError, BagWriter
 from messages.methods import Methods
+from messages.types import PortStatus
 from tests import sessions
 from tests.colours import luminance
 
@@ -371,3 +372,17 @@ def test_the_command_writes_beside_the_bag_and_over_reports_only(
         main()
     assert ended.value.code in (0, None)
     assert json.loads(capsys.readouterr().out)["bag"]["messages"] > 100
+
+
+def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
+    def counted(gaps: int) -> PortStatus:
+        return PortStatus(
+            topic="fingertip", rate_hz=50.0, age_s=0.01, messages=90, dropped=0, gaps=gaps,
+            rejected=0,
+        )  # fmt: skip
+
+    for lived_before, lost in ((True, 3), (False, 8)):
+        port = Port(Spread(Grid(0, 1.0, 1)))
+        for gaps in (5, 8):
+            port.take("planner", 1, counted(gaps), lived_before=lived_before)
+        assert port.totals() == (0, lost, 0)

@@ -47,6 +47,7 @@ STRETCHES, FINE_STRETCHES = 240, 1200
 SHORTEST_STRETCH_S = 0.25
 STEREO_SHOTS, EYE_SHOTS, FRAME_SHOTS = 6, 12, 6
 NOTES_KEPT = 8
+LIVED_BEFORE_S = 10.0
 SILENT_PERIODS, SHORTEST_SILENCE_S = 10.0, 0.5
 SPEED_OVER_NS = 25_000_000
 """Joint and tool speeds are taken over so long: single stamps are not even enough."""
@@ -76,7 +77,8 @@ class Flow:
 
 @dataclass(slots=True)
 class Port:
-    """What the readers of a topic said of it; `was` holds what earlier starts of a node counted."""
+    """What the readers of a topic said of it; what earlier starts of a node counted is in
+    skipped, lost and refused, and taken from them what it had counted before the bag began."""
 
     age: Spread
     newest: dict[str, tuple[int, PortStatus]] = field(default_factory=dict)
@@ -84,18 +86,21 @@ class Port:
     lost: int = 0
     refused: int = 0
 
-    def take(self, node: str, epoch: int, port: PortStatus) -> None:
+    def take(self, node: str, epoch: int, port: PortStatus, *, lived_before: bool) -> None:
+        """lived_before: the node had been counting long before the bag began."""
         before = self.newest.get(node)
         if before is not None and before[0] != epoch:
-            self._add(before[1])
+            self._add(before[1], 1)
+        if before is None and lived_before:
+            self._add(port, -1)
         self.newest[node] = (epoch, port)
         if port.age_s is not None:
             self.age.take(0, port.age_s)
 
-    def _add(self, port: PortStatus) -> None:
-        self.skipped += port.dropped
-        self.lost += port.gaps
-        self.refused += port.rejected
+    def _add(self, port: PortStatus, sign: int) -> None:
+        self.skipped += sign * port.dropped
+        self.lost += sign * port.gaps
+        self.refused += sign * port.rejected
 
     def totals(self) -> tuple[int, int, int]:
         """Skipped, lost and refused messages of all readers."""
@@ -308,10 +313,11 @@ class Session:
             self.events.add(seconds, "error", f"{status.node}: {status.last_error}")
         if starts and said.starts > starts:
             self.events.add(seconds, "restart", f"{status.node} was started again")
+        lived_before = status.uptime_s - seconds > LIVED_BEFORE_S
         for port in status.inputs:
             if port.topic not in self.ports:
                 self.ports[port.topic] = Port(Spread(Grid(0, 1.0, 1)))
-            self.ports[port.topic].take(status.node, header.epoch, port)
+            self.ports[port.topic].take(status.node, header.epoch, port, lived_before=lived_before)
 
     def _take_picture(self, message: Frame | StereoPair | TwinEye, seconds: float) -> None:
         match message:
