@@ -16,6 +16,7 @@ from launch.cli import app
 from launch.commands.output import CommandError
 from launch.commands.tune import NOT_MET
 from launch.methods import tune
+from launch.methods.machine import busy_words
 from launch.methods.tune import Tunable, choose, tunables_named, verdicts, write_choices, written
 from launch.plans.documents import BadInputError
 from launch.plans.plan import load_scene
@@ -470,3 +471,12 @@ def test_a_force_table_that_nobody_made_is_stood_in_for_and_that_is_said(tmp_pat
     assert law.name == "scaled"
     assert "flexsheet prepare" in told
     assert law_by(SCENE, "linear", tmp_path)[0].name == "linear"
+
+
+@pytest.mark.parametrize(("load", "busy"), [(0.2, False), (3.9, False), (4.1, True), (40.0, True)])
+def test_a_busy_machine_is_told_of(
+    monkeypatch: pytest.MonkeyPatch, load: float, busy: bool
+) -> None:
+    monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    assert (busy_words() is not None) == busy

@@ -69,6 +69,7 @@ def chart(
     """
     logs_on_stderr()
     from launch.methods import charts
+    from launch.methods.machine import busy_words
     from launch.plans.plan import load_scene
 
     if redraw:
@@ -86,6 +87,8 @@ def chart(
         families = [charts.family_named(name) for name in ([family] if family else charts.FAMILIES)]
     except charts.UnknownFamilyError as error:
         raise CommandError(str(error), BAD_INPUT) from None
+    if busy := busy_words():
+        words.print(busy, style="yellow")
     results = []
     for each in families:
         with progress_words() as progress:

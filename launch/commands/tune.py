@@ -74,7 +74,7 @@ def tune(
     """
     logs_on_stderr()
     from launch.methods import charts, tune
-    from launch.methods.machine import machine_name
+    from launch.methods.machine import busy_words, machine_name
     from launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
@@ -85,6 +85,8 @@ def tune(
     target = None if dry_run else output or scene_file
     if target is not None:
         tune.check_target(scene_file, target)  # what follows takes minutes
+    if busy := busy_words():
+        words.print(busy, style="yellow")
     with progress_words() as progress:
         choices = tune.tune(scene, tunables, margin=margin, progress=progress)
     for choice in choices:

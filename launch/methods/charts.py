@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
@@ -122,6 +123,7 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
         "tolerance": family.tolerance(scene),
         "along": family.along,
         "machine": machine_name(),
+        "load": os.getloadavg()[0],
         "code": json.loads(git_state(ROOT)),
         "points": [asdict(point) for point in points],
         "front": pareto_front(points),
