@@ -18,16 +18,16 @@ from messages.scene import Scene
 from messages.topics import TOPICS, Delivery, Topic
 from messages.types import Fingertip, Frame
 
-FIRST_RELEASE = Path(__file__).parent / "recorded" / "first-release.mcap"
+OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
 HEADER = Header(1, 10, 11, "clock", "node", 5, "plan")
 
 
-def test_the_first_release_is_read_whole() -> None:
-    summary = info(FIRST_RELEASE)
+def test_a_bag_from_before_any_migration_is_read_whole() -> None:
+    summary = info(OLD_BAG)
     assert {topic.name for topic in summary.topics if topic.readable} == set(
-        BagReader(FIRST_RELEASE).topics
+        BagReader(OLD_BAG).topics
     )
-    found = {name: message for name, message, _, _ in BagReader(FIRST_RELEASE)}
+    found = {name: message for name, message, _, _ in BagReader(OLD_BAG)}
     scene, frame, finger = found["scene"], found["frame"], found["fingertip"]
     assert isinstance(scene, Scene)
     assert scene.name == "cylinder"
@@ -41,7 +41,7 @@ def test_the_first_release_is_read_whole() -> None:
 def test_a_scene_that_stepped_to_the_nearest_of_all_branches_is_still_read(
     kinematics: str | None,
 ) -> None:
-    recorded = next(message for name, message, *_ in BagReader(FIRST_RELEASE) if name == "scene")
+    recorded = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "scene")
     fields = recorded.model_dump()
     fields["methods"]["kinematics"] = kinematics
     migration = migration_for(Scene, "d7307561a5180666", {})
