@@ -19,7 +19,8 @@ class GraphTab:
 
     def __init__(self, gui: Any) -> None:
         gui.add_html(
-            '<p class="fs-words"><b>Latency, ms</b>, over the last half minute, s, as drawn</p>'
+            '<p class="fs-words"><b>Latency, ms</b>, over the last half minute, s; which line is '
+            "which is told below</p>"
         )
         lines = tuple(
             {"label": name, "stroke": line.color, "width": 2, "dash": line.dash, "spanGaps": False}

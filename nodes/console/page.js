@@ -61,6 +61,7 @@
   };
 
   function mend() {
+    stopButton()?.classList.add("fs-stop");
     for (const label of document.querySelectorAll("label[for]"))
       for (const control of controlsOf(label)) name(control, label.textContent);
     for (const [icon, text] of Object.entries(ICONS))

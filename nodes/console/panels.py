@@ -52,7 +52,7 @@ LINES = (
 
 
 def _mark(kind: tuple[str, str], text: str) -> str:
-    return f'<span class="{kind[0]}">{kind[1]} {escape(text)}</span>'
+    return f'<span class="{kind[0]}">{kind[1]}&nbsp;{escape(text)}</span>'
 
 
 def _table(
