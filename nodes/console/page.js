@@ -21,7 +21,7 @@
   }
 
   const stopButton = () =>
-    [...document.querySelectorAll("button")].find((one) => one.textContent.startsWith(STOP));
+    [...document.querySelectorAll("#root button")].find((one) => one.textContent.startsWith(STOP));
 
   // viser heeds no hotkey while a text box has the focus; the e-stop must always be heeded.
   addEventListener(
@@ -61,7 +61,6 @@
   };
 
   function mend() {
-    stopButton()?.classList.add("fs-stop");
     for (const label of document.querySelectorAll("label[for]"))
       for (const control of controlsOf(label)) name(control, label.textContent);
     for (const [icon, text] of Object.entries(ICONS))
@@ -98,6 +97,10 @@
   lost.className = "fs-banner fs-ground-bad";
   lost.setAttribute("role", "alert");
   lost.hidden = true;
+  const stop = document.createElement("button");
+  stop.id = "fs-stop";
+  stop.textContent = `${STOP} (Esc)`;
+  stop.addEventListener("click", () => stopButton()?.click());
   let seen = false;
   setInterval(() => {
     const button = stopButton();
@@ -110,8 +113,8 @@
 
   document.addEventListener("DOMContentLoaded", () => {
     const header = document.createElement("header");
-    header.className = "fs-unseen";
-    header.innerHTML = "<h1>flexsheet console</h1>";
+    header.innerHTML = '<h1 class="fs-unseen">flexsheet console</h1>';
+    header.append(stop);
     const root = document.getElementById("root");
     root.setAttribute("role", "main");
     root.before(header, lost);
