@@ -1,0 +1,215 @@
+"""What each key allows: from a launch file through plan and runner to a node that hears or not."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+import structlog
+from ruamel.yaml import YAML
+
+from launch.plans.plan import load_plan
+from launch.plans.planned import Plan
+from launch.running import runs
+from launch.running.keys import KEYS_VARIABLE, make_rings
+from launch.running.supervisor import node_config
+from messages import bus
+from messages.base import Header, Message
+from messages.bus import Publisher, Source
+from messages.clock import SystemClock
+from messages.security import new_key_pair, write_secret
+from messages.topics import TOPICS
+from messages.types import Arming, EStop
+from nodes import node_class
+from nodes.node import Node, NodeParameters, Output, parameters_of
+from nodes.runner import Links
+from tests.arm_states import arm_state
+from tests.test_messages_bus import until
+from tests.test_security import target
+
+LAUNCH = Path(__file__).resolve().parent.parent / "launch"
+# Of this process's own: ports follow from names, and tests may run beside each other.
+NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"
+BRIDGE = "arm_right_bridge"
+
+
+class Hand(Node):
+    """A console of its own kind, on an arm's computer."""
+
+    parameters: NodeParameters
+    estop: Output[EStop]
+    arming: Output[Arming]
+
+
+@pytest.fixture(autouse=True)
+def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Of runs and keys of the test's own, with a short path."""
+    with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as name:
+        monkeypatch.setenv(runs.ROOT_VARIABLE, f"{name}/runs")
+        monkeypatch.setenv(KEYS_VARIABLE, f"{name}/keys")
+        yield Path(name)
+
+
+@pytest.mark.parametrize("name", ["three.yaml", "lab.yaml"])
+def test_the_plans_that_come_with_it_believe_each_host_its_own_writers_only(name: str) -> None:
+    plan = load_plan(LAUNCH / name)
+    hosts_of = {topic: {one.host for one in writers} for topic, writers in plan.writers.items()}
+    allowed = ("sheet_target", "arm_left", "arm_right", "stereo", "fingertip")
+    assert [hosts_of[topic] for topic in allowed] == [
+        {"main"}, {"left"}, {"right"}, {"main"}, {"main"},
+    ]  # fmt: skip
+    run = runs.create_run()
+    for node in plan.nodes.values():
+        for port in node_config(plan, node, run).inputs:
+            sources = [one for one in port.endpoints if isinstance(one, Source)]
+            assert len(sources) == len(port.endpoints)
+            believed = {(one.writer, one.host or node.host) for one in sources}
+            # Fewer where a recorder leaves a topic out.
+            assert believed <= {(one.name, one.host) for one in plan.writers[port.topic]}
+            for one in sources:
+                assert one.host is not None or one.endpoint.startswith("ipc:"), "no key is asked"
+
+
+def lab(folder: Path, **left: Any) -> Plan:
+    """launch/three.yaml on loopback with keys, and a hand on the left arm's computer."""
+    spec = YAML(typ="safe").load(LAUNCH / "three.yaml")
+    spec["scene"] = str(LAUNCH / spec["scene"])
+    calibration = LAUNCH / "calibrations" / "twin-bumblebee.yaml"
+    spec["nodes"]["triangulator"]["parameters"]["calibration"] = str(calibration)
+    spec["nodes"]["hand"] = {"type": f"{__name__}:Hand", "host": "left"}
+    for number, (name, host) in enumerate(spec["hosts"].items(), start=1):
+        public, secret = new_key_pair()
+        write_secret(folder / "keys" / f"{name}.secret", secret, replace=True)
+        host |= {"address": f"{NET}.{number}", "key": public}
+    spec["hosts"]["left"] |= left
+    path = folder / "three.yaml"
+    path.write_text(json.dumps(spec))  # JSON is YAML
+    return load_plan(path)
+
+
+class Street:
+    """The right arm's bridge as its runner connects it, and whoever speaks to it."""
+
+    def __init__(self, plan: Plan) -> None:
+        self.plan, run = plan, runs.create_run()
+        self.rings = make_rings(plan, run, None)
+        config = node_config(plan, plan.nodes[BRIDGE], run)
+        class_ = node_class(config.type)
+        self.links = Links(config, structlog.get_logger())
+        self.bridge = class_(
+            parameters_of(class_).model_validate(config.parameters),
+            name=config.name,
+            clock=SystemClock(),
+            send=self.links.send,
+            topics={port.port: port.topic for port in (*config.inputs, *config.outputs)},
+            plan_hash=config.plan_hash,
+        )
+        self.heard: list[tuple[str, str]] = []
+        self.sequence = 0
+
+    def hear(self, port: str, message: Message, header: Header) -> None:
+        self.heard.append((header.writer, repr(message)))
+
+    def rejected(self, port: str) -> int:
+        return self.bridge.inputs[port].counts.rejected
+
+    @contextmanager
+    def mouth(self, topic: str, *, at: tuple[str, str], key: str) -> Iterator[Publisher]:
+        """Speaks on `topic` where the plan has (topic, writer) `at`, with the key of a host."""
+        writer = self.plan.writer(*at)
+        assert writer is not None
+        assert writer.tcp is not None
+        publisher = Publisher(TOPICS[topic], [writer.tcp], keys=self.rings[key])
+        try:
+            yield publisher
+        finally:
+            publisher.close()
+
+    async def say(
+        self, mouth: Publisher, writer: str, message: Message, enough: Callable[[], object]
+    ) -> None:
+        """Again and again, until it is enough."""
+
+        def said() -> bool:
+            self.sequence += 1
+            now_ns = self.bridge.clock.now_ns()
+            clock_id, plan = f"{writer}-1", self.plan.hash
+            mouth.send(message, Header(self.sequence, now_ns, now_ns, clock_id, writer, 1, plan))
+            return bool(enough())
+
+        await until(said)
+
+    async def is_taken(self, mouth: Publisher, writer: str, message: Message) -> None:
+        self.heard.clear()
+        await self.say(mouth, writer, message, lambda: (writer, repr(message)) in self.heard)
+
+    async def is_refused(self, mouth: Publisher, writer: str, message: Message, port: str) -> None:
+        """And counted."""
+        first = self.rejected(port)
+        self.heard.clear()
+        await self.say(mouth, writer, message, lambda: self.rejected(port) >= first + 10)
+        assert (writer, repr(message)) not in self.heard
+
+
+@contextmanager
+def street_of(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> Iterator[Street]:
+    monkeypatch.setattr(bus, "GIVEN_UP_S", 0.02)
+    street = Street(plan)
+    monkeypatch.setattr(street.bridge, "deliver", street.hear)
+    street.links.open_inputs(street.bridge)
+    try:
+        yield street
+    finally:
+        street.links.close()
+
+
+async def test_an_arm_s_computer_cannot_command_the_other_arm(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Left is taken over: all it has is its key, its place, and any address it can sit at."""
+    mine, main_s = ("arm_left", "arm_left_bridge"), ("sheet_target", "planner")
+    left, forged = arm_state("left"), target()
+    with street_of(lab(folder), monkeypatch) as street:
+        with street.mouth("arm_left", at=mine, key="left") as mouth:
+            await street.is_taken(mouth, "arm_left_bridge", left)
+            for other in ("planner", BRIDGE, "tools"):
+                await street.is_refused(mouth, other, left, "other_arm")
+        with street.mouth("sheet_target", at=mine, key="left") as mouth:
+            await street.is_refused(mouth, "planner", forged, "other_arm")
+        with street.mouth("sheet_target", at=main_s, key="left") as mouth:
+            street.bridge.last_error = ""
+            await street.say(mouth, "planner", forged, lambda: street.bridge.last_error)
+            assert 'topic "sheet_target": host main did not prove' in street.bridge.last_error
+            assert {writer for writer, _ in street.heard} <= {"arm_left_bridge"}
+        with street.mouth("sheet_target", at=main_s, key="main") as mouth:
+            await street.is_taken(mouth, "planner", forged)
+
+
+@pytest.mark.parametrize("may", [None, False, True], ids=["as it comes", "may not", "may"])
+async def test_who_may_reset_a_stop_and_let_the_arms_move(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, may: bool | None
+) -> None:
+    """A hand on left: it stops whenever it likes; for the rest the launch file must let it."""
+    with street_of(lab(folder, may_reset_estop=may), monkeypatch) as street:
+        words: tuple[tuple[str, Message, Message], ...] = (
+            ("estop", EStop(engaged=True, reason="a hand"), EStop(engaged=False, reason="gone")),
+            ("arming", Arming(ready=False), Arming(ready=True)),
+        )
+        for topic, stops, lets in words:
+            with street.mouth(topic, at=(topic, "hand"), key="left") as mouth:
+                await street.is_taken(mouth, "hand", stops)
+                if may:
+                    await street.is_taken(mouth, "hand", lets)
+                else:
+                    await street.is_refused(mouth, "hand", lets, topic)
+                    assert "hand may not reset an e-stop" in street.bridge.last_error
+                await street.is_taken(mouth, "hand", stops)
+            with street.mouth(topic, at=(topic, "tools"), key="main") as mouth:
+                await street.is_taken(mouth, "tools", lets)
+            assert (street.rejected(topic) == 0) == bool(may)
