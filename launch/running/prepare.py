@@ -16,7 +16,7 @@ from nodes.renderer import dent_cache
 
 Progress = Callable[[str], None]
 
-TOLD_SHARE = 0.25
+TOLD_SHARE = 0.1
 """Progress is told in such steps."""
 
 
@@ -46,19 +46,28 @@ def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress
     Where the membrane finds no equilibrium that is said, and the renderer does with four triangles.
     """
     folder = None if cache_dir is None else Path(cache_dir)
-    told = 0.0
-
-    def solved(done: int, total: int) -> None:
-        nonlocal told
-        if done / total >= told:
-            progress(f"working out how the sheet dents: {100 * done // total} %")
-            told += TOLD_SHARE
-
     try:
-        dent_cache.load_or_solve(scene, folder, solved)
+        told = _with_time_left("working out how the sheet dents, once", progress)
+        dent_cache.load_or_solve(scene, folder, told)
     except NoEquilibriumError as error:
         progress(f"no dent shapes for this sheet: {error}")
     return dent_cache.file_of(scene, folder)
+
+
+def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
+    """Says how far (done, total) is and what is left, in steps."""
+    from nodes.fem_solver.remaining import Remaining
+
+    remaining, next_share = Remaining(), 0.0
+
+    def told(done: int, total: int) -> None:
+        nonlocal next_share
+        far = remaining.text(done, total, time.monotonic())
+        if done >= next_share * total:
+            progress(f"{what}: {far}")
+            next_share = done / total + TOLD_SHARE
+
+    return told
 
 
 def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
@@ -68,10 +77,8 @@ def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress
     """
     from nodes.planner import force_table
 
-    def made(done: int, total: int) -> None:
-        progress(f"working out how the sheet pushes back: {100 * done // total} %")
-
-    force_table.load_or_make(scene, cache_dir, made)
+    told = _with_time_left("working out how the sheet pushes back, once", progress)
+    force_table.load_or_make(scene, cache_dir, told)
     return force_table.file_of(scene, cache_dir)
 
 
