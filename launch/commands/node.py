@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any
 
 import typer
@@ -101,11 +102,14 @@ def describe(
 
 
 def _parameter(name: str, field: Any) -> dict[str, Any]:
-    annotation = field.annotation
-    plain = isinstance(annotation, type) and not hasattr(annotation, "__args__")
+    from messages.reference import field_type
+
+    # As in docs/parameters.md, without the links.
+    kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", field_type(field))
+    kind = re.sub(r"[`\\]", "", kind)
     return {
         "parameter": name,
-        "type": annotation.__name__ if plain else str(annotation).replace("typing.", ""),
+        "type": kind,
         "default": "required" if field.is_required() else str(field.get_default()),
         "about": field.description or "",
     }
