@@ -150,7 +150,7 @@ async def browser(url: str, got: Got) -> AsyncIterator[Page]:
 
         page.on("websocket", connected)
         await page.goto(url, timeout=120_000)
-        await page.get_by_role("button", name="E-STOP").wait_for(timeout=120_000)
+        await page.get_by_role("button", name="E-STOP (Esc)").wait_for(timeout=120_000)
         await page.evaluate(COUNT_DRAWN)
         yield page
         await chromium.close()
