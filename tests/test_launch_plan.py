@@ -158,6 +158,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         (GRAPH + "from_tools: [fingertp]\n", 'did you mean "fingertip"?'),
         (GRAPH + "from_tools: [twin/finger]\n", 'is written by "beacon" already'),
         (GRAPH + f"  tools: {{type: '{LISTENER}'}}\n", '"tools" is taken'),
+        (GRAPH + f"  plan: {{type: '{LISTENER}'}}\n", '"plan" is taken'),
         (GRAPH + "    restart: {policy: somtimes}\n", "'never', 'on_failure' or 'always'"),
         (GRAPH + "record: {bagg: a.mcap}\n", 'did you mean "bag"?'),
         (GRAPH + "record: {bag: a.mcap, topics: [stereo]}\n", 'nobody writes topic "stereo"'),

@@ -20,6 +20,9 @@ from messages.topics import TOPICS, Topic
 from nodes import NODES, UnknownNodeError, node_class
 from nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
 
+RUN_FILES = ("plan", "git", "launcher")
+"""What a run's directory has files of, beside one named after each node."""
+
 _PARAMETERS_THEMSELVES: tuple[Key, ...] = (("record",), ("clocks",))
 """Keys of the launch file that hold a node's parameters; other nodes have them one key deeper."""
 
@@ -53,7 +56,7 @@ def members_of(spec: LaunchFile, document: Document, problems: list[Problem]) ->
     members = []
     for name, node_spec in spec.nodes.items():
         members.append(Member(name, node_spec, ("nodes", name)))
-        taken = (*map(tools_on, spec.hosts), *map(clock_node, spec.hosts), TOOLS)
+        taken = (*map(tools_on, spec.hosts), *map(clock_node, spec.hosts), TOOLS, *RUN_FILES)
         if name in taken or name.partition("_")[0] == LAUNCHER:
             problems.append(
                 document.problem(("nodes", name), f'"{name}" is taken', "give another name")
