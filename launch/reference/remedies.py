@@ -108,6 +108,10 @@ REMEDIES = {
     "`flexsheet launch FILE --dry-run`.",
     "Finding": "of `flexsheet doctor` or `flexsheet bag report`; what to do stands beside it.",
     "Log": "a node goes on, but says this in its log; the words after it name the cause.",
+    "Note": "one line of a node's status (`flexsheet topic echo status`): what hinders it is named "
+    "in it, and its log says more.",
+    "Warning": "the launcher or a node says it and goes on: it names what is wrong and where, once "
+    "for each cause; news of a start, a reset or new keys ask for nothing.",
     "Reason": "it is a state, not a breakdown: put right what it names, or wait.",
     "Value": "follows `does not fit` of a file, or refuses a message: give a value that it allows.",
     "BoundError": "bring the mark into both pictures, or choose another pose.",
