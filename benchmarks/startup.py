@@ -89,7 +89,7 @@ def main() -> None:
         table.add_column(head, justify="left" if head == "command" else "right")
     for row in rows:
         table.add_row(
-            row["command"], *(f"{row[key]:.2f}" for key in ("least_s", "median_s", "ratio"))
+            str(row["command"]), *(f"{row[key]:.2f}" for key in ("least_s", "median_s", "ratio"))
         )
     Console().print(table)
 
