@@ -26,9 +26,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from launch.methods.charts import ROOT
 from launch.methods.machine import machine_name
 from launch.methods.svg import COLOURS, drawn_for_pages, save_svg
 from launch.plans.plan import load_scene
+from launch.running.supervisor import git_state
 from messages.scene import Scene, cylinder_of
 from nodes.fem_solver.body import spec_of
 from nodes.fem_solver.contact import LinearSoftBody, SkinResponse
@@ -331,6 +333,7 @@ def measure_all() -> dict[str, Any]:
                 say(by_contact[-1])
     return {
         "machine": machine_name(),
+        "code": json.loads(git_state(ROOT)),
         "tables": "of made-up numbers and of the right size, at some of the places",
         BY_SIZE: [asdict(point) for point in by_size],
         BY_CONTACT: [asdict(point) for point in by_contact],
