@@ -106,6 +106,7 @@ pages: setup
 	$(BIN)/python -m launch.reference.cli > docs/cli.md
 	$(BIN)/python -m launch.reference.parameters > docs/parameters.md
 	$(BIN)/python -m launch.reference.errors > docs/errors.md
+	$(BIN)/python -m launch.reference.registers
 
 # docs/charts: every method of every family, on this machine; half an hour.
 charts: setup

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-import re
 import struct
 import zlib
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,15 +15,14 @@ from hypothesis import strategies as st
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
+from launch.reference import registers
 from nodes.arm_bridge.link import ArmAnswerError, ArmRefusedError, ArmSilentError
 from nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
-    FAULT_BITS,
     STATUS,
     STATUS_ADDRESS,
     VERSION,
-    Field,
     ModbusLink,
     decode_status,
     encode_command,
@@ -36,32 +33,15 @@ from nodes.twin.arms import ArmServer, Controller, Fault
 from tests.network import Cut
 
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
-DOCUMENT = Path(__file__).parent.parent / "docs" / "modbus.md"
 
 
-def rows(address: int, block: tuple[Field, ...]) -> list[str]:
-    """The document's table rows of a block."""
-    kinds = {"H": "u16", "I": "u32", "f": "float32"}
-    lines = []
-    for field in block:
-        registers = field.count * struct.calcsize(f">{field.kind}") // 2
-        span = str(address) if registers == 1 else f"{address}–{address + registers - 1}"
-        kind = kinds[field.kind] + (f" × {field.count}" if field.count > 1 else "")
-        lines.append(f"| {span} | `{field.name}` | {kind} | {field.about} |")
-        address += registers
-    return lines
-
-
-@pytest.mark.parametrize(
-    ("address", "block"), [(COMMAND_ADDRESS, COMMAND), (STATUS_ADDRESS, STATUS)]
-)
-def test_the_document_has_the_map_of_the_code(address: int, block: tuple[Field, ...]) -> None:
-    text = DOCUMENT.read_text()
-    for row in rows(address, block):
-        assert row in text
-    assert f"{register_count(block)} registers" in text
-    for bit, words in FAULT_BITS.items():
-        assert re.search(rf"\| {bit} \| {words} \|", text)
+def test_the_document_has_the_map_of_the_code() -> None:
+    text = registers.PAGE.read_text()
+    assert registers.page(text) == text, "run: python -m launch.reference.registers"
+    assert "| 8–19 | `joints_rad` | float32 × 6 |" in text
+    assert registers.page(text.replace("| 16 | servo |", "| 16 | motor |")) == text
+    with pytest.raises(ValueError, match="needs the marks"):
+        registers.page("# A page")
 
 
 def status_registers(**changed: int | float) -> list[int]:

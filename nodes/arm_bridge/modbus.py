@@ -1,8 +1,8 @@
 """Modbus TCP to an arm: one FC23 exchange per cycle, guarded by magic, version, sequence and CRC.
 
-The register map is `COMMAND` and `STATUS` below; `docs/modbus.md` is written from them.  Numbers of
-32 bits take two registers, high word first.  The CRC-32 (zlib's) covers every register before it in
-its block, high byte first.
+The register map is `COMMAND` and `STATUS` below; the tables of `docs/modbus.md` are written from
+them (`launch.reference.registers`).  Numbers of 32 bits take two registers, high word first.  The
+CRC-32 (zlib's) covers every register before it in its block, high byte first.
 """
 
 from __future__ import annotations
