@@ -18,20 +18,25 @@ from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
 import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
+from launch.experiments.stroke import STROKE_ANGLE_RAD, TREMOR_M, WANDER_M, object_pose
 from launch.plans.plan import load_plan
 from launch.plans.planned import Plan
 from launch.running.estop_file import STATE_VARIABLE
 from launch.running.keys import KEYS_VARIABLE
-from launch.running.runs import ROOT_VARIABLE
+from launch.running.runs import ROOT_VARIABLE, Run
+from launch.running.tools import ToolsWriter
 from messages.base import Header, Message
 from messages.bus import Subscriber
+from messages.scene import Scene, cylinder_of
 from messages.security import new_key_pair, write_secret
 from messages.topics import topic_named
-from messages.types import ArmState, HostStatus
+from messages.types import ArmState, FingerPath, HostStatus, TwinFinger
+from nodes.models.rigid import apply
 from nodes.node import PortCounts
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -40,6 +45,12 @@ HOSTS = ("main", "left", "right")
 ADDRESS = {name: f"10.77.0.{number}" for number, name in enumerate(HOSTS, start=1)}
 LIGHT = ("fem_solver", "renderer")
 """What is seen is not what these tests are about; a busy computer is better off without."""
+
+FINGER_PATH = "twin/finger_path"
+STROKES = "strokes"
+STROKE_S = 1.5
+"""Each way: 60 degrees so quickly that joints turn at a third of what they can."""
+STROKE_POINTS_HZ = 25
 
 
 def missing() -> str | None:
@@ -101,6 +112,22 @@ class Network:
         assert await self._switch.stdout.readline() == b"done\n"
 
 
+def strokes_path(scene: Scene, *, count: int = 40) -> FingerPath:
+    """Strokes around the scene's cylinder, back and forth without a rest; they end at the top."""
+    times = np.linspace(0.0, count * STROKE_S, round(count * STROKE_S * STROKE_POINTS_HZ) + 1)
+    angles = 0.5 * STROKE_ANGLE_RAD * (1.0 - np.cos(np.pi * times / STROKE_S))
+    radius = cylinder_of(scene).radius_m
+    points = np.column_stack([0.0 * angles, radius * np.sin(angles), radius * np.cos(angles)])
+    return FingerPath(
+        label=STROKES,
+        times_s=times,
+        positions_world_m=apply(object_pose(scene), points),
+        wander_m=WANDER_M,
+        tremor_m=TREMOR_M,
+        joined_by="spline",
+    )
+
+
 class Lab:
     """Use as an async context manager; skips the test where it cannot be.
 
@@ -125,6 +152,8 @@ class Lab:
         self._write_launch_file(without, {"arming": arming, **bridge}, watchdog_s)
         self.launchers: dict[str, subprocess.Popen[bytes]] = {}
         self._subscribers: dict[str, list[Subscriber]] = {}
+        self._watched: dict[str, Path] = {}
+        self._stroking: asyncio.Task[None] | None = None
         self.network = Network(f"fs{os.getpid()}", ADDRESS)
 
     def _write_launch_file(
@@ -165,6 +194,9 @@ class Lab:
 
     async def __aexit__(self, *_: object) -> None:
         try:
+            if self._stroking is not None:
+                self._stroking.cancel()
+                await asyncio.gather(self._stroking, return_exceptions=True)
             self._close_subscribers(*self._subscribers)
             running = [one for one in self.launchers.values() if one.poll() is None]
             for process in running:
@@ -187,12 +219,12 @@ class Lab:
         flexsheet = [sys.executable, str(ROOT / "flexsheet.py")]
         return ["ip", "netns", "exec", self.network.space(host), *flexsheet, *arguments]
 
-    def start(self, *hosts: str) -> None:
-        """`flexsheet launch` on those hosts."""
+    def start(self, *hosts: str, launch_file: Path | None = None) -> None:
+        """`flexsheet launch` on those hosts, by default of the lab's own file."""
         for host in hosts:
             log = (self.folder / f"{host}.log").open("ab")
             self.launchers[host] = subprocess.Popen(
-                self.command(host, "launch", str(self.launch_file), "--host", host),
+                self.command(host, "launch", str(launch_file or self.launch_file), "--host", host),
                 env=self._environment(host), cwd=self.folder, stdout=log, stderr=log,
             )  # fmt: skip
             log.close()
@@ -236,6 +268,7 @@ class Lab:
         await self.until(ready, f"the launcher of {host}")
         directory = self.run_directory(host)
         assert directory is not None
+        self._watched[host] = directory
         plan = self.plan()
         subscribers = []
         for topic in topics:
@@ -274,9 +307,83 @@ class Lab:
         arm = [f"arm_{host}"] if host != "main" else ["sheet_target", "twin/finger"]
         await self.watch(host, "host", *arm)
 
+    def stroke(self) -> None:
+        """From now on the finger strokes, whatever is killed and started again."""
+        self._stroking = asyncio.create_task(self._stroke(), name="strokes")
+
+    async def _stroke(self) -> None:
+        """Tell it so in each run of the main computer, and whenever it is through.
+
+        A twin that is started anew within a run takes the path again by itself, which is latched.
+        """
+        plan = self.plan()
+        scene = plan.scene_message()
+        assert scene is not None
+        path, told, writer = strokes_path(scene), self.folder, None
+        # We stand beside the namespaces, where the sockets in files are all that there is.
+        ends = [one.model_copy(update={"tcp": None}) for one in plan.writers[FINGER_PATH]]
+        plan = plan.model_copy(update={"writers": {**plan.writers, FINGER_PATH: tuple(ends)}})
+        try:
+            while True:
+                directory = self._watched.get("main")
+                if directory is not None and directory != told:
+                    if writer is not None:
+                        writer.close()
+                    writer = ToolsWriter(plan, Run(directory.name, directory), [FINGER_PATH])
+                    writer.publish(FINGER_PATH, path)
+                    told = directory
+                finger = self.newest.get("twin/finger")
+                if writer is not None and isinstance(finger, TwinFinger) and finger.path_done:
+                    del self.newest["twin/finger"]
+                    writer.publish(FINGER_PATH, path)
+                await asyncio.sleep(0.05)
+        finally:
+            if writer is not None:
+                writer.close()
+
+    def strokes(self) -> bool:
+        """Whether the true finger is under way."""
+        finger = self.newest.get("twin/finger")
+        return (
+            isinstance(finger, TwinFinger)
+            and finger.path_label == STROKES
+            and finger.path_time_s > 0
+            and not finger.path_done
+        )
+
+    def strokes_at_the_top(self) -> bool:
+        """Whether the finger is where the arms stood when they were switched on.
+
+        There alone a twin may die: started anew its arm stands at that place, while real ones stay
+        where they were, and a sheet whose other edge is elsewhere is a fault that stays.
+        """
+        finger = self.newest.get("twin/finger")
+        if not self.strokes() or not isinstance(finger, TwinFinger):
+            return False
+        return abs((finger.path_time_s + STROKE_S) % (2 * STROKE_S) - STROKE_S) < 0.1 * STROKE_S
+
     def status(self, host: str) -> HostStatus | None:
         found = self.newest.get(f"host {host}")
         return found if isinstance(found, HostStatus) else None
+
+    def pid_of(self, host: str, node: str) -> int:
+        """A node's process: its command line names its configuration, in the run's directory."""
+        directory = self.run_directory(host)
+        assert directory is not None
+        wanted = str(directory / f"{node}.json").encode()
+        for entry in Path("/proc").glob("[0-9]*/cmdline"):
+            try:
+                if wanted in entry.read_bytes().split(b"\0"):
+                    return int(entry.parent.name)
+            except OSError:
+                continue
+        raise AssertionError(f"{node} does not run on {host}")
+
+    def restarts(self, host: str, node: str) -> int:
+        """How often it has been started anew; -1 while it is not ready."""
+        status = self.status(host)
+        found = [one for one in status.nodes if one.name == node] if status else []
+        return found[0].restarts if found and found[0].state == "ready" else -1
 
     def modes(self) -> set[str]:
         arms = [self.newest.get(f"arm_{side}") for side in ("left", "right")]
@@ -291,12 +398,19 @@ class Lab:
             for host, process in self.launchers.items():
                 log = self.folder / f"{host}.log"
                 assert process.poll() in (None, 0, -9), f"{host}:\n{log.read_text()[-3000:]}"
+            if self._stroking is not None and self._stroking.done():
+                self._stroking.result()
             assert loop.time() < end_s, f"waited in vain for {what}: {self._state()}"
             await asyncio.sleep(0.01)
 
     def _state(self) -> str:
         arms = [self.newest.get(f"arm_{side}") for side in ("left", "right")]
-        said = [(arm.mode, arm.reason, arm.faults) for arm in arms if isinstance(arm, ArmState)]
+        said = [
+            str((one.mode, one.reason, one.faults)) for one in arms if isinstance(one, ArmState)
+        ]
+        finger = self.newest.get("twin/finger")
+        if isinstance(finger, TwinFinger):
+            said.append(f'finger on "{finger.path_label}" for {finger.path_time_s:.1f} s')
         logs = [(self.folder / f"{host}.log") for host in HOSTS]
         return f"{said}\n" + "\n".join(log.read_text()[-1500:] for log in logs if log.exists())
 

@@ -1,0 +1,224 @@
+"""What the bags of a lab tell: true joints, what bridges said, what was wanted, what is lost.
+
+All stamps are of one clock, that of the computer whose namespaces play a lab.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.bag import BagReader
+from messages.base import Header, Message
+from messages.scene import Scene
+from messages.types import ArmState, SheetTarget, TwinArms
+from nodes.models.rigid import transform_from_rpy
+from nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+Span = tuple[int, int]
+"""Begin and end, ns."""
+
+SILENT_NS = 100_000_000
+"""Who says nothing for so long follows nothing, and nobody knows where his arm is."""
+SPEED_OVER_S = 0.05
+"""Commands are compared over so long: single ones are stamped when the computer comes to it."""
+MOMENT_NS = 10_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """An arm by its own computer's bags.
+
+    times_ns (n,), joints_rad (n, 6), edges_world_m (n, 3): the truth, its epochs (n,) those of the
+    twin's starts.  said_ns (m,), modes (m,): what the bridge said.  sent_ns (m,), commanded_rad
+    (m, 6): what it told the arm last.
+    """
+
+    times_ns: Times
+    joints_rad: Floats
+    edges_world_m: Floats
+    epochs: Times
+    said_ns: Times
+    modes: NDArray[np.str_]
+    sent_ns: Times
+    commanded_rad: Floats
+
+    def between(self, span: Span) -> Floats:
+        """The true joints (k, 6) in a time."""
+        return self.joints_rad[(self.times_ns >= span[0]) & (self.times_ns <= span[1])]
+
+    def spans(self, mode: str) -> list[Span]:
+        """When it was in a mode, from each first word of it to the last without a silence."""
+        spans = []
+        begin: int | None = None
+        for i, (at_ns, said) in enumerate(zip(self.said_ns, self.modes, strict=True)):
+            silent = i > 0 and at_ns - self.said_ns[i - 1] > SILENT_NS
+            if begin is not None and (said != mode or silent):
+                spans.append((begin, int(self.said_ns[i - 1])))
+                begin = None
+            if begin is None and said == mode:
+                begin = int(at_ns)
+        return spans if begin is None else [*spans, (begin, int(self.said_ns[-1]))]
+
+    def follows(self, times_ns: Times) -> NDArray[np.bool_]:
+        """Whether its bridge said so, and not too long ago."""
+        newest = np.searchsorted(self.said_ns, times_ns, side="right") - 1
+        fresh = (newest >= 0) & (times_ns - self.said_ns[newest] <= SILENT_NS)
+        return np.asarray(fresh & (self.modes[newest] == "follow"), dtype=np.bool_)
+
+    def knows(self, times_ns: Times) -> NDArray[np.bool_]:
+        """Whether the truth is on record, just before and just after."""
+        after = np.searchsorted(self.times_ns, times_ns)
+        inside = (after > 0) & (after < len(self.times_ns))
+        after = after.clip(1, len(self.times_ns) - 1)
+        near = self.times_ns[after] - self.times_ns[after - 1] <= SILENT_NS
+        return np.asarray(inside & near, dtype=np.bool_)
+
+    def edge_at(self, times_ns: Times) -> Floats:
+        """The middle of its edge of the sheet (k, 3)."""
+        zero = self.times_ns[0]
+        x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
+        return np.column_stack([np.interp(x, xp, column) for column in self.edges_world_m.T])
+
+    def fastest(self) -> float:
+        """The largest share of the maker's speeds, of the true joints and of the commands.
+
+        From one start of the twin to the next no arm has moved, another one was put there.
+        """
+        steps_s = np.diff(self.times_ns) * 1e-9
+        same = (np.diff(self.epochs) == 0) & (steps_s > 0)
+        true = (
+            np.abs(np.diff(self.joints_rad, axis=0))[same] / np.maximum(steps_s, 2e-3)[same, None]
+        )
+        return float(max((true / SPEED_RAD_PER_S).max(initial=0.0), self._fastest_command()))
+
+    def _fastest_command(self) -> float:
+        following = self.modes == "follow"
+        sent, commanded = self.sent_ns[following], self.commanded_rad[following]
+        later = np.searchsorted(sent, sent + round(SPEED_OVER_S * 1e9))
+        there = later < len(sent)
+        here = np.flatnonzero(there)
+        steps_s = (sent[later[there]] - sent[here]) * 1e-9
+        speeds = np.abs(commanded[later[there]] - commanded[here]) / steps_s[:, None]
+        # Across a time without commands the arm may have been started anew elsewhere.
+        return float((speeds[steps_s < 2 * SPEED_OVER_S] / SPEED_RAD_PER_S).max(initial=0.0))
+
+    def leaves_range(self) -> bool:
+        """Whether a joint was ever where the maker allows none."""
+        low, high = RANGE_RAD.T
+        return bool(((self.joints_rad < low) | (self.joints_rad > high)).any())
+
+
+def bags(folder: Path, host: str) -> list[Path]:
+    """A host's bags, in the order of their making."""
+    return sorted(folder.glob(f"{host}*.mcap"), key=lambda bag: bag.stat().st_mtime_ns)
+
+
+def _all(folder: Path, host: str, *topics: str) -> Iterator[tuple[str, Message, Header]]:
+    for bag in bags(folder, host):
+        for topic, message, header, _ in BagReader(bag, topics or None):
+            yield topic, message, header
+
+
+def read_arm(folder: Path, side: str, scene: Scene) -> Arm:
+    """All that a lab's bags have of an arm."""
+    mount = (scene.arms.left if side == "left" else scene.arms.right).flange_from_edge
+    flange_from_edge = transform_from_rpy(mount.position_m, mount.rpy_rad)
+    truth: list[tuple[int, Floats, Floats, int]] = []
+    said: list[tuple[int, str, int, Floats]] = []
+    for _, message, header in _all(folder, side, f"arm_{side}", f"twin/arms_{side}"):
+        match message:
+            case TwinArms():
+                joints, flange = (
+                    (message.joints_left_rad, message.world_from_flange_left)
+                    if side == "left"
+                    else (message.joints_right_rad, message.world_from_flange_right)
+                )
+                edge = (flange @ flange_from_edge)[:3, 3]
+                truth.append((header.source_ns, joints, edge, header.epoch))
+            case ArmState():
+                one = (message.mode, message.command_sent_ns, message.joints_commanded_rad)
+                said.append((header.publish_ns, *one))
+    return Arm(
+        np.array([row[0] for row in truth], dtype=np.int64),
+        np.array([row[1] for row in truth]).reshape(-1, 6),
+        np.array([row[2] for row in truth]).reshape(-1, 3),
+        np.array([row[3] for row in truth], dtype=np.int64),
+        np.array([row[0] for row in said], dtype=np.int64),
+        np.array([row[1] for row in said], dtype=np.str_),
+        np.array([row[2] for row in said], dtype=np.int64),
+        np.array([row[3] for row in said]).reshape(-1, 6),
+    )
+
+
+def wanted(folder: Path) -> tuple[Times, Floats]:
+    """When (n,) and where (n, 3) the sheet's centre was to be, by the main computer's bags."""
+    found = [
+        (message.valid_at_ns, message.world_from_sheet[:3, 3])
+        for _, message, _ in _all(folder, "main", "sheet_target")
+        if isinstance(message, SheetTarget)
+    ]
+    times = np.array([at for at, _ in found], dtype=np.int64)
+    return times, np.array([centre for _, centre in found]).reshape(-1, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """How the sheet was held in a time.
+
+    errors_m (k,): from where its centre was wanted to where the true arms had it, at each target of
+    that time whether they followed or not.  followed: share of the time in which both did.
+    """
+
+    errors_m: Floats
+    followed: float
+
+    def quantile_mm(self, share: float) -> float | None:
+        return 1e3 * float(np.quantile(self.errors_m, share)) if len(self.errors_m) else None
+
+
+def held(arms: tuple[Arm, Arm], targets: tuple[Times, Floats], span: Span) -> Held:
+    """See `Held`."""
+    left, right = arms
+    times, centres = targets
+    keep = (times >= span[0]) & (times <= span[1]) & left.knows(times) & right.knows(times)
+    middle = 0.5 * (left.edge_at(times[keep]) + right.edge_at(times[keep]))
+    moments = np.arange(span[0], span[1], MOMENT_NS, dtype=np.int64)
+    followed = left.follows(moments) & right.follows(moments)
+    return Held(
+        np.asarray(np.linalg.norm(middle - centres[keep], axis=1)),
+        float(followed.mean()) if len(followed) else 0.0,
+    )
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Gap:
+    """Messages of one writer that are missing in the main computer's bags, by their numbers.
+
+    from_ns, to_ns: when the last before and the first after them were published.
+    """
+
+    seconds: float
+    topic: str
+    writer: str
+    from_ns: int
+    to_ns: int
+
+
+def gaps(folder: Path) -> list[Gap]:
+    """What a writer did not say because it had been killed is not missing."""
+    last: dict[tuple[str, str, str, int], Header] = {}
+    found = []
+    for topic, _, header in _all(folder, "main"):
+        key = (topic, header.writer, header.clock_id, header.epoch)
+        before, last[key] = last.get(key), header
+        if before is not None and header.sequence > before.sequence + 1:
+            seconds = (header.publish_ns - before.publish_ns) * 1e-9
+            found.append(Gap(seconds, topic, header.writer, before.publish_ns, header.publish_ns))
+    return found
