@@ -258,7 +258,7 @@ def table(cases: list[dict[str, Any]]) -> str:
             f"{one['followed']:.0%}",
             "no target"
             if one["error_p50_mm"] is None
-            else f"{one['error_p50_mm']:.1f} / {one['error_p95_mm']:.1f} mm",
+            else f"{one['error_p50_mm']:.2f} / {one['error_p95_mm']:.2f} mm",
             f"{one['missing_s']:.2f} s of {one['missing']}" if one["missing"] else "-",
             "; ".join(one["faults"]) or "-",
         ]
@@ -271,12 +271,16 @@ async def main() -> int:
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--only", default="", metavar="WORD", help="troubles with this in the name")
     parser.add_argument("--whole", action="store_true", help="soft body and picture as well")
+    parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges")
+    parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges")
     given = parser.parse_args()
     if why := missing():
         print(f"skipped: {why}", file=sys.stderr)
         return 0
     load = os.getloadavg()
-    async with Lab(without=() if given.whole else LIGHT) as lab:
+    patience = {"hold_after_s": given.hold_after, "stop_after_s": given.stop_after}
+    patience = {name: value for name, value in patience.items() if value is not None}
+    async with Lab(without=() if given.whole else LIGHT, **patience) as lab:
         results = await matrix(lab, given.only)
         for process in lab.launchers.values():
             process.send_signal(signal.SIGINT)
@@ -294,6 +298,7 @@ async def main() -> int:
     report = {
         "load": [load, os.getloadavg()],
         "whole": given.whole,
+        "patience": patience,
         "cases": cases,
         "largest_joint_speed_ratio": speed,
         "violations": violations,
