@@ -48,8 +48,9 @@ LIGHT = ("fem_solver", "renderer")
 
 FINGER_PATH = "twin/finger_path"
 STROKES = "strokes"
-STROKE_S = 1.5
-"""Each way: 60 degrees so quickly that joints turn at a third of what they can."""
+STROKE_S = 3.0
+"""Each way, 60 degrees.  Arms that hear of one another late part the further the faster it is: at
+half of this time, on bad cables, by more than their sheet may be twisted, and that is a fault."""
 STROKE_POINTS_HZ = 25
 
 

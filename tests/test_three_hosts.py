@@ -22,7 +22,7 @@ from tests.lab_bags import Span, gaps, held, read_arm, wanted
 
 SIDES = ("left", "right")
 LONGEST_M = 0.24 * 1.15
-TURNED_RAD = 0.3
+TURNED_RAD = 0.15
 STANDS_RAD = 1e-3
 STOPPED_NS = 200_000_000
 """Joints lag behind what was commanded, and with them the last word of a stop."""
