@@ -27,6 +27,7 @@ from messages.security import new_key_pair, write_secret
 from messages.topics import TOPICS
 from messages.types import Arming, EStop
 from nodes import node_class
+from nodes.console.desk import Desk, Files, Finger, ReleaseError, others_that_may_reset
 from nodes.node import Node, NodeParameters, Output, parameters_of
 from nodes.runner import Links
 from tests.arm_states import arm_state
@@ -82,6 +83,7 @@ def lab(folder: Path, **left: Any) -> Plan:
     spec["scene"] = str(LAUNCH / spec["scene"])
     calibration = LAUNCH / "calibrations" / "twin-bumblebee.yaml"
     spec["nodes"]["triangulator"]["parameters"]["calibration"] = str(calibration)
+    spec["nodes"]["console"] = {"type": "console", "host": "left"}
     spec["nodes"]["hand"] = {"type": f"{__name__}:Hand", "host": "left"}
     for number, (name, host) in enumerate(spec["hosts"].items(), start=1):
         public, secret = new_key_pair()
@@ -213,3 +215,23 @@ async def test_who_may_reset_a_stop_and_let_the_arms_move(
             with street.mouth(topic, at=(topic, "tools"), key="main") as mouth:
                 await street.is_taken(mouth, "tools", lets)
             assert (street.rejected(topic) == 0) == bool(may)
+
+
+@pytest.mark.parametrize("may", [None, True], ids=["as it comes", "may"])
+def test_a_console_that_may_not_reset_says_who_may(folder: Path, may: bool | None) -> None:
+    plan = lab(folder, may_reset_estop=may)
+    (folder / "plan.json").write_text(plan.model_dump_json())
+    sent: list[Message] = []
+    files = Files(folder / "plan.json", folder, folder, folder / "console.json")
+    others = others_that_may_reset(files.plan, "console")
+    finger = Finger(sent.append, speed_m_per_s=0.1)
+    desk = Desk(sent.append, files, finger, print, others)
+    desk.stop("pressed at the console")
+    if may:
+        desk.release()
+        assert sent[-1] == EStop(engaged=False, reason="reset at the console")
+    else:
+        with pytest.raises(ReleaseError, match="do it on main, or let it: may_reset_estop"):
+            desk.release()
+        assert sent == [EStop(engaged=True, reason="pressed at the console")]
+        assert desk.stopped == "pressed at the console"

@@ -169,6 +169,8 @@ REMEDIES = {
     "ProjectorError": "take pictures in more poses, with all of the pattern on the sheet.",
     "DecodeError": "take all pictures in order, exposed neither too dark nor too bright.",
     "ConsoleError": "choose another port, or give a token where the page is open to the network.",
+    "ReleaseError": "release it where the sentence says, or let this host: "
+    "hosts.NAME.may_reset_estop in the launch file on all hosts.",
     "SceneChoiceError": "choose a scene of the same devices as the one that runs.",
     "FingerPathError": "slow the path down or correct the row that is named.",
     "MxtError": "a fault of the simulated controller; its program starts anew.",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
@@ -244,17 +245,27 @@ class Files:
     kept: Path
 
 
+class ReleaseError(ValueError):
+    """An e-stop that this console's host may not reset; the sentence says whose hosts may."""
+
+
 class Desk:
     """All of it together, and what needs no state: stop, mark, record.
 
     A console that is started again goes on with the scene, the sliders and the recording that its
-    run had; warn is told why it cannot.
+    run had; warn is told why it cannot.  others_may: hosts that may reset an e-stop where this
+    console's may not; empty: it may.
     """
 
     def __init__(
-        self, publish: Publish, files: Files, finger: Finger, warn: Callable[[str], None]
+        self,
+        publish: Publish,
+        files: Files,
+        finger: Finger,
+        warn: Callable[[str], None],
+        others_may: tuple[str, ...] = (),
     ) -> None:
-        self._files = files
+        self._files, self.others_may = files, others_may
         first, sliders, self.recording = first_state(files, warn)
         self.scenes = SceneDesk(self._send_scene, files.scenes, first, sliders)
         self.finger = finger
@@ -274,6 +285,12 @@ class Desk:
         self._publish(EStop(engaged=True, reason=reason))
 
     def release(self) -> None:
+        """Reset the e-stop; ReleaseError where nobody would take it."""
+        if self.others_may:
+            raise ReleaseError(
+                f"this console's host may not reset an e-stop; do it on "
+                f"{' or '.join(self.others_may)}, or let it: may_reset_estop in the launch file"
+            )
         self.stopped = None
         self._publish(EStop(engaged=False, reason="reset at the console"))
 
@@ -295,6 +312,13 @@ class Desk:
         sliders = astuple(desk.sliders) if desk.moved else None
         kept = Kept(base=desk.base, sliders=sliders, recording=self.recording)
         save_kept(self._files.kept, kept)
+
+
+def others_that_may_reset(plan_file: Path, console: str) -> tuple[str, ...]:
+    """The hosts that may reset an e-stop where the console's own may not; empty: it may."""
+    plan = json.loads(plan_file.read_text())
+    hosts = tuple(plan["estop_resetters"])
+    return () if plan["nodes"][console]["host"] in hosts else hosts
 
 
 def first_state(files: Files, warn: Callable[[str], None]) -> tuple[Scene, Sliders | None, bool]:

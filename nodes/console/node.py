@@ -15,7 +15,7 @@ from messages.scene import Positive, Scene
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
 from messages.wire import WireError
-from nodes.console.desk import Desk, Files
+from nodes.console.desk import Desk, Files, others_that_may_reset
 from nodes.console.finger import Finger
 from nodes.console.guard import Guard, read_token, start_server
 from nodes.console.newest import Newest
@@ -101,7 +101,8 @@ class Console(Node):
         self.url = f"http://{given.address}:{self._server.get_port()}/"
         finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
         files = Files(given.plan, given.scenes, given.bags, given.kept)
-        desk = Desk(self._publish, files, finger, self.log.warning)
+        others = others_that_may_reset(given.plan, self.name)
+        desk = Desk(self._publish, files, finger, self.log.warning, others)
         has = {"with_finger": given.drives_finger, "with_eye": "in/twin/eye" in self.inputs}
         self.operator = Operator(self._server, self._newest, desk, self._ask, **has)
         desk.begin()

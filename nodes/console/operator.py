@@ -72,7 +72,7 @@ class Operator:
     ) -> None:
         """with_finger: the twin's, which the mouse moves.  with_eye: the twin's, which looks."""
         self._live, self.desk, self._with_eye = live, desk, with_eye
-        self._page = Page(server, ask, with_finger=with_finger)
+        self._page = Page(server, ask, with_finger=with_finger, others_may=desk.others_may)
         self._history = History()
         self._statuses: dict[str, tuple[Status, float]] = {}
         self._drawn_scene: Scene | None = None

@@ -24,7 +24,10 @@ MAIN_WIDTH, STOP_WIDTH = 380, 320
 class Page:
     """All panels; the node tells it what to show."""
 
-    def __init__(self, server: viser.ViserServer, ask: Ask, *, with_finger: bool) -> None:
+    def __init__(
+        self, server: viser.ViserServer, ask: Ask, *, with_finger: bool, others_may: tuple[str, ...]
+    ) -> None:
+        """others_may: see `Desk`."""
         self._gui: Any = server.gui
         self._ask = ask
         self.view = View(server)
@@ -34,7 +37,7 @@ class Page:
         )
         self._gui.main_panel.dock_right()
         self._gui.main_panel.set_width(MAIN_WIDTH)
-        self._add_stop()
+        self._add_stop(others_may)
         self._problem = Html(self._gui)
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Touch", viser.Icon.HAND_FINGER):
@@ -46,7 +49,7 @@ class Page:
         with tabs.add_tab("Record", viser.Icon.PLAYER_RECORD):
             self.record = RecordTab(self._gui, ask)
 
-    def _add_stop(self) -> None:
+    def _add_stop(self, others_may: tuple[str, ...]) -> None:
         """In a window of its own, so that no tab and no scrolling takes it away."""
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
@@ -55,7 +58,7 @@ class Page:
             )
             self._state = Html(self._gui)
             self._release = self._gui.add_button(
-                "Release the e-stop",
+                f"Release: on {' or '.join(others_may)}" if others_may else "Release the e-stop",
                 visible=False,
                 hint="The arms must be at rest; then they follow again",
             )
