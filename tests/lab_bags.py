@@ -53,6 +53,11 @@ class Arm:
         """The true joints (k, 6) in a time."""
         return self.joints_rad[(self.times_ns >= span[0]) & (self.times_ns <= span[1])]
 
+    def turned_rad(self, span: Span) -> float:
+        """How far its joint turned that turned most; 0 where the truth of that time is not known."""
+        joints = self.between(span)
+        return float(np.ptp(joints, axis=0).max()) if len(joints) else 0.0
+
     def spans(self, mode: str) -> list[Span]:
         """When it was in a mode, from each first word of it to the last without a silence."""
         spans = []

@@ -74,16 +74,15 @@ def judge_bags(lab: Lab, troubles: Troubles) -> None:
         assert arm.fastest() <= 1.0
         assert not arm.leaves_range()
         # It turned the sheet with the finger while it followed, and stood whenever it said so.
-        followed = [np.ptp(arm.between(span), axis=0).max() for span in arm.spans("follow")]
-        assert max(followed) > TURNED_RAD
+        assert max(map(arm.turned_rad, arm.spans("follow"))) > TURNED_RAD
         for mode in ("idle", "estop"):
-            stood = [arm.between((begin + STOPPED_NS, end)) for begin, end in arm.spans(mode)]
-            assert any(len(joints) > 50 for joints in stood)
-            assert all(np.ptp(joints, axis=0).max() < STANDS_RAD for joints in stood if len(joints))
+            stood = [(begin + STOPPED_NS, end) for begin, end in arm.spans(mode)]
+            assert any(len(arm.between(span)) > 50 for span in stood)
+            assert all(arm.turned_rad(span) < STANDS_RAD for span in stood)
     lossy = troubles.spans["loss and jitter"]
     sheet = held(arms, wanted(lab.folder), lossy)
     assert sheet.followed > 0.5
-    assert all(np.ptp(arm.between(lossy), axis=0).max() > TURNED_RAD for arm in arms)
+    assert all(arm.turned_rad(lossy) > TURNED_RAD for arm in arms)
     assert len(sheet.errors_m) > 50
     assert np.median(sheet.errors_m) < OFF_M
     lost = gaps(lab.folder)
