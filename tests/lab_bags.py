@@ -54,7 +54,7 @@ class Arm:
         return self.joints_rad[(self.times_ns >= span[0]) & (self.times_ns <= span[1])]
 
     def turned_rad(self, span: Span) -> float:
-        """How far its joint turned that turned most; 0 where the truth of that time is not known."""
+        """How far that joint turned which turned most; 0 where the truth is not known."""
         joints = self.between(span)
         return float(np.ptp(joints, axis=0).max()) if len(joints) else 0.0
 
