@@ -10,14 +10,13 @@ from collections.abc import Iterable
 from typing import get_args
 
 from launch.reference.remedies import AREAS, FINGERTIP, REMEDIES, Area
-from launch.reference.sentences import Said, classes, messages
+from launch.reference.sentences import FILLED_IN, Said, classes, messages
 
 SHORTEST_MATCH = 8
 """Letters below which the part of a message that somebody gives would fit anything."""
 SHORTEST_TEMPLATE = 7
 """Letters of a message's fixed words below which it would fit anything."""
 
-_FILLED_IN = re.compile(r"<[^>]*>")
 _LEFT_OUT = re.compile(r"\s*(?:\.\.\.|…)\s*")
 
 INTRODUCTION = """\
@@ -90,7 +89,7 @@ def explain(message: str) -> list[Said]:
     part = re.compile(".*?".join(map(re.escape, parts)))
     long_enough = sum(map(len, parts)) >= SHORTEST_MATCH
     for one in messages():
-        pattern = ".+?".join(re.escape(part) for part in _FILLED_IN.split(one.template))
+        pattern = ".+?".join(re.escape(part) for part in FILLED_IN.split(one.template))
         letters = _letters(one.template)
         if letters >= SHORTEST_TEMPLATE and re.search(pattern, message, re.DOTALL):
             found.append((letters, one))
@@ -101,7 +100,7 @@ def explain(message: str) -> list[Said]:
 
 def _letters(template: str) -> int:
     """How many letters of a message are always the same."""
-    return sum(len(part.strip()) for part in _FILLED_IN.split(template))
+    return sum(len(part.strip()) for part in FILLED_IN.split(template))
 
 
 def explained(message: str) -> list[dict[str, str]]:

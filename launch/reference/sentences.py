@@ -16,6 +16,9 @@ TOLD = {"on_problem", "on_refused", "report", "tell"}
 """What is called to say a sentence while a graph runs; a leading underscore or none."""
 UNTROUBLED = ("ok", "not asked")
 
+FILLED_IN = re.compile(r"<[^>]*>")
+"""What stands in a message's template for what it fills in."""
+_WORD = re.compile(r"[A-Za-z]{2,}")
 _FIELD = re.compile(r"\{(\w+)[^}]*\}")
 _ANSWERS_WHY = re.compile(
     r"beyond|busy|exit|lacking|note|objection|outside|problem|reason|refus|silence|skewed|too_deep"
@@ -87,7 +90,7 @@ def _said(file: str, tree: ast.Module) -> Iterator[Said]:
     for name, values in _dictionaries(tree):
         if _HOLDS_REASONS.search(name):
             texts = [template(value) for value in values]
-            yield from (Said(file, "Reason", text) for text in texts if text and " " in text)
+            yield from (Said(file, "Reason", text) for text in texts if text and _is_said(text))
         elif file.startswith("launch/health/"):
             yield from _findings(file, values)
 
@@ -105,7 +108,7 @@ def _raised(file: str, call: ast.Call, own: set[str]) -> Iterator[Said]:
         yield Said(file, "BadInputError", words[1], _at(words, 2))
     elif name == "Finding" and len(words) > 2 and words[1] != "ok" and words[2]:
         yield Said(file, "Finding", f"{words[0]}: {words[2]}", _at(words, 3))
-    elif name == "HostFinding" and _at(words, 2) not in UNTROUBLED and " " in _at(words, 3):
+    elif name == "HostFinding" and _at(words, 2) not in UNTROUBLED and _is_said(_at(words, 3)):
         yield Said(file, "Finding", _at(words, 3), _at(words, 4))
 
 
@@ -150,14 +153,19 @@ def _words(node: ast.AST, constants: dict[str, str]) -> Iterator[str]:
             parts = [joined]
         case ast.Name(id=name):
             parts = []
-            if " " in constants.get(name, ""):
+            if _is_said(constants.get(name, "")):
                 yield constants[name]
         case _:
             parts, text = [], template(node)
-            if text and " " in text:
+            if text and _is_said(text):
                 yield text
     for part in parts:
         yield from _words(part, constants)
+
+
+def _is_said(text: str) -> bool:
+    """Whether a string is words of its own, and not only a frame around what it fills in."""
+    return len(_WORD.findall(FILLED_IN.sub(" ", text))) > 1
 
 
 def _says_why(function: ast.FunctionDef | ast.AsyncFunctionDef, file: str) -> bool:
@@ -197,7 +205,7 @@ def _findings(file: str, values: list[ast.expr]) -> Iterator[Said]:
     for value in values:
         if isinstance(value, ast.Tuple) and len(value.elts) > 1:
             what, remedy = (template(element) for element in value.elts[-2:])
-            if what and remedy and " " in what:
+            if what and remedy and _is_said(what):
                 yield Said(file, "Finding", _FIELD.sub(r"<\1>", what), _FIELD.sub(r"<\1>", remedy))
 
 
