@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable
 from typing import get_args
 
-from launch.reference.remedies import AREAS, FINGERTIP, REMEDIES, Area
+from launch.reference.remedies import AREAS, FINGERTIP, PARTICULAR, REMEDIES, Area
 from launch.reference.sentences import FILLED_IN, Said, classes, messages
 
 SHORTEST_MATCH = 8
@@ -169,7 +169,8 @@ def undocumented() -> list[str]:
         "Warning",
     }
     reasons = set(get_args(FingertipReason)) - {"ok"}
-    return sorted({*(raised ^ set(REMEDIES)), *(reasons ^ set(FINGERTIP))})
+    unsaid = {words for words in PARTICULAR if not any(words in one.template for one in messages())}
+    return sorted({*(raised ^ set(REMEDIES)), *(reasons ^ set(FINGERTIP)), *unsaid})
 
 
 if __name__ == "__main__":

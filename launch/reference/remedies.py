@@ -179,6 +179,32 @@ REMEDIES = {
 }
 """By class of error, or by how it is said: a finding of the doctor, a log line, a reason."""
 
+PARTICULAR = {
+    "NOT RECORDING:": "make room, or let it write elsewhere; with room the next bag begins "
+    "by itself.",
+    "hung: no sign of life": "it is started again; the end of its log (`logs/NODE.log` of the run) "
+    "shows where it stood; `liveness_s` of the launch file is how long it may be silent.",
+    "refuses our key": "the launch file there has none or another key for this host: copy the "
+    "newest to all; `flexsheet doctor hosts` says which differ.",
+    "does not speak with our keys": "start it with a launch file that has keys, the same on all "
+    "hosts.",
+    "did not prove that it has its key": "its secret key is another than the launch file has, or "
+    "somebody sits in its place: `flexsheet doctor hosts`.",
+    "a reader or the network is too slow": "`flexsheet topic echo status` shows which port drops; "
+    "give that node more processor time, or the link more room.",
+    "may not reset an e-stop or let the arms move": "do it on a host that may, mostly `main`.",
+    "is not measured": "for some seconds after a start that is so; else its clock node or the "
+    "network is down (docs/clocks.md).",
+    "ms are allowed": "quieten the network, set up chrony, or allow more (docs/clocks.md).",
+    "no way: <error>": "bring the arms nearer to the sheet by hand, or the sheet to another place "
+    "(docs/arms.md).",
+    ": holding the last good sheet plane": "arms that say nothing, or a sheet turned away; it goes "
+    "on by itself.",
+    ", kept until it is reset": "when the danger is over: `flexsheet arms reset`.",
+    "watchdog: no command": "its bridge was silent for 100 ms: is it running, and the cable in?",
+}
+"""By words of a message that says no remedy itself and needs more than its kind's."""
+
 FINGERTIP = {
     "no_mark": "no mark in either picture: finger out of view, mark lost, exposure too dark.",
     "mark_in_one_view": "one camera is blocked or does not see as far: move the finger or camera.",

@@ -5,9 +5,11 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
+
+from launch.reference.remedies import PARTICULAR
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = ("messages", "nodes", "launch")
@@ -44,7 +46,12 @@ class Said:
 @cache
 def messages() -> tuple[Said, ...]:
     """All messages of the three floors, in the order of files and lines."""
-    return tuple(one for file, tree in _trees() for one in _said(file, tree))
+    found = (one for file, tree in _trees() for one in _said(file, tree))
+    return tuple(one if one.remedy else replace(one, remedy=_particular(one)) for one in found)
+
+
+def _particular(one: Said) -> str:
+    return next((text for words, text in PARTICULAR.items() if words in one.template), "")
 
 
 @cache
