@@ -47,8 +47,6 @@ LONGEST_M = 0.24 * 1.15
 BACK_WITHIN_S = 60.0
 SILENT_S = 0.1
 """A bridge that says nothing for so long follows nothing."""
-MARGIN_NS = 1_500_000_000
-"""What is said once a second and lost at the beginning was last heard so long before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,14 +206,21 @@ async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
     await lab.watch_usual(host)
 
 
-def missing_s(gaps: list[Gap], during_ns: tuple[int, int]) -> tuple[float, str]:
-    """The longest that one writer's messages are missing, from a time on, and whose."""
-    begin_ns, end_ns = during_ns
-    found = [one for one in gaps if begin_ns - MARGIN_NS <= one.from_ns < end_ns]
-    if not found:
-        return 0.0, ""
-    worst = max(found)
-    return worst.seconds, f"{worst.topic} of {worst.writer}"
+def worst_gaps(lost: list[Gap], results: list[Result]) -> list[Gap | None]:
+    """The longest that one writer's messages are missing, for each trouble; None: nothing is.
+
+    What is missing belongs to the trouble that it shares most time with.
+    """
+    worst: list[Gap | None] = [None] * len(results)
+    for gap in lost:
+        shared = [
+            min(gap.to_ns, one.during_ns[1]) - max(gap.from_ns, one.during_ns[0]) for one in results
+        ]
+        most = max(range(len(results)), key=shared.__getitem__)
+        known = worst[most]
+        if shared[most] > 0 and (known is None or gap > known):
+            worst[most] = gap
+    return worst
 
 
 def rows(
@@ -226,14 +231,13 @@ def rows(
 ) -> list[dict[str, Any]]:
     """What is told of each trouble, with what the bags know; lengths in mm."""
     found = []
-    for one in results:
-        gap_s, whose = missing_s(lost, one.during_ns)
+    for one, gap in zip(results, worst_gaps(lost, results), strict=True):
         sheet = held(arms, targets, one.during_ns)
         found.append(
             {
                 **asdict(one),
-                "missing_s": gap_s,
-                "missing": whose,
+                "missing_s": 0.0 if gap is None else gap.seconds,
+                "missing": "" if gap is None else f"{gap.topic} of {gap.writer}",
                 "error_p50_mm": sheet.quantile_mm(0.5),
                 "error_p95_mm": sheet.quantile_mm(0.95),
                 "followed": sheet.followed,
@@ -270,7 +274,7 @@ async def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--only", default="", metavar="WORD", help="troubles with this in the name")
-    parser.add_argument("--whole", action="store_true", help="soft body and picture as well")
+    parser.add_argument("--light", action="store_true", help="without soft body and picture")
     parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges")
     parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges")
     given = parser.parse_args()
@@ -280,7 +284,7 @@ async def main() -> int:
     load = os.getloadavg()
     patience = {"hold_after_s": given.hold_after, "stop_after_s": given.stop_after}
     patience = {name: value for name, value in patience.items() if value is not None}
-    async with Lab(without=() if given.whole else LIGHT, **patience) as lab:
+    async with Lab(without=LIGHT if given.light else (), **patience) as lab:
         results = await matrix(lab, given.only)
         for process in lab.launchers.values():
             process.send_signal(signal.SIGINT)
@@ -297,7 +301,7 @@ async def main() -> int:
     violations += ["joint range"] if any(arm.leaves_range() for arm in pair) else []
     report = {
         "load": [load, os.getloadavg()],
-        "whole": given.whole,
+        "light": given.light,
         "patience": patience,
         "cases": cases,
         "largest_joint_speed_ratio": speed,
