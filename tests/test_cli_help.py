@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shlex
@@ -12,13 +13,20 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+import structlog
 from typer.main import get_command
 
 from launch import cli
 from launch.commands import complete
 from launch.commands.experiment import DEMO_FILE
 from launch.commands.failures import LATE
-from launch.commands.output import FAILED, examples_in, print_json, print_json_line
+from launch.commands.output import (
+    FAILED,
+    examples_in,
+    logs_on_stderr,
+    print_json,
+    print_json_line,
+)
 from launch.plans.plan import load_plan
 from launch.reference.cli import commands
 from launch.reference.errors import explained, undocumented
@@ -229,3 +237,17 @@ def test_an_error_points_to_its_explanation_but_not_for_scripts(
             cli.main()
         assert ("flexsheet explain BagError" in capsys.readouterr().err) == pointed
     assert explained("BagError")[0]["kind"] == "BagError"
+
+
+def test_logs_go_to_the_stderr_of_their_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = structlog.get_config()
+    first, second = io.StringIO(), io.StringIO()
+    try:
+        monkeypatch.setattr("sys.stderr", first)
+        logs_on_stderr()
+        first.close()
+        monkeypatch.setattr("sys.stderr", second)
+        structlog.get_logger().warning("kept")
+    finally:
+        structlog.configure(**before)
+    assert "kept" in second.getvalue()

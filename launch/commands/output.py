@@ -172,5 +172,6 @@ def logs_on_stderr() -> None:
             structlog.processors.format_exc_info,
             structlog.dev.ConsoleRenderer(colors=words.in_colour),
         ],
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        # Looked up for each line: who calls this as a library may put another in its place.
+        logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
     )
