@@ -472,7 +472,7 @@ async def test_nobody_listening_is_an_error_in_one_line() -> None:
 
 
 async def test_a_cancellation_is_not_swallowed() -> None:
-    async with linked() as (link, _):
+    async with linked(timeout_s=5.0) as (link, _):
         await exchange(link, "idle")
         for turns in range(1, 8):
             task = asyncio.create_task(exchange(link))
