@@ -56,7 +56,8 @@ def nothing_to_prepare(scene: Scene, told: Progress) -> None:
 class Family:
     """A set of interchangeable methods.
 
-    trials: yields the trials of every method over a scene's working range.
+    trials: yields the trials of every method over a scene's working range; each may be run until
+        the next is asked for.
     tolerance: the scene's tolerance, in `unit`.
     along: the part of the case that errors are drawn over in a picture of their own, if any.
     prepare: works out, and keeps, what takes long and `trials` needs; told of done and total steps.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -22,6 +23,7 @@ from launch.methods.charts import (
     chart_result,
     family_named,
     finite,
+    measure_family,
     write_chart,
 )
 from launch.methods.svg import INK
@@ -198,6 +200,19 @@ def test_a_chart_is_measured_drawn_and_written(tmp_path: Path) -> None:
     assert "prefers-color-scheme: dark" in drawn
     write_chart(result, tmp_path / "charts")
     assert picture.read_text() == drawn, "the same numbers give the same picture"
+
+
+def test_each_trial_is_measured_before_the_next_is_asked_for() -> None:
+    family = make_family()
+
+    def trials(scene: Scene) -> Iterator[Trial]:
+        for trial in family.trials(scene):
+            opened = [trial]
+            yield replace(trial, run=lambda trial=trial, opened=opened: (opened[0], trial.run())[1])
+            opened.clear()
+
+    measured = measure_family(replace(family, trials=trials), SCENE, repeats=2)
+    assert [point.method for point in measured] == [t.method for t in family.trials(SCENE)]
 
 
 def test_what_numpy_answers_can_be_written(tmp_path: Path) -> None:

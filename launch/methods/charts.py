@@ -83,14 +83,19 @@ def measure_family(
     progress: Callable[[str], None] = lambda text: None,
     wanted: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure every trial of the family that is wanted; `progress` is told how much is left of
-    that, and of what has to be worked out before."""
+    """Measure every trial of the family that is wanted; `progress` is told how many are measured,
+    and before, of what has to be worked out, how much is left.
+
+    A family closes what a trial needs when it is asked for a later one, so each is measured at
+    once.
+    """
     family.prepare(scene, _with_time_left("working out what it takes to judge:", progress))
-    points = []
-    trials = list(filter(wanted, family.trials(scene)))
-    told = _with_time_left("measuring", progress)
-    for number, trial in enumerate(trials):
-        told(number, len(trials))
+    points: list[Point] = []
+    last_s = -math.inf
+    for trial in filter(wanted, family.trials(scene)):
+        if time.monotonic() - last_s >= TOLD_EVERY_S:
+            last_s = time.monotonic()
+            progress(f"measuring {trial.method}, {len(points)} done")
         points.append(measure(trial, repeats=repeats))
     return points
 
