@@ -6,12 +6,14 @@ Nine commands in ten are joint goals: NaN, leaps, edges of the range, alternatin
 velocities, spinning wrists, pushes at the tool's speed, and sequences that hypothesis hunted for;
 they go through the limiter and from there into the twin's joint servos.  The others are sheet
 targets for two bridges' controls that share a sheet: leaps, nonsense, late targets, frozen and
-lagging arms, e-stops, resets; whether there is a way to them they are told unseen.  Commands come
-as unevenly as bridges send them.
+lagging arms, e-stops, resets, measurements that are frozen, lagging, offset, swapped, replayed or
+stale, second masters, and combinations of them; whether there is a path to a target they are told
+unseen.  Commands come as unevenly as bridges send them.
 
-Judged are the commands, and each millisecond of the simulated joints, by the twin's kinematics.
-Two things are counted apart: commands that brake harder than the acceleration because range or tool
-speed could not be kept otherwise, and arms that were frozen and catch up by themselves.
+Judged are the commands, and each millisecond of the simulated joints, by kinematics of this file.
+Counted apart are commands that brake harder than the acceleration because range or tool speed could
+not be kept otherwise, arms that were frozen and catch up by themselves, and arms that a second
+master moves.
 Prints the violations (there should be none), the worst share of each limit, and how long a pass
 takes.  Some minutes on one core.
 """
@@ -22,7 +24,7 @@ import argparse
 import json
 import sys
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -40,6 +42,7 @@ from nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal
 from nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, limited, within_range
+from nodes.arm_bridge.link import Freshness
 from nodes.models.motion import SheetMotion
 from nodes.models.rigid import transform, transform_from_rpy
 from nodes.twin.arms import (
@@ -66,13 +69,30 @@ SIDES: tuple[Side, Side] = ("left", "right")
 PAIRS = 32
 LIFE = 400
 """Commands after which an arm starts anew somewhere else."""
-SHEET_SHARE = 0.1
+SHEET_SHARE = 0.2
 THAW_S = 0.4
 """How long an arm that was frozen may take to catch up: sixteen lags of its servos."""
 WITHIN = 1.0 + 1e-6
+NOISE_RAD = 5e-6
+"""Of encoders."""
+HISTORY = 150
+"""Measurements that a false one may come from."""
+FALSE_CHANCE, FALSE_CHANCE_MOVING, SECOND_CHANCE = 0.0005, 0.01, 0.0005
+"""Per arm and cycle: that its measurement becomes false, that a second master commands it."""
+MAX_UNCHANGED_CYCLES = 7
+"""Counters that stand still for longer are stalled."""
 HUNTS = 80
 """Sequences that hypothesis tries in search of bad ones."""
 START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
+
+
+@dataclass
+class Under:
+    """What arms did under one adversary: cycles, those in which they were moved, tool speed."""
+
+    cycles: int = 0
+    moved: int = 0
+    tool_speed_share: float = 0.0
 
 
 @dataclass
@@ -84,6 +104,7 @@ class Tally:
     excused: int = 0
     worst: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     pass_ns: list[int] = field(default_factory=list)
+    under: dict[str, Under] = field(default_factory=lambda: defaultdict(Under))
 
     def judge(self, name: str, share: Floats | float, allowed: Flags | bool = False) -> None:
         """share: of a limit, 1 being all of it; more is counted apart where it is `allowed`."""
@@ -141,6 +162,8 @@ class Judged:
         self.servo.velocity_rad_per_s = np.zeros_like(joints_rad)
         self._tool, self._fastest = tool_of(scene), scene.arms.max_tool_speed_m_per_s
         self._tally = tally
+        self.speed_share = np.zeros(len(joints_rad))
+        """The largest share of the tool speed of each arm in the last `advance`."""
 
     def advance(
         self,
@@ -157,6 +180,7 @@ class Judged:
         steps = int(np.ceil(duration_s / 1e-3))
         step_s = duration_s / steps
         servo, tally = self.servo, self._tally
+        self.speed_share = np.zeros(len(servo.joints_rad))
         for _ in range(steps):
             joints, velocity = servo.joints_rad, servo.velocity_rad_per_s
             before = points_on_tool(joints, self._tool)
@@ -172,6 +196,7 @@ class Judged:
             tally.judge("simulated acceleration", share[moving >= 0])
             speed = np.linalg.norm(after - before, axis=2).max(axis=1) / step_s
             tally.judge("simulated tool speed", speed / self._fastest, allowed=thawing)
+            self.speed_share = np.maximum(self.speed_share, speed / self._fastest)
 
     def _hold_back(self, joints: Floats, velocity: Floats, moving: Floats, step_s: float) -> None:
         """Undo the step of frozen arms; let stopping ones brake instead."""
@@ -446,6 +471,124 @@ def hunt(scene: Scene) -> list[list[Floats]]:
 # Sheet targets.
 
 
+History = deque[Floats]
+"""Measured joints (n, 6) of all arms, the newest last."""
+
+
+@dataclass
+class FalseMeasurement:
+    """How an arm's status lies, for so many cycles; the kinds are applied one after another."""
+
+    kinds: tuple[str, ...]
+    cycles: int
+    lag: int
+    shift_rad: Floats
+    order: NDArray[np.int64]
+    held_rad: Floats | None = None
+    begun: int = 0
+
+    @classmethod
+    def draw(cls, random: Random) -> FalseMeasurement:
+        count = 1 if random.random() < 0.7 else 2
+        kinds = random.choice(list(FALSE_KINDS), count, replace=False)
+        size = float(random.choice([0.003, 0.01, 0.03, 0.1, 0.5]))
+        return cls(
+            tuple(str(kind) for kind in kinds),
+            int(random.integers(3, 200)),
+            int(random.integers(2, HISTORY)),
+            random.uniform(-size, size, 6) * (random.random(6) < random.choice([0.2, 1.0])),
+            random.permutation(6),
+        )
+
+    def report(self, history: History, arm: int) -> tuple[Floats, Freshness]:
+        """Joints (6,) that the arm's status reports, and what its counters say."""
+        joints, freshness = history[-1][arm], Freshness.FRESH
+        for kind in self.kinds:
+            joints, fresh = FALSE_KINDS[kind](self, history, arm, joints)
+            freshness = fresh if fresh != Freshness.FRESH else freshness
+        self.begun += 1
+        self.cycles -= 1
+        return joints, freshness
+
+    def frozen(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
+        """The first one for ever, while the counters go on."""
+        self.held_rad = joints if self.held_rad is None else self.held_rad
+        return self.held_rad, Freshness.FRESH
+
+    def stale(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
+        """The first one for ever, and its counters."""
+        held, _ = self.frozen(history, arm, joints)
+        stalled = self.begun >= MAX_UNCHANGED_CYCLES
+        return held, Freshness.STALLED if stalled else Freshness.REPEATED
+
+    def lagging(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
+        return history[-min(self.lag, len(history))][arm], Freshness.FRESH
+
+    def offset(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
+        return joints + self.shift_rad, Freshness.FRESH
+
+    def joints_swapped(
+        self, history: History, arm: int, joints: Floats
+    ) -> tuple[Floats, Freshness]:
+        return joints[self.order], Freshness.FRESH
+
+    def arms_swapped(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
+        return history[-1][arm ^ 1], Freshness.FRESH
+
+    def replayed(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
+        """A piece of the past again and again, with new counters."""
+        past = (2 * self.begun + self.lag - self.begun % self.lag) % HISTORY
+        return history[-1 - min(past, len(history) - 1)][arm], Freshness.FRESH
+
+    def replayed_whole(
+        self, history: History, arm: int, joints: Floats
+    ) -> tuple[Floats, Freshness]:
+        """The same with the counters of the past."""
+        return self.replayed(history, arm, joints)[0], Freshness.REVERSED
+
+
+FALSE_KINDS: dict[str, Callable[..., tuple[Floats, Freshness]]] = {
+    "frozen": FalseMeasurement.frozen,
+    "stale": FalseMeasurement.stale,
+    "lagging": FalseMeasurement.lagging,
+    "offset": FalseMeasurement.offset,
+    "joints swapped": FalseMeasurement.joints_swapped,
+    "arms swapped": FalseMeasurement.arms_swapped,
+    "replayed": FalseMeasurement.replayed,
+    "replayed with counters": FalseMeasurement.replayed_whole,
+}
+
+
+@dataclass
+class SecondMaster:
+    """Another client that commands the same arm, for so many cycles, as fast as the arm may go.
+
+    refuses: the controller takes its commands and refuses the bridge's; else it takes both in turn.
+    """
+
+    joints_rad: Floats
+    goals: Iterator[tuple[Floats, Floats]]
+    cycles: int
+    refuses: bool
+    velocity: Floats = field(default_factory=lambda: np.zeros(6))
+
+    def command(self, geometry: ArmGeometry, step_s: float) -> Floats:
+        goal, along = next(self.goals)
+        self.velocity = limited(
+            self.joints_rad,
+            self.velocity,
+            goal,
+            along,
+            tool_points=geometry.tool_points,
+            max_tool_speed=0.5 * geometry.max_tool_speed,
+            limits=geometry.joint_limits,
+            step_s=step_s,
+        )
+        self.joints_rad = self.joints_rad + self.velocity * step_s
+        self.cycles -= 1
+        return self.joints_rad
+
+
 @dataclass
 class Bridge:
     """One bridge's control, and for how many cycles more its arm stands or does not answer."""
@@ -454,9 +597,22 @@ class Bridge:
     control: ArmControl
     frozen: int = 0
     unanswered: int = 0
+    lie: FalseMeasurement | None = None
+    second: SecondMaster | None = None
 
-    def state(self, joints_rad: Floats, age_s: float) -> OtherArm:
+    @property
+    def adversary(self) -> str:
+        """What this arm suffers from now."""
+        if self.second is not None:
+            return "second master"
+        if self.lie is not None:
+            return " + ".join(sorted(self.lie.kinds)) if len(self.lie.kinds) == 1 else "combined"
+        return "frozen arm" if self.frozen else "silent arm" if self.unanswered else "none"
+
+    def state(self, age_s: float) -> OtherArm:
         """What the other bridge hears of it."""
+        joints_rad = self.control.last_measured_rad
+        assert joints_rad is not None
         return OtherArm(
             joints_rad,
             self.geometry.world_from_flange(joints_rad),
@@ -467,17 +623,36 @@ class Bridge:
             self.control.ready,
         )
 
-    def hear(self, measured_rad: Floats) -> None:
+    def hear(self, history: History, arm: int) -> None:
         """The arm's answer to the last command, or none."""
-        if self.unanswered == 0:
-            self.control.take_measurement(measured_rad, ())
+        if self.second is not None and self.second.refuses:
+            self.control.fail_exchange("the arm refused the command", silent=False)
+        elif self.unanswered == 0:
+            joints, freshness = history[-1][arm], Freshness.FRESH
+            if self.lie is not None:
+                joints, freshness = self.lie.report(history, arm)
+                self.lie = self.lie if self.lie.cycles > 0 else None
+            self.control.take_measurement(joints, (), freshness)
         else:
             self.unanswered -= 1
             self.control.fail_exchange("no answer", silent=True)
 
+    def other_command(self, random: Random, joints_rad: Floats, step_s: float) -> Floats | None:
+        """Joints (6,) that a second master sends in this cycle after the bridge, or None."""
+        if self.second is None and random.random() < SECOND_CHANCE:
+            self.second = second_master(random, self.geometry, joints_rad)
+        if self.second is None:
+            return None
+        second, theirs = self.second, self.second.command(self.geometry, step_s)
+        self.second = second if second.cycles > 0 else None
+        return theirs if second.refuses or second.cycles % 2 else None
+
     def suffer(self, random: Random, stamp_ns: int) -> None:
         """Now and then the arm freezes or falls silent, somebody stops it, or clears it."""
         chance = random.random()
+        false = FALSE_CHANCE if self.control.at_rest else FALSE_CHANCE_MOVING
+        if self.lie is None and random.random() < false:
+            self.lie = FalseMeasurement.draw(random)
         if chance < 0.0005:
             self.frozen = int(random.integers(1, 60))
         elif chance < 0.001:
@@ -532,23 +707,27 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
         for geometry in geometries
     ]
     arms = Judged(np.array(starts * PAIRS), scene, tally)
+    history: History = deque([arms.servo.joints_rad], maxlen=HISTORY)
     for bridge, joints in zip(bridges, starts * PAIRS, strict=True):
         bridge.control.take_measurement(joints, ())
         bridge.control.mode = "idle"
     wanted, moving = arms.servo.joints_rad.copy(), np.zeros(2 * PAIRS)
     thaw_s = np.zeros(2 * PAIRS)
+    sent: list[Floats | None] = [None] * len(bridges)
     goals = [sheet_goals(random, scene) for _ in range(PAIRS)]
     for cycle in range(cycles):
         step_s = BEAT_S * float(random.uniform(0.5, 2.0))
         arms.advance(wanted, step_s, moving, thawing=thaw_s > 0.0)
-        measured, thaw_s = arms.servo.joints_rad.copy(), thaw_s - step_s
+        noise = NOISE_RAD * random.standard_normal(arms.servo.joints_rad.shape)
+        history.append(arms.servo.joints_rad + noise)
+        note_adversaries(tally, bridges, arms.speed_share, moving=moving, thawing=thaw_s > 0.0)
+        thaw_s = thaw_s - step_s
         pair_goals = [next(goal) for goal in goals]
         for number, bridge in enumerate(bridges):
             control, other = bridge.control, number ^ 1
-            bridge.hear(measured[number])
+            bridge.hear(history, number)
             age_s = float(random.choice([0.005] * 20 + [0.03, 0.2]))
-            seen, before = bridges[other].state(measured[other], age_s), control.commanded_rad
-            heard = measured[number] if control.measured_rad is None else control.measured_rad
+            seen, before = bridges[other].state(age_s), sent[number]
             began_ns = time.thread_time_ns()
             command = control.step(bridge.geometry, pair_goals[number // 2], seen, step_s)
             if command.mode == "move":
@@ -560,10 +739,16 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
                 bridge.geometry,
                 command,
                 before=before,
-                measured=heard,
                 step_s=step_s,
             )
-            wanted[number], moving[number] = command.joints_rad, float(command.mode == "move")
+            moves = command.mode == "move"
+            sent[number] = command.joints_rad if moves else None
+            wanted[number], moving[number] = command.joints_rad, float(moves)
+            theirs = bridge.other_command(random, arms.servo.joints_rad[number], step_s)
+            if bridge.second is not None:
+                thaw_s[number] = THAW_S
+            if theirs is not None:
+                wanted[number], moving[number] = theirs, 1.0
             if bridge.frozen > 0:
                 bridge.frozen -= 1
                 moving[number], thaw_s[number] = -1.0, THAW_S
@@ -571,26 +756,45 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
         tally.commands += len(bridges)
 
 
+def note_adversaries(
+    tally: Tally, bridges: list[Bridge], speed_share: Floats, *, moving: Floats, thawing: Flags
+) -> None:
+    """Note how fast the arms (n,) went under their adversaries; thawing ones are left out."""
+    for number, bridge in enumerate(bridges):
+        under = tally.under[bridge.adversary]
+        under.cycles += 1
+        under.moved += bool(moving[number] > 0.0)
+        if not thawing[number]:
+            under.tool_speed_share = max(under.tool_speed_share, float(speed_share[number]))
+
+
+def second_master(random: Random, geometry: ArmGeometry, joints_rad: Floats) -> SecondMaster:
+    """One that takes the arm from where it is."""
+    lane = Lane(joints_rad.copy(), np.zeros(6), iter(()))
+    goals = walks(random, geometry.joint_limits, lane)
+    return SecondMaster(
+        joints_rad.copy(), goals, int(random.integers(5, 200)), refuses=bool(random.random() < 0.5)
+    )
+
+
 def judge_bridge(
     tally: Tally,
     geometry: ArmGeometry,
     command: Command,
     *,
-    before: Floats,
-    measured: Floats,
+    before: Floats | None,
     step_s: float,
 ) -> None:
-    """A bridge's command (6,) after the one before, its arm having been measured there."""
+    """A bridge's command (6,) after the last one; before: None if that did not move the arm."""
     if command.mode != "move":
         return
     joints, limits = command.joints_rad, geometry.joint_limits
     tally.judge("finite", 0.0 if np.isfinite(joints).all() else 2.0)
     beyond = np.maximum(limits.lowest_rad - joints, joints - limits.highest_rad).max()
     tally.judge("commanded position", 1.0 + float(beyond))
-    # One that begins anew goes on from the measured pose instead.
-    furthest = step_s * limits.speed_rad_per_s
-    share = min((np.abs(joints - origin) / furthest).max() for origin in (before, measured))
-    tally.judge("commanded speed", float(share))
+    if before is not None:
+        furthest = step_s * limits.speed_rad_per_s
+        tally.judge("commanded speed", float((np.abs(joints - before) / furthest).max()))
 
 
 def stroke_passes(scene: Scene) -> list[int]:
@@ -629,7 +833,15 @@ def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) ->
             name: round(max(tally.worst[name], sheets.worst[name]), 4) for name in names
         },
         "harder_braking": tally.excused,
-        "thawed_ms": sheets.excused,
+        "excused_ms": sheets.excused,
+        "under": {
+            name: {
+                "cycles": under.cycles,
+                "moved": under.moved,
+                "tool_speed_share": round(under.tool_speed_share, 4),
+            }
+            for name, under in sorted(sheets.under.items())
+        },
         "stroke_us": percentiles_us(stroke_ns),
         "limiter_us": percentiles_us(tally.pass_ns),
         "bridge_pass_us": percentiles_us(sheets.pass_ns),
@@ -674,7 +886,12 @@ def main() -> int:
             worst = result["worst_share"][name]
             print(f"{name:26} {count:6} violations, worst {worst:.4f} of the limit")
         print(f"{'braked harder (allowed)':26} {result['harder_braking']:6} commands")
-        print(f"{'thawed arms (their own)':26} {result['thawed_ms']:6} ms beyond the tool speed")
+        print(f"{'thawed, second master':26} {result['excused_ms']:6} ms beyond the tool speed")
+        for name, under in result["under"].items():
+            print(
+                f"{name:26} {under['cycles']:6} cycles, {under['moved']} of them moved, "
+                f"tool speed {under['tool_speed_share']:.4f} of the limit"
+            )
         for name, words in PASSES.items():
             p50, p99 = result[name]["p50"], result[name]["p99"]
             print(f"{words:40} p50 {p50:.0f} us, p99 {p99:.0f} us of the processor's time")

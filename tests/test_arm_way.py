@@ -257,7 +257,7 @@ async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
         assert go_on.wait(10.0)
         return "barred"
 
-    monkeypatch.setattr(way_module, "trouble_on_way", slow)
+    monkeypatch.setattr(way_module, "check_way", slow)
     lookout, way = Lookout(LEFT, RIGHT), way_between(HOME, HOME)
     assert lookout.answer(None) is None
     for _ in range(5):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from messages.topics import Topic
 from messages.types import ArmState, SheetTarget, Side
 from nodes.arm_bridge import node as bridge_node
 from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.link import CounterMonitor
 from nodes.arm_bridge.modbus import ModbusStatus, decode_status, encode_command
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.models.rigid import transform_from_rpy
@@ -55,6 +56,7 @@ class Bench:
     speeds: list[Floats] = field(default_factory=list)
     bridges: dict[str, ArmBridge] = field(default_factory=dict)
     targets: int = 0
+    tick_ns: int = TICK_NS
     _sleepers: list[tuple[int, asyncio.Future[None]]] = field(default_factory=list)
     _beats: dict[str, tuple[int, asyncio.Task[None] | None]] = field(default_factory=dict)
 
@@ -106,7 +108,7 @@ class Bench:
             bridge.deliver("sheet_target", target, self.header("planner", self.targets))
 
     async def pass_tick(self) -> None:
-        now_ns = self.clock.now_ns() + TICK_NS
+        now_ns = self.clock.now_ns() + self.tick_ns
         self.clock.move_to(now_ns)
         due = [one for one in self._sleepers if one[0] <= now_ns]
         self._sleepers = [one for one in self._sleepers if one[0] > now_ns]
@@ -141,6 +143,7 @@ class Link:
     bench: Bench
     side: str
     sequence: int = 0
+    counters: CounterMonitor = field(default_factory=CounterMonitor)
 
     def due(self, now_ns: int) -> bool:
         return True
@@ -157,7 +160,11 @@ class Link:
         self.bench.speeds.append(controller.servo.velocity_rad_per_s.copy())
         await self.bench.sleep(ANSWER_S)
         self.bench.twin._advance(self.side)
-        return decode_status(controller.status_registers())
+        status = decode_status(controller.status_registers())
+        freshness = self.counters.judge(
+            (status.time_us, status.cycle), now_ns, may_restart=mode == "idle"
+        )
+        return replace(status, freshness=freshness)
 
     def close(self) -> None:
         pass

@@ -17,15 +17,20 @@ from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, pace, slowed
 from nodes.arm_bridge.kinematics import UnreachableError
 from nodes.arm_bridge.limiter import (
+    SheetLimits,
+    bounded_step,
     braked,
     limited,
     place_trouble,
+    relaxed_limits,
     sheet_trouble,
     step_trouble,
     with_tool_speed,
     within_range,
 )
-from nodes.arm_bridge.way import START_BOUNDS, Way, lag
+from nodes.arm_bridge.link import Freshness
+from nodes.arm_bridge.standstill import MAX_RESTART_SHIFT_M, StandstillMonitor, edge_shift_m
+from nodes.arm_bridge.way import START_BOUNDS, Alignment, Way, lag
 from nodes.models.motion import (
     EdgeBound,
     SheetBounds,
@@ -62,6 +67,8 @@ MEASURED_SLACK_M = 0.002
 SLACK_STRETCH = 1.0005
 """A sheet this long pulls with a tenth of a newton: let go."""
 
+NO_MOTION = np.zeros(6)
+
 FAR_BEYOND = 1.1
 """A sheet that seems longer than so many times its limit is no sheet: nothing relaxes."""
 
@@ -74,12 +81,24 @@ JUMP_RAD = 0.35
 LET_GO_AFTER_S = 0.5
 """An arm without a target lets the sheet go after so long: a moment's gap is not worth it."""
 
+NOT_BELIEVED = {
+    Freshness.STALLED: "the counters of its status stand still, its joints are not believed",
+    Freshness.REVERSED: "the counters of its status run backwards, its joints are not believed",
+}
+
 READY_TOGETHER_S = 1.0
 """An arm that was told to be ready is no longer, if the other has not become so by then."""
 
 OLDEST_ARMING_S = 1.0
 """An older word was held up on the way; who gave it may no longer mean it."""
 
+
+ALIGNED_RAD = 1e-4
+"""Joints this near to the end of an alignment are there."""
+
+MAX_FUTURE_S = 0.02
+"""A state of the other arm from further in the future cannot be right.  Measured clocks are off by
+less, and a state that was believed would stay fresh for as long as it lies ahead."""
 
 LOOK_AGAIN_S = 0.5
 """How long a barred way stays barred before it is looked at again, the target having moved on."""
@@ -119,10 +138,15 @@ class OtherArm:
         )
 
     @property
-    def is_somewhere(self) -> bool:
-        """Whether joints and poses are numbers; else it is as good as silent."""
-        places = (self.joints_rad, self.world_from_flange, self.world_from_flange_commanded)
-        return all(bool(np.isfinite(place).all()) for place in places)
+    def invalid_reason(self) -> str | None:
+        """Why nothing can be done with this state, or None; it is then as good as none."""
+        if not np.isfinite(self.joints_rad).all():
+            return "its joints are not finite"
+        if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
+            return "its flange is not a rigid pose"
+        if self.age_s < -MAX_FUTURE_S:
+            return f"it is of {-self.age_s:.3g} s in the future"
+        return None
 
     @property
     def estopped(self) -> bool:
@@ -175,12 +199,18 @@ class ArmControl:
         self._unready_since = ""
         self._stood_down: str | None = None
         self._waited_s = 0.0
-        self._clear_way: Way | None = None
+        self._clear_way: tuple[Way, Alignment | None] | None = None
+        self._alignment: Alignment | None = None
+        self._aligned_s = 0.0
+        self._relaxed_limits: SheetLimits
         self._barred: tuple[str, float] | None = None
         self._together = False
         self._patience = patience
         self._largest_lag_rad = largest_lag_rad
         self._velocity = np.zeros(6)
+        self._standstill = StandstillMonitor()
+        self._has_commanded = False
+        self._silence = ""
         self._sheet: SheetMotion | None = None
         self._settled = False
         self._clear_arm = False
@@ -230,26 +260,42 @@ class ArmControl:
     def lose_connection(self, text: str) -> None:
         """The arm cannot be reached: forget all but a latched fault or e-stop."""
         self.measured_rad = None
+        self._standstill.forget()
         self.mode, self.reason = "disconnected", text
         self._hinder(text)
         self._has_pulled = False
         self._forget_motion()
 
-    def take_measurement(self, joints_rad: Floats, arm_faults: tuple[str, ...]) -> None:
-        """What the arm answered; the first answer after a connection starts from there."""
-        if self.measured_rad is None:
-            self._start_at(joints_rad)
-        self.measured_rad, self._missed = joints_rad, False
-        self.last_measured_rad = joints_rad
+    def take_measurement(
+        self,
+        joints_rad: Floats,
+        arm_faults: tuple[str, ...],
+        freshness: Freshness = Freshness.FRESH,
+    ) -> None:
+        """Take over what the arm answered: joints (6,) where they are believed, and its faults."""
+        self._missed = False
+        self._standstill.on_measurement(joints_rad, freshness)
+        if self.last_measured_rad is None or freshness in (Freshness.FIRST, Freshness.FRESH):
+            self.last_measured_rad = joints_rad
+        if not freshness.is_believed and not self.faults:
+            self.faults = (f"arm: {NOT_BELIEVED[freshness]}",)
+        self.measured_rad = self.last_measured_rad
+        if not self._has_commanded:
+            self.commanded_rad = self.measured_rad
         if arm_faults == ("watchdog: no command",):
-            # The cycle came late, the arm has stopped by itself: begin again from where it is.
-            self._start_at(joints_rad)
-            self._clear_arm = True
+            # The cycle came late, the arm has stopped by itself: begin again from where it stands.
+            self._stop_short()
             self.mode, self.reason = "stopping", "the arm's watchdog stopped it"
             self._hinder(self.reason)
             self._has_pulled = False
         elif arm_faults and not self.faults:
             self.faults = tuple(f"arm: {text}" for text in arm_faults)
+
+    def _stop_short(self) -> None:
+        """The arm stands without a command of this bridge: tell it to be idle."""
+        self._forget_motion()
+        self._standstill.restart()
+        self._clear_arm = True
 
     def interrupt(self) -> None:
         """Come to rest and begin anew: the scene has changed under the motion."""
@@ -289,8 +335,7 @@ class ArmControl:
             return False
         self.estop_reason, self.faults = None, ()
         if self.measured_rad is not None:
-            self._start_at(self.measured_rad)
-            self._clear_arm = True
+            self._stop_short()
         return True
 
     def take_arming(self, arming: Arming, age_s: float) -> str | None:
@@ -327,7 +372,7 @@ class ArmControl:
         elif self.faults:
             why = self.faults[0]
         elif other is None or silent:
-            why = "the other arm is silent"
+            why = self._silence
         elif other.trouble is not None:
             why = other.trouble
         elif goal is None or not goal.overdue_s <= self._patience.stop_after_s:
@@ -354,13 +399,12 @@ class ArmControl:
         clock_trouble: why it cannot be known how old goal and other arm are; empty: it is.
         """
         measured = self.measured_rad
-        if measured is None:
-            return Command("idle", self.commanded_rad)
-        if self._clear_arm:
-            self._clear_arm = False
-            return Command("idle", measured)
-        if other is not None and not other.is_somewhere:
-            other = None
+        if measured is None or self._clear_arm:
+            self._clear_arm = self._clear_arm and measured is None
+            return self._send("idle", self.commanded_rad, geometry, step_s)
+        self._silence = "the other arm is silent"
+        if other is not None and (invalid := other.invalid_reason) is not None:
+            self._silence, other = f"state of the other arm: {invalid}", None
         self._watch(geometry, other, measured)
         self._look_for_hindrance(goal, other)
         if clock_trouble:
@@ -387,7 +431,7 @@ class ArmControl:
     ) -> Command:
         """Nothing is wrong with this arm: go with the target, if there are target and other arm."""
         if other is None or not other.age_s <= self._patience.stop_after_s:
-            return self._stop("idle", "the other arm is silent", geometry, step_s)
+            return self._stop("idle", self._silence, geometry, step_s)
         if other.trouble is not None:
             return self._stop_and_relax("idle", other.trouble, geometry, other, step_s)
         if goal is None or not self.ready or not other.ready:
@@ -436,10 +480,14 @@ class ArmControl:
         late = max(goal.overdue_s, other.age_s - self._patience.hold_after_s)
         if late > self._patience.hold_after_s:
             self.mode, self.reason = "hold", "sheet target or other arm late"
+            if self._alignment is not None:
+                return self._align(self._alignment, geometry, other, step_s)
             sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
         else:
             self._together = self._together or other.mode == "follow"
             self.mode, self.reason = "follow", "" if self._together else "waits for the other arm"
+            if self._alignment is not None:
+                return self._align(self._alignment, geometry, other, step_s)
             share = pace(
                 geometry.world_from_edge(self.commanded_rad),
                 other.world_from_flange_commanded @ geometry.other_flange_from_edge,
@@ -460,12 +508,12 @@ class ArmControl:
         elif other is not None:
             flange = geometry.world_from_flange(measured)
             trouble = place_trouble(
-                flange, other.world_from_flange, geometry.sheet_limits, slack_m=MEASURED_SLACK_M
+                flange, other.world_from_flange, self._limits(geometry), slack_m=MEASURED_SLACK_M
             ) or sheet_trouble(
                 flange @ geometry.flange_from_edge,
                 other.world_from_flange @ geometry.other_flange_from_edge,
                 left=geometry.left,
-                limits=geometry.sheet_limits,
+                limits=self._limits(geometry),
             )
             if trouble is not None:
                 self.faults = (f"measured: {trouble}",)
@@ -482,12 +530,19 @@ class ArmControl:
 
         The other bridge asks the same of the same two arms.  Neither moves before both follow.
         """
+        if not self._stands_still(measured):
+            return self._stop("hold", "waits until the arm stands still", geometry, step_s)
+        if (doubt := self._restart_doubt(measured)) is not None:
+            return self._stop("hold", doubt, geometry, step_s)
         sheet = geometry.sheet_between(
             geometry.world_from_edge(measured),
             other.world_from_flange @ geometry.other_flange_from_edge,
         )
-        if self._clear_way is not None and self._clear_way.leads_to(goal.motion):
-            return self._begin(sheet, measured)
+        if self._clear_way is not None:
+            way, alignment = self._clear_way
+            if way.leads_to(goal.motion) and way.begins_at(measured, other.joints_rad):
+                self._restart_at(measured)
+                return self._begin(sheet, alignment, geometry, other, step_s)
         reason = "looks whether the way is clear"
         if self._barred is not None:
             reason, since_s = self._barred
@@ -496,21 +551,55 @@ class ArmControl:
             self.question = Way(sheet, goal.motion, measured, other.joints_rad)
         return self._stop("hold", reason, geometry, step_s)
 
-    def take_way(self, way: Way, trouble: str | None) -> None:
-        """The answer to the question; to one that is no longer asked it is thrown away."""
+    def take_way(self, way: Way, found: Alignment | str | None) -> None:
+        """Take the answer to the question: how to begin, or why not; None: to begin as it stands.
+
+        The answer to a question that is no longer asked is thrown away.
+        """
         if way is not self.question:
             return
         self.question = None
-        self._clear_way = way if trouble is None else None
-        self._barred = None if trouble is None else (trouble, 0.0)
+        if isinstance(found, str):
+            self._clear_way, self._barred = None, (found, 0.0)
+        else:
+            self._clear_way, self._barred = (way, found), None
 
-    def _begin(self, sheet: SheetMotion, measured: Floats) -> Command:
+    def _begin(
+        self,
+        sheet: SheetMotion,
+        alignment: Alignment | None,
+        geometry: ArmGeometry,
+        other: OtherArm,
+        step_s: float,
+    ) -> Command:
         """The first command of a motion is the measured pose."""
-        self._start_at(measured)
-        self._sheet = sheet
+        self._sheet = sheet if alignment is None else alignment.sheet
+        self._alignment, self._aligned_s = alignment, 0.0
+        flange = geometry.world_from_flange(self.commanded_rad)
+        self._relaxed_limits = relaxed_limits(
+            geometry.sheet_limits,
+            flange,
+            flange @ geometry.flange_from_edge,
+            other.world_from_flange,
+            other.world_from_flange @ geometry.other_flange_from_edge,
+            left=geometry.left,
+        )
         self._has_pulled = True
         self.mode, self.reason = "follow", "waits for the other arm"
-        return Command("move", measured)
+        return self._send("move", self.commanded_rad, geometry, step_s)
+
+    def _align(
+        self, alignment: Alignment, geometry: ArmGeometry, other: OtherArm, step_s: float
+    ) -> Command:
+        """Go on with the alignment, if this arm does not wait; then with the sheet."""
+        if self.mode == "follow" and self._together:
+            self._aligned_s += step_s
+        goal_rad = alignment.joints_at(self._aligned_s)
+        command = self._lead(goal_rad, geometry, other, step_s)
+        left_rad = float(np.abs(self.commanded_rad - alignment.to_rad).max())
+        if self._aligned_s >= alignment.duration_s and left_rad <= ALIGNED_RAD and self._together:
+            self._alignment = None
+        return command
 
     def _towards(
         self,
@@ -545,20 +634,30 @@ class ArmControl:
             return self._fail(
                 f"joints would leap by {np.degrees(jump):.0f} degrees", geometry, step_s
             )
+        self._sheet = sheet
+        return self._lead(goal_rad, geometry, other, step_s)
+
+    def _limits(self, geometry: ArmGeometry) -> SheetLimits:
+        """The limits of the sheet that hold now: while the arms align, wide enough to begin."""
+        return geometry.sheet_limits if self._alignment is None else self._relaxed_limits
+
+    def _lead(
+        self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
+    ) -> Command:
+        """Go towards joints (6,), through the limiter; a sheet that would suffer is a fault."""
         velocity = self._limited(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
-        trouble = place_trouble(
-            flange, other.world_from_flange_commanded, geometry.sheet_limits
-        ) or sheet_trouble(
+        limits = self._limits(geometry)
+        trouble = place_trouble(flange, other.world_from_flange_commanded, limits) or sheet_trouble(
             flange @ geometry.flange_from_edge,
             other.world_from_flange_commanded @ geometry.other_flange_from_edge,
             left=geometry.left,
-            limits=geometry.sheet_limits,
+            limits=limits,
         )
         if trouble is not None:
             return self._fail(f"commanded: {trouble}", geometry, step_s)
-        self._sheet, self._goal_rad = sheet, goal_rad
-        return self._move(velocity, step_s)
+        self._goal_rad = goal_rad
+        return self._move(velocity, geometry, step_s)
 
     def _fail(self, text: str, geometry: ArmGeometry, step_s: float) -> Command:
         self.faults = (text,)
@@ -588,14 +687,21 @@ class ArmControl:
             return self._stop(rest_mode, reason, geometry, step_s)
         if between.stretch_ratio > FAR_BEYOND * limits.longest_m / limits.width_m:
             return self._stop(rest_mode, f"{reason}; no sheet can be so long", geometry, step_s)
-        if self._relax_from is None or self._sheet is None:
-            self._start_at(measured)
-            self._sheet, self._relax_from = between, between.stretch_ratio
-        trailing = step_trouble(self.commanded_rad, measured, self._largest_lag_rad)
-        if trailing is not None:
+        starts = self._relax_from is None or self._sheet is None
+        if starts and not self._stands_still(measured):
+            return self._stop(rest_mode, reason, geometry, step_s)
+        doubt = (
+            self._restart_doubt(measured)
+            if starts
+            else step_trouble(self.commanded_rad, measured, self._largest_lag_rad)
+        )
+        if doubt is not None:
             # It does not obey: to go on would be a leap once it does.
             self._has_pulled = False
-            return self._stop(rest_mode, f"{reason}; {trailing}", geometry, step_s)
+            return self._stop(rest_mode, f"{reason}; {doubt}", geometry, step_s)
+        if self._relax_from is None or self._sheet is None:
+            self._restart_at(measured)
+            self._sheet, self._relax_from = between, between.stretch_ratio
         # Alone, this arm has to give way by the whole of the stretch, twice its share.
         target = replace(
             self._sheet,
@@ -616,7 +722,7 @@ class ArmControl:
             return self._stop(rest_mode, reason, geometry, step_s)
         self._sheet, self._goal_rad = sheet, goal_rad
         self.mode, self.reason = "relax", reason
-        return self._move(velocity, step_s)
+        return self._move(velocity, geometry, step_s)
 
     def _stop(
         self, rest_mode: ArmMode, reason: str, geometry: ArmGeometry, step_s: float
@@ -626,7 +732,8 @@ class ArmControl:
         self.reason = reason
         if self.at_rest:
             self.mode = rest_mode
-            return Command("idle" if rest_mode == "idle" else "stop", self.commanded_rad)
+            mode = "idle" if rest_mode == "idle" else "stop"
+            return self._send(mode, self.commanded_rad, geometry, step_s)
         self.mode = "stopping"
         slower = braked(self._velocity, limits=geometry.joint_limits, step_s=step_s)
         velocity = with_tool_speed(
@@ -644,7 +751,7 @@ class ArmControl:
             limits=geometry.joint_limits,
             step_s=step_s,
         )
-        return self._move(velocity, step_s)
+        return self._move(velocity, geometry, step_s)
 
     def _limited(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
         """Joint velocities towards a goal that moves as it did since the last cycle."""
@@ -660,21 +767,74 @@ class ArmControl:
             step_s=step_s,
         )
 
-    def _move(self, velocity: Floats, step_s: float) -> Command:
+    def _move(self, velocity: Floats, geometry: ArmGeometry, step_s: float) -> Command:
         self._velocity = velocity
-        self.commanded_rad = self.commanded_rad + velocity * step_s
-        return Command("move", self.commanded_rad)
+        return self._send("move", self.commanded_rad + velocity * step_s, geometry, step_s)
 
-    def _start_at(self, joints_rad: Floats) -> None:
+    def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
+        """Return the command for these joints; every command is made here.
+
+        Whatever has been decided, it leads no further from the last commanded joints than joint
+        speeds and tool speed allow.  A decision that would lead further is a fault.
+        """
+        before = self.commanded_rad
+        bounded = bounded_step(
+            before,
+            joints_rad,
+            tool_points=geometry.tool_points,
+            max_tool_speed=geometry.max_tool_speed,
+            limits=geometry.joint_limits,
+            step_s=step_s,
+        )
+        if bounded is not joints_rad:
+            self._velocity = (bounded - before) / step_s
+            self.faults = self.faults or ("commanded: a step beyond the joint or tool speed",)
+        self.commanded_rad = bounded
+        self._has_commanded = self._has_commanded or mode == "move"
+        if mode != "move":
+            self._velocity = np.zeros(6)
+        self._standstill.on_command(NO_MOTION if self.at_rest else self._velocity, step_s)
+        return Command(mode, bounded)
+
+    def _is_where_sent(self, measured: Floats) -> bool:
+        """Whether the arm stands at its last command, near enough to start from the measurement."""
+        shift_m = edge_shift_m(self.commanded_rad, measured)
+        return not self._has_commanded or shift_m <= MAX_RESTART_SHIFT_M
+
+    def _stands_still(self, measured: Floats) -> bool:
+        return self._standstill.is_standing(where_sent=self._is_where_sent(measured))
+
+    def _restart_doubt(self, measured: Floats) -> str | None:
+        """Why the last commanded joints may not be forgotten for the measured ones, or None.
+
+        For an arm that stands still.  One that stands where it was sent to may start from there.
+        Elsewhere, either the arm has not obeyed or the measurement is wrong, which is a leap if it
+        is believed.
+        """
+        if self._is_where_sent(measured):
+            return None
+        monitor = self._standstill
+        if monitor.is_alive and not monitor.has_jumped:
+            return None
+        angle = float(np.degrees(np.abs(self.commanded_rad - measured).max()))
+        why = "leapt before" if monitor.has_jumped else "are frozen"
+        return (
+            f"the arm stands {angle:.1f} degrees off its command by measured joints that {why}: "
+            "check the arm, then restart its bridge"
+        )
+
+    def _restart_at(self, measured: Floats) -> None:
+        """Forget the last commanded joints: the next command goes on from the measured ones."""
         self._forget_motion()
-        self.commanded_rad = joints_rad.copy()
+        self.commanded_rad = measured.copy()
+        self._standstill.has_jumped = False
 
     def _forget_motion(self) -> None:
         self._velocity = np.zeros(6)
         self._leave_way()
 
     def _leave_way(self) -> None:
-        self._sheet = self._goal_rad = self._relax_from = self._clear_way = None
+        self._sheet = self._goal_rad = self._relax_from = self._clear_way = self._alignment = None
         self._settled = self._together = False
 
 

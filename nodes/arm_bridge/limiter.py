@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,13 @@ SHORTEST_STEP_S, LONGEST_STEP_S = 1e-6, 10.0
 
 LEAST_SHARE = 0.02
 """Below this share of the way from braking to the wanted velocity it is not worth looking."""
+
+WITHIN = 1.0 + 1e-6
+"""A step that is longer than its limit by rounding errors is within it."""
+
+RELAXED_M, RELAXED_RAD = 0.002, 0.01
+"""By how much a limit that is exceeded at the start of a motion may be exceeded further: servos
+ripple, and measurements are noisy."""
 
 RANGE_BRAKE_SHARE = 2.0 / 3.0
 """Share of a joint's acceleration kept for stopping short of the end of its range."""
@@ -63,6 +70,15 @@ class SheetLimits:
     min_flange_distance_m: float
     workspace_min_m: Floats
     workspace_max_m: Floats
+
+    def force_n(self, length_m: float) -> float:
+        """Force on each edge of a sheet of that length."""
+        return edge_force_n(
+            length_m / self.width_m,
+            young_modulus_pa=self.young_modulus_pa,
+            height_m=self.height_m,
+            thickness_m=self.thickness_m,
+        )
 
 
 def limited(
@@ -198,6 +214,40 @@ def with_tool_speed(
     return slower
 
 
+def bounded_step(
+    joints_rad: Floats,
+    wanted_rad: Floats,
+    *,
+    tool_points: Callable[[Floats], Floats],
+    max_tool_speed: float,
+    limits: JointLimits,
+    step_s: float,
+) -> Floats:
+    """Joints (6,) no further from `joints_rad` than joint speeds and tool speed allow in a step.
+
+    Returns `wanted_rad` itself where it is near enough, else joints on the straight line to it; the
+    present joints where it is not finite.
+    """
+    if wanted_rad is joints_rad:
+        return wanted_rad
+    step = wanted_rad - joints_rad
+    ratio = float((np.abs(step) / (limits.speed_rad_per_s * step_s)).max())
+    if not np.isfinite(ratio):
+        return joints_rad
+    if ratio > WITHIN:
+        step = step / ratio
+    here = tool_points(joints_rad)
+    furthest = max_tool_speed * min(step_s, EVEN_STEP_S)
+    shift = _longest(tool_points(joints_rad + step if ratio > WITHIN else wanted_rad) - here)
+    if ratio <= WITHIN and shift <= WITHIN * furthest:
+        return wanted_rad
+    while shift > furthest:
+        step = step * (0.99 * furthest / shift)
+        shift = _longest(tool_points(joints_rad + step) - here)
+    result: Floats = joints_rad + step
+    return result
+
+
 def _longest(shifts: Floats) -> float:
     """The length of the longest of vectors (n, 3)."""
     return math.sqrt(float((shifts * shifts).sum(axis=1).max()))
@@ -215,6 +265,45 @@ def _share_within(slow: Floats, fast: Floats, furthest: float) -> float:
     return float(((root - mixed) / np.maximum(square, 1e-30)).min()) * (1.0 - 1e-3)
 
 
+def relaxed_limits(
+    limits: SheetLimits,
+    flange: Floats,
+    edge: Floats,
+    other_flange: Floats,
+    other_edge: Floats,
+    *,
+    left: bool,
+) -> SheetLimits:
+    """The limits, widened where the arms (world poses) stand beyond them or nearly so.
+
+    A motion that begins beyond a limit may lead back, and no further.  `left`: as `sheet_trouble`.
+    """
+    across = other_edge[:3, 3] - edge[:3, 3]
+    apart = other_flange[:3, 3] - flange[:3, 3]
+    longest_m = math.sqrt(float(across @ across)) + RELAXED_M
+    skewed = angle_between(across if left else -across, edge[:3, 0])
+    return replace(
+        limits,
+        longest_m=max(limits.longest_m, longest_m),
+        max_edge_force_n=max(limits.max_edge_force_n, limits.force_n(longest_m)),
+        max_twist_rad=max(
+            limits.max_twist_rad, max(skewed, _twist(edge, other_edge)) + RELAXED_RAD
+        ),
+        min_flange_distance_m=min(
+            limits.min_flange_distance_m, math.sqrt(float(apart @ apart)) - RELAXED_M
+        ),
+        workspace_min_m=np.minimum(limits.workspace_min_m, flange[:3, 3] - RELAXED_M),
+        workspace_max_m=np.maximum(limits.workspace_max_m, flange[:3, 3] + RELAXED_M),
+    )
+
+
+def _twist(edge: Floats, other_edge: Floats) -> float:
+    """Angle between two edges' orientations, rad."""
+    # Of two rotations' difference the Frobenius norm is sqrt(8) sin(half the angle between them).
+    apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
+    return 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
+
+
 def sheet_trouble(
     edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits
 ) -> str | None:
@@ -226,17 +315,10 @@ def sheet_trouble(
     distance = math.sqrt(float(across @ across))
     if not distance <= limits.longest_m:
         return f"sheet of {distance * 1e3:.1f} mm, at most {limits.longest_m * 1e3:.1f} mm"
-    force = edge_force_n(
-        distance / limits.width_m,
-        young_modulus_pa=limits.young_modulus_pa,
-        height_m=limits.height_m,
-        thickness_m=limits.thickness_m,
-    )
+    force = limits.force_n(distance)
     if not force <= limits.max_edge_force_n:
         return f"edge force {force:.1f} N, at most {limits.max_edge_force_n:.1f} N"
-    # Of two rotations' difference the Frobenius norm is sqrt(8) sin(half the angle between them).
-    apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
-    twist = 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
+    twist = _twist(edge, other_edge)
     if not twist <= limits.max_twist_rad:
         return (
             f"edges turned by {np.degrees(twist):.1f} degrees to one another, "

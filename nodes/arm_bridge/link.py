@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +14,12 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 JOINTS = 6
+
+MAX_UNCHANGED_S = 0.05
+"""Counters that stand still for longer are stalled.  Within a controller's cycle (7.1 ms) two
+exchanges may see the same counters; 50 ms are seven such cycles."""
+
+_CIRCLE = 2**32
 
 
 class ArmLinkError(Exception):
@@ -31,12 +38,62 @@ class ArmAnswerError(ArmLinkError):
     """The answer is not of this protocol, is damaged, or belongs to another command."""
 
 
+class Freshness(StrEnum):
+    """What the controller's counters say about the age of the measured joints."""
+
+    FIRST = "first"
+    """First answer, or first after the controller has restarted: there is nothing to compare."""
+    FRESH = "fresh"
+    """The counters have advanced: the joints have been measured again."""
+    REPEATED = "repeated"
+    """The counters of the answer before; not for longer than MAX_UNCHANGED_S."""
+    STALLED = "stalled"
+    """The counters have stood still for longer than MAX_UNCHANGED_S."""
+    REVERSED = "reversed"
+    """A counter runs backwards: the joints are older than those of the answer before."""
+
+    @property
+    def is_believed(self) -> bool:
+        """Whether the measured joints may be used."""
+        return self not in (Freshness.STALLED, Freshness.REVERSED)
+
+
+class CounterMonitor:
+    """Compares a controller's 32-bit counters from answer to answer; they may wrap."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, ...] = ()
+        self._advanced_ns: list[int] = []
+
+    def judge(self, counters: tuple[int, ...], now_ns: int, *, may_restart: bool) -> Freshness:
+        """Return the freshness of an answer with these counters.
+
+        counters: the first one counts measurements (or is their time); all must go on.  now_ns: of
+        this computer.  may_restart: a counter that runs backwards means a restarted controller.
+        """
+        steps = [(new - old) % _CIRCLE for new, old in zip(counters, self._last, strict=False)]
+        reverses = any(step >= _CIRCLE // 2 for step in steps)
+        if not self._last or (reverses and may_restart):
+            self._last, self._advanced_ns = counters, [now_ns] * len(counters)
+            return Freshness.FIRST
+        if reverses:
+            return Freshness.REVERSED
+        self._last = counters
+        for number, step in enumerate(steps):
+            if step > 0:
+                self._advanced_ns[number] = now_ns
+        if (now_ns - min(self._advanced_ns)) * 1e-9 > MAX_UNCHANGED_S:
+            return Freshness.STALLED
+        return Freshness.FRESH if steps[0] > 0 else Freshness.REPEATED
+
+
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """What an arm answers: joints (6,) rad as measured, and what is wrong with it."""
+    """What an arm answers: joints (6,) rad as measured, what is wrong with it, and how fresh."""
 
     joints_rad: Floats
     faults: tuple[str, ...]
+    freshness: Freshness = field(default=Freshness.FIRST, kw_only=True)
 
 
 class ArmLink(Protocol):

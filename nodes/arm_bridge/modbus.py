@@ -13,7 +13,7 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from nodes.arm_bridge.link import (
     ArmRefusedError,
     ArmSilentError,
     ArmStatus,
+    CounterMonitor,
     be_cancelled,
     checked_joints,
 )
@@ -215,6 +216,7 @@ class ModbusLink:
         self._client: AsyncModbusTcpClient | None = None
         self._framer: _Framer | None = None
         self._sequence = 0
+        self._counters = CounterMonitor()
         self.connections = 0
 
     @property
@@ -246,7 +248,10 @@ class ModbusLink:
         finally:
             be_cancelled()
         self._pause_s = 0.0
-        return status
+        freshness = self._counters.judge(
+            (status.time_us, status.cycle), now_ns, may_restart=mode == "idle"
+        )
+        return replace(status, freshness=freshness)
 
     async def _open(self) -> AsyncModbusTcpClient:
         if self._client is not None and self._client.connected:

@@ -14,7 +14,7 @@ import math
 import socket
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from nodes.arm_bridge.link import (
     ArmRefusedError,
     ArmSilentError,
     ArmStatus,
+    CounterMonitor,
     be_cancelled,
     checked_joints,
 )
@@ -186,6 +187,7 @@ class MxtLink:
         self._move_packet = pose_packet if poses else joints_packet
         self._socket: socket.socket | None = None
         self._count: int | None = None
+        self._counters = CounterMonitor()
         self._unanswered = 0
 
     def due(self, now_ns: int) -> bool:
@@ -216,7 +218,8 @@ class MxtLink:
         finally:
             be_cancelled()
         self._count, self._unanswered = status.count, 0
-        return status
+        freshness = self._counters.judge((status.count,), now_ns, may_restart=mode == "idle")
+        return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:
         """The socket; bound to the controller's address, others' packets do not reach it."""

@@ -137,7 +137,7 @@ class ArmBridge(Node):
                 self.log.warning("arm lost", problem=str(error))
             return
         newest.answered(self.clock.now_ns())
-        control.take_measurement(status.joints_rad, status.faults)
+        control.take_measurement(status.joints_rad, status.faults, status.freshness)
 
     def _goal(self) -> Goal | None:
         """The newest sheet target, carried on to the moment when this cycle's command acts."""

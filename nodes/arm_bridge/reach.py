@@ -51,6 +51,8 @@ PLACE_LIMITS = (
     "flange distance",
     "edge force",
 )
+COMMAND_LIMITS = ("reach", *RANGES, "workspace", "flange distance", "edge force")
+"""Those without which the limiter lets no command through."""
 SPEED_LIMITS = (*SPEEDS, "tool speed")
 LIMITS = (*PLACE_LIMITS, *SPEED_LIMITS)
 """In the order in which the first that is not kept is said to bind."""
@@ -412,7 +414,7 @@ def _track(
         share, step = 0.0, 0.25
         while share < 1.0:
             ahead = min(share + step, 1.0)
-            place, before = _between(near, far, ahead), track[-1]
+            place, before = sheet_between(near, far, ahead), track[-1]
             whole = (number + ahead) / (len(corners) - 1)
             there = Step(
                 place,
@@ -492,7 +494,43 @@ def _joints_there(
         ) from error
 
 
-def _between(start: SheetMotion, goal: SheetMotion, share: float) -> SheetMotion:
+def hold_step(
+    left: ArmGeometry, right: ArmGeometry, sheet: SheetMotion, near: Step, *, share: float
+) -> Step:
+    """Both arms' joints that hold the sheet there, near those of another step; else PathError.
+
+    All limits of commands are kept: ranges, workspace, distance of the flanges and edge force, but
+    not the distances to singularities.  share: of the path, for the error.
+    """
+    step = Step(
+        sheet,
+        _joints_there(left, sheet, near.left_rad, share=share),
+        _joints_there(right, sheet, near.right_rad, share=share),
+    )
+    places = _places([sheet])
+    flanges = [flange_poses(arm, places) for arm in (left, right)]
+    for number, (arm, joints) in enumerate(((left, step.left_rad), (right, step.right_rad))):
+        margins = _margins(
+            arm,
+            branch_of(joints),
+            joints=joints[None],
+            flanges=flanges[number],
+            others=flanges[1 - number],
+            places=places,
+        )
+        for limit in COMMAND_LIMITS:
+            if not margins[limit][0] >= 0.0:
+                raise PathError(
+                    f"{limit} is not kept",
+                    side=arm.side,
+                    limit=limit,
+                    share=share,
+                    world_from_sheet=sheet.world_from_sheet,
+                )
+    return step
+
+
+def sheet_between(start: SheetMotion, goal: SheetMotion, share: float) -> SheetMotion:
     """The sheet at rest on the straight way between two places."""
     begin, end = start.world_from_sheet, goal.world_from_sheet
     turn = vector_from_rotation(end[:3, :3] @ begin[:3, :3].T)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from messages.base import Header
 from messages.methods import SheetForceMethod, chosen
 from messages.scene import Scene
@@ -20,6 +22,11 @@ from nodes.planner.yielding import Yielding
 FIRST_LEAD_S = 0.05
 CLOCK_SLACK_S = 0.005
 """A fingertip from further in the future than this is no measurement."""
+
+
+def _is_finite(fingertip: Fingertip) -> bool:
+    motion = fingertip.position_world_m, fingertip.velocity_world_m_per_s, fingertip.ahead_world_m
+    return all(bool(np.isfinite(values).all()) for values in motion)
 
 
 class Planner(Node):
@@ -88,6 +95,8 @@ class Planner(Node):
         age_s = (header.publish_ns - source_ns) * 1e-9
         if not fingertip.valid:
             planned = plan.hold(f"fingertip: {fingertip.reason}", step_s)
+        elif not _is_finite(fingertip):
+            planned = plan.hold("fingertip: numbers that are not finite", step_s)
         elif not -CLOCK_SLACK_S <= age_s <= self.parameters.oldest_s:
             planned = plan.hold(f"fingertip is {age_s * 1e3:.0f} ms old", step_s)
         else:
