@@ -7,6 +7,7 @@ Every patience is stretched alike, so that the pauses of a busy machine are not 
 from __future__ import annotations
 
 import asyncio
+import zlib
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
@@ -19,8 +20,9 @@ import pytest
 from messages.base import Header, Message
 from messages.types import ArmState, EStop
 from nodes.arm_bridge.link_drivers import link_for
+from nodes.arm_bridge.modbus import MAGIC
 from nodes.twin import arms as twin_arms
-from nodes.twin.arms import STATE_FAULT, Fault
+from nodes.twin.arms import SPEED_RAD_PER_S, STATE_FAULT, Fault, Servo, forward
 from tests.network import Cut
 from tests.test_arm_loop import (
     AT_FRONT,
@@ -94,12 +96,42 @@ def to_and_fro(radius: float, seconds: float) -> Path3:
     return path
 
 
+class FalseStatus(Cut):
+    """A proxy that repeats a part of the arm's status, with a right CRC and a true echo."""
+
+    REPLY_BYTES, BLOCK_AT = 61, 9
+    JOINTS, COUNTERS = slice(20, 44), slice(8, 16)
+
+    def __init__(self, target_port: int) -> None:
+        super().__init__(target_port)
+        self.repeats: tuple[slice, ...] = ()
+        self._last = b""
+
+    async def _pass_on(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with suppress(ConnectionError):
+            while data := await reader.read(4096):
+                writer.write(self._changed(data))
+        writer.transport.abort()
+
+    def _changed(self, data: bytes) -> bytes:
+        block = bytearray(data[self.BLOCK_AT :])
+        if len(data) != self.REPLY_BYTES or block[:2] != MAGIC.to_bytes(2, "big"):
+            return data
+        for part in self.repeats:
+            block[part] = self._last[part]
+        block[-4:] = zlib.crc32(block[:-4]).to_bytes(4, "big")
+        self._last = bytes(block)
+        return data[: self.BLOCK_AT] + bytes(block)
+
+
 @asynccontextmanager
-async def mid_stroke(seconds: float = 6.0, **bridge: Any) -> AsyncIterator[Stroke]:
+async def mid_stroke(
+    seconds: float = 6.0, proxy: type[Cut] = Cut, **bridge: Any
+) -> AsyncIterator[Stroke]:
     """Both arms follow a stroking finger; the left bridge reaches its arm through a cable."""
     async with (
         running_rig(PATIENT_TWIN, **(PATIENT | bridge)) as (rig, nodes),
-        Cut(nodes["twin"].servers["left"].port) as cut,
+        proxy(nodes["twin"].servers["left"].port) as cut,
     ):
         left = nodes["left"]
         left._link.close()
@@ -116,6 +148,44 @@ async def mid_stroke(seconds: float = 6.0, **bridge: Any) -> AsyncIterator[Strok
             task.cancel()
             with suppress(asyncio.CancelledError):
                 await task
+
+
+@pytest.mark.parametrize(
+    ("repeats", "words"),
+    [
+        ((FalseStatus.JOINTS,), "trails its command"),
+        ((FalseStatus.JOINTS, FalseStatus.COUNTERS), "counters of its status stand still"),
+    ],
+    ids=["joints", "joints and counters"],
+)
+async def test_a_status_that_is_repeated_makes_no_arm_leap(
+    repeats: tuple[slice, ...], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    speeds: list[float] = []
+    advance = Servo.advance
+
+    def watched(servo: Servo, wanted: np.ndarray, duration_s: float, **kinds: Any) -> None:
+        before = forward(servo.joints_rad)[:3, 3]
+        advance(servo, wanted, duration_s, **kinds)
+        if duration_s > 1e-4:
+            shift = np.linalg.norm(forward(servo.joints_rad)[:3, 3] - before)
+            speeds.append(float(shift) / duration_s)
+
+    async with mid_stroke(2.5, FalseStatus) as stroke:
+        assert isinstance(stroke.cut, FalseStatus)
+        monkeypatch.setattr(Servo, "advance", watched)
+        stroke.cut.repeats = repeats
+        await until(lambda: words in stroke.reasons())
+        await until(lambda: stroke.modes() <= {"idle", "fault"})
+        await stroke.lasts(150)
+        assert stroke.modes() <= {"idle", "fault"}
+        steps = [
+            np.abs(np.diff([state.joints_commanded_rad for state, _ in states], axis=0)).max()
+            for states in stroke.rig.states.values()
+        ]
+        # Two beats at the speed of the fastest joint.
+        assert max(steps) <= 2.0 / 140.0 * SPEED_RAD_PER_S.max()
+        assert max(speeds) <= 0.25
 
 
 @pytest.mark.parametrize(

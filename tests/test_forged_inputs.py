@@ -131,7 +131,8 @@ class ForgedBench(Bench):
 # Forged fingertips.
 
 FINGERTIPS = (
-    "jump", "nan", "infinite", "stale", "future", "fast", "path", "path nan", "behind", "covariance",
+    "jump", "nan", "infinite", "stale", "future", "fast", "path", "path nan", "behind",
+    "covariance",
 )  # fmt: skip
 
 
