@@ -268,27 +268,45 @@ def test_nothing_starts_before_fresh_measurements_confirm_a_standstill() -> None
 MS = 10**6
 
 
+def judge(
+    monitor: CounterMonitor, counters: tuple[int, ...], at_ns: int, *, may_restart: bool
+) -> Freshness:
+    """An answer that comes at once."""
+    return monitor.judge(counters, sent_ns=at_ns, received_ns=at_ns, may_restart=may_restart)
+
+
+def test_counters_of_answers_that_came_late_are_not_stalled() -> None:
+    """Two answers of the same cycle: the one came 0.1 s late, the other at once or late too."""
+    for received_ns in (101 * MS, 300 * MS):
+        monitor = CounterMonitor()
+        monitor.judge((5, 6), sent_ns=0, received_ns=100 * MS, may_restart=False)
+        found = monitor.judge((6, 6), sent_ns=100 * MS, received_ns=received_ns, may_restart=False)
+        assert found == Freshness.FRESH
+
+
 def test_counters_that_go_on_are_fresh_also_over_their_end() -> None:
     monitor, found = CounterMonitor(), []
     for number in range(6):
         counters = ((2**32 - 30_000 + 10_000 * number) % 2**32, number)
-        found.append(monitor.judge(counters, number * 10 * MS, may_restart=False))
+        found.append(judge(monitor, counters, number * 10 * MS, may_restart=False))
     assert found == [Freshness.FIRST, *[Freshness.FRESH] * 5]
 
 
 def test_counters_that_stand_still_are_repeated_then_stalled() -> None:
     for counters in ((5, 6), (5, 7)):
         monitor = CounterMonitor()
-        assert monitor.judge((5, 6), 0, may_restart=True) == Freshness.FIRST
-        assert monitor.judge(counters, 40 * MS, may_restart=True) == Freshness.REPEATED
+        assert judge(monitor, (5, 6), 0, may_restart=True) == Freshness.FIRST
+        assert judge(monitor, counters, 40 * MS, may_restart=True) == Freshness.REPEATED
         late_ns = round(MAX_UNCHANGED_S * 1e9) + MS
-        assert monitor.judge(counters, late_ns, may_restart=True) == Freshness.STALLED
-        assert monitor.judge((9, 9), late_ns + MS, may_restart=True) == Freshness.FRESH
+        assert judge(monitor, counters, late_ns, may_restart=True) == Freshness.STALLED
+        assert judge(monitor, (9, 9), late_ns + MS, may_restart=True) == Freshness.FRESH
 
 
 def test_a_measurement_time_that_goes_on_without_cycles_is_stalled_too() -> None:
     monitor = CounterMonitor()
-    found = [monitor.judge((number, 3), number * 10 * MS, may_restart=False) for number in range(8)]
+    found = [
+        judge(monitor, (number, 3), number * 10 * MS, may_restart=False) for number in range(8)
+    ]
     assert found[:6] == [Freshness.FIRST, *[Freshness.FRESH] * 5]
     assert found[6:] == [Freshness.STALLED] * 2
 
@@ -296,9 +314,9 @@ def test_a_measurement_time_that_goes_on_without_cycles_is_stalled_too() -> None
 def test_counters_that_run_backwards_are_a_restart_only_where_one_is_possible() -> None:
     for counters in ((4, 7), (6, 5)):
         monitor = CounterMonitor()
-        monitor.judge((5, 6), 0, may_restart=True)
-        assert monitor.judge(counters, MS, may_restart=False) == Freshness.REVERSED
-        assert monitor.judge(counters, MS, may_restart=True) == Freshness.FIRST
+        judge(monitor, (5, 6), 0, may_restart=True)
+        assert judge(monitor, counters, MS, may_restart=False) == Freshness.REVERSED
+        assert judge(monitor, counters, MS, may_restart=True) == Freshness.FIRST
 
 
 # Standstill.
@@ -311,7 +329,7 @@ def test_a_standstill_takes_fresh_unchanged_measurements_after_the_last_motion()
         monitor.on_measurement(GUESS + number * 1e-6, Freshness.FRESH)
     assert monitor.is_standing(where_sent=True)
     assert monitor.is_alive
-    monitor.on_command(np.full(6, 0.1), STEP_S)
+    monitor.on_command(GUESS, np.full(6, 0.1), STEP_S)
     assert not monitor.is_standing(where_sent=True)
     for number in range(3 * STANDSTILL_COUNT):
         monitor.on_measurement(GUESS + number * 0.6e-3, Freshness.FRESH)
@@ -324,6 +342,27 @@ def test_a_standstill_takes_fresh_unchanged_measurements_after_the_last_motion()
         monitor.on_measurement(GUESS, Freshness.FRESH)
     assert monitor.is_standing(where_sent=True)
     assert not monitor.is_alive, "exactly the same each time"
+
+
+def test_a_jump_is_a_change_off_the_commanded_path_that_is_too_fast() -> None:
+    def after(*readings: float, commands: int = 40) -> bool:
+        """Joint 1 follows its command by 0.5 rad/s and then reads so."""
+        monitor = StandstillMonitor()
+        velocity = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+        joints = np.zeros(6)
+        for _ in range(commands):
+            joints = joints + velocity * STEP_S
+            monitor.on_command(joints, velocity, STEP_S)
+            monitor.on_measurement(joints - 0.025 * velocity, Freshness.FRESH)
+        for reading in readings:
+            monitor.on_command(joints, np.zeros(6), STEP_S)
+            monitor.on_measurement(np.array([joints[0] + reading, 0, 0, 0, 0, 0]), Freshness.FRESH)
+        return monitor.has_jumped
+
+    assert not after(0.0, 0.0), "catches up with its command"
+    assert after(0.04), "leads its command"
+    assert after(-0.2), "far behind all recent commands"
+    assert not after(*np.linspace(-0.0125, 0.05, 60)), "moved by hand"
 
 
 joints_in_range = st.tuples(*[st.floats(0.02, 0.98)] * 6).map(

@@ -316,7 +316,8 @@ async def aim(rig: Rig, nodes: dict[str, ArmBridge], sheet: SheetMotion) -> None
 
 async def test_the_twins_arms_stand_before_a_barred_way_and_go_a_clear_one() -> None:
     sides: tuple[Side, Side] = ("left", "right")
-    async with running_rig(hold_after_s=0.1, stop_after_s=0.6) as (rig, nodes):
+    patient = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
+    async with running_rig({"watchdog_s": 0.8}, **patient) as (rig, nodes):
         servos = [nodes["twin"].servers[side].controller.servo for side in sides]
         places = [servo.joints_rad.copy() for servo in servos]
         task = asyncio.create_task(aim(rig, nodes, FAR))

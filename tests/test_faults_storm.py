@@ -162,7 +162,10 @@ class Link:
         self.bench.twin._advance(self.side)
         status = decode_status(controller.status_registers())
         freshness = self.counters.judge(
-            (status.time_us, status.cycle), now_ns, may_restart=mode == "idle"
+            (status.time_us, status.cycle),
+            sent_ns=now_ns,
+            received_ns=self.bench.clock.now_ns(),
+            may_restart=mode == "idle",
         )
         return replace(status, freshness=freshness)
 

@@ -7,7 +7,7 @@ simulated joints, the tool's by the simulator's kinematics.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from messages.base import Header, Message
 from messages.topics import Topic
 from messages.types import ArmState, EStop, Fingertip, SheetTarget
+from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.way import Alignment, Lookout, Way, check_way
 from nodes.models.rigid import transform_from_rpy
 from nodes.planner.node import Planner
 from nodes.planner.parameters import PlannerParameters
@@ -47,6 +49,27 @@ def tool_points(side: str, joints_rad: Floats) -> Floats:
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
+class Immediate(Lookout):
+    """Answers at once: a thread would take real time, and here time is virtual."""
+
+    def answer(self, question: Way | None) -> tuple[Way, Alignment | str] | None:
+        if question is None:
+            return None
+        return question, check_way(self._arm, self._other, question)
+
+
+def edge_distance_m(joints_rad: Mapping[str, Floats]) -> float:
+    """Between the middles of both clamped edges, by the simulator's kinematics."""
+    places = []
+    for side, arm in (("left", SCENE.arms.left), ("right", SCENE.arms.right)):
+        world_from_base = transform_from_rpy(
+            arm.world_from_base.position_m, arm.world_from_base.rpy_rad
+        )
+        middle = np.append(arm.flange_from_edge.position_m, 1.0)
+        places.append(world_from_base @ forward(joints_rad[side]) @ middle)
+    return float(np.linalg.norm(places[0] - places[1]))
+
+
 @dataclass
 class ForgedBench(Bench):
     """The bench with a planner, and with somebody who replaces states of the other arm."""
@@ -56,6 +79,7 @@ class ForgedBench(Bench):
     _points: dict[str, Floats] = field(default_factory=dict)
     max_tool_speed: float = 0.0
     max_joint_ratio: float = 0.0
+    longest_m: float = 0.0
     fingertips: int = 0
 
     async def set_up(self) -> None:
@@ -65,6 +89,10 @@ class ForgedBench(Bench):
             PlannerParameters(), name="planner", clock=self.clock, send=self.take
         )
         await self.planner.setup()
+        for side, other in (SIDES, SIDES[::-1]):
+            self.bridges[side]._lookout = Immediate(
+                ArmGeometry(SCENE, side), ArmGeometry(SCENE, other)
+            )
         await self.planner.step("scene", SCENE, self.header("scene", 1))
 
     def take(self, topic: Topic, message: Message, header: Header) -> None:
@@ -92,6 +120,9 @@ class ForgedBench(Bench):
             shift = np.linalg.norm(points - self._points.get(side, points), axis=1).max()
             self.max_tool_speed = max(self.max_tool_speed, float(shift) / (TICK_NS * 1e-9))
             self._points[side] = points
+        servos: Any = {side: self.twin.servers[side].controller.servo for side in SIDES}
+        length_m = edge_distance_m({side: servo.joints_rad for side, servo in servos.items()})
+        self.longest_m = max(self.longest_m, length_m)
 
     async def point(self, seconds: float, tip: Callable[[], tuple[Fingertip, Header]]) -> None:
         """Let time pass while the planner gets these fingertips."""
@@ -114,8 +145,8 @@ class ForgedBench(Bench):
     def assert_within_limits(self) -> None:
         assert self.max_tool_speed <= MAX_TOOL_SPEED
         assert self.max_joint_ratio <= 1.0
+        assert self.longest_m <= LONGEST_M
         for states in self.states.values():
-            assert max(state.edge_distance_m or 0.0 for state in states) <= LONGEST_M
             for state in states:
                 # Whoever does not follow says why.
                 assert state.mode == "follow" or state.reason or state.faults
@@ -131,17 +162,20 @@ class ForgedBench(Bench):
 # Forged fingertips.
 
 FINGERTIPS = (
-    "jump", "nan", "infinite", "stale", "future", "fast", "path", "path nan", "behind",
+    "jump", "nan", "infinite", "stale", "future", "fast", "path", "path nan", "behind", "huge",
     "covariance",
 )  # fmt: skip
+
+
+ODD = {"nan": [np.nan], "infinite": [np.inf, -np.inf], "huge": [1e300, -1e300, 1e12]}
 
 
 def forged_tip(bench: ForgedBench, kind: str, random: Random) -> tuple[Fingertip, Header]:
     honest, header = bench.honest()
     if kind == "jump":
         return fingertip(random.normal(0.0, 0.2, 3)), header
-    if kind in ("nan", "infinite"):
-        odd = float(random.choice([np.nan] if kind == "nan" else [np.inf, -np.inf, 1e300]))
+    if kind in ODD:
+        odd = float(random.choice(ODD[kind]))
         values = [AT_FRONT.copy(), np.zeros(3)]
         values[int(random.integers(2))][random.integers(3)] = odd
         tip = honest.model_copy(
@@ -151,7 +185,7 @@ def forged_tip(bench: ForgedBench, kind: str, random: Random) -> tuple[Fingertip
         path[random.integers(len(path))] = odd
         return tip.model_copy(update={"ahead_world_m": path}), header
     if kind in ("stale", "future"):
-        age_s = random.choice([0.05, 0.5, 30.0, 1e6]) * (1.0 if kind == "stale" else -1.0)
+        age_s = random.choice([0.5, 30.0, 1e6]) * (1.0 if kind == "stale" else -1.0)
         tip = fingertip(random.normal(0.0, 0.1, 3))
         return tip, replace(header, source_ns=header.source_ns - round(age_s * 1e9))
     if kind == "fast":
@@ -184,7 +218,7 @@ def run_bench(test: Callable[[ForgedBench], Awaitable[None]]) -> None:
 seeds = st.integers(0, 2**32 - 1)
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(kinds=st.lists(st.sampled_from(FINGERTIPS), min_size=1, max_size=4), seed=seeds)
 def test_forged_fingertips_move_no_arm_beyond_a_limit(kinds: list[str], seed: int) -> None:
     async def test(bench: ForgedBench) -> None:
@@ -285,7 +319,7 @@ def forger(
     return forge
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=5, deadline=None)
 @given(
     kinds=st.lists(st.sampled_from([*STATES, "future"]), min_size=1, max_size=3),
     seed=seeds,

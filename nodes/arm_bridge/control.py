@@ -245,6 +245,7 @@ class ArmControl:
         if self._missed or self.measured_rad is None:
             return False
         self._missed = True
+        self._standstill.forget()
         if self.mode == "follow":
             self.mode, self.reason = "hold", text
         return True
@@ -793,7 +794,8 @@ class ArmControl:
         self._has_commanded = self._has_commanded or mode == "move"
         if mode != "move":
             self._velocity = np.zeros(6)
-        self._standstill.on_command(NO_MOTION if self.at_rest else self._velocity, step_s)
+        velocity = NO_MOTION if self.at_rest else self._velocity
+        self._standstill.on_command(bounded, velocity, step_s)
         return Command(mode, bounded)
 
     def _is_where_sent(self, measured: Floats) -> bool:

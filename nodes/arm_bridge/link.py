@@ -65,24 +65,28 @@ class CounterMonitor:
         self._last: tuple[int, ...] = ()
         self._advanced_ns: list[int] = []
 
-    def judge(self, counters: tuple[int, ...], now_ns: int, *, may_restart: bool) -> Freshness:
+    def judge(
+        self, counters: tuple[int, ...], *, sent_ns: int, received_ns: int, may_restart: bool
+    ) -> Freshness:
         """Return the freshness of an answer with these counters.
 
-        counters: the first one counts measurements (or is their time); all must go on.  now_ns: of
-        this computer.  may_restart: a counter that runs backwards means a restarted controller.
+        counters: the first one counts measurements (or is their time); all must go on.  sent_ns,
+        received_ns: when the command was sent and its answer came, by this computer's clock.
+        may_restart: a counter that runs backwards means a restarted controller.
         """
         steps = [(new - old) % _CIRCLE for new, old in zip(counters, self._last, strict=False)]
         reverses = any(step >= _CIRCLE // 2 for step in steps)
         if not self._last or (reverses and may_restart):
-            self._last, self._advanced_ns = counters, [now_ns] * len(counters)
+            self._last, self._advanced_ns = counters, [received_ns] * len(counters)
             return Freshness.FIRST
         if reverses:
             return Freshness.REVERSED
         self._last = counters
         for number, step in enumerate(steps):
             if step > 0:
-                self._advanced_ns[number] = now_ns
-        if (now_ns - min(self._advanced_ns)) * 1e-9 > MAX_UNCHANGED_S:
+                self._advanced_ns[number] = received_ns
+        # The time between two answers is at least that from receiving one to asking for the other.
+        if (sent_ns - min(self._advanced_ns)) * 1e-9 > MAX_UNCHANGED_S:
             return Freshness.STALLED
         return Freshness.FRESH if steps[0] > 0 else Freshness.REPEATED
 

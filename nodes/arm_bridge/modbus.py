@@ -229,6 +229,8 @@ class ModbusLink:
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ModbusStatus:
         """Send one command and return the status that answers it; raises ArmLinkError."""
+        loop = asyncio.get_running_loop()
+        begun_s = loop.time()
         try:
             client = await self._open()
             self._sequence = (self._sequence + 1) & 0xFFFFFFFF
@@ -249,7 +251,10 @@ class ModbusLink:
             be_cancelled()
         self._pause_s = 0.0
         freshness = self._counters.judge(
-            (status.time_us, status.cycle), now_ns, may_restart=mode == "idle"
+            (status.time_us, status.cycle),
+            sent_ns=now_ns,
+            received_ns=now_ns + round((loop.time() - begun_s) * 1e9),
+            may_restart=mode == "idle",
         )
         return replace(status, freshness=freshness)
 

@@ -201,6 +201,8 @@ class MxtLink:
         """
         if mode == "idle":
             self._count, self._unanswered = None, 0
+        loop = asyncio.get_running_loop()
+        begun_s = loop.time()
         packet = self._move_packet(joints_rad) if mode == "move" else encode(COMMAND_NONE)
         try:
             link = await self._open()
@@ -218,7 +220,12 @@ class MxtLink:
         finally:
             be_cancelled()
         self._count, self._unanswered = status.count, 0
-        freshness = self._counters.judge((status.count,), now_ns, may_restart=mode == "idle")
+        freshness = self._counters.judge(
+            (status.count,),
+            sent_ns=now_ns,
+            received_ns=now_ns + round((loop.time() - begun_s) * 1e9),
+            may_restart=mode == "idle",
+        )
         return replace(status, freshness=freshness)
 
     async def _open(self) -> socket.socket:

@@ -38,6 +38,8 @@ def arm_state(
     """The state of an arm that has been measured at least once."""
     measured = control.last_measured_rad
     assert measured is not None
+    if other is not None and other.invalid_reason is not None:
+        other = None
     distance_m, force_n = geometry.sheet_state(
         measured, None if other is None else other.world_from_flange
     )

@@ -34,8 +34,12 @@ may be moved with its teach pendant."""
 OVERSPEED = 1.5
 """An arm may move faster than its commands by this factor while it catches up."""
 
-SPEED_MEMORY_S = 0.1
-"""Time constant with which the largest recent commanded speed is forgotten."""
+MEMORY_S = 0.1
+"""Time constant with which recent commanded speeds and joints are forgotten."""
+
+ON_PATH_RAD = 0.005
+"""A measurement within so much of the recently commanded joints is where the arm may well be, even
+if it was not measured for some time."""
 
 
 def edge_shift_m(joints_rad: Floats, other_rad: Floats) -> float:
@@ -56,6 +60,7 @@ class StandstillMonitor:
         self._count = 0
         self._anchor_rad = self._last_rad = np.full(6, np.nan)
         self._elapsed_s, self._speeds_rad_per_s = 0.0, np.zeros(6)
+        self._lowest_rad, self._highest_rad = np.full(6, np.inf), np.full(6, -np.inf)
 
     def is_standing(self, *, where_sent: bool) -> bool:
         """Whether the arm stands still; where_sent: where its last command has sent it to."""
@@ -74,12 +79,19 @@ class StandstillMonitor:
         self.restart()
         self._last_rad = np.full(6, np.nan)
 
-    def on_command(self, velocity_rad_per_s: Floats, step_s: float) -> None:
-        """Take note of a command that moves the joints (6,) so fast for `step_s`."""
+    def on_command(self, joints_rad: Floats, velocity_rad_per_s: Floats, step_s: float) -> None:
+        """Take note of a command to joints (6,) that moves them so fast for `step_s`."""
         self._elapsed_s += step_s
         speeds = np.abs(velocity_rad_per_s)
-        faded = self._speeds_rad_per_s * max(0.0, 1.0 - step_s / SPEED_MEMORY_S)
-        self._speeds_rad_per_s = np.maximum(speeds, faded)
+        kept = max(0.0, 1.0 - step_s / MEMORY_S)
+        self._speeds_rad_per_s = np.maximum(speeds, self._speeds_rad_per_s * kept)
+        if np.isfinite(self._lowest_rad[0]):
+            lower = joints_rad + kept * (self._lowest_rad - joints_rad)
+            upper = joints_rad + kept * (self._highest_rad - joints_rad)
+            self._lowest_rad = np.minimum(lower, joints_rad)
+            self._highest_rad = np.maximum(upper, joints_rad)
+        else:
+            self._lowest_rad = self._highest_rad = joints_rad
         if speeds.any():
             self.restart()
 
@@ -95,7 +107,10 @@ class StandstillMonitor:
         # Comparisons with NaN are false: after `forget` nothing has jumped and nothing stands.
         change = np.abs(joints_rad - self._last_rad)
         speeds = JUMP_SPEED_RAD_PER_S + OVERSPEED * self._speeds_rad_per_s
-        if (change > JUMP_MARGIN_RAD + speeds * self._elapsed_s).any():
+        off_path = (joints_rad < self._lowest_rad - ON_PATH_RAD) | (
+            joints_rad > self._highest_rad + ON_PATH_RAD
+        )
+        if (off_path & (change > JUMP_MARGIN_RAD + speeds * self._elapsed_s)).any():
             self.has_jumped = True
         if self._count and float(np.abs(joints_rad - self._anchor_rad).max()) <= STANDSTILL_RAD:
             self._count += 1
