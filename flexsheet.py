@@ -1,11 +1,24 @@
 """Entry of the `flexsheet` command and of every node's process.
 
+The first statements give SIGINT its default action, which ends a process without a trace of it.
+Python's own handler raises an exception in whatever runs: as a traceback in an import, or ignored
+in a callback of the garbage collector.  Commands that clean up get that handler back in `launch.cli`;
+graphs and nodes handle SIGINT in their event loop (`nodes.signals`).  Both also hold for a SIGINT
+that is ignored or blocked by inheritance: see docs/deploy.md.
+
 ROS 2 has a Python package named `launch` too.  With foreign packages named `launch`, `nodes` or
-`messages` on PYTHONPATH ours must win; so the first thing is to put our folder first.
+`messages` on PYTHONPATH ours must win; so our folder is put first.
 """
 
 from __future__ import annotations
 
+# The built-in module: `signal` itself imports others first.
+from _signal import SIG_DFL, SIG_UNBLOCK, SIGINT, pthread_sigmask, signal
+
+signal(SIGINT, SIG_DFL)
+pthread_sigmask(SIG_UNBLOCK, {SIGINT})
+
+# ruff: noqa: E402 - see above
 import atexit
 import gc
 import os

@@ -30,6 +30,7 @@ from messages.topics import Delivery, Topic, topic_named
 from messages.types import Arming, EStop, HostStatus, Status
 from nodes import node_class
 from nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
+from nodes.signals import handle_signals
 
 STATUS_PERIOD_S = 1.0
 CANCEL_AGAIN_S = 0.2
@@ -331,10 +332,9 @@ class Life:
 async def run_until_signal(config: NodeConfig) -> None:
     """Run the node until SIGINT or SIGTERM."""
     stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    await run_node(config, stop)
+    # A launcher that is gone is reported by the kernel and by the lifeline, with a signal each.
+    with handle_signals(stop.set, signal.SIGINT, signal.SIGTERM, ignore_afterwards=True):
+        await run_node(config, stop)
 
 
 def main(config_path: str) -> int:

@@ -92,15 +92,20 @@ class Child:
         try:
             with_pipe = config.model_copy(update={"ready_fd": ready_write})
             config_file.write_text(with_pipe.model_dump_json())
-            self._process = subprocess.Popen(
-                [sys.executable, str(ENTRY), "--node", str(config_file)],
-                stdin=subprocess.DEVNULL,
-                stdout=output_write,
-                stderr=output_write,
-                start_new_session=True,
-                pass_fds=(ready_write, lifeline),
-                env=environment,
-            )
+            # Python itself starts with a SIGINT that raises; the node's first statement unblocks it.
+            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                self._process = subprocess.Popen(
+                    [sys.executable, str(ENTRY), "--node", str(config_file)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=output_write,
+                    stderr=output_write,
+                    start_new_session=True,
+                    pass_fds=(ready_write, lifeline),
+                    env=environment,
+                )
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         except BaseException:
             os.close(self._output)
             os.close(self._ready_fd)
