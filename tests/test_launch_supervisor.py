@@ -26,6 +26,7 @@ from launch.plans.documents import BadInputError
 from launch.plans.plan import load_plan
 from launch.plans.planned import Plan
 from launch.running import runs, supervisor
+from launch.running.starvation import ProcessorTime, starved_s
 from launch.running.supervisor import NodeFailedError, RunningGraph
 from messages.bag import BagReader
 
@@ -214,6 +215,64 @@ async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: P
         assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
     told = "hung: no sign of life for 2 s; its log shows where; starts again in 0.01 s"
     assert f"stuck {told}" in said
+    assert not any("launch_nodes.py" in line for line in said)
+
+
+def spin_on(processor: int) -> None:
+    os.sched_setaffinity(0, {processor})
+
+
+async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(tmp_path: Path) -> None:
+    if ProcessorTime.of(os.getpid()) is None:
+        pytest.skip("this kernel keeps no statistics of its scheduler")
+    plan = plan_of(tmp_path, beacon=beacon(liveness_s=1.5))
+    said: list[str] = []
+    processor = min(os.sched_getaffinity(0))
+    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        os.sched_setaffinity(graph.pids["beacon"], {processor})
+        os.sched_setscheduler(graph.pids["beacon"], os.SCHED_IDLE, os.sched_param(0))
+        busy = [
+            subprocess.Popen(
+                [sys.executable, "-c", "while True: pass"],
+                preexec_fn=partial(spin_on, processor),  # noqa: PLW1509
+            )
+            for _ in range(3)
+        ]
+        try:
+            async with asyncio.timeout(2 * DEADLINE_S):
+                while not any("beacon is starved, not hung" in line for line in said):
+                    assert graph.hangs == {"beacon": 0}
+                    await asyncio.sleep(0.1)
+        finally:
+            for process in busy:
+                process.kill()
+                process.wait()
+        assert graph.restarts == graph.hangs == {"beacon": 0}
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "starved"),
+    [
+        ((1.0, 5.0, "S"), (1.1, 5.0, "S"), 0.0),
+        ((1.0, 5.0, "S"), (1.0, 5.0, "T"), 0.0),
+        ((1.0, 5.0, "S"), (1.5, 5.0, "R"), 0.0),
+        ((1.0, 5.0, "S"), (1.1, 5.3, "S"), 0.3),
+        ((1.0, 5.0, "R"), (1.1, 5.0, "R"), 0.4),
+        ((1.0, 5.0, "R"), (1.0, 9.0, "S"), 0.5),
+        (None, (1.0, 9.0, "S"), 0.0),
+        ((1.0, 5.0, "R"), None, 0.0),
+    ],
+)
+def test_what_counts_as_starved_in_half_a_second(
+    before: tuple[float, float, str] | None,
+    now: tuple[float, float, str] | None,
+    starved: float,
+) -> None:
+    """Asleep, suspended, in a loop of its own; sometimes and always waiting for a processor."""
+    earlier = None if before is None else ProcessorTime(*before)
+    later = None if now is None else ProcessorTime(*now)
+    assert starved_s(earlier, later, 0.5) == pytest.approx(starved)
 
 
 async def test_silence_that_the_launcher_itself_was_absent_for_is_no_hang(tmp_path: Path) -> None:
@@ -359,7 +418,7 @@ def start_command(
         stderr=subprocess.PIPE,
         text=True,
         cwd="/",
-        preexec_fn=partial(set_sigint, sigint, blocked=blocked),
+        preexec_fn=partial(set_sigint, sigint, blocked=blocked),  # noqa: PLW1509
     )
     started.append(process)
     return process
@@ -386,7 +445,7 @@ def start_up_s(tmp_path_factory: pytest.TempPathFactory) -> float:
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, runs.ROOT_VARIABLE: str(folder)},
-        preexec_fn=partial(set_sigint, signal.SIG_DFL, blocked=False),
+        preexec_fn=partial(set_sigint, signal.SIG_DFL, blocked=False),  # noqa: PLW1509
     )
     try:
         wait_for_words(process, "are ready")
