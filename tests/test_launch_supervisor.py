@@ -218,37 +218,45 @@ async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: P
     assert not any("launch_nodes.py" in line for line in said)
 
 
-def spin_on(processor: int) -> None:
-    os.sched_setaffinity(0, {processor})
-
-
-async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(tmp_path: Path) -> None:
-    if ProcessorTime.of(os.getpid()) is None:
-        pytest.skip("this kernel keeps no statistics of its scheduler")
-    plan = plan_of(tmp_path, beacon=beacon(liveness_s=1.5))
+async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Suspended, but with the readings of a process that waits for a processor."""
+    starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
+    monkeypatch.setattr(ProcessorTime, "of", lambda process: starved)
+    plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
     said: list[str] = []
-    processor = min(os.sched_getaffinity(0))
     async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
         await graph.wait_ready(DEADLINE_S)
-        os.sched_setaffinity(graph.pids["beacon"], {processor})
-        os.sched_setscheduler(graph.pids["beacon"], os.SCHED_IDLE, os.sched_param(0))
-        busy = [
-            subprocess.Popen(
-                [sys.executable, "-c", "while True: pass"],
-                preexec_fn=partial(spin_on, processor),  # noqa: PLW1509
-            )
-            for _ in range(3)
-        ]
-        try:
-            async with asyncio.timeout(2 * DEADLINE_S):
-                while not any("beacon is starved, not hung" in line for line in said):
-                    assert graph.hangs == {"beacon": 0}
-                    await asyncio.sleep(0.1)
-        finally:
-            for process in busy:
-                process.kill()
-                process.wait()
+        graph.kill("beacon", signal.SIGSTOP)
+        async with asyncio.timeout(DEADLINE_S):
+            while not any("beacon is starved, not hung" in line for line in said):
+                await asyncio.sleep(0.05)
+        # As long again: it is reported once.
+        await asyncio.sleep(2.5)
+        graph.kill("beacon", signal.SIGCONT)
         assert graph.restarts == graph.hangs == {"beacon": 0}
+    assert sum("is starved" in line for line in said) == 1
+
+
+def test_the_kernel_counts_how_long_processes_wait_for_a_processor() -> None:
+    processor = min(os.sched_getaffinity(0))
+    code = f"import os; os.sched_setaffinity(0, {{{processor}}})\nwhile True: pass"
+    spinning = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(2)]
+    try:
+        if ProcessorTime.of(os.getpid()) is None:
+            pytest.skip("this kernel keeps no statistics of its scheduler")
+
+        def waited() -> bool:
+            found = [ProcessorTime.of(process.pid) for process in spinning]
+            return all(one and one.state == "R" and one.wait_s > 0.1 < one.run_s for one in found)
+
+        wait_until(waited, "both to run and to wait")
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
+    assert ProcessorTime.of(spinning[0].pid) is None
 
 
 @pytest.mark.parametrize(
