@@ -4,7 +4,7 @@ The first statements give SIGINT its default action, which ends a process withou
 Python's own handler raises an exception in whatever runs: as a traceback in an import, or ignored
 in a callback of the garbage collector.  Commands that clean up get it back in `launch.cli`; graphs
 and nodes handle SIGINT in their event loop (`nodes.signals`).  A SIGINT that is ignored or blocked
-by inheritance is taken like any other: docs/deploy.md says why.
+by inheritance is taken like any other: docs/launch-files.md says why.
 
 ROS 2 has a Python package named `launch` too.  With foreign packages named `launch`, `nodes` or
 `messages` on PYTHONPATH ours must win; so our folder is put first.

@@ -162,7 +162,8 @@ class HostVoice:
 
     def _stop(self, reason: str) -> None:
         """Engage an e-stop that came through the socket."""
-        self._on_problem(f"e-stop of {tools_on(self._host)}, kept until it is reset")
+        writer = tools_on(self._host)
+        self._on_problem(f"e-stop of {writer}, kept until it is reset")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
 
     def _keep(self, estop: EStop, header: Header) -> None:
