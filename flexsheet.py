@@ -45,6 +45,11 @@ def main() -> None:
 
         sys.exit(run_node(sys.argv[2]))
     _start_and_end_quickly()
+    if sys.argv[1:3] == ["arms", "stop"]:
+        # The command line takes several times as long to import as the stop to arrive.
+        from launch.running.stopping import send_early
+
+        send_early(sys.argv[3:])
     from launch.cli import main as run_command
 
     run_command()

@@ -38,11 +38,14 @@ import psutil
 
 from benchmarks.faults import LONGEST_M, Result, Span, kill, kill_launcher, tried
 from launch.running.runs import FINISHED_RUNS_KEPT, RUN_VARIABLE
+from messages.bag import FLUSH_PERIOD_S
 from tests.lab import HOSTS, LIGHT, Lab
 from tests.lab_bags import Arm, Gap, bags, gaps, read_arm
 
-MARGIN_NS = 1_500_000_000
-"""What is published once a second was last heard so long before a fault."""
+PUBLISH_PERIOD_S = 1.0
+MARGIN_NS = round(1e9 * (FLUSH_PERIOD_S + PUBLISH_PERIOD_S + 0.5))
+"""What may be missing before and after a fault: what was not yet on the disk, up to the next of the
+topics that are published once a second."""
 
 STANDS_RAD = 1e-3
 STOPPED_NS = 200_000_000

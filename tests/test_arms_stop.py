@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from launch.running import runs
+from launch.running import runs, stopping
 from launch.running.stopping import KILL_AFTER_S, StopAttempt, StopOutcome, StopPath, stop_arms
 from nodes.stop_socket import MAX_CONNECTIONS, StopSocket
 
@@ -262,6 +262,34 @@ def test_where_nobody_answers_the_senders_of_targets_are_ended(runs_root: Path) 
         for process in started.values():
             process.kill()
             process.wait()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sent"),
+    [
+        ([], ("", "flexsheet arms stop")),
+        (["--json", "--reason", "a hand"], ("", "a hand")),
+        (["--reason=a=b", "--run", "here"], ("here", "a=b")),
+        (["--help"], None),
+        (["--reason"], None),
+        (["--run=here", "there"], None),
+    ],
+)
+def test_a_stop_is_sent_before_the_command_line_is_imported(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], sent: tuple[str, str] | None
+) -> None:
+    """With the command's own options; all else is for the command line to refuse or to explain."""
+    calls: list[tuple[str, str]] = []
+
+    def record(directories: list[Path], reason: str) -> list[StopAttempt]:
+        calls.append((" ".join(map(str, directories)), reason))
+        return []
+
+    monkeypatch.setattr(stopping, "stop_arms", record)
+    monkeypatch.setattr(stopping, "sent_early", [])
+    stopping.send_early(arguments)
+    assert calls == ([] if sent is None else [sent])
+    assert stopping.sent_early == [[] for _ in calls]
 
 
 def test_a_stop_imports_next_to_nothing() -> None:

@@ -93,10 +93,12 @@ def stop(
     Exit code 0 when a launcher or a bridge has confirmed it, or both arms show it.
     """
     from launch.running.runs import live_runs
-    from launch.running.stopping import stop_arms
+    from launch.running.stopping import sent_early, stop_arms
 
-    # Sent before anything else is imported.
-    attempts = stop_arms([run] if run else [one.directory for one in live_runs()], reason)
+    if sent_early:
+        attempts = sent_early.pop()
+    else:
+        attempts = stop_arms([run] if run else [one.directory for one in live_runs()], reason)
     raise typer.Exit(run_interruptible(_confirm_stop(run, reason, attempts, as_json)))
 
 

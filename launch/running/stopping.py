@@ -18,15 +18,17 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
+from launch.running.runs import live_runs
 from nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, peer_of
 
 CONTINUE_AFTER_S = 0.06
 KILL_AFTER_S = 0.15
+DEFAULT_REASON = "flexsheet arms stop"
 TARGET_TOPIC = "sheet_target"
 
 
@@ -76,6 +78,28 @@ class _Receiver:
     name: str
     connection: socket.socket
     process: int
+
+
+def send_early(arguments: Sequence[str]) -> None:
+    """Send the stop of `flexsheet arms stop ARGUMENTS` before the command line is imported.
+
+    Nothing is sent with arguments that are not options of that command; it refuses them later.
+    The command finds what came of it in `sent_early`.
+    """
+    options = {"--run": "", "--reason": DEFAULT_REASON}
+    rest = [argument for argument in arguments if argument != "--json"]
+    while rest:
+        name, given, value = rest.pop(0).partition("=")
+        if name not in options or not (given or rest):
+            return
+        options[name] = value if given else rest.pop(0)
+    run = options["--run"]
+    directories = [Path(run)] if run else [one.directory for one in live_runs()]
+    sent_early.append(stop_arms(directories, options["--reason"]))
+
+
+sent_early: list[list[StopAttempt]] = []
+"""The attempts of `send_early`, at most one list of them."""
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
