@@ -1,11 +1,24 @@
 """Entry of the `flexsheet` command and of every node's process.
 
+The first statements give SIGINT its default action, which ends a process without a trace of it.
+Python's own handler raises an exception in whatever runs: as a traceback in an import, or ignored
+in a callback of the garbage collector.  Commands that clean up get it back in `launch.cli`; graphs
+and nodes handle SIGINT in their event loop (`nodes.signals`).  A SIGINT that is ignored or blocked
+by inheritance is taken like any other: docs/launch-files.md says why.
+
 ROS 2 has a Python package named `launch` too.  With foreign packages named `launch`, `nodes` or
-`messages` on PYTHONPATH ours must win; so the first thing is to put our folder first.
+`messages` on PYTHONPATH ours must win; so our folder is put first.
 """
 
 from __future__ import annotations
 
+# The built-in module: `signal` itself imports others first.
+from _signal import SIG_DFL, SIG_UNBLOCK, SIGINT, pthread_sigmask, signal
+
+signal(SIGINT, SIG_DFL)
+pthread_sigmask(SIG_UNBLOCK, {SIGINT})
+
+# ruff: noqa: E402 - see above
 import atexit
 import gc
 import os
@@ -32,6 +45,11 @@ def main() -> None:
 
         sys.exit(run_node(sys.argv[2]))
     _start_and_end_quickly()
+    if sys.argv[1:3] == ["arms", "stop"]:
+        # The command line takes several times as long to import as the stop to arrive.
+        from launch.running.stopping import send_early
+
+        send_early(sys.argv[3:])
     from launch.cli import main as run_command
 
     run_command()

@@ -4,6 +4,8 @@ Network namespaces at a bad switch, each with its own launcher and keys (`tests/
 root).  Each trouble is brought about while the arms follow a finger that strokes back and forth;
 judged by what both bridges said, by the arms' true joints, from their own computers' bags, and by
 the main one's bags: where the sheet was wanted, and what is missing in them.
+
+With --random it draws one fault after another instead: `benchmarks.random_faults`.
 """
 
 from __future__ import annotations
@@ -277,10 +279,18 @@ async def main() -> int:
     parser.add_argument("--light", action="store_true", help="without soft body and picture")
     parser.add_argument("--hold-after", type=float, metavar="S", help="of both bridges")
     parser.add_argument("--stop-after", type=float, metavar="S", help="of both bridges")
+    parser.add_argument("--random", action="store_true", help="faults that are drawn, always light")
+    parser.add_argument("--minutes", type=float, default=60.0, help="with --random: for how long")
+    parser.add_argument("--every", type=float, default=10.0, metavar="S", help="with --random")
+    parser.add_argument("--seed", type=int, default=1, help="with --random")
     given = parser.parse_args()
     if why := missing():
         print(f"skipped: {why}", file=sys.stderr)
         return 0
+    if given.random:
+        from benchmarks.random_faults import run_random
+
+        return await run_random(given)
     load = os.getloadavg()
     patience = {"hold_after_s": given.hold_after, "stop_after_s": given.stop_after}
     patience = {name: value for name, value in patience.items() if value is not None}

@@ -6,6 +6,7 @@ that nobody waits for the others.
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
@@ -54,6 +55,12 @@ def load_command(name: str) -> Any:
     return command
 
 
+ENDED_AT_ONCE = frozenset({"launch", "try", "topic", "arms"})
+"""Commands that hold nothing that an interrupt could leave behind before their event loop handles
+it: until then SIGINT ends the process.  In the others Python's own handler raises, and they clean
+up."""
+
+
 class CommandTable(Mapping[str, Any]):
     """The commands of `COMMANDS`, each imported when it is looked up."""
 
@@ -73,6 +80,13 @@ class CommandGroup(TyperGroup):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.commands = CommandTable()  # type: ignore[assignment]  # nobody adds to it
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command; once its module is imported, an interrupt is its own affair."""
+        found = super().resolve_command(ctx, args)
+        if found[0] not in ENDED_AT_ONCE:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        return found
 
 
 app = typer.Typer(

@@ -26,6 +26,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol
 
 import zmq
@@ -47,7 +48,7 @@ QUEUE_LENGTH_MIN = 16
 QUEUE_BYTES = 1 << 30
 BATCH = 256
 LINGER_MS = 500
-IPC_PATH_BYTES = 107
+IPC, IPC_PATH_BYTES = "ipc://", 107
 BIND_PATIENCE_S = 1.0
 IPC_CLOSING_S = 0.02
 REFUSABLE_BYTES = 256 << 20
@@ -236,6 +237,10 @@ class Publisher:
         """Give the endpoints free; what was sent is still delivered for half a second."""
         if self._socket.closed:
             return
+        for endpoint in self.endpoints:
+            # ZeroMQ leaves the file; removed before the socket closes, it cannot be a successor's.
+            if endpoint.startswith(IPC):
+                Path(endpoint.removeprefix(IPC)).unlink(missing_ok=True)
         self._close_socket(unbind=False)
         self._dismiss()
 
@@ -721,7 +726,7 @@ def _refuse_beyond_loopback(topic: Topic, endpoint: str) -> None:
 
 def _ipc_is_served(endpoint: str) -> bool:
     """Whether somebody listens there: binding would take the path from under him."""
-    path = endpoint.removeprefix("ipc://")
+    path = endpoint.removeprefix(IPC)
     if path == endpoint or path.startswith("@"):
         return False
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:

@@ -14,6 +14,9 @@ from messages.types import ClockOffset, Clocks
 
 M = TypeVar("M", bound=Message)
 
+MAX_STAMP_AHEAD_NS = 20_000_000
+"""By how much clocks that are trusted may at most seem to be ahead of our own."""
+
 
 class ClockTable:
     """What a host knows of the other hosts' clocks: the newest `Clocks` of its clock node."""

@@ -37,9 +37,15 @@ class UnknownNodeError(KeyError):
 
 
 def node_class(name: str) -> type[Node]:
-    """The class of node type `name`; a "module:Class" outside the table is imported as it is."""
+    """The class of node type `name`; a "module:Class" outside the table is imported as it is.
+
+    UnknownNodeError for a name that is neither, ImportError or AttributeError for one that is not
+    there.
+    """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")
+    if class_name and not all(map(str.isidentifier, (*module_name.split("."), class_name))):
+        raise UnknownNodeError(f'"{name}" is no node: write "package.module:Class"')
     if not class_name:
         near = get_close_matches(name, NODES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(NODES)}"

@@ -30,6 +30,8 @@ from messages.topics import Delivery, Topic, topic_named
 from messages.types import Arming, EStop, HostStatus, Status
 from nodes import node_class
 from nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
+from nodes.signals import handle_signals
+from nodes.stop_socket import StopSocket
 
 STATUS_PERIOD_S = 1.0
 CANCEL_AGAIN_S = 0.2
@@ -81,6 +83,7 @@ class Links:
         self._publishers: dict[str, Publisher] = {}
         self._subscribers: list[Subscriber] = []
         self._keys_problem = ""
+        self._stop_socket: StopSocket | None = None
 
     def open_outputs(self, node: Node) -> None:
         for output in self._config.outputs:
@@ -136,6 +139,19 @@ class Links:
             )
             subscriber.start()
             self._subscribers.append(subscriber)
+            if node.opens_devices and not node.takes_frames and node_input.topic.message is EStop:
+                self._open_stop_socket(node, config.port)
+
+    def _open_stop_socket(self, node: Node, port: str) -> None:
+        """Let a node that moves something be stopped though its launcher does not answer."""
+
+        def stop(reason: str) -> None:
+            now_ns = node.clock.now_ns()
+            header = Header(1, now_ns, now_ns, node.clock.id, node.name, now_ns, node.plan_hash)
+            node.deliver(port, EStop(engaged=True, reason=reason), header)
+
+        self._stop_socket = StopSocket(Path(self._config.run_dir), "node", node.name, stop)
+        self._stop_socket.open()
 
     def _tell(self, node: Node, text: str) -> None:
         node.last_error = text
@@ -181,6 +197,8 @@ class Links:
             publisher.send(message, header)
 
     def close(self) -> None:
+        if self._stop_socket is not None:
+            self._stop_socket.close()
         for subscriber in self._subscribers:
             subscriber.close()
         for publisher in self._publishers.values():
@@ -331,10 +349,9 @@ class Life:
 async def run_until_signal(config: NodeConfig) -> None:
     """Run the node until SIGINT or SIGTERM."""
     stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
-    await run_node(config, stop)
+    # A launcher that is gone is reported by the kernel and by the lifeline, with a signal each.
+    with handle_signals(stop.set, signal.SIGINT, signal.SIGTERM, ignore_afterwards=True):
+        await run_node(config, stop)
 
 
 def main(config_path: str) -> int:

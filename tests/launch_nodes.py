@@ -7,10 +7,12 @@ import os
 import signal
 import time
 from pathlib import Path
+from typing import ClassVar
 
 from messages.base import Header
-from messages.types import EStop, TwinFinger
+from messages.types import ArmState, EStop, Side, TwinFinger
 from nodes.node import Input, Node, NodeParameters, Output, periodic
+from tests.arm_states import arm_state
 
 
 class BeaconParameters(NodeParameters):
@@ -92,3 +94,34 @@ class Listener(Node):
         if finger.path_time_s >= 10.0 and not self.said:
             self.said = True
             self.estop.publish(EStop(engaged=True, reason="ten"), source_ns=header.source_ns)
+
+
+class StandInBridgeParameters(NodeParameters):
+    rate_hz: float = 50.0
+    side: Side
+    hangs: Path | None = None
+
+
+class StandInBridge(Node):
+    """Publishes an arm that follows until it is stopped; hangs while a file exists."""
+
+    opens_devices: ClassVar[bool] = True
+    parameters: StandInBridgeParameters
+    estop: Input[EStop]
+    arm: Output[ArmState]
+
+    async def setup(self) -> None:
+        self.stopped: EStop | None = None
+
+    def on_estop(self, estop: EStop, header: Header) -> None:
+        self.stopped = estop if estop.engaged else None
+
+    @periodic("rate_hz")
+    def cycle(self) -> None:
+        mark = self.parameters.hangs
+        while mark is not None and mark.exists():
+            time.sleep(0.05)
+        side, stopped = self.parameters.side, self.stopped
+        faults = () if stopped is None else (f"e-stop: {stopped.reason}",)
+        mode = "follow" if stopped is None else "estop"
+        self.arm.publish(arm_state(side, mode=mode, faults=faults))

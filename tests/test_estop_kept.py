@@ -22,8 +22,10 @@ from launch.running.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_p
 from messages.base import Header
 from messages.bus import Publisher, Source, Subscriber
 from messages.clock import SystemClock
+from messages.clock_table import MAX_STAMP_AHEAD_NS
 from messages.topics import topic_named
 from messages.types import EStop
+from nodes.arm_bridge.control import ArmControl, Patience
 from nodes.node import PortCounts
 from tests.arm_states import arm_state
 
@@ -110,7 +112,7 @@ class Launchers:
         return endpoint.replace(RUN_DIRECTORY, str(self.folder))
 
     def say(self, estop: EStop, *, before_ns: int = 0) -> None:
-        """As a tool on main does; before_ns: of a time so long ago."""
+        """As a tool on main does; before_ns: of a time so long ago, negative: in the future."""
         self._sequence += 1
         now_ns = self._clock.now_ns() - before_ns
         self._tool.send(
@@ -172,6 +174,29 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(folder: Path) -> 
         arms.cancel()
     async with Launchers(folder, plan) as third:
         assert await third.heard_late() == set()
+
+
+async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
+    async with Launchers(folder, plan_of(folder)) as launchers:
+        await asyncio.sleep(0.3)
+        launchers.say(STOP)
+        await until(lambda: len(files(folder)) == 2, launchers.said)
+        launchers.say(RESET, before_ns=-(10**10))
+        refused = "e-stop not reset: by tools, stamped in the future"
+        await until(lambda: launchers.said.count(refused) == 2, launchers.said)
+        assert len(files(folder)) == 2
+
+
+def test_a_bridge_refuses_a_reset_from_the_future() -> None:
+    """It would clear, sent again to a late reader, all stops until then."""
+    control = ArmControl(Patience(0.02, 0.1), largest_lag_rad=0.12)
+    assert control.take_estop(STOP, 200, 200) is None
+    now_ns = 10**9
+    far_ns = now_ns + MAX_STAMP_AHEAD_NS + 1
+    assert control.take_estop(RESET, far_ns, now_ns) == "it is stamped in the future"
+    assert control.estop_reason == STOP.reason
+    assert control.take_estop(RESET, far_ns, now_ns + 1) is None
+    assert control.estop_reason is None
 
 
 async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:

@@ -113,6 +113,8 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (GRAPH.replace(f"type: {BEACON}", "type: planer"), 'did you mean "planner"?'),
         (GRAPH.replace(f"type: {BEACON}", "type: no.such:Thing"), "cannot be imported"),
+        (GRAPH.replace(f"type: {BEACON}", "type: '../x:Y'"), 'unknown node type "../x:Y"'),
+        (GRAPH.replace(f"type: {BEACON}", "type: ':Y'"), 'unknown node type ":Y"'),
         (GRAPH.replace(f"type: {BEACON}", "type: pathlib:Path"), "is no node class"),
         (GRAPH.replace(f"    type: {LISTENER}", "    host: main"), '"type" is missing'),
         (

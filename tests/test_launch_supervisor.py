@@ -26,6 +26,7 @@ from launch.plans.documents import BadInputError
 from launch.plans.plan import load_plan
 from launch.plans.planned import Plan
 from launch.running import runs, supervisor
+from launch.running.starvation import ProcessorTime, starved_s
 from launch.running.supervisor import NodeFailedError, RunningGraph
 from messages.bag import BagReader
 
@@ -214,6 +215,75 @@ async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: P
         assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
     told = "hung: no sign of life for 2 s; its log shows where; starts again in 0.01 s"
     assert f"stuck {told}" in said
+    assert not any("launch_nodes.py" in line for line in said)
+
+
+def any_has(lines: list[str], words: str) -> bool:
+    return any(words in line for line in lines)
+
+
+async def test_a_node_that_gets_no_processor_is_starved_and_not_hung(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Suspended, but with the readings of a process that waits for a processor."""
+    starved = ProcessorTime(run_s=1.0, wait_s=2.0, state="R")
+    monkeypatch.setattr(ProcessorTime, "of", lambda process: starved)
+    plan = plan_of(tmp_path, beacon=beacon(liveness_s=2.0))
+    said: list[str] = []
+    async with RunningGraph(plan, report=lambda node, line: said.append(line)) as graph:
+        await graph.wait_ready(DEADLINE_S)
+        graph.kill("beacon", signal.SIGSTOP)
+        starved_once = partial(any_has, said, "beacon is starved, not hung")
+        await asyncio.to_thread(wait_until, starved_once, "it to be reported")
+        # As long again: it is reported once.
+        await asyncio.sleep(2.5)
+        graph.kill("beacon", signal.SIGCONT)
+        assert graph.restarts == graph.hangs == {"beacon": 0}
+    assert sum("is starved" in line for line in said) == 1
+
+
+def test_the_kernel_counts_how_long_processes_wait_for_a_processor() -> None:
+    processor = min(os.sched_getaffinity(0))
+    code = f"import os; os.sched_setaffinity(0, {{{processor}}})\nwhile True: pass"
+    spinning = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(2)]
+    try:
+        if ProcessorTime.of(os.getpid()) is None:
+            pytest.skip("this kernel keeps no statistics of its scheduler")
+
+        def waited() -> bool:
+            found = [ProcessorTime.of(process.pid) for process in spinning]
+            return all(one and one.state == "R" and one.wait_s > 0.1 < one.run_s for one in found)
+
+        wait_until(waited, "both to run and to wait")
+    finally:
+        for process in spinning:
+            process.kill()
+            process.wait()
+    assert ProcessorTime.of(spinning[0].pid) is None
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "starved"),
+    [
+        ((1.0, 5.0, "S"), (1.1, 5.0, "S"), 0.0),
+        ((1.0, 5.0, "S"), (1.0, 5.0, "T"), 0.0),
+        ((1.0, 5.0, "S"), (1.5, 5.0, "R"), 0.0),
+        ((1.0, 5.0, "S"), (1.1, 5.3, "S"), 0.3),
+        ((1.0, 5.0, "R"), (1.1, 5.0, "R"), 0.4),
+        ((1.0, 5.0, "R"), (1.0, 9.0, "S"), 0.5),
+        (None, (1.0, 9.0, "S"), 0.0),
+        ((1.0, 5.0, "R"), None, 0.0),
+    ],
+)
+def test_what_counts_as_starved_in_half_a_second(
+    before: tuple[float, float, str] | None,
+    now: tuple[float, float, str] | None,
+    starved: float,
+) -> None:
+    """Asleep, suspended, in a loop of its own; sometimes and always waiting for a processor."""
+    earlier = None if before is None else ProcessorTime(*before)
+    later = None if now is None else ProcessorTime(*now)
+    assert starved_s(earlier, later, 0.5) == pytest.approx(starved)
 
 
 async def test_silence_that_the_launcher_itself_was_absent_for_is_no_hang(tmp_path: Path) -> None:
@@ -327,15 +397,42 @@ async def test_the_directory_of_runs_must_be_ours(
         await RunningGraph(plan_of(tmp_path, beacon=beacon())).__aenter__()
 
 
-def start_command(*arguments: str, **options: Any) -> subprocess.Popen[str]:
-    return subprocess.Popen(
+@pytest.fixture
+def started() -> Iterator[list[subprocess.Popen[str]]]:
+    """Commands of a test; those that it leaves running are killed, with their nodes."""
+    processes: list[subprocess.Popen[str]] = []
+    yield processes
+    left = [process for process in processes if process.poll() is None]
+    for process in left:
+        process.kill()
+        process.communicate()
+    if left:
+        runs.sweep()
+
+
+def set_sigint(action: signal.Handlers, *, blocked: bool) -> None:
+    """In a child before it runs: a test's own parent may ignore SIGINT, and children inherit it."""
+    signal.signal(signal.SIGINT, action)
+    how = signal.SIG_BLOCK if blocked else signal.SIG_UNBLOCK
+    signal.pthread_sigmask(how, {signal.SIGINT})
+
+
+def start_command(
+    started: list[subprocess.Popen[str]],
+    *arguments: str,
+    sigint: signal.Handlers = signal.SIG_DFL,
+    blocked: bool = False,
+) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
         [*FLEXSHEET, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         cwd="/",
-        **options,
+        preexec_fn=partial(set_sigint, sigint, blocked=blocked),  # noqa: PLW1509
     )
+    started.append(process)
+    return process
 
 
 def wait_for_words(process: subprocess.Popen[str], words: str) -> None:
@@ -348,24 +445,94 @@ def wait_for_words(process: subprocess.Popen[str], words: str) -> None:
     pytest.fail(f'"{words}" was never said: {"".join(seen)}')
 
 
-@pytest.mark.parametrize("delay_s", [0.1, 0.6, 0.8, 1.0, None])
+@pytest.fixture(scope="module")
+def start_up_s(tmp_path_factory: pytest.TempPathFactory) -> float:
+    """How long a launcher takes now from its start until its nodes are ready."""
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    path = write(tmp_path_factory.mktemp("graph"), {"beacon": beacon(), "listener": LISTENER})
+    begun_s = time.monotonic()
+    process = subprocess.Popen(
+        [*FLEXSHEET, "launch", str(path)],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, runs.ROOT_VARIABLE: str(folder)},
+        preexec_fn=partial(set_sigint, signal.SIG_DFL, blocked=False),  # noqa: PLW1509
+    )
+    try:
+        wait_for_words(process, "are ready")
+        return time.monotonic() - begun_s
+    finally:
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=DEADLINE_S)
+        shutil.rmtree(folder)
+
+
+FRACTIONS = [*(0.05 * i for i in range(1, 21)), None]
+
+
+@pytest.mark.parametrize("fraction", FRACTIONS)
 def test_interrupted_at_any_moment_the_command_leaves_nothing(
-    tmp_path: Path, runs_root: Path, delay_s: float | None
+    tmp_path: Path,
+    runs_root: Path,
+    started: list[subprocess.Popen[str]],
+    start_up_s: float,
+    fraction: float | None,
 ) -> None:
+    """After a fraction of the start-up, or when it is over (None).
+
+    The interpreter's own start is left out: SIGINT is blocked until our first statement.
+    """
     path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
-    process = start_command("launch", str(path))
-    if delay_s is None:
+    process = start_command(started, "launch", str(path), blocked=True)
+    if fraction is None:
         wait_for_words(process, "are ready")
     else:
-        time.sleep(delay_s)
+        time.sleep(fraction * start_up_s)
     process.send_signal(signal.SIGINT)
-    process.communicate(timeout=DEADLINE_S)
-    # Before the loop runs there is nothing to stop, and Python's or typer's own answer holds.
-    assert process.returncode in ((0,) if delay_s is None else (0, 1, 130, -signal.SIGINT))
+    _, said = process.communicate(timeout=DEADLINE_S)
+    # Before the loop runs there is nothing to stop, and the default action ends the process.
+    assert process.returncode in ((0,) if fraction is None else (0, -signal.SIGINT)), said
+    assert "Traceback" not in said
+    assert "Exception ignored" not in said
     assert_nothing_left(runs_root)
 
 
-def test_a_killed_launcher_leaves_no_node_behind(tmp_path: Path, runs_root: Path) -> None:
+@pytest.mark.parametrize("arguments", [["launch", "graph.yaml"], ["--node", "config.json"]])
+def test_an_interrupt_from_before_the_first_statement_ends_commands_and_nodes(
+    started: list[subprocess.Popen[str]], arguments: list[str]
+) -> None:
+    process = start_command(started, *arguments, blocked=True)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=DEADLINE_S)
+    assert (process.returncode, said) == (-signal.SIGINT, "")
+
+
+def ignores_sigint(pid: int) -> bool:
+    status = Path(f"/proc/{pid}/status").read_text()
+    mask = next(line.split()[1] for line in status.splitlines() if line.startswith("SigIgn:"))
+    return bool(int(mask, 16) >> (signal.SIGINT - 1) & 1)
+
+
+@pytest.mark.parametrize("ready", [False, True])
+def test_an_interrupt_that_is_ignored_by_inheritance_ends_a_graph(
+    tmp_path: Path, runs_root: Path, started: list[subprocess.Popen[str]], ready: bool
+) -> None:
+    """As in a background job of a shell script, which ends it by `kill -INT`."""
+    path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
+    process = start_command(started, "launch", str(path), sigint=signal.SIG_IGN)
+    if ready:
+        wait_for_words(process, "are ready")
+    else:
+        wait_until(lambda: not ignores_sigint(process.pid), "the first statements")
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=DEADLINE_S)
+    assert process.returncode == (0 if ready else -signal.SIGINT)
+    assert_nothing_left(runs_root)
+
+
+def test_a_killed_launcher_leaves_no_node_behind(
+    tmp_path: Path, runs_root: Path, started: list[subprocess.Popen[str]]
+) -> None:
     nodes = {
         "beacon": beacon(parameters={"with_child": True}),
         "listener": LISTENER,
@@ -375,13 +542,15 @@ def test_a_killed_launcher_leaves_no_node_behind(tmp_path: Path, runs_root: Path
             "topics": {"twin__finger": None},
         },
     }
-    process = start_command("launch", str(write(tmp_path, nodes)))
+    process = start_command(started, "launch", str(write(tmp_path, nodes)))
     wait_for_words(process, "are ready")
     (run,) = runs.live_runs()
     assert len(processes_of(run.id)) == 4
     process.kill()
     process.communicate(timeout=DEADLINE_S)
     wait_until(lambda: len(processes_of(run.id)) <= 2, "the nodes that listen to end")
+    # Who ends in order removes its own.
+    assert not [path for path in sockets_in(runs_root) if path.name.startswith(("beac", "listen"))]
     runs.sweep()
     wait_until(lambda: not processes_of(run.id), "the deaf node and the child to end")
     assert_nothing_left(runs_root)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
@@ -24,9 +24,11 @@ if TYPE_CHECKING:
 
     from launch.plans.planned import Plan
     from launch.running.runs import Run
+    from launch.running.stopping import StopAttempt
     from launch.running.tools import ToolsWriter
     from messages.base import Message
-    from messages.types import ArmState
+    from messages.bus import Subscriber
+    from messages.types import ArmState, EStop
 
 app = typer.Typer(
     add_completion=False,
@@ -34,11 +36,10 @@ app = typer.Typer(
     help="The arms of the graph that runs: ready, stop, reset.",
 )
 
+SIDES = ("left", "right")
 TOPICS = ("arm_left", "arm_right")
 ANSWER_S = 3.0
 FRESH_S, TURN_S = 0.5, 0.02
-ATTEMPTS = 4
-"""To say a stop while another tool speaks there; each waits up to a second."""
 
 ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for whoever reads it.")]
 
@@ -85,15 +86,50 @@ def stand_down(
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """E-stop by software: both arms stop and stay; it latches.  Never instead of the red button."""
+    """E-stop by software: both arms stop and stay; it latches.  Never instead of the red button.
+
+    Without --run every graph of yours on this computer is stopped.
+
+    Exit code 0 when a launcher or a bridge has confirmed it, or both arms show it.
+    """
+    from launch.running.runs import live_runs
+    from launch.running.stopping import sent_early, stop_arms
+
+    if sent_early:
+        attempts = sent_early.pop()
+    else:
+        attempts = stop_arms([run] if run else [one.directory for one in live_runs()], reason)
+    raise typer.Exit(run_interruptible(_confirm_stop(run, reason, attempts, as_json)))
+
+
+async def _confirm_stop(
+    run_directory: Path | None, reason: str, attempts: list[StopAttempt], as_json: bool
+) -> int:
+    """Publish the stop too where no launcher has confirmed it; show how the arms are then."""
+    from launch.running.stopping import StopOutcome, StopPath
     from messages.types import EStop
 
-    message = EStop(engaged=True, reason=reason)
+    plan, run = running_graph(run_directory)
+    latched = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
+    async with _Arms(plan, run) as arms:
+        if not latched:
+            attempts = [*attempts, await arms.publish_stop(EStop(engaged=True, reason=reason))]
 
-    def done(arms: dict[str, ArmState]) -> bool:
-        return len(arms) == 2 and all(arm.mode == "estop" for arm in arms.values())
+        def stopped(states: dict[str, ArmState]) -> bool:
+            return len(states) == 2 and all(arm.mode == "estop" for arm in states.values())
 
-    raise typer.Exit(run_interruptible(_say(run, ("estop", message), done, as_json)))
+        shown = await arms.wait_for(stopped)
+    good = shown or any(one.worked for one in attempts)
+    _show_stop(arms.states, attempts, good, as_json)
+    for text in arms.problems:
+        words.print(text, markup=False)
+    if not shown:
+        silent = [side for side, state in arms.states.items() if state.mode != "estop"]
+        silent += [side for side in SIDES if side not in arms.states]
+        words.print(f"[red]not confirmed by the arms themselves[/]: {', '.join(silent)}")
+    if any(one.outcome is StopOutcome.REFUSED for one in attempts):
+        words.print("another tool holds the endpoint of the topic estop")
+    return 0 if good else FAILED
 
 
 @app.command(epilog=examples("flexsheet arms reset --reason 'looked at, all clear'"))
@@ -102,7 +138,11 @@ def reset(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Clear an e-stop and latched faults, once the arms are at rest; it moves nothing."""
+    """Clear an e-stop and latched faults, once the arms are at rest.
+
+    Arms that wait for `arms ready` stay where they are.  Arms with `arming: by_itself`, which are
+    simulated, follow at once when there is a target.
+    """
     from messages.types import EStop
 
     message = EStop(engaged=False, reason=reason)
@@ -112,8 +152,97 @@ def reset(
 
     code = run_interruptible(_say(run, ("estop", message), done, as_json))
     if code == 0:
-        words.print("reset; the arms move again only after: flexsheet arms ready")
+        words.print(_what_moves(running_graph(run)[0]))
     raise typer.Exit(code)
+
+
+def _what_moves(plan: Plan) -> str:
+    """What the arms of a plan do after a reset, by their bridges' `arming`."""
+    arming = {
+        node.parameters["side"]: node.parameters["arming"]
+        for node in plan.nodes.values()
+        if node.type == "arm_bridge"
+    }
+    waiting = [side for side, how in arming.items() if how != "by_itself"]
+    free = [side for side in arming if side not in waiting]
+    sentences = ["reset"]
+    if waiting:
+        sentences.append(f"{' and '.join(waiting)}: moves again only after flexsheet arms ready")
+    if free:
+        sentences.append(
+            f"{' and '.join(free)}: moves by itself as soon as there is a target "
+            "(arming: by_itself)"
+        )
+    return "; ".join(sentences)
+
+
+class _Arms:
+    """The arms of a running graph, as their bridges publish them; use as an async context."""
+
+    def __init__(self, plan: Plan, run: Run) -> None:
+        self._plan, self._run = plan, run
+        self._loop = asyncio.get_running_loop()
+        self._came_s: dict[str, float] = {}
+        self._subscribers: list[Subscriber] = []
+        self._writer: ToolsWriter | None = None
+        self.states: dict[str, ArmState] = {}
+        self.problems: list[str] = []
+
+    async def __aenter__(self) -> Self:
+        from launch.running.tools import subscriber_to
+
+        for topic in TOPICS:
+            self._subscribers.append(
+                subscriber_to(
+                    topic, self._plan, self._run, self._take, on_problem=self.problems.append
+                )
+            )
+            self._subscribers[-1].start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        if self._writer is not None:
+            self._writer.close()
+        for subscriber in self._subscribers:
+            subscriber.close()
+
+    def _take(self, state: Any, _: Any) -> None:
+        self.states[state.side], self._came_s[state.side] = state, self._loop.time()
+
+    async def publish(self, topic: str, message: Message) -> None:
+        """Send it once readers have connected, and once only: a person means now."""
+        from launch.running.tools import READER_RECONNECT_S, ToolsWriter
+
+        self._writer = ToolsWriter(self._plan, self._run, [topic])
+        await asyncio.sleep(READER_RECONNECT_S)
+        self._writer.publish(topic, message)
+
+    async def publish_stop(self, estop: EStop) -> StopAttempt:
+        """Send it at once: it is latched, and readers get it as they connect."""
+        from launch.running.stopping import StopAttempt, StopOutcome, StopPath
+        from launch.running.tools import READER_RECONNECT_S, ToolsWriter
+        from messages.bus import BusError
+
+        begun_s, outcome = self._loop.time(), StopOutcome.PUBLISHED
+        try:
+            self._writer = ToolsWriter(self._plan, self._run, ["estop"])
+            self._writer.publish("estop", estop)
+            # The last reader may be a launcher, which is to keep it.
+            await asyncio.sleep(READER_RECONNECT_S)
+        except BusError:
+            outcome = StopOutcome.REFUSED
+        return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
+
+    async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
+        """Whether `done` holds of fresh states within `ANSWER_S`."""
+        for _ in range(round(ANSWER_S / TURN_S)):
+            now_s = self._loop.time()
+            if done(
+                {s: arm for s, arm in self.states.items() if now_s - self._came_s[s] < FRESH_S}
+            ):
+                return True
+            await asyncio.sleep(TURN_S)
+        return False
 
 
 async def _say(
@@ -122,73 +251,21 @@ async def _say(
     done: Callable[[dict[str, ArmState]], bool],
     as_json: bool,
 ) -> int:
-    """Say a word to both arms and wait until it holds; show how they are then.
-
-    It is said once only: a person means now, not when the network is back.
-    """
-    from launch.running.tools import READER_RECONNECT_S, host_of, subscriber_to
-    from messages.types import EStop
+    """Say a word to both arms and wait until it holds; show how they are then."""
+    from launch.running.tools import host_of
 
     plan, run = running_graph(run_directory)
     _refuse_reset_from_elsewhere(plan, host_of(run), word)
-    loop = asyncio.get_running_loop()
-    arms: dict[str, ArmState] = {}
-    came_s: dict[str, float] = {}
-    said: list[str] = []
-
-    def take(state: Any, _: Any) -> None:
-        arms[state.side], came_s[state.side] = state, loop.time()
-
-    def holds() -> bool:
-        fresh = {side: arm for side, arm in arms.items() if loop.time() - came_s[side] < FRESH_S}
-        return done(fresh)
-
-    subscribers = [
-        subscriber_to(topic, plan, run, take, on_problem=said.append) for topic in TOPICS
-    ]
-    writer = None
-    try:
-        for subscriber in subscribers:
-            subscriber.start()
+    async with _Arms(plan, run) as arms:
         if word is not None:
-            stop = isinstance(word[1], EStop) and word[1].engaged
-            writer = await _writer(plan, run, word[0], insist=stop)
-            # A stop waits for nobody: it is latched, and readers get it as they come.  The last
-            # of them may be a launcher, which is to remember it.
-            if stop:
-                writer.publish(*word)
-            await asyncio.sleep(READER_RECONNECT_S)
-            if not stop:
-                writer.publish(*word)
-        for _ in range(round(ANSWER_S / TURN_S)):
-            await asyncio.sleep(TURN_S)
-            if holds():
-                break
-        good = holds()
-    finally:
-        if writer is not None:
-            writer.close()
-        for subscriber in subscribers:
-            subscriber.close()
-    _show(arms, as_json)
-    for text in said:
+            await arms.publish(*word)
+        good = await arms.wait_for(done)
+    _show(arms.states, as_json)
+    for text in arms.problems:
         words.print(text, markup=False)
     if not good:
         words.print("[red]not so[/]: see the reasons; each bridge's log says what it refused")
     return 0 if good else FAILED
-
-
-async def _writer(plan: Plan, run: Run, topic: str, *, insist: bool) -> ToolsWriter:
-    """A tool's publisher of a topic; insist: wait for a tool that speaks there now to end."""
-    from launch.running.tools import ToolsWriter
-    from messages.bus import BusError
-
-    for _ in range(ATTEMPTS if insist else 0):
-        try:
-            return ToolsWriter(plan, run, [topic])
-        except BusError:
-            await asyncio.sleep(TURN_S)
-    return ToolsWriter(plan, run, [topic])
 
 
 def _refuse_reset_from_elsewhere(plan: Plan, host: str, word: tuple[str, Message] | None) -> None:
@@ -205,8 +282,8 @@ def _refuse_reset_from_elsewhere(plan: Plan, host: str, word: tuple[str, Message
         )
 
 
-def _show(arms: dict[str, ArmState], as_json: bool) -> None:
-    rows: list[dict[str, Any]] = [
+def _rows(arms: dict[str, ArmState]) -> list[dict[str, Any]]:
+    return [
         {
             "side": side,
             "mode": arms[side].mode if side in arms else "silent",
@@ -214,8 +291,32 @@ def _show(arms: dict[str, ArmState], as_json: bool) -> None:
             "reason": arms[side].reason if side in arms else "nothing came from its bridge",
             "faults": list(arms[side].faults) if side in arms else [],
         }
-        for side in ("left", "right")
+        for side in SIDES
     ]
+
+
+def _show_stop(
+    arms: dict[str, ArmState], attempts: list[StopAttempt], stopped: bool, as_json: bool
+) -> None:
+    paths = [
+        {
+            "path": one.path.value,
+            "receiver": one.receiver,
+            "outcome": one.outcome.value,
+            "after_ms": round(one.after_ms, 1),
+        }
+        for one in attempts
+    ]
+    if as_json:
+        print_json({"stopped": stopped, "paths": paths, "arms": _rows(arms)})
+        return
+    print_table(("path", "to", "outcome", "after ms"), [tuple(path.values()) for path in paths])
+    print()
+    _show(arms, as_json=False)
+
+
+def _show(arms: dict[str, ArmState], as_json: bool) -> None:
+    rows = _rows(arms)
     if as_json:
         print_json(rows)
         return

@@ -12,6 +12,7 @@ import typer
 
 from launch.commands import complete
 from launch.commands.output import BAD_INPUT, CommandError
+from nodes.signals import handle_signals
 
 if TYPE_CHECKING:
     from launch.plans.planned import Plan
@@ -50,12 +51,10 @@ def run_interruptible(work: Coroutine[Any, Any, int]) -> int:
 
     async def guarded() -> int:
         task = asyncio.ensure_future(work)
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, task.cancel)
-        try:
-            return await task
-        except asyncio.CancelledError:
-            return 0
+        with handle_signals(task.cancel, signal.SIGINT, signal.SIGTERM):
+            try:
+                return await task
+            except asyncio.CancelledError:
+                return 0
 
     return asyncio.run(guarded())

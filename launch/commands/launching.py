@@ -21,10 +21,12 @@ from launch.commands.output import (
     print_table,
     words,
 )
+from nodes.signals import handle_signals
 
 if TYPE_CHECKING:
     from launch.plans.planned import Plan, PlannedNode
     from launch.running.runs import Run
+    from launch.running.supervisor import RunningGraph
 
 app = typer.Typer(add_completion=False)
 
@@ -104,22 +106,36 @@ async def run_graph(
     when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
     """Run the plan's nodes until a signal, or `duration_s` after they are ready; the exit code."""
-    from launch.running.notify import keep_telling, tell
-    from launch.running.supervisor import NodeFailedError, RunningGraph
+    from launch.running.supervisor import RunningGraph
 
     asked_to_stop = asyncio.Event()
     graph = RunningGraph(plan, host=host, report=_say)
-    loop = asyncio.get_running_loop()
 
     def on_signal() -> None:
         if asked_to_stop.is_set():
             graph.hurry()
         asked_to_stop.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        # What nohup has set stays so.
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-            loop.add_signal_handler(number, on_signal)
+    with handle_signals(on_signal, *_ending_signals()):
+        return await _run_until(graph, asked_to_stop, duration_s, when_ready)
+
+
+def _ending_signals() -> list[int]:
+    """The signals that end a graph; `nohup` ignores SIGHUP, and so it stays ignored."""
+    hung_up = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
+    return [signal.SIGINT, signal.SIGTERM, *hung_up]
+
+
+async def _run_until(
+    graph: RunningGraph,
+    asked_to_stop: asyncio.Event,
+    duration_s: float | None,
+    when_ready: Callable[[Run], None],
+) -> int:
+    """Run the graph until `asked_to_stop`, or `duration_s` after it is ready; the exit code."""
+    from launch.running.notify import keep_telling, tell
+    from launch.running.supervisor import NodeFailedError
+
     stop = asyncio.create_task(asked_to_stop.wait())
     turning = asyncio.create_task(keep_telling())
     try:

@@ -14,6 +14,7 @@ from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.launching import about_run, run_graph
 from launch.commands.output import examples, print_json_line, progress_words, words
+from nodes.signals import keyboard_interrupts
 
 if TYPE_CHECKING:
     from launch.running.runs import Run
@@ -53,7 +54,7 @@ def try_it(
 
     page = [f"console.page_port={port}"]
     plan = load_plan(launch_file, settings=[*page, *(settings or ())], console=True)
-    with progress_words() as progress:
+    with keyboard_interrupts(), progress_words() as progress:
         prepare_plan(plan, progress)
     given = plan.nodes["console"].parameters
     url = f"http://{given['address']}:{given['page_port']}/"

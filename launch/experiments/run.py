@@ -17,6 +17,7 @@ from launch.running.prepare import prepare_plan
 from launch.running.supervisor import RunningGraph
 from messages.scene import Scene
 from messages.types import Correction, FingerPath, Shading
+from nodes.signals import handle_signals
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")
@@ -95,13 +96,11 @@ def run_experiment(
 async def _interruptible(work: Coroutine[Any, Any, None]) -> None:
     """Do `work`; SIGINT and SIGTERM end it in order, as an ExperimentError."""
     task = asyncio.create_task(work)
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, task.cancel)
-    try:
-        await task
-    except asyncio.CancelledError:
-        raise ExperimentError("interrupted; all nodes have been ended") from None
+    with handle_signals(task.cancel, signal.SIGINT, signal.SIGTERM):
+        try:
+            await task
+        except asyncio.CancelledError:
+            raise ExperimentError("interrupted; all nodes have been ended") from None
 
 
 def settings_of_type(launch_file: Path, node_type: str, setting: str) -> list[str]:

@@ -20,16 +20,17 @@ import psutil
 import zmq
 
 from launch.plans.hosts import clock_node, launcher_on
-from launch.plans.planned import Plan, PlannedNode
+from launch.plans.planned import Plan, PlannedNode, tools_on
 from launch.running.estop_file import EStopFile
 from messages.base import Header, Message
 from messages.bus import Handler, Publisher, Source, Subscriber
 from messages.clock import SystemClock
-from messages.clock_table import ClockTable
+from messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from messages.security import KeyChange, KeyRing
 from messages.topics import topic_named
 from messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
 from nodes.node import PortCounts
+from nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
 DEVICES = "/dev/"
@@ -50,6 +51,7 @@ class HostVoice:
     """The launcher's part in the graph, for one host; use between `start` and `close`.
 
     endpoints, sources: fill in the run's directory.  code: the commit, for `HostStatus`.
+    run_directory: where the socket for e-stops is made; None: there is none.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class HostVoice:
         sources: Sources,
         keys: KeyRing | None,
         on_problem: Callable[[str], None],
+        run_directory: Path | None = None,
     ) -> None:
         self._plan, self._host, self._run_id, self._code = plan, host, run_id, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
@@ -90,6 +93,11 @@ class HostVoice:
         self._engaged_ns = 0
         self._resetting: asyncio.Task[None] | None = None
         self._file = EStopFile(host, arms_of(plan)) if waits_for_a_person(plan) else None
+        self._stop_socket = (
+            None
+            if run_directory is None
+            else StopSocket(run_directory, "launcher", self._name, self._stop)
+        )
         self._unwritten = False
         self._untold = ""
         nodes = plan.nodes_on(host)
@@ -97,6 +105,8 @@ class HostVoice:
 
     def start(self) -> None:
         """Begin to listen and to speak; needs a running loop."""
+        if self._stop_socket is not None:
+            self._stop_socket.open()
         remembered = None if self._file is None else self._file.read()
         if remembered is not None:
             self._on_problem(
@@ -139,6 +149,8 @@ class HostVoice:
 
     async def close(self) -> None:
         """Fall silent; may be called twice."""
+        if self._stop_socket is not None:
+            self._stop_socket.close()
         for task in (self._task, self._resetting):
             if task is not None:
                 task.cancel()
@@ -147,6 +159,12 @@ class HostVoice:
             subscriber.close()
         for publisher in self.publishers.values():
             publisher.close()
+
+    def _stop(self, reason: str) -> None:
+        """Engage an e-stop that came through the socket."""
+        writer = tools_on(self._host)
+        self._on_problem(f"e-stop of {writer}, kept until it is reset")
+        self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
 
     def _keep(self, estop: EStop, header: Header) -> None:
         now_ns = self._clock.now_ns()
@@ -162,6 +180,8 @@ class HostVoice:
             # A late reader is given each writer's last word: a reset may be older than the stop.
             if header.source_ns < self._engaged_ns:
                 return
+            if header.source_ns > now_ns + MAX_STAMP_AHEAD_NS:
+                clock_trouble = clock_trouble or "stamped in the future"
             if clock_trouble:
                 self._on_problem(f"e-stop not reset: by {header.writer}, {clock_trouble}")
             elif self._resetting is None or self._resetting.done():

@@ -2,6 +2,7 @@
 
 A run is named after its launcher's process: pid, start time, and a count.  So anybody can tell
 whether the launcher still lives, and a process tagged with a dead launcher's run is an orphan.
+Imports are light: `flexsheet arms stop` finds the runs before it loads anything else.
 """
 
 from __future__ import annotations
@@ -17,8 +18,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-from launch.plans.planned import RUN_DIRECTORY
 
 if TYPE_CHECKING:
     import psutil
@@ -36,6 +35,7 @@ ORPHAN_GRACE_S = 3.5
 
 HOST_FILE = "host"
 _LAUNCHER_FILE = "launcher.json"
+_BEGUN_PREFIX = ".begun-"
 _count = itertools.count(1)
 
 
@@ -84,11 +84,15 @@ def ring_file(run: Run, host: str) -> Path:
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
     """Endpoints of a plan with the run's directory filled in."""
+    from launch.plans.planned import RUN_DIRECTORY
+
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
     """Sources of a plan with the run's directory filled in."""
+    from launch.plans.planned import RUN_DIRECTORY
+
     return tuple(
         replace(one, endpoint=one.endpoint.replace(RUN_DIRECTORY, str(run.directory)))
         for one in sources
@@ -112,10 +116,13 @@ def create_run() -> Run:
     directory.chmod(0o700)
     run_id = f"{os.getpid()}.{_start_ticks(os.getpid())}.{next(_count)}"
     run = Run(run_id, directory / run_id)
-    run.directory.mkdir(mode=0o700)
-    run.logs.mkdir()
+    # Under its name it is complete, so that no sweep of another launcher takes it for a dead run.
+    begun = Run(run_id, directory / f"{_BEGUN_PREFIX}{run_id}")
+    begun.directory.mkdir(mode=0o700)
+    begun.logs.mkdir()
     marker = {"pid": os.getpid(), "pid_namespace": _pid_namespace()}
-    (run.directory / _LAUNCHER_FILE).write_text(json.dumps(marker))
+    (begun.directory / _LAUNCHER_FILE).write_text(json.dumps(marker))
+    begun.directory.rename(run.directory)
     return run
 
 
@@ -123,7 +130,11 @@ def all_runs() -> list[Run]:
     """All runs that have a directory, newest first."""
     if not root().is_dir():
         return []
-    runs = [Run(entry.name, entry) for entry in root().iterdir() if entry.is_dir()]
+    runs = [
+        Run(entry.name, entry)
+        for entry in root().iterdir()
+        if entry.is_dir() and not entry.name.startswith(_BEGUN_PREFIX)
+    ]
     return sorted(runs, key=lambda run: run.directory.stat().st_ctime_ns, reverse=True)
 
 
@@ -174,6 +185,9 @@ def sweep() -> list[int]:
             run.end()
         else:
             shutil.rmtree(run.directory, ignore_errors=True)
+    for begun in root().glob(f"{_BEGUN_PREFIX}*"):
+        if not launcher_is_alive(begun.name.removeprefix(_BEGUN_PREFIX)):
+            shutil.rmtree(begun, ignore_errors=True)
     return [process.pid for process in found]
 
 

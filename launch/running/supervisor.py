@@ -42,6 +42,7 @@ from launch.running.runs import (
     ring_file,
     sweep,
 )
+from launch.running.starvation import ProcessorTime, starved_s
 from messages.base import Header
 from messages.bus import Publisher
 from messages.clock import SystemClock
@@ -89,18 +90,24 @@ class Child:
         self._output, output_write = os.pipe()
         self._ready_fd, ready_write = os.pipe()
         self._signs = 0
+        self._reports = True
         try:
             with_pipe = config.model_copy(update={"ready_fd": ready_write})
             config_file.write_text(with_pipe.model_dump_json())
-            self._process = subprocess.Popen(
-                [sys.executable, str(ENTRY), "--node", str(config_file)],
-                stdin=subprocess.DEVNULL,
-                stdout=output_write,
-                stderr=output_write,
-                start_new_session=True,
-                pass_fds=(ready_write, lifeline),
-                env=environment,
-            )
+            # While Python starts, SIGINT would raise; the node's first statement unblocks it.
+            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                self._process = subprocess.Popen(
+                    [sys.executable, str(ENTRY), "--node", str(config_file)],
+                    stdin=subprocess.DEVNULL,
+                    stdout=output_write,
+                    stderr=output_write,
+                    start_new_session=True,
+                    pass_fds=(ready_write, lifeline),
+                    env=environment,
+                )
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         except BaseException:
             os.close(self._output)
             os.close(self._ready_fd)
@@ -141,21 +148,34 @@ class Child:
         if not signs:
             self._loop.remove_reader(self._ready_fd)
 
-    async def silent_for(self, seconds: float) -> None:
+    async def silent_for(self, seconds: float, on_starved: Callable[[float], None]) -> None:
         """Until it has given no sign of life for so long, though we have listened all the while.
 
         What counts is our own turns, not the clock: a launcher that stood still itself (suspended,
-        starved) has heard nobody, and that is nobody's fault.
+        starved) has heard nobody, and that is nobody's fault.  Nor does the time count in which the
+        process waited for a processor; `on_starved` is called once with that time when it alone
+        has kept the process from being taken for hanging.
         """
-        heard, silence_s = self._signs, 0.0
+        heard, silence_s, waited_s, reported = self._signs, 0.0, 0.0, False
+        before = ProcessorTime.of(self.pid)
         while silence_s < seconds:
             await asyncio.sleep(LIVENESS_TURN_S)
-            silence_s += LIVENESS_TURN_S
+            now = ProcessorTime.of(self.pid)
+            starved = starved_s(before, now, LIVENESS_TURN_S)
+            before, silence_s, waited_s = (
+                now,
+                silence_s + LIVENESS_TURN_S - starved,
+                waited_s + starved,
+            )
             if self._signs != heard:
-                heard, silence_s = self._signs, 0.0
+                heard, silence_s, waited_s = self._signs, 0.0, 0.0
+            elif not reported and silence_s < seconds <= silence_s + waited_s:
+                reported = True
+                on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Make it say where it hangs (Python's fault handler does), then kill it."""
+        """Make it write to its log where it hangs (Python's fault handler does), then kill it."""
+        self._reports = False
         self.signal(signal.SIGABRT)
         self._loop.call_later(LAST_WORDS_S, self.signal, signal.SIGKILL)
 
@@ -171,8 +191,12 @@ class Child:
         self._log.write(piece)
         *lines, self._partial = (self._partial + piece).split(b"\n")
         for line in lines:
-            self._report(self._node, line.decode(errors="replace"))
+            self._report_line(line)
         return True
+
+    def _report_line(self, line: bytes) -> None:
+        if self._reports:
+            self._report(self._node, line.decode(errors="replace"))
 
     def _reap(self) -> None:
         """The process has ended: end what it started, read the rest of its words, let go."""
@@ -187,7 +211,7 @@ class Child:
         while self._read_output():
             pass
         if self._partial:
-            self._report(self._node, self._partial.decode(errors="replace"))
+            self._report_line(self._partial)
         for fd in (self._pidfd, self._output, self._ready_fd):
             os.close(fd)
         self._log.close()
@@ -399,6 +423,7 @@ class RunningGraph:
             sources=partial(local_sources, self.run),
             keys=self._rings.get(host),
             on_problem=partial(self._report, LAUNCHER),
+            run_directory=self.run.directory,
         )
         self._voices[host] = voice
         voice.start()
@@ -483,7 +508,7 @@ class RunningGraph:
         elif child.ready.done():
             self._ready[node.name].set()
             self._report(LAUNCHER, f"{node.name} is ready, pid {child.pid}")
-        hangs = not late and await self._outlives(child, node.liveness_s)
+        hangs = not late and await self._outlives(child, node)
         # The future must outlive this task's cancellation: `stop` waits for it too.
         code = await asyncio.shield(child.exited)
         self._ready[node.name].clear()
@@ -495,11 +520,19 @@ class RunningGraph:
             return f"hung: no sign of life for {node.liveness_s:g} s; its log shows where"
         return describe_exit(code)
 
-    async def _outlives(self, child: Child, liveness_s: float | None) -> bool:
+    async def _outlives(self, child: Child, node: PlannedNode) -> bool:
         """Whether the process hangs, and so has to be ended; False when it ends by itself."""
-        if liveness_s is None:
+        if node.liveness_s is None:
             return False
-        silence = asyncio.ensure_future(child.silent_for(liveness_s))
+
+        def on_starved(waited_s: float) -> None:
+            self._report(
+                LAUNCHER,
+                f"{node.name} is starved, not hung: it waited {waited_s:.1f} s for a processor; "
+                "this computer has too much to do",
+            )
+
+        silence = asyncio.ensure_future(child.silent_for(node.liveness_s, on_starved))
         try:
             await asyncio.wait((silence, child.exited), return_when=asyncio.FIRST_COMPLETED)
             hangs = silence.done() and not child.exited.done()

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from messages.clock_table import MAX_STAMP_AHEAD_NS
 from messages.types import Arming, ArmMode, ArmState, EStop
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, pace, slowed
@@ -315,7 +316,8 @@ class ArmControl:
 
         stamp_ns: when the message was made, which clock_trouble says not to be sure of.  Several
         nodes may write e-stops, and the last word of each comes anew to a late reader, in any
-        order: a reset from before the last stop does not clear it.
+        order: a reset from before the last stop does not clear it.  One that is stamped in the
+        future would clear the stops that come until then.
         """
         if estop.engaged:
             # A stamp from the future would bar every reset to come.
@@ -324,6 +326,8 @@ class ArmControl:
             self.engage_estop(estop.reason)
         elif clock_trouble:
             return clock_trouble
+        elif stamp_ns > now_ns + MAX_STAMP_AHEAD_NS:
+            return "it is stamped in the future"
         elif stamp_ns < self._engaged_ns:
             return "it is older than the stop"
         elif not self.reset():

@@ -60,7 +60,7 @@ class Page:
             self._release = self._gui.add_button(
                 f"Release: on {' or '.join(others_may)}" if others_may else "Release the e-stop",
                 visible=False,
-                hint="The arms must be at rest; then they follow again",
+                hint="The arms must be at rest. Then they follow, unless they wait for: arms ready",
             )
         # At the bottom: viser's own notices come at the top.
         panel.float(x=14, y=-14, width=STOP_WIDTH)

@@ -1,0 +1,214 @@
+"""An e-stop from outside of a graph, by paths that no other tool can hold.
+
+Each launcher and each arm bridge of this computer has a socket of its own for it
+(`nodes.stop_socket`).  All are asked at once.  A launcher publishes the stop to every host and
+keeps it; a bridge stops its own arm.  Those that do not answer are sent SIGCONT, for they may have
+been suspended.  If no launcher has answered then, bridges that do not answer are killed, and the
+watchdogs of their arms stop the arms.  If nobody has answered at all, the nodes that send sheet
+targets are killed: without targets the bridges of all hosts stop.
+
+Imports are light: nobody who stops the arms waits for the rest of flexsheet.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from launch.running.runs import live_runs
+from nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, peer_of
+
+CONTINUE_AFTER_S = 0.06
+KILL_AFTER_S = 0.15
+DEFAULT_REASON = "flexsheet arms stop"
+TARGET_TOPIC = "sheet_target"
+
+
+class StopPath(StrEnum):
+    """The way by which an e-stop was sent."""
+
+    LAUNCHER = "launcher"
+    NODE = "node"
+    TOPIC = "topic"
+    SIGNAL = "signal"
+
+
+class StopOutcome(StrEnum):
+    """What came of it.
+
+    confirmed: the receiver has engaged the stop.  silent: it was sent, and may be taken later.
+    absent: nobody listens.  published: on the topic, without an answer.  refused: the topic's
+    endpoint is held by another tool.  killed: the process was ended.
+    """
+
+    CONFIRMED = "confirmed"
+    SILENT = "silent"
+    ABSENT = "absent"
+    PUBLISHED = "published"
+    REFUSED = "refused"
+    KILLED = "killed"
+
+
+@dataclass(frozen=True, slots=True)
+class StopAttempt:
+    """One path, to whom, what came of it, and when: after the first packet was sent."""
+
+    path: StopPath
+    receiver: str
+    outcome: StopOutcome
+    after_ms: float
+
+    @property
+    def worked(self) -> bool:
+        """Whether an arm stops by it for certain."""
+        return self.outcome in (StopOutcome.CONFIRMED, StopOutcome.KILLED)
+
+
+@dataclass(slots=True)
+class _Receiver:
+    path: StopPath
+    name: str
+    connection: socket.socket
+    process: int
+
+
+def send_early(arguments: Sequence[str]) -> None:
+    """Send the stop of `flexsheet arms stop ARGUMENTS` before the command line is imported.
+
+    Nothing is sent with arguments that are not options of that command; it refuses them later.
+    The command finds what came of it in `sent_early`.
+    """
+    options = {"--run": "", "--reason": DEFAULT_REASON}
+    rest = [argument for argument in arguments if argument != "--json"]
+    while rest:
+        name, given, value = rest.pop(0).partition("=")
+        if name not in options or not (given or rest):
+            return
+        options[name] = value if given else rest.pop(0)
+    run = options["--run"]
+    directories = [Path(run)] if run else [one.directory for one in live_runs()]
+    sent_early.append(stop_arms(directories, options["--reason"]))
+
+
+sent_early: list[list[StopAttempt]] = []
+"""The attempts of `send_early`, at most one list of them."""
+
+
+def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
+    """Engage the e-stop in these runs (their directories); takes `KILL_AFTER_S` at most."""
+    begun_s = time.monotonic()
+    attempts: list[StopAttempt] = []
+
+    def note(path: StopPath, receiver: str, outcome: StopOutcome) -> None:
+        after_ms = (time.monotonic() - begun_s) * 1e3
+        attempts.append(StopAttempt(path, receiver, outcome, after_ms))
+
+    request = (REQUEST + reason.encode())[:MAX_REQUEST_BYTES]
+    directories = list(runs)
+    waiting: list[_Receiver] = []
+    for file in (one for directory in directories for one in directory.glob(f"*{SUFFIX}")):
+        name, _, kind = file.stem.rpartition(".")
+        connection = _send_request(file, request)
+        if connection is None:
+            note(StopPath(kind), name, StopOutcome.ABSENT)
+        else:
+            process, _ = peer_of(connection)
+            waiting.append(_Receiver(StopPath(kind), name, connection, process))
+    try:
+        for until_s, signalled in ((CONTINUE_AFTER_S, signal.SIGCONT), (KILL_AFTER_S, None)):
+            for receiver in _await_answers(waiting, begun_s + until_s):
+                note(receiver.path, receiver.name, StopOutcome.CONFIRMED)
+            for receiver in waiting if signalled else ():
+                _send_signal(receiver.process, signalled or 0)
+        # A bridge gets the stop of a launcher as soon as it runs; until then it commands no arm.
+        kept = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
+        for receiver in waiting:
+            kill = receiver.path is StopPath.NODE and not kept
+            if kill and _send_signal(receiver.process, signal.SIGKILL):
+                note(StopPath.SIGNAL, receiver.name, StopOutcome.KILLED)
+            else:
+                note(receiver.path, receiver.name, StopOutcome.SILENT)
+    finally:
+        for receiver in waiting:
+            receiver.connection.close()
+    if not any(attempt.outcome is StopOutcome.CONFIRMED for attempt in attempts):
+        for name in _kill_target_senders(directories):
+            note(StopPath.SIGNAL, name, StopOutcome.KILLED)
+    return attempts
+
+
+def _send_request(file: Path, request: bytes) -> socket.socket | None:
+    """The connection on which the answer comes; None where nobody listens."""
+    connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+    try:
+        connection.connect(os.fspath(file))
+        connection.send(request)
+    except OSError:
+        connection.close()
+        return None
+    return connection
+
+
+def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
+    """Take those out of `waiting` that confirm before `until_s` of the monotonic clock."""
+    confirmed = []
+    poll = select.poll()
+    by_number = {one.connection.fileno(): one for one in waiting}
+    for number in by_number:
+        poll.register(number, select.POLLIN)
+    while by_number and (left_s := until_s - time.monotonic()) > 0:
+        for number, _ in poll.poll(left_s * 1e3):
+            receiver = by_number.pop(number)
+            poll.unregister(number)
+            try:
+                answer = receiver.connection.recv(len(ANSWER))
+            except ConnectionError:
+                answer = b""
+            if answer == ANSWER:
+                confirmed.append(receiver)
+                waiting.remove(receiver)
+                receiver.connection.close()
+    return confirmed
+
+
+def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
+    """Kill the nodes of these runs that publish sheet targets; their names."""
+    killed = []
+    for directory in directories:
+        try:
+            nodes = json.loads((directory / "plan.json").read_text())["nodes"]
+        except (OSError, ValueError, KeyError):
+            continue
+        senders = {
+            os.fsencode(directory / f"{name}.json"): name
+            for name, node in nodes.items()
+            if any(port["topic"] == TARGET_TOPIC for port in node["outputs"])
+        }
+        for entry in Path("/proc").glob("[0-9]*/cmdline"):
+            try:
+                named = senders.keys() & set(entry.read_bytes().split(b"\0"))
+            except OSError:
+                # It has ended meanwhile, or belongs to somebody else.
+                continue
+            if named and _send_signal(int(entry.parent.name), signal.SIGKILL):
+                killed.append(senders[named.pop()])
+    return killed
+
+
+def _send_signal(process: int, number: int) -> bool:
+    """Whether the process was there to get it; 0 is one that this computer does not know."""
+    if process <= 0:
+        return False
+    try:
+        os.kill(process, number)
+    except (ProcessLookupError, PermissionError):
+        return False
+    return True

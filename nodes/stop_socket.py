@@ -1,0 +1,105 @@
+"""A unix socket of a launcher or a node that takes an e-stop, and nothing else.
+
+Command-line tools share one endpoint of the topic `estop`, which one of them may hold.  Any number
+of them can connect to this socket at once; each sends one packet and gets one back.  Nothing that
+is heavy to import is needed for that.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+SUFFIX = ".stop"
+Kind = Literal["launcher", "node"]
+REQUEST, ANSWER = b"stop ", b"stopped"
+MAX_REQUEST_BYTES = 4096
+MAX_CONNECTIONS = 32
+"""Of several that say nothing the oldest makes room for a new one."""
+
+_PEER = struct.Struct("3i")
+
+
+class StopSocket:
+    """Calls `on_stop(reason)` for each e-stop; use between `open` and `close`.
+
+    The directory of the run is closed to other users, and so is the socket; who connects must be
+    this user or root besides.
+    """
+
+    def __init__(
+        self, directory: Path, kind: Kind, name: str, on_stop: Callable[[str], None]
+    ) -> None:
+        self._path, self._on_stop = directory / f"{name}.{kind}{SUFFIX}", on_stop
+        self._listener: socket.socket | None = None
+        self._connections: list[socket.socket] = []
+
+    def open(self) -> None:
+        """Listen; needs a running loop.  OSError where the path is too long."""
+        self._path.unlink(missing_ok=True)
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        try:
+            listener.bind(os.fspath(self._path))
+            self._path.chmod(0o600)
+            listener.listen(MAX_CONNECTIONS)
+        except BaseException:
+            listener.close()
+            raise
+        self._listener = listener
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(listener.fileno(), self._accept, listener)
+
+    def close(self) -> None:
+        """Stop listening and remove the socket's file; may be called twice."""
+        if self._listener is None:
+            return
+        self._path.unlink(missing_ok=True)
+        self._loop.remove_reader(self._listener.fileno())
+        self._listener.close()
+        self._listener = None
+        for connection in list(self._connections):
+            self._drop(connection)
+
+    def _accept(self, listener: socket.socket) -> None:
+        try:
+            connection, _ = listener.accept()
+        except BlockingIOError:
+            return
+        connection.setblocking(False)
+        _, user = peer_of(connection)
+        if user not in (os.getuid(), 0):
+            connection.close()
+            return
+        if len(self._connections) >= MAX_CONNECTIONS:
+            self._drop(self._connections[0])
+        self._connections.append(connection)
+        self._loop.add_reader(connection.fileno(), self._read, connection)
+
+    def _read(self, connection: socket.socket) -> None:
+        try:
+            request = connection.recv(MAX_REQUEST_BYTES)
+            if request.startswith(REQUEST):
+                self._on_stop(request.removeprefix(REQUEST).decode(errors="replace"))
+                connection.send(ANSWER)
+        except (BlockingIOError, ConnectionError):
+            # It has gone without waiting for the answer; a stop that it sent is engaged.
+            pass
+        finally:
+            self._drop(connection)
+
+    def _drop(self, connection: socket.socket) -> None:
+        self._connections.remove(connection)
+        self._loop.remove_reader(connection.fileno())
+        connection.close()
+
+
+def peer_of(connection: socket.socket) -> tuple[int, int]:
+    """Process and user at the other end of a connected unix socket."""
+    packed = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+    process, user, _ = _PEER.unpack(packed)
+    return process, user

@@ -1,0 +1,302 @@
+"""`flexsheet arms stop` whatever other tools hold, and whoever does not answer."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch.running import runs, stopping
+from launch.running.stopping import KILL_AFTER_S, StopAttempt, StopOutcome, StopPath, stop_arms
+from nodes.stop_socket import MAX_CONNECTIONS, StopSocket
+
+ROOT = Path(__file__).resolve().parent.parent
+FLEXSHEET = [sys.executable, str(ROOT / "flexsheet.py")]
+DEADLINE_S = 60.0
+REASON = "a hand in the sheet"
+
+
+@pytest.fixture(autouse=True)
+def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
+    monkeypatch.setenv(runs.ROOT_VARIABLE, str(folder))
+    yield folder
+    shutil.rmtree(folder)
+
+
+def wait_until(condition: Callable[[], Any], what: str) -> None:
+    end_s = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < end_s, f"waited in vain: {what}"
+        time.sleep(0.02)
+
+
+@dataclass
+class Graph:
+    """A launcher with two bridges that stand in for real ones."""
+
+    launcher: subprocess.Popen[str]
+    run: runs.Run
+    hangs: Path
+
+    def log(self) -> str:
+        return (self.run.logs / "launch.log").read_text()
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Iterator[Graph]:
+    hangs = tmp_path / "hangs"
+    nodes = {
+        side: {
+            "type": "tests.launch_nodes:StandInBridge",
+            "parameters": {"side": side, "hangs": str(hangs) if side == "left" else None},
+            "topics": {"arm": f"arm_{side}"},
+            "liveness_s": None,
+            "restart": {"delay_s": 0.01},
+        }
+        for side in ("left", "right")
+    }
+    (tmp_path / "graph.yaml").write_text(json.dumps({"nodes": nodes}))
+    launcher = subprocess.Popen(
+        [*FLEXSHEET, "launch", str(tmp_path / "graph.yaml")], stderr=subprocess.PIPE, text=True
+    )
+    assert launcher.stderr is not None
+    try:
+        assert any("are ready" in line for line in launcher.stderr)
+        yield Graph(launcher, runs.live_runs()[0], hangs)
+    finally:
+        hangs.unlink(missing_ok=True)
+        launcher.send_signal(signal.SIGCONT)
+        launcher.send_signal(signal.SIGINT)
+        launcher.communicate(timeout=DEADLINE_S)
+
+
+@pytest.fixture
+def holder(graph: Graph) -> Iterator[subprocess.Popen[bytes]]:
+    """A tool that holds the endpoint of the tools' e-stops, and stands still."""
+    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); "
+    code += "s.listen(); print(flush=True); time.sleep(1000)"
+    endpoint = graph.run.directory / "tools.estop"
+    process = subprocess.Popen([sys.executable, "-c", code, str(endpoint)], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.readline()
+    process.send_signal(signal.SIGSTOP)
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def stop_by_command() -> tuple[int, dict[str, Any]]:
+    done = subprocess.run(
+        [*FLEXSHEET, "arms", "stop", "--reason", REASON, "--json"],
+        capture_output=True, text=True, timeout=DEADLINE_S, check=False,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr
+    return done.returncode, json.loads(done.stdout)
+
+
+def outcomes(answer: dict[str, Any]) -> set[tuple[str, str, str]]:
+    return {(one["path"], one["receiver"], one["outcome"]) for one in answer["paths"]}
+
+
+@pytest.mark.usefixtures("holder")
+def test_a_tool_that_holds_the_endpoint_does_not_hinder_a_stop(graph: Graph) -> None:
+    code, answer = stop_by_command()
+    assert code == 0
+    assert answer["stopped"]
+    # Bridges of a busy computer may answer too late; the launcher's word reaches them then.
+    assert ("launcher", "launch", "confirmed") in outcomes(answer)
+    assert all(one["mode"] == "estop" for one in answer["arms"])
+    assert all(REASON in one["faults"][0] for one in answer["arms"])
+    assert "e-stop of tools, kept until it is reset" in graph.log()
+
+
+@pytest.mark.usefixtures("holder")
+def test_a_suspended_launcher_hears_a_stop(graph: Graph) -> None:
+    graph.launcher.send_signal(signal.SIGSTOP)
+    code, answer = stop_by_command()
+    assert code == 0
+    assert answer["stopped"]
+    wait_until(lambda: "kept until it is reset" in graph.log(), "the launcher to keep the stop")
+
+
+@pytest.mark.usefixtures("holder")
+def test_a_bridge_that_hangs_is_stopped_when_it_goes_on(graph: Graph) -> None:
+    graph.hangs.touch()
+    code, answer = stop_by_command()
+    assert code == 0
+    assert ("launcher", "launch", "confirmed") in outcomes(answer)
+    assert ("node", "left", "silent") in outcomes(answer)
+    assert answer["arms"][1]["mode"] == "estop"
+    graph.hangs.unlink()
+    wait_until(lambda: stop_by_command()[1]["arms"][0]["mode"] == "estop", "it to stop")
+
+
+def test_without_a_graph_there_is_nothing_to_stop() -> None:
+    done = subprocess.run([*FLEXSHEET, "arms", "stop"], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "no graph is running" in done.stderr
+
+
+class Sockets:
+    """Stop sockets of this process, whose loop runs while `stop_arms` is in a thread."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.reasons: list[str] = []
+        self.opened: list[StopSocket] = []
+
+    def open(self, kind: Any, name: str) -> None:
+        self.opened.append(StopSocket(self.folder, kind, name, self.reasons.append))
+        self.opened[-1].open()
+
+    async def stop(self, reason: str = REASON) -> list[StopAttempt]:
+        return await asyncio.to_thread(stop_arms, [self.folder], reason)
+
+
+@pytest.fixture
+def sockets(runs_root: Path) -> Sockets:
+    return Sockets(runs_root)
+
+
+async def test_all_are_asked_at_once_and_others_may_not_connect(sockets: Sockets) -> None:
+    sockets.open("launcher", "launch")
+    sockets.open("node", "arm_left_bridge")
+    for file in sockets.folder.iterdir():
+        assert file.stat().st_mode & 0o777 == 0o600
+    attempts = await sockets.stop("é" * 10_000)
+    assert {(one.path, one.receiver) for one in attempts if one.worked} == {
+        (StopPath.LAUNCHER, "launch"),
+        (StopPath.NODE, "arm_left_bridge"),
+    }
+    assert [set(reason) <= {"é", "\ufffd"} for reason in sockets.reasons] == [True, True]
+    for one in sockets.opened:
+        one.close()
+        one.close()
+    assert list(sockets.folder.iterdir()) == []
+
+
+async def test_what_is_no_stop_stops_nothing_and_keeps_nobody_waiting(sockets: Sockets) -> None:
+    sockets.open("launcher", "launch")
+    (file,) = sockets.folder.iterdir()
+    held = []
+    for content in [b"", b"reset", b"\0" * 100, *([None] * (2 * MAX_CONNECTIONS))]:
+        held.append(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET))
+        await asyncio.to_thread(held[-1].connect, str(file))
+        if content is not None:
+            held[-1].send(content)
+    attempts = await sockets.stop()
+    assert [one.outcome for one in attempts] == [StopOutcome.CONFIRMED]
+    assert sockets.reasons == [REASON]
+    for one in (*held, *sockets.opened):
+        one.close()
+
+
+def test_a_socket_of_the_dead_is_absent_and_a_silent_launcher_is_not_killed(
+    runs_root: Path,
+) -> None:
+    dead = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    dead.bind(str(runs_root / "bridge.node.stop"))
+    dead.close()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
+        silent.bind(str(runs_root / "launch.launcher.stop"))
+        silent.listen()
+        attempts = stop_arms([runs_root], REASON)
+    assert {(one.path, one.outcome) for one in attempts} == {
+        (StopPath.NODE, StopOutcome.ABSENT),
+        (StopPath.LAUNCHER, StopOutcome.SILENT),
+    }
+
+
+def test_a_bridge_that_hangs_is_killed_where_no_launcher_answers(runs_root: Path) -> None:
+    code = "import socket, sys, time; s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); "
+    code += "s.bind(sys.argv[1]); s.listen(); print(flush=True); time.sleep(1000)"
+    bridge = subprocess.Popen(
+        [sys.executable, "-c", code, str(runs_root / "bridge.node.stop")], stdout=subprocess.PIPE
+    )
+    try:
+        assert bridge.stdout is not None
+        bridge.stdout.readline()
+        bridge.send_signal(signal.SIGSTOP)
+        attempts = stop_arms([runs_root], REASON)
+        assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
+            (StopPath.SIGNAL, "bridge", StopOutcome.KILLED)
+        ]
+        assert bridge.wait(DEADLINE_S) == -signal.SIGKILL
+    finally:
+        bridge.kill()
+        bridge.communicate()
+
+
+def test_where_nobody_answers_the_senders_of_targets_are_ended(runs_root: Path) -> None:
+    port = {"topic": "sheet_target"}
+    plan = {"nodes": {"planner": {"outputs": [port]}, "camera": {"outputs": []}}}
+    (runs_root / "plan.json").write_text(json.dumps(plan))
+    started = {
+        name: subprocess.Popen(
+            [sys.executable, "-c", "import time; time.sleep(1000)", str(runs_root / f"{name}.json")]
+        )
+        for name in ("planner", "camera")
+    }
+    try:
+        attempts = stop_arms([runs_root], REASON)
+        assert [(one.path, one.receiver, one.outcome) for one in attempts] == [
+            (StopPath.SIGNAL, "planner", StopOutcome.KILLED)
+        ]
+        assert started["planner"].wait(DEADLINE_S) == -signal.SIGKILL
+        assert started["camera"].poll() is None
+    finally:
+        for process in started.values():
+            process.kill()
+            process.wait()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sent"),
+    [
+        ([], ("", "flexsheet arms stop")),
+        (["--json", "--reason", "a hand"], ("", "a hand")),
+        (["--reason=a=b", "--run", "here"], ("here", "a=b")),
+        (["--help"], None),
+        (["--reason"], None),
+        (["--run=here", "there"], None),
+    ],
+)
+def test_a_stop_is_sent_before_the_command_line_is_imported(
+    monkeypatch: pytest.MonkeyPatch, arguments: list[str], sent: tuple[str, str] | None
+) -> None:
+    """With the command's own options; all else is for the command line to refuse or to explain."""
+    calls: list[tuple[str, str]] = []
+
+    def record(directories: list[Path], reason: str) -> list[StopAttempt]:
+        calls.append((" ".join(map(str, directories)), reason))
+        return []
+
+    monkeypatch.setattr(stopping, "stop_arms", record)
+    monkeypatch.setattr(stopping, "sent_early", [])
+    stopping.send_early(arguments)
+    assert calls == ([] if sent is None else [sent])
+    assert stopping.sent_early == [[] for _ in calls]
+
+
+def test_a_stop_imports_next_to_nothing() -> None:
+    code = "import launch.running.stopping, launch.running.runs, sys; print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert not {"pydantic", "zmq", "numpy", "psutil"} & set(done.stdout.split())
+    assert KILL_AFTER_S < 0.2
