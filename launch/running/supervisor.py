@@ -29,6 +29,7 @@ from launch.plans.hosts import clock_node, is_loopback
 from launch.plans.plan import load_scene
 from launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort
 from launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
+from launch.running.code_state import git_state
 from launch.running.host import HostVoice
 from launch.running.keys import KeyWatch, make_rings
 from launch.running.runs import (
@@ -50,7 +51,6 @@ from messages.topics import topic_named
 from messages.types import NodeProcess
 from nodes.runner import NodeConfig, PortConfig
 
-COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 ENTRY = Path(__file__).resolve().parents[2] / "flexsheet.py"
 STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
@@ -634,34 +634,6 @@ def describe_exit(code: int) -> str | None:
     if code < 0:
         return f"was ended by {signal.Signals(-code).name}"
     return f"ended with exit code {code}"
-
-
-def git_state(directory: Path) -> str:
-    """Commit of the code and whether it was changed since, as JSON.
-
-    Outside of git (in a container) the commit is what COMMIT_VARIABLE says, else null.
-    """
-
-    def git(*arguments: str) -> str | None:
-        try:
-            result = subprocess.run(
-                # A service's user is seldom the one who cloned; git would answer owners alone.
-                ["git", "-c", "safe.directory=*", "-C", str(directory), *arguments],
-                capture_output=True,
-                text=True,
-                timeout=5,
-                check=True,
-            )
-        except (OSError, subprocess.SubprocessError):
-            return None
-        return result.stdout.strip()
-
-    changes = git("status", "--porcelain")
-    state = {
-        "commit": git("rev-parse", "HEAD") or os.environ.get(COMMIT_VARIABLE) or None,
-        "changed": None if changes is None else bool(changes),
-    }
-    return json.dumps(state)
 
 
 def _fill_run(value: Any, run: Run) -> Any:
