@@ -395,6 +395,7 @@ class RunningGraph:
             run_id=self.run.id,
             code=f"{(git['commit'] or 'unknown')[:12]}{'+' if git['changed'] else ''}",
             processes=partial(self._processes, host),
+            pids=lambda: self.pids,
             endpoints=partial(local_endpoints, self.run),
             sources=partial(local_sources, self.run),
             keys=self._rings.get(host),

@@ -1,0 +1,34 @@
+"""Says whether a computer is too busy for its nodes, and by what, from its launcher's message."""
+
+from __future__ import annotations
+
+from messages.types import HostStatus
+
+MAX_LOAD_RATIO = 1.5
+"""Processes that want to run per core; for computers that cannot measure their nodes' waiting."""
+
+BUSY_REMEDY = (
+    "end other programs, give the graph more cores, or start less of it; "
+    "as root the simulated arms take precedence (docs/launch-files.md, nice)"
+)
+
+
+def is_busy(host: HostStatus) -> bool:
+    """Whether a computer has too few free processors for the nodes that run on it."""
+    return host.load_ratio > MAX_LOAD_RATIO if host.cpu is None else host.cpu.busy
+
+
+def describe_busy(host: HostStatus) -> str:
+    """Say in one sentence what makes a computer busy; empty where it is not."""
+    if not is_busy(host):
+        return ""
+    begin = f"the computer {host.host} is busy"
+    if host.cpu is None:
+        return f"{begin}: {host.load_ratio:.1f} processes per core want to run"
+    sentence = (
+        f"{begin}: {host.cpu.node} waits for a processor {host.cpu.wait_ratio:.0%} of the time"
+    )
+    if not host.cpu.programs:
+        return sentence
+    programs = ", ".join(f"{one.name} {one.cores:.1f}" for one in host.cpu.programs)
+    return f"{sentence}; cores in use: {programs}"
