@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from messages.types import HostStatus
+from messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
 """Processes that want to run per core; for computers that cannot measure their nodes' waiting."""
@@ -22,13 +22,17 @@ def describe_busy(host: HostStatus) -> str:
     """Say in one sentence what makes a computer busy; empty where it is not."""
     if not is_busy(host):
         return ""
-    begin = f"the computer {host.host} is busy"
     if host.cpu is None:
-        return f"{begin}: {host.load_ratio:.1f} processes per core want to run"
-    sentence = (
-        f"{begin}: {host.cpu.node} waits for a processor {host.cpu.wait_ratio:.0%} of the time"
-    )
-    if not host.cpu.programs:
-        return sentence
-    programs = ", ".join(f"{one.name} {one.cores:.1f}" for one in host.cpu.programs)
-    return f"{sentence}; cores in use: {programs}"
+        why = f"{host.load_ratio:.1f} processes per core want to run"
+    else:
+        why = describe_pressure(host.cpu)
+    return f"the computer {host.host} is busy: {why}"
+
+
+def describe_pressure(cpu: CpuPressure) -> str:
+    """Say who waits for a processor for how long, and who takes the processors."""
+    waits = f"{cpu.node} waits for a processor {cpu.wait_ratio:.0%} of the time"
+    if not cpu.programs:
+        return waits
+    programs = ", ".join(f"{one.name} {one.cores:.1f}" for one in cpu.programs)
+    return f"{waits}; cores in use: {programs}"

@@ -50,12 +50,17 @@ class CpuWatch:
         self._cpu_before: tuple[float, Counter[tuple[str, int]]] | None = None
 
     def update(
-        self, watched: Mapping[str, int], named: Mapping[str, int] | None = None
+        self,
+        watched: Mapping[str, int],
+        named: Mapping[str, int] | None = None,
+        *,
+        measure_programs: bool = False,
     ) -> CpuPressure | None:
         """Return the pressure since the oldest sample of the window; None where it is unknown.
 
         watched: process ids, by node, of those whose waiting counts.  named: process ids of all
         nodes, to call them by name among the programs; default: those that are watched.
+        measure_programs: even while the computer is not known to be busy.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -68,16 +73,14 @@ class CpuWatch:
             if pid in waited_s and (before := self._first_with(pid)) and before.time_s < now_s
         }
         self._history.append(Waits(now_s, waited_s))
-        if not ratios:
+        node = max(ratios, key=lambda name: ratios[name], default="")
+        busy = bool(node) and ratios[node] > MAX_WAIT_RATIO
+        programs: tuple[ProgramCpu, ...] = ()
+        if busy or measure_programs:
+            programs = self._programs(now_s, watched if named is None else named)
+        if not node:
             return None
-        node = max(ratios, key=lambda name: ratios[name])
-        busy = ratios[node] > MAX_WAIT_RATIO
-        return CpuPressure(
-            busy=busy,
-            wait_ratio=max(0.0, ratios[node]),
-            node=node,
-            programs=self._programs(now_s, watched if named is None else named) if busy else (),
-        )
+        return CpuPressure(busy=busy, wait_ratio=ratios[node], node=node, programs=programs)
 
     def _first_with(self, pid: int) -> Waits | None:
         return next((one for one in self._history if pid in one.waited_s), None)

@@ -279,7 +279,7 @@ class HostVoice:
         began, self._was_busy = busy and not self._was_busy, busy
         if began and now_ns >= self._busy_reported_ns + BUSY_REPORT_PERIOD_S * 1e9:
             self._busy_reported_ns = now_ns
-            self._on_problem(f"{describe_busy(status)}; what to do: {BUSY_REMEDY}")
+            self._on_problem(f"{describe_busy(status)}; {BUSY_REMEDY}")
 
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)

@@ -32,6 +32,7 @@ from launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIAB
 from launch.running.code_state import git_state
 from launch.running.host import HostVoice
 from launch.running.keys import KeyWatch, make_rings
+from launch.running.priority import min_nice_step, precedence_problem
 from launch.running.runs import (
     HOST_FILE,
     RUN_VARIABLE,
@@ -357,6 +358,8 @@ class RunningGraph:
         for host in self.plan.hosts if self._host is None else [self._host]:
             self._start_voice(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
+        if problem := precedence_problem(self.nodes):
+            self._report(LAUNCHER, problem)
         for node in self.nodes:
             self._keepers[node.name] = asyncio.create_task(self._keep(node), name=node.name)
 
@@ -517,7 +520,7 @@ class RunningGraph:
             RUN_VARIABLE: self.run.id,
             PARENT_VARIABLE: str(os.getpid()),
             LIFELINE_VARIABLE: str(self._lifeline[0]),
-            NICE_VARIABLE: str(node.nice),
+            NICE_VARIABLE: str(max(node.nice, min_nice_step())),
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }

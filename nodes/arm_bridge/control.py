@@ -136,6 +136,8 @@ class OtherArm:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):
             return f"other arm: {self.mode}"
+        if self.mode == "starting":
+            return "waiting for the other arm"
         return None
 
 
@@ -161,9 +163,9 @@ class ArmControl:
     def __init__(
         self, patience: Patience, *, largest_lag_rad: float, by_itself: bool = False
     ) -> None:
-        self.mode: ArmMode = "disconnected"
+        self.mode: ArmMode = "starting"
         self.faults: tuple[str, ...] = ()
-        self.reason = "not connected yet"
+        self.reason = "waiting for the arm to answer"
         self.estop_reason: str | None = None
         self.measured_rad: Floats | None = None
         self.last_measured_rad: Floats | None = None
@@ -175,6 +177,7 @@ class ArmControl:
         self._unready_since = ""
         self._stood_down: str | None = None
         self._waited_s = 0.0
+        self._silence = ""
         self._clear_way: Way | None = None
         self._barred: tuple[str, float] | None = None
         self._together = False
@@ -221,6 +224,10 @@ class ArmControl:
 
     def fail_exchange(self, text: str, *, silent: bool) -> bool:
         """An exchange has failed; True when with it the arm counts as lost, for the first time."""
+        if silent and self.last_measured_rad is None:
+            # It has never answered: it may still be starting, which is no fault.
+            self.reason = f"waiting for the arm: {text}"
+            return False
         if silent and self.miss_answer(text):
             return False
         newly = self.mode != "disconnected"
@@ -327,11 +334,11 @@ class ArmControl:
         elif self.faults:
             why = self.faults[0]
         elif other is None or silent:
-            why = "the other arm is silent"
+            why = self._silence
         elif other.trouble is not None:
             why = other.trouble
         elif goal is None or not goal.overdue_s <= self._patience.stop_after_s:
-            why = why or "no sheet target"
+            why = why or ("waiting for a sheet target" if goal is None else "no sheet target")
         if why is not None:
             self._hinder(why)
         else:
@@ -359,6 +366,7 @@ class ArmControl:
         if self._clear_arm:
             self._clear_arm = False
             return Command("idle", measured)
+        self._silence = "the other arm is silent" if other else "waiting for the other arm"
         if other is not None and not other.is_somewhere:
             other = None
         self._watch(geometry, other, measured)
@@ -387,7 +395,7 @@ class ArmControl:
     ) -> Command:
         """Nothing is wrong with this arm: go with the target, if there are target and other arm."""
         if other is None or not other.age_s <= self._patience.stop_after_s:
-            return self._stop("idle", "the other arm is silent", geometry, step_s)
+            return self._stop("idle", self._silence, geometry, step_s)
         if other.trouble is not None:
             return self._stop_and_relax("idle", other.trouble, geometry, other, step_s)
         if goal is None or not self.ready or not other.ready:
