@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections import Counter, deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,7 +47,7 @@ class CpuWatch:
     def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
         self._proc, self._now_s = proc, now_s
         self._history: deque[Waits] = deque()
-        self._cpu_before: tuple[float, Counter[tuple[str, int]]] | None = None
+        self._cpu_before: tuple[float, dict[tuple[str, int], float]] | None = None
 
     def update(
         self,
@@ -96,19 +96,16 @@ class CpuWatch:
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
         """Return who takes most since the last call; nothing at the first of a busy time."""
         names = {pid: name for name, pid in named.items()}
-        used = Counter({(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()})
+        used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}
         before, self._cpu_before = self._cpu_before, (now_s, used)
         if before is None or not 0.0 < now_s - before[0] <= WINDOW_S:
             return ()
-        cores: Counter[str] = Counter()
+        cores: dict[str, float] = defaultdict(float)
         for key, seconds in used.items():
             if key in before[1]:
                 cores[key[0]] += (seconds - before[1][key]) / (now_s - before[0])
-        return tuple(
-            ProgramCpu(name=name, cores=one)
-            for name, one in cores.most_common(PROGRAMS_SHOWN)
-            if one >= MIN_CORES
-        )
+        largest = sorted(cores.items(), key=lambda one: -one[1])[:PROGRAMS_SHOWN]
+        return tuple(ProgramCpu(name=name, cores=one) for name, one in largest if one >= MIN_CORES)
 
     def _cpu_times(self) -> Iterator[tuple[str, int, float]]:
         """Return name, id and processor time (s) of each process."""
