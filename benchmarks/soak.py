@@ -1,15 +1,20 @@
 """Does anything grow, leak or drift while the whole graph is used for long?
 
-    python -m benchmarks.soak [--minutes 60] [--set NODE.PARAMETER=VALUE] [--output FOLDER]
+    python -m benchmarks.soak [--minutes 60] [--busy 0] [--set NODE.PARAMETER=VALUE]
+                              [--output FOLDER]
 
-Starts `launch/demo.yaml`, strokes and pushes all the while, and records what is logged.  Reports
+Starts `launch/demo.yaml`, strokes and pushes all the while, and records what is logged.  With
+`--busy N`, N other processes compute without a pause meanwhile, each in a session of its own as
+another program of the user would be.  Reports
 
 - per process: how fast its memory grows (its own, what it shares with none; and what it has
   resident; the median of the slopes between all pairs of samples, after a warm-up), descriptors,
   threads, processor time, restarts and hangs;
 - per topic and reader: messages, those superseded or overflown, lost on the way, refused;
 - per window of five minutes: exposure to arm command, to fingertip and to frame, how much of the
-  time the arms followed, how much of the cameras' pictures gave a fingertip;
+  time the arms followed, how often they ended to follow and in which mode, how much of the
+  cameras' pictures gave a fingertip;
+- lines of log per node;
 - findings: what of that grew or went wrong.
 
 Each window is a bag of its own, by the topic `recording`: it is read when it is complete and then
@@ -25,6 +30,7 @@ import json
 import multiprocessing
 import os
 import signal
+import subprocess
 import sys
 import time
 from collections import Counter, defaultdict
@@ -53,7 +59,7 @@ from messages.bag import BagError, BagReader, info
 from messages.base import Header
 from messages.scene import Scene
 from messages.topics import TOPICS, Delivery
-from messages.types import ArmState, FingerPath, Fingertip, Frame, Recording, Status
+from messages.types import ArmMode, ArmState, FingerPath, Fingertip, Frame, Recording, Status
 
 Floats = NDArray[np.float64]
 
@@ -171,6 +177,7 @@ class Window:
     valid_share: float
     follow_share: float
     stops: dict[str, int]
+    stops_by_mode: dict[ArmMode, int]
     faults: tuple[str, ...]
 
 
@@ -180,6 +187,7 @@ def read_window(bag: Path) -> Window:
     valid: Counter[bool] = Counter()
     modes: Counter[str] = Counter()
     stops: Counter[str] = Counter()
+    stops_by_mode: Counter[ArmMode] = Counter()
     faults: set[str] = set()
     last_mode: dict[str, str] = {}
 
@@ -200,6 +208,7 @@ def read_window(bag: Path) -> Window:
                 before, last_mode[message.side] = last_mode.get(message.side), message.mode
                 if before == "follow" and message.mode != "follow":
                     stops[f"{message.side} arm: {message.mode}, {message.reason}"] += 1
+                    stops_by_mode[message.mode] += 1
                 if message.target_source_ns and message.command_sent_ns:
                     delay(message.side, message.target_source_ns, message.command_sent_ns)
             case _:
@@ -226,6 +235,7 @@ def read_window(bag: Path) -> Window:
         valid_share=valid[True] / max(valid.total(), 1),
         follow_share=modes["follow"] / max(modes.total(), 1),
         stops=dict(stops.most_common()),
+        stops_by_mode=dict(stops_by_mode.most_common()),
         faults=tuple(sorted(faults)),
     )
 
@@ -245,18 +255,26 @@ class Soak:
     """One run of the graph: its samples, its windows, and what the nodes said.
 
     seconds: of stroking and pushing.  window_s: of each bag.  folder: for bags and report.
+    busy: number of other processes that compute meanwhile.
     """
 
     def __init__(
-        self, seconds: float, window_s: float, folder: Path, settings: Sequence[str]
+        self,
+        seconds: float,
+        window_s: float,
+        folder: Path,
+        settings: Sequence[str],
+        *,
+        busy: int = 0,
     ) -> None:
-        self.seconds, self.window_s, self.folder = seconds, window_s, folder
+        self.seconds, self.window_s, self.folder, self.busy = seconds, window_s, folder, busy
         self.samples: dict[str, list[Sample]] = defaultdict(list)
         self.machine: list[MachineSample] = []
         self.heard = Heard()
         self.windows: list[Window] = []
         self.problems: list[str] = []
         self.paths_followed = 0
+        self.log_lines: dict[str, int] = {}
         self.began_s = self.lasted_s = 0.0
         bag = folder / "soak-%Y%m%d-%H%M%S.mcap"
         self.plan = load_plan(DEMO_FILE, record=bag, settings=["recorder.waits=true", *settings])
@@ -288,6 +306,8 @@ class Soak:
         )
         writer = ToolsWriter(self.plan, self.graph.run, ["recording"])
         status.start()
+        others = [start_busy_process() for _ in range(self.busy)]
+        lines_before = self._count_log_lines()
         self.began_s = time.monotonic()
         writer.publish("recording", Recording(running=True))
         say(f"{self.seconds / 60.0:g} minutes begin")
@@ -309,10 +329,20 @@ class Soak:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            for other in others:
+                other.kill()
+                other.wait()
             self._take_samples()
+            for name, lines in self._count_log_lines().items():
+                self.log_lines[name] = lines - lines_before.get(name, 0)
             writer.publish("recording", Recording(running=False))
             status.close()
             writer.close()
+
+    def _count_log_lines(self) -> dict[str, int]:
+        """Count the lines of each log of the run."""
+        logs = self.graph.run.logs.glob("*.log")
+        return {log.stem: len(log.read_bytes().splitlines()) for log in logs}
 
     async def _stroke(self, driver: Driver, scene: Scene) -> None:
         for path in paths(scene):
@@ -381,6 +411,12 @@ class Soak:
                 bag.unlink()
 
 
+def start_busy_process() -> subprocess.Popen[bytes]:
+    """Start a process that computes without a pause until it is killed."""
+    program = [sys.executable, "-c", "while True: pass"]
+    return subprocess.Popen(program, start_new_session=True)
+
+
 def give_way() -> None:
     """Of the process that reads bags while the graph is being measured."""
     os.nice(READER_NICE)
@@ -440,6 +476,7 @@ def report_of(soak: Soak) -> dict[str, Any]:
     result = {
         "machine": machine_name(),
         "minutes": soak.lasted_s / 60.0,
+        "busy_processes": soak.busy,
         "paths_followed": soak.paths_followed,
         "processes": processes,
         "ports": ports,
@@ -449,6 +486,7 @@ def report_of(soak: Soak) -> dict[str, Any]:
         "errors": dict(soak.heard.errors),
         "last_errors": soak.heard.last_error,
         "logs_bytes_per_h": logs_growth(soak.machine),
+        "log_lines": {name: lines for name, lines in soak.log_lines.items() if lines},
         "series": {name: thinned(samples) for name, samples in soak.samples.items()},
     }
     return {**result, "findings": [*soak.problems, *findings(result)]}
@@ -580,7 +618,7 @@ def in_words(result: dict[str, Any]) -> str:
             both(one["to_frame_ms"]),
             share(one["valid_share"]),
             share(one["follow_share"]),
-            str(sum(one["stops"].values())),
+            ", ".join(f"{n} {mode}" for mode, n in one["stops_by_mode"].items()) or "0",
             f"{one['megabytes']:.0f}",
             share(one["graph_busy"]),
             share(one["machine_busy"]),
@@ -606,7 +644,8 @@ def in_words(result: dict[str, Any]) -> str:
     logs = result["logs_bytes_per_h"]
     parts = [
         f"{result['machine']}; {result['minutes']:.1f} minutes, "
-        f"{result['paths_followed']} strokes, pushes and other paths",
+        f"{result['paths_followed']} strokes, pushes and other paths, "
+        f"beside {result['busy_processes']} busy processes",
         table(
             [
                 "process",
@@ -629,7 +668,7 @@ def in_words(result: dict[str, Any]) -> str:
                 "to frame",
                 "valid",
                 "both follow",
-                "stops",
+                "ends of following, by mode",
                 "bag, MB",
                 "graph's share of the cores",
                 "all work",
@@ -642,6 +681,8 @@ def in_words(result: dict[str, Any]) -> str:
         "\n".join(f"- {number} × {reason}" for reason, number in stops.most_common(10))
         or "the arms never stopped following",
         "" if logs is None else f"logs grow by {logs / 1024:.0f} KiB/h",
+        "lines of log: "
+        + (", ".join(f"{name} {n}" for name, n in result["log_lines"].items()) or "none"),
         "findings: " + ("none" if not result["findings"] else ""),
         "\n".join(f"- {one}" for one in result["findings"]),
     ]
@@ -665,6 +706,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n", maxsplit=1)[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--window-minutes", type=float, default=5.0)
+    parser.add_argument("--busy", type=int, default=0, metavar="N", help="other processes")
     parser.add_argument("--set", action="append", default=[], metavar="NODE.PARAMETER=VALUE")
     parser.add_argument("--output", type=Path, help="a new folder; default runs/TIME-soak")
     parser.add_argument("--json", action="store_true")
@@ -674,7 +716,13 @@ def main() -> int:
     else:
         folder = given.output
         folder.mkdir(parents=True)
-    soak = Soak(60.0 * given.minutes, 60.0 * given.window_minutes, folder.resolve(), given.set)
+    soak = Soak(
+        60.0 * given.minutes,
+        60.0 * given.window_minutes,
+        folder.resolve(),
+        given.set,
+        busy=given.busy,
+    )
     asyncio.run(until_interrupted(soak))
     result = report_of(soak)
     (folder / "soak.json").write_text(json.dumps(result, indent=1))

@@ -30,7 +30,7 @@ from launch.methods.charts import ROOT
 from launch.methods.machine import machine_name
 from launch.methods.svg import COLOURS, drawn_for_pages, save_svg
 from launch.plans.plan import load_scene
-from launch.running.supervisor import git_state
+from launch.running.code_state import git_state
 from messages.scene import Scene, cylinder_of
 from nodes.fem_solver.body import spec_of
 from nodes.fem_solver.contact import LinearSoftBody, SkinResponse

@@ -128,7 +128,10 @@ class SheetTarget(Message):
     )
 
 
-ArmMode = Literal["disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop"]
+ArmMode = Literal[
+    "disconnected", "idle", "follow", "hold", "stopping", "fault", "relax", "estop", "starting"
+]
+"""Of them "starting" is no fault: the arm has not answered since its bridge was started."""
 
 
 class ArmState(Message):
@@ -372,6 +375,29 @@ class HostKey(Part):
     key: str
 
 
+class ProgramCpu(Part):
+    """The processor time of all processes of one name."""
+
+    name: str = Field(description="of the node, for nodes of the graph; else the program's")
+    cores: NonNegative = Field(description="processor time over time passed")
+
+
+class CpuPressure(Part):
+    """How long the nodes of a computer were ready to run while no processor was free.
+
+    Over the last seconds, of the nodes that do not give way to all others (`nice` below 10).
+    """
+
+    busy: bool = Field(description="`wait_ratio` is above a quarter")
+    wait_ratio: NonNegative = Field(
+        description="of the node that waited longest: time ready to run but not running, over time"
+    )
+    node: str = Field(description="that node")
+    programs: tuple[ProgramCpu, ...] = Field(
+        default=(), description="while busy: those that take most, the largest first"
+    )
+
+
 class HostStatus(Message):
     """How a computer is, from its launcher, once a second."""
 
@@ -389,6 +415,9 @@ class HostStatus(Message):
     software: str = Field(default="", description="versions of what the hosts must agree about")
     keys: tuple[HostKey, ...] = Field(default=(), description="which hosts it lets in")
     estop: str | None = Field(default=None, description="reason of the e-stop that it keeps")
+    cpu: CpuPressure | None = Field(
+        default=None, description="None: its system does not measure it, or no node runs yet"
+    )
 
 
 PathJoin = Literal["rounded_lines", "spline"]

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-import traceback
 from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
@@ -239,7 +238,6 @@ class Node:
     parameters: NodeParameters
     status: Output[Status]
 
-    handler_errors_shown: ClassVar[int] = 3
     takes_frames: ClassVar[bool] = False
     """Whether `deliver` is given each message as the wire's frames, unopened."""
     measures_clocks: ClassVar[bool] = False
@@ -369,19 +367,10 @@ class Node:
         await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:
-        """Count an error and keep it for the status.
-
-        The first few are logged with their trace, then each that doubles the count: a handler that
-        fails at 140 Hz must not bury the log.
-        """
+        """Count an error, keep it for the status, and log it with its trace."""
         self.errors += 1
         self.last_error = f"{what}: {type(error).__name__}: {error}"
-        if self.errors > self.handler_errors_shown and self.errors & (self.errors - 1):
-            return
-        trace = traceback.format_exc() if self.errors <= self.handler_errors_shown else None
-        self.log.error(
-            "handler failed", what=what, error=str(error), count=self.errors, trace=trace
-        )
+        self.log.error("handler failed", what=what, error=str(error), exc_info=error)
 
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
         """Tasks in which coroutine handlers run now; for the runner to end."""

@@ -29,6 +29,7 @@ from messages.security import KeyRing, SecurityError
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import Arming, EStop, HostStatus, Status
 from nodes import node_class
+from nodes.log_limit import RepeatLimiter
 from nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
 from nodes.signals import handle_signals
 from nodes.stop_socket import StopSocket
@@ -96,12 +97,11 @@ class Links:
                 )
 
     def _refusals(self, counts: PortCounts, topic: Topic) -> Callable[[str], None]:
-        """Counts refused connections, and tells of the 1st, 2nd, 4th, 8th, ..."""
+        """Count and log refused connections."""
 
         def refused(text: str) -> None:
             counts.rejected += 1
-            if not counts.rejected & (counts.rejected - 1):
-                self._log.warning("output", topic=topic.name, problem=text, count=counts.rejected)
+            self._log.warning("output", topic=topic.name, problem=text)
 
         return refused
 
@@ -359,6 +359,7 @@ def main(config_path: str) -> int:
     config = NodeConfig.model_validate_json(Path(config_path).read_text())
     structlog.configure(
         processors=[
+            RepeatLimiter(),
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso"),
             structlog.processors.format_exc_info,

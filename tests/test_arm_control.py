@@ -128,7 +128,7 @@ def test_before_the_arm_answers_it_is_told_to_be_idle() -> None:
     geometry = ArmGeometry(SCENE, "left")
     command = control.step(geometry, on_time(HOME), None, STEP_S)
     assert command.mode == "idle"
-    assert control.mode == "disconnected"
+    assert control.mode == "starting"
 
 
 def test_a_far_target_is_reached_slowly_and_together() -> None:
@@ -232,7 +232,8 @@ def test_without_the_other_arm_nothing_moves(age_s: float | None) -> None:
         arms[0].cycle(on_time(sheet_at(0.05)), other)
     assert arms[0].control.mode == "idle"
     assert arms[0].command.mode == "idle"
-    assert arms[0].control.reason == "the other arm is silent"
+    silent = "waiting for the other arm" if age_s is None else "the other arm is silent"
+    assert arms[0].control.reason == silent
 
 
 def test_the_other_arms_fault_stops_this_one_in_the_same_cycle_and_slackens_the_sheet() -> None:

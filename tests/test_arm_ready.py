@@ -151,9 +151,9 @@ def test_a_reset_alone_moves_nothing() -> None:
 
 def test_the_word_is_refused_where_it_cannot_be_meant() -> None:
     arms = unready()
-    assert say_go(arms) == ["not connected yet", "not connected yet"]
+    assert say_go(arms) == ["waiting for the arm to answer", "waiting for the arm to answer"]
     run(arms, None, 3)
-    assert say_go(arms) == ["no sheet target", "no sheet target"]
+    assert say_go(arms) == ["waiting for a sheet target", "waiting for a sheet target"]
     run(arms, GOAL, 3)
     assert arms[0].control.take_arming(GO, OLDEST_ARMING_S + 0.5) == "the word is 1.5 s old"
     assert "nan" in str(arms[0].control.take_arming(GO, float("nan")))

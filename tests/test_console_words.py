@@ -86,6 +86,28 @@ def test_the_banner_shouts_what_matters_most() -> None:
     assert "&lt;" in panels.problem("<")
 
 
+def test_a_busy_computer_comes_first_on_the_banner() -> None:
+    lost = {"left": arm_state("left", mode="disconnected", faults=("no answer",))}
+    why = "the computer main is busy: twin_arms waits for a processor 60% of the time"
+    html = panels.banner("cylinder", lost, None, overloaded=why)
+    heading, _, words = html.partition("fs-words")
+    assert "The computer is busy. left arm: not connected (no answer)" in heading
+    assert "fs-ground-warn" in heading
+    assert "The computer main is busy: twin_arms waits" in words
+    # The numbers change all the while; what is read aloud does not.
+    assert "60%" not in heading
+    stopped = panels.banner("cylinder", lost, "why", overloaded=why)
+    assert "E-STOP is engaged: why" in stopped
+    assert "The computer is busy." not in stopped
+
+
+def test_arms_that_start_are_no_trouble() -> None:
+    starting = {"left": arm_state("left", mode="starting")}
+    html = panels.banner("cylinder", starting, None)
+    assert "Arms: starting" in html
+    assert "fs-ground-warn" not in html
+
+
 def test_under_the_banner_stands_why_nothing_happens() -> None:
     idle = {"left": arm_state("left", mode="idle", reason="not told <yet>")}
     assert "The left arm says: not told &lt;yet&gt;." in panels.banner("cylinder", idle, None)

@@ -40,6 +40,7 @@ from messages.types import (
     ArmState,
     ClockOffset,
     Clocks,
+    CpuPressure,
     HostKey,
     HostStatus,
     NodeProcess,
@@ -141,7 +142,7 @@ def test_where_all_is_well_nothing_is_found(three: Plan) -> None:
     checks = {one.check for one in found}
     assert checks >= {
         "reachable", "launcher", "plan", "keys", "software", "clocks", "nodes", "rates", "camera",
-        "picture", "arm left", "arm right", "disk", "load",
+        "picture", "arm left", "arm right", "disk", "load", "memory",
     }  # fmt: skip
     assert {one.host for one in found} == set(NAMES)
 
@@ -161,6 +162,14 @@ def changed(visit: Visit, **values: Any) -> None:
 
 TROUBLES: dict[str, tuple[Any, tuple[str, str, str], str]] = {
     "plan": (lambda v: changed(v["left"], plan_hash="else"), ("left", "plan", "failed"), "same"),
+    "load": (
+        lambda v: changed(
+            v["left"],
+            cpu=CpuPressure(busy=True, wait_ratio=0.6, node="arm_left_bridge"),
+        ),
+        ("left", "load", "warning"),
+        "end other programs",
+    ),
     "stop": (lambda v: changed(v["left"], estop="a hand"), ("left", "e-stop", "warning"), "reset"),
     "keys": (
         lambda v: changed(v["right"], keys=v["right"].status.keys[1:]),
@@ -181,7 +190,7 @@ TROUBLES: dict[str, tuple[Any, tuple[str, str, str], str]] = {
     ),
     "disk": (lambda v: changed(v["main"], disk_free_bytes=1), ("main", "disk", "warning"), "room"),
     "memory": (
-        lambda v: changed(v["main"], memory_free_bytes=1), ("main", "load", "warning"), "top"
+        lambda v: changed(v["main"], memory_free_bytes=1), ("main", "memory", "warning"), "top"
     ),
     "clock": (
         lambda v: setattr(v["left"], "clocks", v["left"].clocks.model_copy(update={"offsets": ()})),

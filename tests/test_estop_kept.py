@@ -71,7 +71,7 @@ class Launchers:
         self._epoch, self._sequence = self._clock.now_ns(), 0
         for host in self.plan.hosts:
             self.voices[host] = HostVoice(
-                self.plan, host, run_id="1", code="", processes=tuple,
+                self.plan, host, run_id="1", code="", processes=tuple, pids=dict,
                 endpoints=lambda ends: tuple(map(self._near, ends)),
                 sources=lambda ones: tuple(
                     Source(self._near(one.endpoint), one.writer, one.host) for one in ones

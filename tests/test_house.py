@@ -10,7 +10,9 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("messages", "nodes", "launch")
-SHARED_ROOMS = {"nodes.node", "nodes.methods", "nodes.cache", "nodes.models", "nodes"}
+SHARED_ROOMS = {
+    "nodes.node", "nodes.methods", "nodes.cache", "nodes.background", "nodes.models", "nodes",
+}  # fmt: skip
 TWIN_MAY_SHARE = {"nodes.models.rigid", "nodes.models.shapes", "nodes.models"}
 
 

@@ -26,6 +26,7 @@ from launch.plans.documents import BadInputError
 from launch.plans.plan import load_plan
 from launch.plans.planned import Plan
 from launch.running import runs, supervisor
+from launch.running.priority import min_nice_step
 from launch.running.starvation import ProcessorTime, starved_s
 from launch.running.supervisor import NodeFailedError, RunningGraph
 from messages.bag import BagReader
@@ -109,6 +110,19 @@ async def test_a_nice_node_gives_way_as_a_process_and_as_a_session(tmp_path: Pat
             pid = graph.pids[name]
             assert psutil.Process(pid).nice() == min(own + more, 19)
             assert session_niceness(pid) in (None, more)
+
+
+async def test_a_node_takes_precedence_where_the_user_may_give_it(tmp_path: Path) -> None:
+    plan = plan_of(tmp_path, beacon=beacon(nice=-7))
+    async with RunningGraph(plan) as graph:
+        await graph.wait_ready()
+        least = min_nice_step()
+        pid = graph.pids["beacon"]
+        own = os.getpriority(os.PRIO_PROCESS, 0)
+        assert psutil.Process(pid).nice() == own + max(-7, least)
+        assert session_niceness(pid) in (None, max(-7, least))
+        log = (graph.run.logs / "launch.log").read_text()
+        assert ("may not give precedence" in log) is (least > -7)
 
 
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from launch.bags.report.album import MARKED_MOST, Album
 from launch.bags.report.charts import stretches_of
 from launch.bags.report.findings import findings_of
-from launch.bags.report.numbers import methods_of
+from launch.bags.report.numbers import methods_of, numbers_of
 from launch.bags.report.page import COLOURS, MARK, SECTIONS, page_of
 from launch.bags.report.series import Events, Grid, Moments, Range, Spread, States
 from launch.bags.report.session import Port, read_session
@@ -30,8 +30,9 @@ from launch.cli import main
 from launch.experiments.stroke import read_recording, stroke_errors, summary
 from messages.bag import BagError, BagWriter
 from messages.methods import Methods
-from messages.types import PortStatus
+from messages.types import CpuPressure, HostStatus, PortStatus, ProgramCpu
 from tests import sessions
+from tests.arm_states import arm_state
 from tests.colours import luminance
 
 LONELY = ("scene", "fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "status",
@@ -189,6 +190,47 @@ def test_topics_know_what_is_missing(numbers: dict[str, Any]) -> None:
     assert topic["longest_silence_s"] == pytest.approx(0.8, abs=0.03)
     assert (topic["skipped"], topic["lost"], topic["refused"]) == (5, 2, 1)
     assert numbers["topics"]["sheet_target"]["missing"] == 0
+
+
+def test_a_busy_computer_is_the_first_finding(tmp_path: Path) -> None:
+    bag = tmp_path / "busy.mcap"
+    arm = arm_state("left", mode="follow")
+    lost = arm_state("left", mode="disconnected", reason="no answer", faults=("no answer",))
+    pressure = CpuPressure(
+        busy=True, wait_ratio=0.61, node="twin_arms",
+        programs=(ProgramCpu(name="chromium", cores=1.3),),
+    )  # fmt: skip
+    quiet = HostStatus(
+        host="main", run="1", plan_hash="", code="", python="3.11", uptime_s=1.0, load_ratio=8.14,
+        disk_free_bytes=0, memory_free_bytes=0, nodes=(), missing_devices=(),
+        cpu=CpuPressure(busy=False, wait_ratio=0.1, node="planner"),
+    )  # fmt: skip
+    with BagWriter(bag, {"recording": {"clock_id": "clock"}}) as writer:
+        desk = sessions.Desk(writer, ())
+        desk.write("arm_left", arm, 0.0)
+        desk.write("host", quiet, 0.5, writer="launch")
+        desk.write("arm_left", lost, 1.0)
+        desk.write("host", quiet.model_copy(update={"cpu": pressure}), 1.5, writer="launch")
+        desk.write("arm_left", arm, 2.0)
+    numbers = numbers_of(read_session(bag))
+    assert numbers["hosts"]["main"]["busy_fraction"] == 0.5
+    first = findings_of(numbers)[0]
+    assert first.gravity == "bad"
+    assert first.text.startswith(
+        "In 50% of the time the computer main is busy: twin_arms waits for a processor 61% of the "
+        "time; cores in use: chromium 1.3 (at worst). An arm dropped out once; this is the "
+        "probable cause."
+    )
+
+
+def test_an_arm_that_starts_is_no_event_and_no_fault(tmp_path: Path) -> None:
+    bag = tmp_path / "start.mcap"
+    with BagWriter(bag, {"recording": {"clock_id": "clock"}}) as writer:
+        desk = sessions.Desk(writer, ())
+        for number, mode in enumerate(("starting", "idle", "follow")):
+            desk.write("arm_left", arm_state("left", mode=mode), 0.1 * number)
+    numbers = numbers_of(read_session(bag))
+    assert numbers["events"]["counts"] == {}
 
 
 def test_what_was_wrong_is_said_and_the_worst_first(numbers: dict[str, Any]) -> None:

@@ -182,7 +182,7 @@ def _say(node: str, line: str) -> None:
             record.pop("timestamp", None)
             record.pop("node", None)
             event = record.pop("event")
-            trace = record.pop("trace", None) or record.pop("exception", None)
+            trace = record.pop("exception", None)
             text = " ".join([str(event), *(f"{key}={value}" for key, value in record.items())])
             if trace:
                 text += f"\n{trace}"

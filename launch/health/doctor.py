@@ -16,13 +16,17 @@ from typing import Literal
 from launch.health.system import MANUAL, opengl_problem
 from launch.plans.documents import BadInputError
 from launch.plans.plan import load_plan
+from launch.running.cpu import CpuWatch
 from launch.running.runs import is_free, live_runs, orphans, root
+from messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
 
 DEMO = Path(__file__).parent.parent / "demo.yaml"
 CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
 QUICK_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "xen")
 LEAST_DISK_BYTES = 2 << 30
 LEAST_CORES = 2
+PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
+"""Duration of the check of the load; period and processor time of an arm's bridge."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +42,7 @@ class Finding:
 def check_all() -> Iterator[Finding]:
     """All checks, one after another."""
     checks: tuple[Callable[[], Finding], ...] = (
+        check_load,
         check_python,
         check_libraries,
         check_opencv,
@@ -51,6 +56,30 @@ def check_all() -> Iterator[Finding]:
     )
     for check in checks:
         yield check()
+
+
+def check_load() -> Finding:
+    """Whether a program as light as an arm's node gets a processor when it needs one.
+
+    This process computes for PROBE_RUN_S in each PROBE_PERIOD_S; what it waits is measured.
+    """
+    watch, own = CpuWatch(), {"this check": os.getpid()}
+    watch.update(own, measure_programs=True)
+    end_s = time.monotonic() + PROBE_S
+    while (now_s := time.monotonic()) < end_s:
+        while time.monotonic() < now_s + PROBE_RUN_S:
+            pass
+        time.sleep(PROBE_PERIOD_S - PROBE_RUN_S)
+    pressure = watch.update(own, measure_programs=True)
+    if pressure is None:
+        load_ratio = os.getloadavg()[0] / (os.cpu_count() or 1)
+        text = f"{load_ratio:.1f} processes per core want to run"
+        busy = load_ratio > MAX_LOAD_RATIO
+    else:
+        text, busy = describe_pressure(pressure), pressure.busy
+    if busy:
+        return Finding("load", "warning", f"this computer is busy: {text}", BUSY_REMEDY)
+    return Finding("load", "ok", text)
 
 
 def check_python() -> Finding:

@@ -26,16 +26,16 @@ from launch.running.host import devices_of, folder_of, python_version, software
 from launch.running.keys import secret_file
 from launch.running.runs import is_free
 from messages.bus import HANDSHAKE_FAILED
+from messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from messages.security import SecurityError, public_of, read_secret
 from messages.topics import TOPICS
-from messages.types import PortStatus
+from messages.types import HostStatus, PortStatus
 
 State = Literal["ok", "warning", "failed", "not asked"]
 SLACK = 0.1
 """Rates are of one second, in which a message more or less says nothing."""
 
 LEAST_MEMORY_BYTES = 256 << 20
-MOST_LOAD_RATIO = 1.5
 CONTROLLER_S = 2.0
 NAMES_SHOWN = 3
 
@@ -121,6 +121,9 @@ def judge(plan: Plan, here: str, visits: Mapping[str, Visit]) -> list[HostFindin
     )
     running = any(visit.status is not None for visit in visits.values())
     for host, visit in visits.items():
+        if visit.status is not None:
+            # First, since it explains most of what else may be wrong.
+            found.append(_load(visit.status))
         found += _way(plan, here, visit, running=running)
         if visit.status is None:
             continue
@@ -382,7 +385,7 @@ def _arm(node: PlannedNode, visit: Visit) -> HostFinding:
     arm = visit.arms.get(str(node.parameters["side"]))
     check = f"arm {node.parameters['side']}"
     if arm is None:
-        return HostFinding(visit.host, check, "failed", f"{node.name} is silent", "see its log")
+        return _silent_arm(node, visit, check)
     what = ", ".join(filter(None, (arm.mode, arm.reason, "; ".join(arm.faults))))
     if arm.mode == "disconnected":
         where = f"{node.parameters['host']}:{node.parameters['port']}"
@@ -398,19 +401,37 @@ def _arm(node: PlannedNode, visit: Visit) -> HostFinding:
     return HostFinding(visit.host, check, "ok", f"{what}; {ready}")
 
 
+def _silent_arm(node: PlannedNode, visit: Visit, check: str) -> HostFinding:
+    """Tell an arm that its bridge waits for from a bridge that does not report."""
+    status = visit.nodes.get(node.name)
+    if status is None:
+        return HostFinding(visit.host, check, "failed", f"{node.name} is silent", "see its log")
+    assert visit.status is not None
+    starts = any(one.state == "starting" for one in visit.status.nodes)
+    where = f"{node.parameters['host']}:{node.parameters['port']}"
+    remedy = f"is the controller at {where} on, and its program running? see its log"
+    return HostFinding(visit.host, check, "warning" if starts else "failed", status.note, remedy)
+
+
 def _room(visit: Visit) -> Iterator[HostFinding]:
     status = visit.status
     assert status is not None
     yield _disk(visit.host, status.disk_free_bytes)
-    what = (
-        f"load {status.load_ratio:.2f} of its cores, "
-        f"{status.memory_free_bytes / 2**30:.1f} GiB of memory free"
-    )
-    if status.memory_free_bytes < LEAST_MEMORY_BYTES or status.load_ratio > MOST_LOAD_RATIO:
-        remedy = "what else runs there? top"
-        yield HostFinding(visit.host, "load", "warning", what, remedy)
+    what = f"{status.memory_free_bytes / 2**30:.1f} GiB free"
+    if status.memory_free_bytes < LEAST_MEMORY_BYTES:
+        yield HostFinding(visit.host, "memory", "warning", what, "what else runs there? top")
     else:
-        yield HostFinding(visit.host, "load", "ok", what)
+        yield HostFinding(visit.host, "memory", "ok", what)
+
+
+def _load(status: HostStatus) -> HostFinding:
+    """Whether the processors of a host leave its nodes enough time."""
+    if is_busy(status):
+        return HostFinding(status.host, "load", "warning", describe_busy(status), BUSY_REMEDY)
+    what = f"{status.load_ratio:.2f} processes per core want to run"
+    if status.cpu is not None:
+        what += f"; {status.cpu.node} waits longest, {status.cpu.wait_ratio:.0%} of the time"
+    return HostFinding(status.host, "load", "ok", what)
 
 
 def _disk(host: str, free_bytes: int) -> HostFinding:

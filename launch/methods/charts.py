@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from launch.methods.finite import finite
 from launch.methods.machine import machine_name
 from launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
-from launch.running.supervisor import git_state
+from launch.running.code_state import git_state
 from messages.scene import Scene
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 

@@ -51,7 +51,11 @@ class NodeSpec(Strict):
         description="a node without a sign of life for so long hangs and is killed; null: never",
     )
     nice: int = Field(
-        default=0, ge=0, le=19, description="how much it gives way to others on a busy computer"
+        default=0,
+        ge=-20,
+        le=19,
+        description="how much it gives way to others on a busy computer; below 0: it takes "
+        "precedence, where the user may give it",
     )
 
 

@@ -151,7 +151,9 @@ REMEDIES = {
     "UnreachableError": "`flexsheet doctor scene SCENE` says what is out of reach and what would "
     "help.",
     "PathError": "bring the arms nearer to the sheet by hand, then `flexsheet arms ready` again.",
-    "ArmSilentError": "check the arm's address, power and cable, and that its program runs.",
+    "ArmSilentError": "first see whether the computer is busy: `flexsheet doctor`, row `load`; "
+    "that is the usual cause where arms are simulated.  Otherwise check the arm's address, power "
+    "and cable, and that its program runs.",
     "ArmRefusedError": "the controller says why on its teach pendant: enabled, no alarm, in remote "
     "mode?",
     "ArmAnswerError": "another program may speak to the same arm, or its program is of another "
@@ -179,7 +181,17 @@ REMEDIES = {
 }
 """By class of error, or by how it is said: a finding of the doctor, a log line, a reason."""
 
+BUSY_FIRST = "first see whether the computer is busy: `flexsheet doctor`, row `load`"
+
 PARTICULAR = {
+    "the computer <host> is busy": "processes wait for a processor, so nodes are late and "
+    "simulated arms drop out: end other programs, or give the graph more cores.",
+    "no answer from <host>:<port> within": f"{BUSY_FIRST}; else check the arm's address, power, "
+    "cable and program.",
+    "sheet target or other arm late": f"{BUSY_FIRST}; else the network, and what is late upstream.",
+    "the other arm is silent": f"{BUSY_FIRST}; else the other bridge, its log, and the network.",
+    "no sheet target": f"{BUSY_FIRST}; else camera, triangulator, planner: `flexsheet topic hz`.",
+    "the arm's watchdog stopped it": f"{BUSY_FIRST}; else its bridge was silent: see its log.",
     "NOT RECORDING:": "make room, or let it write elsewhere; with room the next bag begins "
     "by itself.",
     "hung: no sign of life": "it is started again; the end of its log (`logs/NODE.log` of the run) "

@@ -16,6 +16,9 @@ FLOORS = ("messages", "nodes", "launch")
 LOGGED = ("warning", "error", "critical")
 TOLD = {"on_problem", "on_refused", "report", "tell"}
 """What is called to say a sentence while a graph runs; a leading underscore or none."""
+REASONS = {"reason", "why", "silence"}
+"""Names of variables that hold why a node does not do its work."""
+
 UNTROUBLED = ("ok", "not asked")
 
 FILLED_IN = re.compile(r"<[^>]*>")
@@ -90,6 +93,10 @@ def _said(file: str, tree: ast.Module) -> Iterator[Said]:
                 yield from (Said(file, "Reason", text) for text in _returned(node, constants))
         elif isinstance(node, ast.Assign):
             target = _name(node.targets[0])
+            if file.startswith("nodes/"):
+                for name, value in _assigned(node):
+                    if name.lstrip("_") in REASONS:
+                        yield from (Said(file, "Reason", text) for text in _words(value, constants))
             if target.lstrip("_") == "note" and file.startswith("nodes/"):
                 yield from (Said(file, "Note", text) for text in _words(node.value, constants))
             elif target.isupper() and file.startswith("nodes/planner/"):
@@ -100,6 +107,15 @@ def _said(file: str, tree: ast.Module) -> Iterator[Said]:
             yield from (Said(file, "Reason", text) for text in texts if text and _is_said(text))
         elif file.startswith("launch/health/"):
             yield from _findings(file, values)
+
+
+def _assigned(node: ast.Assign) -> Iterator[tuple[str, ast.expr]]:
+    """Return the names that an assignment sets, each with its value."""
+    match node.targets[0], node.value:
+        case ast.Tuple(elts=targets), ast.Tuple(elts=values):
+            yield from zip(map(_name, targets), values, strict=False)
+        case target, value:
+            yield _name(target), value
 
 
 def _raised(file: str, call: ast.Call, own: set[str]) -> Iterator[Said]:
@@ -113,7 +129,13 @@ def _raised(file: str, call: ast.Call, own: set[str]) -> Iterator[Said]:
         yield Said(file, "BadInputError", words[2], _at(words, 3))
     elif name == "problem" and len(words) > 1 and words[1]:
         yield Said(file, "BadInputError", words[1], _at(words, 2))
-    elif name == "Finding" and len(words) > 2 and words[1] != "ok" and words[2]:
+    elif (
+        name == "Finding"
+        and file.startswith("launch/health/")
+        and len(words) > 2
+        and words[1] != "ok"
+        and words[2]
+    ):
         yield Said(file, "Finding", f"{words[0]}: {words[2]}", _at(words, 3))
     elif name == "HostFinding" and _at(words, 2) not in UNTROUBLED and _is_said(_at(words, 3)):
         yield Said(file, "Finding", _at(words, 3), _at(words, 4))

@@ -51,9 +51,9 @@ def _end_with(lifeline: int) -> None:
 
 
 def give_way() -> None:
-    """Be nicer than the launcher by what the launch file gives this node, and so its session.
+    """Be nicer than the launcher by what the launcher allows this node, and so its session.
 
-    OSError where the system does not let it.
+    Less than 0 takes precedence.  OSError where the system does not let it.
     """
     nice = int(os.environ.get(NICE_VARIABLE, "0"))
     if nice == 0:

@@ -21,9 +21,11 @@ import zmq
 
 from launch.plans.hosts import clock_node, launcher_on
 from launch.plans.planned import Plan, PlannedNode, tools_on
+from launch.running.cpu import BACKGROUND_NICE, CpuWatch
 from launch.running.estop_file import EStopFile
 from messages.base import Header, Message
 from messages.bus import Handler, Publisher, Source, Subscriber
+from messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from messages.clock import SystemClock
 from messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from messages.security import KeyChange, KeyRing
@@ -33,6 +35,7 @@ from nodes.node import PortCounts
 from nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
+BUSY_REPORT_PERIOD_S = 60.0
 DEVICES = "/dev/"
 REASON_LENGTH = 1000
 """What is longer is cut: an e-stop must fit into every message that repeats it."""
@@ -43,6 +46,7 @@ RESET_WITHIN_S = 5.0
 ARMS = ("arm_left", "arm_right")
 
 Processes = Callable[[], tuple[NodeProcess, ...]]
+Pids = Callable[[], dict[str, int]]
 Endpoints = Callable[[tuple[str, ...]], tuple[str, ...]]
 Sources = Callable[[list[Source]], tuple[Source, ...]]
 
@@ -52,6 +56,7 @@ class HostVoice:
 
     endpoints, sources: fill in the run's directory.  code: the commit, for `HostStatus`.
     run_directory: where the socket for e-stops is made; None: there is none.
+    pids: process ids by node of those that run now.
     """
 
     def __init__(
@@ -62,6 +67,7 @@ class HostVoice:
         run_id: str,
         code: str,
         processes: Processes,
+        pids: Pids,
         endpoints: Endpoints,
         sources: Sources,
         keys: KeyRing | None,
@@ -70,6 +76,8 @@ class HostVoice:
     ) -> None:
         self._plan, self._host, self._run_id, self._code = plan, host, run_id, code
         self._processes, self._keys, self._on_problem = processes, keys, on_problem
+        self._pids, self._cpu = pids, CpuWatch()
+        self._was_busy, self._busy_reported_ns = False, 0
         self._sources = sources
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
@@ -102,6 +110,7 @@ class HostVoice:
         self._untold = ""
         nodes = plan.nodes_on(host)
         self._devices, self._folder = devices_of(nodes), folder_of(nodes)
+        self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
         """Begin to listen and to speak; needs a running loop."""
@@ -272,7 +281,9 @@ class HostVoice:
     async def _speak(self) -> None:
         while True:
             try:
-                self._publish("host", self._status())
+                status = self._status()
+                self._publish("host", status)
+                self._report_busy(status)
             except OSError as error:
                 untold = f"how this host is cannot be told: {error}"
                 if untold != self._untold:
@@ -282,8 +293,23 @@ class HostVoice:
                 self._write_down()
             await asyncio.sleep(PERIOD_S)
 
+    def _report_busy(self, status: HostStatus) -> None:
+        """Log that the computer has become busy, at most once in BUSY_REPORT_PERIOD_S."""
+        busy, now_ns = is_busy(status), self._clock.now_ns()
+        began, self._was_busy = busy and not self._was_busy, busy
+        if began and now_ns >= self._busy_reported_ns + BUSY_REPORT_PERIOD_S * 1e9:
+            self._busy_reported_ns = now_ns
+            self._on_problem(f"{describe_busy(status)}; {BUSY_REMEDY}")
+
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
+        processes, pids = self._processes(), self._pids()
+        # A node that starts imports for seconds and waits meanwhile; nothing of it is late yet.
+        watched = {
+            one.name: pids[one.name]
+            for one in processes
+            if one.state == "ready" and one.name in pids and one.name not in self._background
+        }
         return HostStatus(
             host=self._host,
             run=self._run_id,
@@ -294,13 +320,14 @@ class HostVoice:
             load_ratio=os.getloadavg()[0] / (os.cpu_count() or 1),
             disk_free_bytes=disk.f_bavail * disk.f_frsize,
             memory_free_bytes=psutil.virtual_memory().available,
-            nodes=self._processes(),
+            nodes=processes,
             missing_devices=tuple(one for one in self._devices if not os.path.exists(one)),
             software=software(),
             keys=()
             if self._keys is None
             else tuple(HostKey(host=name, key=key) for name, key in self._keys.public.items()),
             estop=None if self._kept is None else self._kept.reason,
+            cpu=self._cpu.update(watched, pids),
         )
 
 

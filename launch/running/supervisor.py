@@ -29,8 +29,10 @@ from launch.plans.hosts import clock_node, is_loopback
 from launch.plans.plan import load_scene
 from launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort
 from launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
+from launch.running.code_state import git_state
 from launch.running.host import HostVoice
 from launch.running.keys import KeyWatch, make_rings
+from launch.running.priority import min_nice_step, precedence_problem
 from launch.running.runs import (
     HOST_FILE,
     RUN_VARIABLE,
@@ -51,7 +53,6 @@ from messages.topics import topic_named
 from messages.types import NodeProcess
 from nodes.runner import NodeConfig, PortConfig
 
-COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
 ENTRY = Path(__file__).resolve().parents[2] / "flexsheet.py"
 STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
@@ -381,6 +382,8 @@ class RunningGraph:
         for host in self.plan.hosts if self._host is None else [self._host]:
             self._start_voice(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
+        if problem := precedence_problem(self.nodes):
+            self._report(LAUNCHER, problem)
         for node in self.nodes:
             self._keepers[node.name] = asyncio.create_task(self._keep(node), name=node.name)
 
@@ -419,6 +422,7 @@ class RunningGraph:
             run_id=self.run.id,
             code=f"{(git['commit'] or 'unknown')[:12]}{'+' if git['changed'] else ''}",
             processes=partial(self._processes, host),
+            pids=lambda: self.pids,
             endpoints=partial(local_endpoints, self.run),
             sources=partial(local_sources, self.run),
             keys=self._rings.get(host),
@@ -549,7 +553,7 @@ class RunningGraph:
             RUN_VARIABLE: self.run.id,
             PARENT_VARIABLE: str(os.getpid()),
             LIFELINE_VARIABLE: str(self._lifeline[0]),
-            NICE_VARIABLE: str(node.nice),
+            NICE_VARIABLE: str(max(node.nice, min_nice_step())),
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }
@@ -667,34 +671,6 @@ def describe_exit(code: int) -> str | None:
     if code < 0:
         return f"was ended by {signal.Signals(-code).name}"
     return f"ended with exit code {code}"
-
-
-def git_state(directory: Path) -> str:
-    """Commit of the code and whether it was changed since, as JSON.
-
-    Outside of git (in a container) the commit is what COMMIT_VARIABLE says, else null.
-    """
-
-    def git(*arguments: str) -> str | None:
-        try:
-            result = subprocess.run(
-                # A service's user is seldom the one who cloned; git would answer owners alone.
-                ["git", "-c", "safe.directory=*", "-C", str(directory), *arguments],
-                capture_output=True,
-                text=True,
-                timeout=5,
-                check=True,
-            )
-        except (OSError, subprocess.SubprocessError):
-            return None
-        return result.stdout.strip()
-
-    changes = git("status", "--porcelain")
-    state = {
-        "commit": git("rev-parse", "HEAD") or os.environ.get(COMMIT_VARIABLE) or None,
-        "changed": None if changes is None else bool(changes),
-    }
-    return json.dumps(state)
 
 
 def _fill_run(value: Any, run: Run) -> Any:

@@ -161,6 +161,8 @@ class OtherArm:
             return f"other arm: {self.faults[0]}"
         if self.mode in ("disconnected", "fault", "estop"):
             return f"other arm: {self.mode}"
+        if self.mode == "starting":
+            return "waiting for the other arm"
         return None
 
 
@@ -186,9 +188,9 @@ class ArmControl:
     def __init__(
         self, patience: Patience, *, largest_lag_rad: float, by_itself: bool = False
     ) -> None:
-        self.mode: ArmMode = "disconnected"
+        self.mode: ArmMode = "starting"
         self.faults: tuple[str, ...] = ()
-        self.reason = "not connected yet"
+        self.reason = "waiting for the arm to answer"
         self.estop_reason: str | None = None
         self.measured_rad: Floats | None = None
         self.last_measured_rad: Floats | None = None
@@ -200,6 +202,7 @@ class ArmControl:
         self._unready_since = ""
         self._stood_down: str | None = None
         self._waited_s = 0.0
+        self._silence = ""
         self._clear_way: tuple[Way, Alignment | None] | None = None
         self._alignment: Alignment | None = None
         self._aligned_s = 0.0
@@ -211,7 +214,6 @@ class ArmControl:
         self._velocity = np.zeros(6)
         self._standstill = StandstillMonitor()
         self._has_commanded = False
-        self._silence = ""
         self._sheet: SheetMotion | None = None
         self._settled = False
         self._clear_arm = False
@@ -253,6 +255,10 @@ class ArmControl:
 
     def fail_exchange(self, text: str, *, silent: bool) -> bool:
         """An exchange has failed; True when with it the arm counts as lost, for the first time."""
+        if silent and self.last_measured_rad is None:
+            # It has never answered: it may still be starting, which is no fault.
+            self.reason = f"waiting for the arm: {text}"
+            return False
         if silent and self.miss_answer(text):
             return False
         newly = self.mode != "disconnected"
@@ -381,7 +387,7 @@ class ArmControl:
         elif other.trouble is not None:
             why = other.trouble
         elif goal is None or not goal.overdue_s <= self._patience.stop_after_s:
-            why = why or "no sheet target"
+            why = why or ("waiting for a sheet target" if goal is None else "no sheet target")
         if why is not None:
             self._hinder(why)
         else:
@@ -407,7 +413,7 @@ class ArmControl:
         if measured is None or self._clear_arm:
             self._clear_arm = self._clear_arm and measured is None
             return self._send("idle", self.commanded_rad, geometry, step_s)
-        self._silence = "the other arm is silent"
+        self._silence = "the other arm is silent" if other else "waiting for the other arm"
         if other is not None and (invalid := other.invalid_reason) is not None:
             self._silence, other = f"state of the other arm: {invalid}", None
         self._watch(geometry, other, measured)

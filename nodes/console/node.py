@@ -24,7 +24,7 @@ from nodes.node import Input, Node, NodeParameters, Output, periodic
 
 SHOWN = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),
-    *("frame", "twin/eye", "status", "estop", "display"),
+    *("frame", "twin/eye", "status", "host", "estop", "display"),
 }
 """Topics that it reads, as far as the graph has them."""
 

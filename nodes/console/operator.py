@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from messages.bag import BagError
 from messages.base import Header, Message
+from messages.busy import describe_busy
 from messages.scene import Scene
 from messages.types import (
     ArmState,
@@ -19,6 +20,7 @@ from messages.types import (
     EStop,
     Fingertip,
     Frame,
+    HostStatus,
     SheetTarget,
     Skin,
     Status,
@@ -75,6 +77,7 @@ class Operator:
         self._page = Page(server, ask, with_finger=with_finger, others_may=desk.others_may)
         self._history = History()
         self._statuses: dict[str, tuple[Status, float]] = {}
+        self._hosts: dict[str, HostStatus] = {}
         self._drawn_scene: Scene | None = None
         self._drawn_skin: Skin | None = None
         self._pictured: Frame | None = None
@@ -127,6 +130,8 @@ class Operator:
         """Take what must not be missed."""
         if isinstance(message, Status):
             self._statuses[message.node] = (message, now_s)
+        elif isinstance(message, HostStatus):
+            self._hosts[message.host] = message
         elif isinstance(message, EStop):
             self.desk.stopped = message.reason if message.engaged else None
         elif isinstance(message, Display):
@@ -221,6 +226,7 @@ class Operator:
             stopped,
             sheet=None if sheet is None else sheet[0],
             busy=self._busy(),
+            overloaded="; ".join(filter(None, map(describe_busy, self._hosts.values()))),
             replay=None if timeline is None else timeline.path.name,
         )
         self._page.show_state(html, stopped=stopped is not None)

@@ -22,6 +22,7 @@ STALE_S = 3.0
 
 FAULTY_MODES = ("fault", "estop", "disconnected", "stopping")
 MODES = {
+    "starting": "starting",
     "disconnected": "not connected",
     "idle": "at rest",
     "follow": "following the finger",
@@ -169,12 +170,13 @@ def banner(
     *,
     sheet: SheetTarget | None = None,
     busy: str = "",
+    overloaded: str = "",
     replay: str | None = None,
 ) -> str:
     """What the arms do, over everything else.
 
-    stopped: the reason of an e-stop, or None.  busy: what the object waits for.  replay: name of
-    the bag that is shown.
+    stopped: the reason of an e-stop, or None.  busy: what the object waits for.  overloaded: which
+    computers are too busy for their nodes, and by what.  replay: name of the bag that is shown.
     """
     if stopped is not None:
         text, ground = f"E-STOP is engaged: {stopped}", "bad"
@@ -185,7 +187,12 @@ def banner(
         text, ground = f"Arms: {' / '.join(modes)}", "good"
     else:
         text, ground = "Waiting for the arms", "quiet"
+    if overloaded and stopped is None:
+        # First, since it is the probable cause of what the arms do.
+        text, ground = f"The computer is busy. {text}", "warn"
     said = [_arms_hold(arms, sheet)] if stopped is None else []
+    if overloaded:
+        said.insert(0, f"{overloaded[:1].upper()}{overloaded[1:]}.")
     forces = [arm.edge_force_n for arm in arms.values() if arm.edge_force_n is not None]
     if forces:
         said.append(f"The sheet pulls with {max(forces):.1f} N.")

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -28,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from nodes.background import enter_background
 from nodes.cache import Parts, load_arrays, save_arrays, say_damaged
 from nodes.fem_solver import precompute, pushes
 from nodes.fem_solver.carried import Carrier, Hull, Solved
@@ -44,8 +44,6 @@ PUSH_STEPS, PLACE_STEPS = 200, 1
 """How much of the progress a push, and a place that is filled in, are."""
 PULSE_S = 0.2
 """How often progress is told, and may be stopped, while pushes run."""
-NICER = 10
-"""Worker processes give way to all that runs in real time."""
 PUSH_BYTES = 600_000_000
 """About what solving one push takes."""
 
@@ -97,7 +95,7 @@ asked_to_stop: ContextVar[Callable[[], bool]] = ContextVar("asked_to_stop", defa
 
 
 def _begin(stop: Event) -> None:
-    os.nice(NICER)
+    enter_background()
     asked_to_stop.set(stop.is_set)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.scene import Scene
+from nodes.background import enter_background
 from nodes.cache import default_cache_dir, load_arrays, save_arrays
 from nodes.models.sheet.dents import DentRange, DentShapes, Push, solve_dents, solve_push
 from nodes.models.sheet.rubber import Rubber
@@ -29,9 +29,6 @@ STRETCH_SLACK = 0.01
 
 KEPT = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
 """Fields of `DentShapes` that are in the file, in their order."""
-
-WORKERS_NICE = 10
-"""A graph may be running meanwhile."""
 
 DEPTH_SHARE = 1.2
 """Deepest dent over the scene's push depth."""
@@ -90,7 +87,7 @@ def load_or_solve(
 
     def solve_all(pushes: Sequence[Push]) -> Iterator[Floats]:
         with ProcessPoolExecutor(
-            mp_context=get_context("spawn"), initializer=os.nice, initargs=(WORKERS_NICE,)
+            mp_context=get_context("spawn"), initializer=enter_background
         ) as workers:
             for done, solved in enumerate(workers.map(solve_push, pushes), start=1):
                 progress(done, len(pushes))

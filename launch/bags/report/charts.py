@@ -24,7 +24,8 @@ WIDTH_IN = 9.0
 GOOD, MIDDLE, DOUBTFUL, BAD = "#7fa99b", "#0072b2", "#e69f00", "#c0392b"
 STATE_COLOURS = {
     "wait": "#9aa5ad", "approach": "#56b4e9", "contact": MIDDLE, "hold": DOUBTFUL,
-    "idle": "#9aa5ad", "follow": MIDDLE, "relax": DOUBTFUL, "disconnected": BAD,
+    "starting": "#9aa5ad", "idle": "#9aa5ad", "follow": MIDDLE, "relax": DOUBTFUL,
+    "disconnected": BAD,
     "stopping": BAD, "fault": BAD, "estop": BAD,
     "tracking": MIDDLE, "acquiring": "#56b4e9", "coasting": DOUBTFUL, "lost": BAD,
     "released": "#9aa5ad", "engaged": BAD,

@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from messages.busy import BUSY_REMEDY
+
 Gravity = Literal["bad", "doubtful"]
 
 SLOW_SHARE = 0.5
@@ -30,7 +32,11 @@ class Finding:
     section: str
 
 
+BRIEFLY_BUSY_FRACTION = 0.05
+"""Of the time: a computer that is busy for longer is a fault."""
+
 CHECKED = (
+    "whether the computers were busy; "
     "the bag's end, its types and the state of the code; e-stops, faults and modes of the arms; "
     "joint speed, tool speed and edge force against their limits; nodes' errors and restarts; "
     "each topic's rate, silences, losses and refusals; latency, sheet position and the soft body's "
@@ -39,7 +45,7 @@ CHECKED = (
 
 
 def findings_of(numbers: dict[str, Any]) -> list[Finding]:
-    """All of them, the bad ones first."""
+    """All of them: a busy computer first, since it explains most others, then the bad ones."""
     found = [
         *_of_the_bag(numbers),
         *_of_the_arms(numbers),
@@ -48,7 +54,25 @@ def findings_of(numbers: dict[str, Any]) -> list[Finding]:
         *_of_tolerances(numbers),
         *_of_the_finger(numbers),
     ]
-    return sorted(found, key=lambda one: one.gravity != "bad")
+    others = sorted(found, key=lambda one: one.gravity != "bad")
+    return [*_of_the_load(numbers, others), *others]
+
+
+def _of_the_load(numbers: dict[str, Any], others: list[Finding]) -> Iterator[Finding]:
+    """others: what else was found."""
+    stopped = numbers["events"]["counts"].get("arm", 0)
+    for host in numbers["hosts"].values():
+        if not host["busy_fraction"]:
+            continue
+        text = f"In {host['busy_fraction']:.0%} of the time {host['busy_at_worst']} (at worst). "
+        if stopped:
+            times = "once" if stopped == 1 else f"{stopped} times"
+            text += f"An arm dropped out {times}; this is the probable cause. "
+        elif others:
+            text += "This is the probable cause of what was late. "
+        often = host["busy_fraction"] > BRIEFLY_BUSY_FRACTION
+        gravity: Gravity = "bad" if stopped or often else "doubtful"
+        yield Finding(gravity, f"{text}What to do: {BUSY_REMEDY}.", "bag")
 
 
 def _of_the_bag(numbers: dict[str, Any]) -> Iterator[Finding]:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from launch.bags.report.series import Range, Spread, States
-from launch.bags.report.session import Arm, NodeSaid, Session
+from launch.bags.report.session import Arm, HostLoad, NodeSaid, Session
 from launch.bags.report.strokes import Stroke
+from messages.busy import describe_busy
 from messages.methods import Methods
 from messages.scene import Scene
 from messages.topics import TOPICS
@@ -49,7 +50,8 @@ def numbers_of(session: Session) -> dict[str, Any]:
             "max_tool_speed_m_per_s": scene.arms.max_tool_speed_m_per_s,
         },
         "hosts": {
-            name: host.model_dump(exclude={"nodes", "host"}) for name, host in session.hosts.items()
+            name: host.model_dump(exclude={"nodes", "host"}) | _load(session.loads[name])
+            for name, host in session.hosts.items()
         },
         "topics": _topics(session),
         "latency_ms": {event: _spread_ms(spread) for event, spread in session.latencies.items()},
@@ -90,6 +92,13 @@ def numbers_of(session: Session) -> dict[str, Any]:
             "eye": session.eye.seen,
             "frame": session.drawn.seen,
         },
+    }
+
+
+def _load(load: HostLoad) -> dict[str, Any]:
+    return {
+        "busy_fraction": load.busy / load.reports,
+        "busy_at_worst": "" if load.worst is None else describe_busy(load.worst),
     }
 
 

@@ -194,9 +194,11 @@ def _bag(numbers: Mapping[str, Any]) -> Iterator[str]:
     if numbers["hosts"]:
         yield table(
             "Computers, at the end",
-            ("host", "code", "Python", "load per core", "free disk, GB", "missing devices"),
+            ("host", "busy, % of the time", "code", "Python", "load per core", "free disk, GB",
+             "missing devices"),
             [
-                (name, one["code"], one["python"], one["load_ratio"], one["disk_free_bytes"] / 1e9,
+                (name, 100.0 * one["busy_fraction"], one["code"], one["python"],
+                 one["load_ratio"], one["disk_free_bytes"] / 1e9,
                  ", ".join(one["missing_devices"]) or "none")
                 for name, one in numbers["hosts"].items()
             ],

@@ -20,6 +20,7 @@ from launch.experiments.stroke import events_of
 from launch.plans.planned import Plan
 from messages.bag import BagError, BagInfo, BagReader
 from messages.base import Header, Message
+from messages.busy import is_busy
 from messages.clock_table import ClockTable
 from messages.scene import Scene
 from messages.topics import TOPICS
@@ -53,7 +54,9 @@ SPEED_OVER_NS = 25_000_000
 """Joint and tool speeds are taken over so long: single stamps are not even enough."""
 
 PHASES = ("wait", "approach", "contact", "hold")
-MODES = ("idle", "follow", "hold", "relax", "disconnected", "stopping", "fault", "estop")
+MODES = (
+    "starting", "idle", "follow", "hold", "relax", "disconnected", "stopping", "fault", "estop",
+)  # fmt: skip
 FINGER_STATES = ("tracking", "acquiring", "coasting", "lost")
 FAULTY = ("fault", "estop", "disconnected", "stopping")
 
@@ -110,6 +113,27 @@ class Port:
             self.lost + sum(port.gaps for port in now),
             self.refused + sum(port.rejected for port in now),
         )
+
+
+@dataclass(slots=True)
+class HostLoad:
+    """How often a host's launcher called it busy, and the worst that it reported."""
+
+    reports: int = 0
+    busy: int = 0
+    worst: HostStatus | None = None
+
+    def update(self, host: HostStatus) -> None:
+        """Add one report."""
+        self.reports += 1
+        if is_busy(host):
+            self.busy += 1
+            if self.worst is None or _pressure(host) > _pressure(self.worst):
+                self.worst = host
+
+
+def _pressure(host: HostStatus) -> float:
+    return host.load_ratio if host.cpu is None else host.cpu.wait_ratio
 
 
 @dataclass(slots=True)
@@ -195,6 +219,7 @@ class Session:
         self.ports: dict[str, Port] = {}
         self.nodes: dict[str, NodeSaid] = {}
         self.hosts: dict[str, HostStatus] = {}
+        self.loads: dict[str, HostLoad] = {}
         self.latencies: dict[str, Spread] = {}
         self.phases, self.finger = States(self.fine, PHASES), States(self.fine, FINGER_STATES)
         self.estop = States(self.fine, ("released", "engaged"))
@@ -360,6 +385,7 @@ class Session:
                 self.events.add(seconds, "moment", message.label)
             case HostStatus():
                 self.hosts[message.host] = message
+                self.loads.setdefault(message.host, HostLoad()).update(message)
                 for node in message.nodes:
                     key = f"{message.run} {node.name}"
                     if node.restarts > self._restarts.get(key, 0):

@@ -1,0 +1,122 @@
+"""Measures how long nodes wait for a processor, and which programs take the processors.
+
+Linux counts for each thread how long it was ready to run but did not (`/proc/PID/schedstat`).  The
+main thread of a node runs its loop, so its waiting delays all that the node does.  Counters of the
+whole system (load, /proc/pressure) also count programs that wait because they give way to others,
+and therefore do not say whether nodes are late.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections import defaultdict, deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from messages.types import CpuPressure, ProgramCpu
+
+MAX_WAIT_RATIO = 0.25
+"""Fraction of the time for which a node may wait; beyond it the computer is called busy."""
+
+WINDOW_S = 3.0
+BACKGROUND_NICE = 10
+"""Nodes of this niceness and above give way to all others: that they wait says nothing."""
+
+PROGRAMS_SHOWN = 3
+MIN_CORES = 0.1
+PROC = Path("/proc")
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+@dataclass(frozen=True, slots=True)
+class Waits:
+    """The time waited so far (s) by process id, at one time (s)."""
+
+    time_s: float
+    waited_s: dict[int, float]
+
+
+class CpuWatch:
+    """Compares the kernel's counters with those of WINDOW_S before; call `update` once a second.
+
+    proc: the folder of the kernel's counters.  now_s: a steady clock.
+    """
+
+    def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._proc, self._now_s = proc, now_s
+        self._history: deque[Waits] = deque()
+        self._cpu_before: tuple[float, dict[tuple[str, int], float]] | None = None
+
+    def update(
+        self,
+        watched: Mapping[str, int],
+        named: Mapping[str, int] | None = None,
+        *,
+        measure_programs: bool = False,
+    ) -> CpuPressure | None:
+        """Return the pressure since the oldest sample of the window; None where it is unknown.
+
+        watched: process ids, by node, of those whose waiting counts.  named: process ids of all
+        nodes, to call them by name among the programs; default: those that are watched.
+        measure_programs: even while the computer is not known to be busy.
+        """
+        now_s = self._now_s()
+        counted = {pid: self._waited_s(pid) for pid in watched.values()}
+        waited_s = {pid: waited for pid, waited in counted.items() if waited is not None}
+        while self._history and self._history[0].time_s < now_s - WINDOW_S:
+            self._history.popleft()
+        ratios = {
+            name: (waited_s[pid] - before.waited_s[pid]) / (now_s - before.time_s)
+            for name, pid in watched.items()
+            if pid in waited_s and (before := self._first_with(pid)) and before.time_s < now_s
+        }
+        self._history.append(Waits(now_s, waited_s))
+        node = max(ratios, key=lambda name: ratios[name], default="")
+        busy = bool(node) and ratios[node] > MAX_WAIT_RATIO
+        programs: tuple[ProgramCpu, ...] = ()
+        if busy or measure_programs:
+            programs = self._programs(now_s, watched if named is None else named)
+        if not node:
+            return None
+        return CpuPressure(busy=busy, wait_ratio=ratios[node], node=node, programs=programs)
+
+    def _first_with(self, pid: int) -> Waits | None:
+        return next((one for one in self._history if pid in one.waited_s), None)
+
+    def _waited_s(self, pid: int) -> float | None:
+        """Return how long a process's main thread has waited so far; None where it is unknown."""
+        try:
+            fields = (self._proc / str(pid) / "schedstat").read_text().split()
+        except OSError:
+            return None  # it has just ended, or the kernel was built without these counters
+        return int(fields[1]) * 1e-9
+
+    def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
+        """Return who takes most since the last call; nothing at the first of a busy time."""
+        names = {pid: name for name, pid in named.items()}
+        used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}
+        before, self._cpu_before = self._cpu_before, (now_s, used)
+        if before is None or not 0.0 < now_s - before[0] <= WINDOW_S:
+            return ()
+        cores: dict[str, float] = defaultdict(float)
+        for key, seconds in used.items():
+            if key in before[1]:
+                cores[key[0]] += (seconds - before[1][key]) / (now_s - before[0])
+        largest = sorted(cores.items(), key=lambda one: -one[1])[:PROGRAMS_SHOWN]
+        return tuple(ProgramCpu(name=name, cores=one) for name, one in largest if one >= MIN_CORES)
+
+    def _cpu_times(self) -> Iterator[tuple[str, int, float]]:
+        """Return name, id and processor time (s) of each process."""
+        for folder in self._proc.iterdir():
+            if not folder.name.isdigit():
+                continue
+            try:
+                text = (folder / "stat").read_text(errors="replace")
+            except OSError:
+                continue  # it has just ended
+            # The name is in brackets and may hold brackets; user and system time are fields 14, 15.
+            head, _, tail = text.rpartition(")")
+            user, system = tail.split()[11:13]
+            yield head.partition("(")[2], int(folder.name), (int(user) + int(system)) / _TICKS_PER_S

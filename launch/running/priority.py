@@ -1,0 +1,41 @@
+"""Finds how far this user may raise the priority of processes."""
+
+from __future__ import annotations
+
+import os
+import resource
+from collections.abc import Sequence
+from pathlib import Path
+
+from launch.plans.planned import PlannedNode
+
+MIN_NICE = -20
+CAP_SYS_NICE = 23
+"""Number of the Linux capability that allows any niceness."""
+
+
+def min_nice_step() -> int:
+    """Return the least niceness, relative to this process's own, that a child of it may take."""
+    own = os.getpriority(os.PRIO_PROCESS, 0)
+    # RLIMIT_NICE counts from 20 downwards: 25 allows -5.
+    soft_limit, _ = resource.getrlimit(resource.RLIMIT_NICE)
+    allowed = MIN_NICE if _may_take_any() else 20 - soft_limit
+    return min(0, max(MIN_NICE, allowed) - own)
+
+
+def _may_take_any() -> bool:
+    lines = Path("/proc/self/status").read_text().splitlines()
+    effective = next(line.split()[1] for line in lines if line.startswith("CapEff:"))
+    return bool(int(effective, 16) >> CAP_SYS_NICE & 1)
+
+
+def precedence_problem(nodes: Sequence[PlannedNode]) -> str | None:
+    """Say which nodes cannot take the precedence that their launch file gives; None: all can."""
+    least = min_nice_step()
+    names = [node.name for node in nodes if node.nice < least]
+    if not names:
+        return None
+    return (
+        f"{', '.join(names)}: this user may not give precedence (nice below {least}), so they run "
+        "as any program; to allow it, start as root or set `nice` in /etc/security/limits.conf"
+    )

@@ -1,0 +1,16 @@
+"""Priority of processes that compute something for later while a graph runs."""
+
+from __future__ import annotations
+
+import os
+
+MAX_NICE = 19
+
+
+def enter_background() -> None:
+    """Leave the processors to all others: take the highest niceness and batch scheduling.
+
+    A process of the batch class never interrupts another one when it wakes up.
+    """
+    os.setpriority(os.PRIO_PROCESS, 0, MAX_NICE)
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))

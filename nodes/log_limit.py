@@ -1,0 +1,73 @@
+"""Limits how often a node's log repeats a warning or an error."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections import OrderedDict
+from collections.abc import Callable, MutableMapping
+from dataclasses import dataclass
+from typing import Any
+
+import structlog
+
+LIMITED_LEVELS = {"warning", "error", "critical"}
+REPORT_PERIOD_S = 60.0
+MAX_DISTINCT = 1000
+"""Number of distinct records whose counts are kept; the one that is unseen for longest goes."""
+
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+_WITHOUT_MEANING = {"exc_info", "count"}
+
+Record = MutableMapping[str, Any]
+Key = tuple[tuple[str, str], ...]
+
+
+@dataclass(slots=True)
+class Repeats:
+    """How often a record came, and when it was last logged (s)."""
+
+    count: int = 0
+    logged_s: float = float("-inf")
+
+
+class RepeatLimiter:
+    """Structlog processor that passes the 1st, 10th, 100th, ... of records that say the same.
+
+    A record that continues is passed once in REPORT_PERIOD_S too.  Records say the same if they
+    differ in numbers alone.  From the second on, a record that is passed carries its `count` since
+    the node's start.
+    """
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._known: OrderedDict[Key, Repeats] = OrderedDict()
+
+    def __call__(self, logger: Any, method: str, record: Record) -> Record:
+        if method not in LIMITED_LEVELS:
+            return record
+        repeats = self._repeats_of(record)
+        repeats.count += 1
+        now_s = self._now_s()
+        if not _is_power_of_ten(repeats.count) and now_s < repeats.logged_s + REPORT_PERIOD_S:
+            raise structlog.DropEvent
+        repeats.logged_s = now_s
+        if repeats.count > 1:
+            record["count"] = repeats.count
+        return record
+
+    def _repeats_of(self, record: Record) -> Repeats:
+        key = tuple(
+            (name, _NUMBER.sub("#", str(value)))
+            for name, value in sorted(record.items())
+            if name not in _WITHOUT_MEANING
+        )
+        repeats = self._known.setdefault(key, Repeats())
+        self._known.move_to_end(key)
+        if len(self._known) > MAX_DISTINCT:
+            self._known.popitem(last=False)
+        return repeats
+
+
+def _is_power_of_ten(count: int) -> bool:
+    return int(f"1{'0' * (len(str(count)) - 1)}") == count

@@ -1,0 +1,133 @@
+"""How long nodes wait for a processor, and what is said of a computer that is busy."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from launch.running.cpu import MAX_WAIT_RATIO, WINDOW_S, CpuWatch
+from messages.busy import describe_busy, is_busy
+from messages.types import CpuPressure, HostStatus, ProgramCpu
+
+TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+class Kernel:
+    """Counters of processes as the kernel shows them in a folder, and a clock."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.now_s = folder, 100.0
+        self.watch = CpuWatch(folder, lambda: self.now_s)
+        self._waited_s: dict[int, float] = {}
+        self._used_s: dict[int, float] = {}
+        (folder / "pressure").mkdir()
+
+    def let(self, name: str, pid: int, *, wait_s: float = 0.0, run_s: float = 0.0) -> None:
+        """Let a process wait and run for so long."""
+        self._waited_s[pid] = self._waited_s.get(pid, 0.0) + wait_s
+        self._used_s[pid] = self._used_s.get(pid, 0.0) + run_s
+        folder = self.folder / str(pid)
+        folder.mkdir(exist_ok=True)
+        run_ns, wait_ns = round(1e9 * self._used_s[pid]), round(1e9 * self._waited_s[pid])
+        (folder / "schedstat").write_text(f"{run_ns} {wait_ns} 7\n")
+        ticks = round(self._used_s[pid] * TICKS_PER_S)
+        (folder / "stat").write_text(f"{pid} ({name}) S {'0 ' * 10}{ticks} 0 0 0 20 0 1 0 5\n")
+
+
+@pytest.fixture
+def kernel(tmp_path: Path) -> Kernel:
+    return Kernel(tmp_path)
+
+
+ARMS = {"left": 11, "right": 12}
+
+
+def run(kernel: Kernel, seconds: int, *, left_s: float, right_s: float) -> CpuPressure | None:
+    """Let both arms' nodes wait for so long in each second."""
+    found = None
+    for _ in range(seconds):
+        kernel.let("python", 11, wait_s=left_s, run_s=0.3)
+        kernel.let("python", 12, wait_s=right_s, run_s=0.2)
+        kernel.let("Web Content (1)", 20, run_s=1.5)
+        kernel.now_s += 1.0
+        found = kernel.watch.update(ARMS)
+    return found
+
+
+def test_the_first_look_says_nothing(kernel: Kernel) -> None:
+    assert run(kernel, 1, left_s=0.9, right_s=0.9) is None
+
+
+def test_a_quiet_computer_is_not_busy(kernel: Kernel) -> None:
+    found = run(kernel, 10, left_s=0.02, right_s=0.05)
+    assert found is not None
+    assert found.wait_ratio == pytest.approx(0.05)
+    assert (found.busy, found.node, found.programs) == (False, "right", ())
+
+
+def test_a_busy_computer_names_who_waits_and_who_runs(kernel: Kernel) -> None:
+    found = run(kernel, 10, left_s=0.6, right_s=0.3)
+    assert found is not None
+    assert found.wait_ratio == pytest.approx(0.6)
+    assert (found.busy, found.node) == (True, "left")
+    assert [one.name for one in found.programs] == ["Web Content (1)", "left", "right"]
+    assert [one.cores for one in found.programs] == pytest.approx([1.5, 0.3, 0.2])
+
+
+def test_what_is_long_past_does_not_count(kernel: Kernel) -> None:
+    run(kernel, 10, left_s=0.9, right_s=0.9)
+    found = run(kernel, int(WINDOW_S) + 1, left_s=0.0, right_s=0.0)
+    assert found is not None
+    assert found.wait_ratio < MAX_WAIT_RATIO
+    assert not found.busy
+
+
+def test_a_process_that_is_started_again_begins_anew(kernel: Kernel) -> None:
+    run(kernel, 5, left_s=0.01, right_s=0.01)
+    kernel.now_s += 1.0
+    found = kernel.watch.update({"left": 11, "right": 99})
+    assert found is not None
+    assert found.node == "left"
+    assert kernel.watch.update({"right": 99}) is None
+
+
+def test_the_kernel_of_this_computer_has_the_counters() -> None:
+    watch = CpuWatch()
+    assert watch.update({"test": os.getpid()}) is None
+    found = watch.update({"test": os.getpid()})
+    assert found is not None
+    assert found.wait_ratio >= 0.0
+
+
+def host(**values: Any) -> HostStatus:
+    return HostStatus(
+        host="main", run="1", plan_hash="", code="", python="3.11", uptime_s=1.0,
+        disk_free_bytes=0, memory_free_bytes=0, nodes=(), missing_devices=(),
+        **{"load_ratio": 0.5} | values,
+    )  # fmt: skip
+
+
+def test_a_busy_computer_is_described_by_node_and_programs() -> None:
+    programs = (ProgramCpu(name="chromium", cores=1.34), ProgramCpu(name="renderer", cores=0.4))
+    cpu = CpuPressure(busy=True, wait_ratio=0.61, node="twin_arms", programs=programs)
+    assert is_busy(host(cpu=cpu))
+    assert describe_busy(host(cpu=cpu)) == (
+        "the computer main is busy: twin_arms waits for a processor 61% of the time; "
+        "cores in use: chromium 1.3, renderer 0.4"
+    )
+
+
+def test_where_waiting_is_not_measured_the_load_decides() -> None:
+    assert not is_busy(host(load_ratio=1.4))
+    assert describe_busy(host(load_ratio=1.4)) == ""
+    assert describe_busy(host(load_ratio=8.14)) == (
+        "the computer main is busy: 8.1 processes per core want to run"
+    )
+
+
+def test_a_load_of_programs_that_give_way_makes_no_computer_busy() -> None:
+    cpu = CpuPressure(busy=False, wait_ratio=0.1, node="planner")
+    assert not is_busy(host(load_ratio=8.0, cpu=cpu))

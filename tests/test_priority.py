@@ -1,0 +1,71 @@
+"""How far priorities may be raised, and what is said where they may not."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from launch.plans.plan import load_plan
+from launch.running import priority
+from launch.running.priority import MIN_NICE, min_nice_step, precedence_problem
+
+ROOT = Path(__file__).resolve().parent.parent
+DEMO = load_plan(ROOT / "launch" / "demo.yaml")
+
+
+def allow(monkeypatch: pytest.MonkeyPatch, *, capable: bool, limit: int) -> None:
+    """Let the user have the capability or not, and this soft limit of niceness."""
+    monkeypatch.setattr(priority, "_may_take_any", lambda: capable)
+    monkeypatch.setattr(priority.resource, "getrlimit", lambda which: (limit, limit))
+    monkeypatch.setattr(os, "getpriority", lambda which, who: 0)
+
+
+@pytest.mark.parametrize(
+    ("capable", "limit", "least"), [(True, 0, MIN_NICE), (False, 0, 0), (False, 25, -5)]
+)
+def test_capability_and_limit_allow_precedence(
+    monkeypatch: pytest.MonkeyPatch, capable: bool, limit: int, least: int
+) -> None:
+    allow(monkeypatch, capable=capable, limit=limit)
+    assert min_nice_step() == least
+
+
+def test_a_launcher_that_gives_way_itself_allows_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    allow(monkeypatch, capable=False, limit=20)
+    monkeypatch.setattr(os, "getpriority", lambda which, who: 5)
+    assert min_nice_step() == -5
+
+
+def test_who_may_not_give_precedence_is_told_once_for_all_nodes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    nodes = list(DEMO.nodes.values())
+    allow(monkeypatch, capable=True, limit=0)
+    assert precedence_problem(nodes) is None
+    allow(monkeypatch, capable=False, limit=0)
+    problem = precedence_problem(nodes)
+    assert problem is not None
+    assert "arm_left_bridge" in problem
+    assert "renderer" not in problem
+    assert "\n" not in problem
+
+
+def test_what_the_arms_wait_for_goes_before_all_else_in_the_demo() -> None:
+    chain = {
+        "twin_finger", "camera", "triangulator", "planner", "twin_arms", "arm_left_bridge",
+        "arm_right_bridge",
+    }  # fmt: skip
+    first = max(DEMO.nodes[name].nice for name in chain)
+    assert first < 0 <= min(node.nice for node in DEMO.nodes.values() if node.name not in chain)
+
+
+def test_simulated_arms_may_answer_late_and_then_nothing_else_stops_them() -> None:
+    arms = DEMO.nodes["twin_arms"].parameters
+    for side in ("left", "right"):
+        bridge = DEMO.nodes[f"arm_{side}_bridge"].parameters
+        # Two answers may fail before an arm counts as lost; nothing may give up earlier.
+        assert 2 * bridge["timeout_s"] < bridge["stop_after_s"] < arms["watchdog_s"]
+    lab = load_plan(ROOT / "launch" / "lab.yaml").nodes["arm_left_bridge"].parameters
+    assert (lab["timeout_s"], lab["stop_after_s"]) == (None, 0.1)
