@@ -180,7 +180,8 @@ class _Peer:
 
 
 class Publisher:
-    """Sends the messages of one topic to whoever is connected; needs a running loop.
+    """Sends the messages of one topic to whoever is connected; needs a running loop if latched or
+    if there are keys.  Without a loop, new subscribers are noticed with each message.
 
     Subscribers announce themselves by one empty message per connection (ZMQ_PROBE_ROUTER).  A
     connection that sends anything else is closed.  A ZeroMQ PUB socket would store every
@@ -206,7 +207,13 @@ class Publisher:
         self._keys = keys if any(one.startswith("tcp:") for one in bind) else None
         self._domain: bytes | None = None
         self._on_refused = on_refused
-        self._loop = asyncio.get_running_loop()
+        self._loop: asyncio.AbstractEventLoop | None
+        try:
+            self._loop = asyncio.get_running_loop()
+        except RuntimeError:
+            if self._latched or self._keys is not None:
+                raise
+            self._loop = None
         self._subscribers: dict[bytes, _Peer] = {}
         if self._keys is not None:
             self._domain = Gatekeeper.admit(self._keys, on_refused)
@@ -235,8 +242,9 @@ class Publisher:
             self._socket.close(linger=0)
             raise
         self.endpoints = endpoints
-        self._loop.add_reader(self._socket.fileno(), self._serve_subscribers)
-        self._loop.call_soon(self._serve_subscribers)
+        if self._loop is not None:
+            self._loop.add_reader(self._socket.fileno(), self._serve_subscribers)
+            self._loop.call_soon(self._serve_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
         """Open anew where a key is ours no more, or somebody's who may be connected."""
@@ -287,7 +295,7 @@ class Publisher:
                 return
             peer, *frames = self._socket.recv_multipart(NOBLOCK, copy=False)
             self._on_peer_message(peer.bytes, frames)
-        if not self._loop.is_closed():
+        if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon(self._serve_subscribers)
 
     def _on_peer_message(self, subscriber: bytes, frames: list[zmq.Frame]) -> None:
@@ -325,7 +333,7 @@ class Publisher:
         self._dismiss()
 
     def _close_socket(self, *, unbind: bool) -> None:
-        if not self._loop.is_closed():
+        if self._loop is not None and not self._loop.is_closed():
             self._loop.remove_reader(self._socket.fileno())
         if unbind:
             for endpoint in self.endpoints:

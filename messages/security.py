@@ -38,9 +38,11 @@ class SecurityError(RuntimeError):
 
 
 def new_key_pair() -> tuple[str, str]:
-    """A fresh (public, secret) key pair."""
-    public, secret = zmq.curve_keypair()
-    return public.decode(), secret.decode()
+    """Make a (public, secret) key pair; no public key looks like an option of a command line."""
+    while True:
+        public, secret = zmq.curve_keypair()
+        if not public.startswith(b"-"):
+            return public.decode(), secret.decode()
 
 
 def public_of(secret: str) -> str:
