@@ -26,8 +26,8 @@ from messages.arrays import (
     Vector3,
     Vector6,
 )
-from messages.base import Message
-from messages.scene import Finite, NonNegative, Part, Positive
+from messages.base import Message, MessagePart
+from messages.scene import Finite, NonNegative, Positive
 
 Correction = methods.Correction
 Side = Literal["left", "right"]
@@ -281,7 +281,7 @@ class Arming(Message):
     reason: str = ""
 
 
-class PortStatus(Part):
+class PortStatus(MessagePart):
     """One input or output of a node over the last second and since its start."""
 
     topic: str
@@ -293,7 +293,7 @@ class PortStatus(Part):
     rejected: int = Field(ge=0, description="malformed or of another type")
 
 
-class ClockEcho(Part):
+class ClockEcho(MessagePart):
     """The newest ping that came from another clock."""
 
     clock_id: str
@@ -308,7 +308,7 @@ class ClockPing(Message):
     echoes: tuple[ClockEcho, ...]
 
 
-class ClockOffset(Part):
+class ClockOffset(MessagePart):
     """What another clock shows, less the clock of the header, when that shows `at_ns`."""
 
     clock_id: str
@@ -354,7 +354,7 @@ class Status(Message):
     )
 
 
-class NodeProcess(Part):
+class NodeProcess(MessagePart):
     """A node as its launcher knows it."""
 
     name: str
@@ -365,7 +365,7 @@ class NodeProcess(Part):
     hangs: int = Field(ge=0, description="restarts because it gave no sign of life")
 
 
-class HostKey(Part):
+class HostKey(MessagePart):
     """A host's public key, as another one knows it."""
 
     host: str
