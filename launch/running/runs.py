@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from launch.plans.planned import RUN_DIRECTORY
+from messages.files import write_file
 
 if TYPE_CHECKING:
     import psutil
@@ -115,7 +116,7 @@ def create_run() -> Run:
     run.directory.mkdir(mode=0o700)
     run.logs.mkdir()
     marker = {"pid": os.getpid(), "pid_namespace": _pid_namespace()}
-    (run.directory / _LAUNCHER_FILE).write_text(json.dumps(marker))
+    write_file(run.directory / _LAUNCHER_FILE, json.dumps(marker))
     return run
 
 
