@@ -11,6 +11,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -111,10 +112,19 @@ def main() -> None:
         code = exit_code(error)
         if code is None:
             raise
-        words.print(f"flexsheet: {error}", markup=False)
+        words.print(f"flexsheet: {error_text(error)}", markup=False)
         if "--json" not in sys.argv and (more := explained_by(error)):
             words.print(f"what that means: {more}", markup=False, style="dim")
         sys.exit(code)
+
+
+def error_text(error: Exception) -> str:
+    """The sentence about an error; for one of the disk, with path and remedy."""
+    from messages.files import FileWriteError, write_error
+
+    if not isinstance(error, OSError) or isinstance(error, FileWriteError):
+        return str(error)
+    return str(write_error(Path(error.filename or "standard output"), error))
 
 
 def explained_by(error: Exception) -> str | None:

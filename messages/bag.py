@@ -39,6 +39,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from messages.base import Header, Message, schema_fingerprint
+from messages.files import write_error
 from messages.migrations import Migration, migration_for
 from messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
 from messages.wire import PROTOCOL, WireError, encode, read_envelope
@@ -110,7 +111,7 @@ class BagWriter:
         except FileExistsError:
             raise BagError(f"{self.path}: exists already; a bag is never written over") from None
         except OSError as error:
-            raise BagError(f"{self.path}: cannot be written: {error.strerror}") from error
+            raise BagError(str(write_error(self.path, error))) from error
         self._writer: Any = Writer(  # mcap's types are incomplete
             self._file,
             chunk_size=CHUNK_BYTES,
@@ -118,9 +119,13 @@ class BagWriter:
         )
         self._lock = threading.Lock()
         self._closing = threading.Event()
-        with self._writing():
-            self._writer.start(profile=PROFILE, library="flexsheet")
-            self._file.flush()
+        try:
+            with self._writing():
+                self._writer.start(profile=PROFILE, library="flexsheet")
+                self._file.flush()
+        except BagError:
+            self.path.unlink(missing_ok=True)
+            raise
         for name, values in (metadata or {}).items():
             self.add_metadata(name, values)
         self._flusher = threading.Thread(target=self._flush_regularly, name="bag", daemon=True)
@@ -164,7 +169,7 @@ class BagWriter:
             os.fsync(self._file.fileno())
         except OSError as error:
             self._failure = error
-            raise BagError(f"{self.path}: cannot be written: {error.strerror}") from error
+            raise BagError(str(write_error(self.path, error))) from error
 
     def close(self) -> None:
         """Write the index and close; raises BagError if the disk did not take everything."""
@@ -183,9 +188,7 @@ class BagWriter:
             with suppress(OSError):
                 self._file.close()
         if self._failure is not None:
-            raise BagError(
-                f"{self.path}: cannot be written: {self._failure.strerror}"
-            ) from self._failure
+            raise BagError(str(write_error(self.path, self._failure))) from self._failure
 
     def __enter__(self) -> BagWriter:
         return self
@@ -217,7 +220,7 @@ class BagWriter:
                 yield
             except OSError as error:
                 self._failure = error
-                raise BagError(f"{self.path}: cannot be written: {error.strerror}") from error
+                raise BagError(str(write_error(self.path, error))) from error
 
     def _register(self, topic: Topic) -> int:
         kind = topic.message
@@ -682,7 +685,9 @@ def recover(
     except FileExistsError:
         raise BagError(f"{path_out}: exists already; a bag is never written over") from None
     except OSError as error:
-        raise BagError(f"{path_out}: cannot be written: {error.strerror or error}") from error
+        with suppress(OSError):
+            path_out.unlink(missing_ok=True)
+        raise BagError(str(write_error(path_out, error))) from error
     if not BagReader(path_out).complete:
         raise BagError(f"{path_out}: the recovered bag cannot be read back; is the disk full?")
     return RecoverReport(

@@ -22,6 +22,12 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
 
+class MessagePart(BaseModel):
+    """A named group of a message's fields."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+
 @dataclass(frozen=True, slots=True)
 class Header:
     """The envelope of one message.

@@ -10,6 +10,7 @@ from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from messages.files import write_file
 from messages.scene import Part
 
 Calibration = TypeVar("Calibration", bound=Part)
@@ -36,9 +37,7 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
     if comment:
         text.write(f"# {comment}\n")
     yaml.dump(calibration.model_dump(mode="json"), text)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(text.getvalue())
-    partial.replace(path)
+    write_file(path, text.getvalue())
 
 
 def read_calibration(

@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from messages.arrays import ColorImage, Transform, Triangles, Vector3, Vertices
-from messages.base import Message
+from messages.base import Message, MessagePart
+from messages.limits import LimitedModel
 from messages.methods import Methods
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -22,10 +23,8 @@ NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
-class Part(BaseModel):
-    """A named group of a message's fields."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+class Part(MessagePart, LimitedModel):
+    """A named group of values in a scene or a calibration, each within the limits of its unit."""
 
 
 class Pose(Part):

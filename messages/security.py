@@ -24,6 +24,8 @@ from typing import Any, ClassVar
 import zmq
 from zmq.utils import z85
 
+from messages.files import write_error, write_file
+
 KEY_LENGTH = 40
 ZAP_ENDPOINT = "inproc://zeromq.zap.01"
 ZAP_VERSION = b"1.0"
@@ -38,9 +40,11 @@ class SecurityError(RuntimeError):
 
 
 def new_key_pair() -> tuple[str, str]:
-    """A fresh (public, secret) key pair."""
-    public, secret = zmq.curve_keypair()
-    return public.decode(), secret.decode()
+    """Make a (public, secret) key pair; no public key looks like an option of a command line."""
+    while True:
+        public, secret = zmq.curve_keypair()
+        if not public.startswith(b"-"):
+            return public.decode(), secret.decode()
 
 
 def public_of(secret: str) -> str:
@@ -77,7 +81,7 @@ def write_secret(path: Path, secret: str, *, replace: bool = False) -> None:
             "told of"
         ) from error
     except OSError as error:
-        raise SecurityError(f"{path}: cannot be written: {error.strerror}") from error
+        raise SecurityError(str(write_error(path, error))) from error
     finally:
         part.unlink(missing_ok=True)
 
@@ -190,9 +194,7 @@ class KeyRing:
 def write_ring(file: Path, *, host: str, secret_file: Path, public: dict[str, str]) -> None:
     """Write what a `KeyRing` reads, at once."""
     text = json.dumps({"host": host, "secret_file": str(secret_file), "public": public})
-    part = file.with_suffix(".part")
-    part.write_text(text)
-    part.rename(file)
+    write_file(file, text)
 
 
 class Gatekeeper:

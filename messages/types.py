@@ -26,8 +26,8 @@ from messages.arrays import (
     Vector3,
     Vector6,
 )
-from messages.base import Message
-from messages.scene import Finite, NonNegative, Part, Positive
+from messages.base import Message, MessagePart
+from messages.scene import Finite, NonNegative, Positive
 
 Correction = methods.Correction
 Side = Literal["left", "right"]
@@ -284,7 +284,7 @@ class Arming(Message):
     reason: str = ""
 
 
-class PortStatus(Part):
+class PortStatus(MessagePart):
     """One input or output of a node over the last second and since its start."""
 
     topic: str
@@ -296,7 +296,7 @@ class PortStatus(Part):
     rejected: int = Field(ge=0, description="malformed or of another type")
 
 
-class ClockEcho(Part):
+class ClockEcho(MessagePart):
     """The newest ping that came from another clock."""
 
     clock_id: str
@@ -311,7 +311,7 @@ class ClockPing(Message):
     echoes: tuple[ClockEcho, ...]
 
 
-class ClockOffset(Part):
+class ClockOffset(MessagePart):
     """What another clock shows, less the clock of the header, when that shows `at_ns`."""
 
     clock_id: str
@@ -357,7 +357,7 @@ class Status(Message):
     )
 
 
-class NodeProcess(Part):
+class NodeProcess(MessagePart):
     """A node as its launcher knows it."""
 
     name: str
@@ -368,21 +368,21 @@ class NodeProcess(Part):
     hangs: int = Field(ge=0, description="restarts because it gave no sign of life")
 
 
-class HostKey(Part):
+class HostKey(MessagePart):
     """A host's public key, as another one knows it."""
 
     host: str
     key: str
 
 
-class ProgramCpu(Part):
+class ProgramCpu(MessagePart):
     """The processor time of all processes of one name."""
 
     name: str = Field(description="of the node, for nodes of the graph; else the program's")
     cores: NonNegative = Field(description="processor time over time passed")
 
 
-class CpuPressure(Part):
+class CpuPressure(MessagePart):
     """How long the nodes of a computer were ready to run while no processor was free.
 
     Over the last seconds, of the nodes that do not give way to all others (`nice` below 10).

@@ -29,11 +29,12 @@ from typing import Any, ClassVar, Generic, TypeVar, get_args, get_origin, get_ty
 import numpy as np
 import structlog
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
 from messages.base import Header, Message
 from messages.clock import Clock
 from messages.clock_table import ClockTable
+from messages.limits import LimitedModel
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import PortStatus, Status
 
@@ -48,7 +49,7 @@ TOLD_AGAIN_NS = 5_000_000_000
 """So long after its start a node tells all its steps each time: a recorder may come late."""
 
 
-class NodeParameters(BaseModel):
+class NodeParameters(LimitedModel):
     """A node's parameters; subclasses declare theirs with units in the names and sane defaults."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -284,7 +284,7 @@ def test_a_message_of_any_size_is_taken_as_json(
     for text, word in (
         ('{"engaged": true, "engaged": false, "reason": ""}', "duplicate key"),
         ('{"engaged": NaN, "reason": ""}', "MESSAGE (EStop): engaged"),
-        ("[" * 100_000, "brackets are open at once"),
+        ("[" * 100_000, "lists or mappings are nested"),
     ):
         said = flexsheet("topic", "pub", "estop", text)
         assert said.code == 2

@@ -181,7 +181,8 @@ def small_disk() -> Iterator[Path]:
         folder.rmdir()
         pytest.skip(f"no disk can be mounted here: {mounted.stderr.strip()}")
     yield folder
-    subprocess.run(["umount", str(folder)], check=True)
+    # Lazily: what a failed command had open is closed with its traceback.
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
     folder.rmdir()
 
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
+import psutil
 import pytest
 import pytest_asyncio
 
@@ -29,7 +30,7 @@ from nodes.node import PortCounts
 from nodes.runner import Links, NodeConfig
 from tests.hosts import Hosts, hosts
 from tests.network import Cut
-from tests.test_messages_bus import finger, pictures, stop
+from tests.test_messages_bus import ForeignPublisher, finger, pictures, stop
 
 PLAN = "0123456789abcdef"
 ESTOP, FINGER = TOPICS["estop"], TOPICS["twin/finger"]
@@ -254,6 +255,81 @@ async def test_what_is_changed_repeated_or_replayed_on_the_wire_is_not_heard(
         assert message == stop(str(header.sequence))
     assert ear.sequences == sorted(set(ear.sequences)), "each at most once, in order"
     assert ear.counts.rejected == 0, "ZeroMQ's own seal catches it, before any message is made"
+
+
+async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
+    """All bytes that a subscriber sent open no connection again: the session's keys were made
+    for it, by both ends."""
+    mouth = street.mouth()
+    sent: list[bytes] = []
+
+    class Recorder(Cut):
+        async def _pass_on(
+            self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+        ) -> None:
+            to_publisher = writer.get_extra_info("peername")[1] == street.port
+            with suppress(ConnectionError):
+                while data := await reader.read(1 << 16):
+                    if to_publisher:
+                        sent.append(data)
+                    writer.write(data)
+            writer.transport.abort()
+
+    async with Recorder(street.port) as wire:
+        ear = street.ear(street.rings["left"], port=wire.port)
+        await street.speak(mouth, lambda: len(ear.heard) > 5)
+    assert len(mouth._subscribers) <= 1
+    refused_before = len(mouth._subscribers)
+    reader, writer = await asyncio.open_connection("127.0.0.1", street.port)
+    writer.write(b"".join(sent))
+    answer = bytearray()
+
+    async def listen() -> None:
+        with suppress(ConnectionError):
+            while data := await reader.read(1 << 16):
+                answer.extend(data)
+
+    # ZeroMQ hangs up; until then the publisher goes on.
+    listening = asyncio.create_task(listen())
+    await street.speak(mouth, listening.done)
+    writer.close()
+    assert len(mouth._subscribers) <= refused_before, "nobody new has announced himself"
+    # Greeting (64 bytes) and WELCOME (170 bytes in a frame) at most: no message.
+    assert len(answer) < 300
+
+
+async def test_messages_of_250_mib_are_counted_and_everything_else_goes_on(
+    street: Street,
+) -> None:
+    """Each topic has its own limit; what is longer is refused, and its memory is given back."""
+    foreign = ForeignPublisher(f"tcp://127.0.0.1:{street.port}")
+    street.closers.append(foreign.close)
+    ear = Ear()
+    subscriber = Subscriber(
+        ESTOP, [f"tcp://127.0.0.1:{street.port}"], ear.hear, ear.counts,
+        on_problem=ear.problems.append,
+    )  # fmt: skip
+    subscriber.start()
+    street.closers.append(subscriber.close)
+    number = 0
+
+    async def speak(until_: Callable[[], object]) -> None:
+        nonlocal number
+        while not until_():
+            number += 1
+            foreign.send(*plain(encode(stop("good"), replace(HEADER, sequence=number))))
+            await asyncio.sleep(0.002)
+
+    await speak(lambda: ear.heard)
+    process = psutil.Process()
+    before = process.memory_info().rss
+    for count in range(1, 4):
+        foreign.send(bytes(250 << 20))
+        await speak(lambda: ear.counts.rejected == count)  # noqa: B023
+        heard = len(ear.heard)
+        await speak(lambda: len(ear.heard) > heard)  # noqa: B023
+    assert "at most 1048576 are allowed" in ear.problems[0]
+    assert process.memory_info().rss - before < 300 << 20
 
 
 async def test_nothing_speaks_beyond_loopback_without_keys() -> None:

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zmq
 
-from launch.plans.documents import BadInputError
+from launch.plans.documents import BadInputError, read_document
 from launch.plans.plan import load_plan
 from launch.plans.planned import Plan
 from launch.running import runs
@@ -122,6 +123,26 @@ def test_any_key_can_stand_in_a_launch_file(tmp_path: Path, first: str) -> None:
     install(file, "main", key)
     install(file, "main", key)
     assert load_plan(file).keys == {"main": key}
+
+
+def test_no_new_public_key_looks_like_an_option(monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs = iter([(b"-" + ONE[1:].encode(), b"first"), (ONE.encode(), b"second")])
+    monkeypatch.setattr(zmq, "curve_keypair", lambda: next(pairs))
+    assert new_key_pair() == (ONE, "second")
+
+
+@pytest.mark.parametrize("key", ["-h=j" + "0" * 36, "--js" + "0" * 36, "-" + "0" * 39])
+@pytest.mark.parametrize("order", ["{file} main {key}", "{file} main {key} --json",
+                                   "--json {file} main -- {key}"])  # fmt: skip
+def test_a_key_that_looks_like_an_option_is_installed(
+    tmp_path: Path, command: Command, key: str, order: str
+) -> None:
+    assert is_key(key)
+    file = tmp_path / "graph.yaml"
+    file.write_text(LAB)
+    result = command("keys", "install", *order.format(file=file, key=key).split())
+    assert result.code == 0, result
+    assert read_document(file).values["hosts"]["main"]["key"] == key
 
 
 def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:

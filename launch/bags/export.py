@@ -15,7 +15,9 @@ the bag knows the time of day at its start they count from 1970, else from the h
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -29,6 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from messages.bag import BagReader
 from messages.base import Message
+from messages.files import free_bytes, write_error
 from messages.scene import Scene
 from messages.types import (
     ArmState,
@@ -54,6 +57,10 @@ SHEET_HEIGHT_M, FINGER_RADIUS_M = 0.24, 0.007
 
 Picture = tuple[str, NDArray[np.uint8]]
 Output = tuple[str, Any]
+
+
+MIN_FREE_BYTES = 4 << 20
+"""On the disk of an export; more than the library holds back before it writes."""
 
 
 class ExportError(RuntimeError):
@@ -97,23 +104,39 @@ def export(
     result.wall_clock = offset_ns is not None
     context = foxglove.Context()
     channels: dict[str, Any] = {}
-    try:
-        writer = foxglove.open_mcap(output, context=context)
-    except Exception as error:
-        raise ExportError(f"{output}: cannot be written: {error}") from error
+    draft = output.with_name(f"{output.name}.part")
     seen = Seen()
-    with writer:
-        for number, (topic, message, _, log_time_ns) in enumerate(BagReader(bag, readable)):
-            at_ns = log_time_ns + (offset_ns or 0)
-            for name, value in (*numbers_of(topic, message), *seen.views(topic, message, at_ns)):
-                channel = channels.get(name) or _channel(foxglove, name, value, context)
-                channels[name] = channel
-                channel.log(value, log_time=at_ns)
-                result.messages[name] = result.messages.get(name, 0) + 1
-            if number % 200 == 0:
-                progress((log_time_ns - summary.start_ns) * 1e-9, summary.duration_s)
-        writer.write_metadata("flexsheet", {"bag": bag.name, "complete": str(summary.complete)})
+    try:
+        _check_room(output)
+        with foxglove.open_mcap(draft, context=context, allow_overwrite=True) as writer:
+            for number, (topic, message, _, log_time_ns) in enumerate(BagReader(bag, readable)):
+                # The library itself would print a line for each message that it cannot write.
+                _check_room(output)
+                at_ns = log_time_ns + (offset_ns or 0)
+                views = seen.views(topic, message, at_ns)
+                for name, value in (*numbers_of(topic, message), *views):
+                    channel = channels.get(name) or _channel(foxglove, name, value, context)
+                    channels[name] = channel
+                    channel.log(value, log_time=at_ns)
+                    result.messages[name] = result.messages.get(name, 0) + 1
+                if number % 200 == 0:
+                    progress((log_time_ns - summary.start_ns) * 1e-9, summary.duration_s)
+            complete = str(summary.complete)
+            writer.write_metadata("flexsheet", {"bag": bag.name, "complete": complete})
+        draft.replace(output)
+    except OSError as error:
+        raise ExportError(str(write_error(output, error))) from error
+    except RuntimeError as error:
+        raise ExportError(f"{output}: cannot be written: {error}") from error
+    finally:
+        draft.unlink(missing_ok=True)
     return result
+
+
+def _check_room(output: Path) -> None:
+    """Raise OSError where the disk is nearly full."""
+    if free_bytes(output.parent) < MIN_FREE_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def numbers_of(topic: str, message: Message) -> Iterator[Output]:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.calibration import Board, StereoCalibration
+from messages.files import write_file
 from messages.scene import Lens as SceneLens
 from messages.scene import Pose, Scene
 from messages.types import Side
@@ -32,6 +33,7 @@ from nodes.camera.corners import (
     find_pairs,
     pair_of,
 )
+from nodes.camera.pictures import encode_png
 from nodes.models.camera import camera_matrix, project
 from nodes.models.rigid import (
     apply,
@@ -263,7 +265,7 @@ class PlaceTaker:
         self.taken += 1
         names = [f"{side}{self.taken:02}.png" for side in ("left", "right")]
         for name, picture in zip(names, (left, right), strict=True):
-            cv2.imwrite(str(self._folder / name), picture)
+            write_file(self._folder / name, encode_png(picture))
         add_row(self._folder, names, joints_rad)
 
 
@@ -333,7 +335,7 @@ def twin_places(
         done += 1
         names = [f"{one}{done:02}.png" for one in ("left", "right")]
         for name, picture in zip(names, shown.pair(left_from_board), strict=True):
-            cv2.imwrite(str(folder / name), picture)
+            write_file(folder / name, encode_png(picture))
         add_row(folder, names, joints)
         yield done
 

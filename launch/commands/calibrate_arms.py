@@ -9,6 +9,7 @@ import sys
 import tempfile
 from datetime import UTC, datetime
 from importlib.metadata import version
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,6 +33,7 @@ from launch.commands.output import (
     print_json,
     words,
 )
+from messages.files import write_file
 
 if TYPE_CHECKING:
     from launch.bench.arm_places import PlaceTaker
@@ -390,8 +392,9 @@ def _write_copy(scene_file: Path, found: ArmsCalibration, copy: Path) -> None:
         for key in ("position_m", "rpy_rad"):
             for index, value in enumerate(getattr(base.world_from_base, key)):
                 given[key][index] = _rounded(value)
-    with copy.open("w", encoding="utf-8") as file:
-        yaml.dump(tree, file)
+    text = StringIO()
+    yaml.dump(tree, text)
+    write_file(copy, text.getvalue())
     load_scene(copy)
 
 

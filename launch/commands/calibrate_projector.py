@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +18,7 @@ from launch.commands.output import (
     print_json,
     words,
 )
+from messages.files import write_file
 
 if TYPE_CHECKING:
     from messages.scene import Projector, Scene, StereoCamera
@@ -126,11 +128,11 @@ def projector(
 
 
 def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
-    import cv2
+    from nodes.camera.pictures import encode_png
 
     folder.mkdir(parents=True, exist_ok=True)
     for number, pattern in enumerate(patterns):
-        cv2.imwrite(str(folder / f"pattern{number:02}.png"), pattern)
+        write_file(folder / f"pattern{number:02}.png", encode_png(pattern))
     words.print(
         f"{len(patterns)} patterns in {folder}: show them pixel for pixel, take a picture of each",
         markup=False,
@@ -234,8 +236,9 @@ def write_scene(scene_file: Path, found: Projector, copy: Path) -> None:
     for key in ("position_m", "rpy_rad"):
         values = getattr(found.world_from_projector, key)
         pose[key] = _in_a_row([_rounded(value) for value in values])
-    with copy.open("w", encoding="utf-8") as file:
-        yaml.dump(tree, file)
+    text = StringIO()
+    yaml.dump(tree, text)
+    write_file(copy, text.getvalue())
     load_scene(copy)
 
 

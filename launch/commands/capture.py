@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from launch.commands.output import BAD_INPUT, CommandError, words
+from messages.files import write_file
+from nodes.camera.pictures import encode_png
 
 if TYPE_CHECKING:
     import numpy as np
@@ -87,7 +89,6 @@ def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int
     Ends when all is covered, when the pictures end, or at Ctrl-C; what is still missing is said.
     Returns the number of pairs, at least one.
     """
-    import cv2
 
     if folder.exists():
         raise CommandError(f"--pictures {folder}: exists already; name a new folder", BAD_INPUT)
@@ -100,7 +101,7 @@ def take_pairs(pictures: Iterator[Views], capture: Capture, folder: Path) -> int
                     taken += 1
                     folder.mkdir(parents=True, exist_ok=True)
                     for side, picture in (("left", left), ("right", right)):
-                        cv2.imwrite(str(folder / f"{side}{taken:02}.png"), picture)
+                        write_file(folder / f"{side}{taken:02}.png", encode_png(picture))
                 show(seen.hint, seen.taken)
                 if capture.complete:
                     break

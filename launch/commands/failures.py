@@ -11,6 +11,7 @@ from launch.running.runs import RunDirectoryError
 from launch.running.supervisor import NodeFailedError
 from messages.bag import BagError
 from messages.bus import BusError
+from messages.files import DISK_ERRORS, FileWriteError
 from messages.security import SecurityError
 
 BAD_INPUTS: tuple[type[Exception], ...] = (BadInputError,)
@@ -22,6 +23,7 @@ FAILURES: tuple[type[Exception], ...] = (
     ExperimentError,
     ExportError,
     NodeFailedError,
+    FileWriteError,
 )
 LATE = {
     "messages.scene": "UnfitGeometryError",
@@ -35,5 +37,7 @@ LATE = {
 
 def is_failure(error: Exception) -> bool:
     """Has something failed that the user can put right?"""
+    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        return True
     late = (getattr(sys.modules[name], kind) for name, kind in LATE.items() if name in sys.modules)
     return isinstance(error, (*FAILURES, *late))

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand
 
 from launch.commands import complete
 from launch.commands.graph import JsonOption
@@ -19,9 +20,23 @@ from launch.commands.output import (
     words,
 )
 
+KEY_LENGTH = 40
+
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Keys between hosts: one pair per host."
 )
+
+
+class KeyCommand(TyperCommand):
+    """A command whose last argument may be a key that begins with "-"."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put such a key where no option is looked for."""
+        keys = [one for one in args if one.startswith("-") and len(one) == KEY_LENGTH]
+        if keys and "--" not in args:
+            args = [one for one in args if one not in keys] + ["--", *keys]
+        return super().parse_args(ctx, args)
+
 
 HostArgument = Annotated[str, typer.Argument(metavar="HOST", help="Its name in the launch file.")]
 
@@ -95,9 +110,10 @@ def show(
 
 
 @app.command(
+    cls=KeyCommand,
     epilog=examples(
         "flexsheet keys install lab.yaml arm_left 'rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7'"
-    )
+    ),
 )
 def install(
     file: Annotated[

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +10,7 @@ import typer
 from launch.commands import complete
 from launch.commands.graph import JsonOption
 from launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
+from messages.files import write_file
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 
@@ -73,8 +73,7 @@ def install(
             continue
         try:
             file.path.parent.mkdir(parents=True, exist_ok=True)
-            file.path.write_text(file.text)
-            os.chmod(file.path, file.mode)
+            write_file(file.path, file.text, mode=file.mode)
         except OSError as error:
             raise CommandError(
                 f"{file.path}: cannot be written: {error.strerror}; as root?"

@@ -18,6 +18,7 @@ from launch.experiments.run import (
     settings_of_type,
     stroke_procedure,
 )
+from messages.files import write_file
 from messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
@@ -88,5 +89,5 @@ def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoRes
     results = [
         stroke.stroke_result(recording, one, seconds, bag) for seconds, one in errors.items()
     ]
-    (folder / "stroke.json").write_text(json.dumps(results, indent=1) + "\n")
+    write_file(folder / "stroke.json", json.dumps(results, indent=1) + "\n")
     return DemoResult(folder=folder, bag=bag, strokes=results, pictures=pictures)

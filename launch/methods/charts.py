@@ -18,6 +18,7 @@ from launch.methods.finite import finite
 from launch.methods.machine import machine_name
 from launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
 from launch.running.code_state import git_state
+from messages.files import write_file
 from messages.scene import Scene
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 
@@ -271,7 +272,7 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     picture, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
     draw_chart(result, picture)
-    numbers.write_text(json.dumps(finite(result), indent=1) + "\n")
+    write_file(numbers, json.dumps(finite(result), indent=1) + "\n")
     return picture, numbers
 
 
@@ -290,7 +291,7 @@ def _as_today(result: dict[str, Any]) -> dict[str, Any]:
 def write_overview(folder: Path) -> Path:
     """One page of all the charts that lie in the folder; returns its path."""
     path = folder / OVERVIEW
-    path.write_text("\n".join(_overview_lines(folder)) + "\n", encoding="utf-8")
+    write_file(path, "\n".join(_overview_lines(folder)) + "\n")
     return path
 
 

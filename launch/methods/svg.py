@@ -8,6 +8,8 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from messages.files import write_file
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
@@ -65,4 +67,4 @@ def svg_of(figure: Figure) -> str:
 
 def save_svg(figure: Figure, path: Path) -> None:
     """Write `svg_of` the figure."""
-    path.write_text(svg_of(figure), encoding="utf-8")
+    write_file(path, svg_of(figure))

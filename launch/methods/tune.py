@@ -27,6 +27,7 @@ from launch.methods.charts import duration, family_at, git_commit, measure_famil
 from launch.methods.machine import machine_name
 from launch.plans.documents import BadInputError, Problem, did_you_mean
 from launch.plans.plan import load_scene
+from messages.files import DISK_ERRORS, write_error
 from messages.scene import Scene
 from nodes.methods import Family, Point, Trial
 
@@ -518,6 +519,8 @@ def check_target(source: Path, target: Path) -> None:
 
 
 def _unwritable(target: Path, error: OSError) -> BadInputError:
+    if error.errno in DISK_ERRORS:
+        return BadInputError([Problem(str(write_error(target, error)), (), "nothing is changed")])
     what = f"cannot be written: {error.strerror or error}"
     remedy = "give --output FILE, in a folder that is there and may be written to"
     return BadInputError([Problem(str(target), (), what, remedy)])

@@ -14,10 +14,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from launch.objects.textures import put_image
 from launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
+from messages.limits import LimitedModel
 from messages.scene import Mesh, Positive, Scene
 from nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape
 from nodes.models.shapes.smooth_mesh import usual_smoothing_m
@@ -46,7 +47,7 @@ MOST_CUTTING = 0.01
 another object.  Fewer are bridged by the smooth surface."""
 
 
-class MeshFile(BaseModel):
+class MeshFile(LimitedModel):
     """An object's geometry as a scene file gives it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -24,16 +24,32 @@ from ruamel.yaml.scalarfloat import ScalarFloat
 from ruamel.yaml.scalarint import ScalarInt
 from ruamel.yaml.scalarstring import ScalarString
 from ruamel.yaml.tokens import (
+    AliasToken,
+    BlockEndToken,
+    BlockMappingStartToken,
+    BlockSequenceStartToken,
     FlowMappingEndToken,
     FlowMappingStartToken,
     FlowSequenceEndToken,
     FlowSequenceStartToken,
+    ScalarToken,
 )
 
 M = TypeVar("M", bound=BaseModel)
-TEXT_MAX = 1 << 20
-DEPTH_MAX = 50
-VALUES_MAX = 20_000
+MAX_TEXT_LENGTH = 1 << 18
+MAX_DEPTH = 50
+MAX_VALUES = 5000
+"""The largest file of launch/ has 300; the parser takes a second for these."""
+
+OPENING_TOKENS = (
+    BlockMappingStartToken,
+    BlockSequenceStartToken,
+    FlowMappingStartToken,
+    FlowSequenceStartToken,
+)
+CLOSING_TOKENS = (BlockEndToken, FlowMappingEndToken, FlowSequenceEndToken)
+VALUE_TOKENS = (ScalarToken, AliasToken)
+
 SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarBoolean, bool),
     (ScalarFloat, float),
@@ -41,6 +57,9 @@ SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarString, str),
 )
 """The parser's own kinds of values, which remember how they were written."""
+
+MAPPING_WANTED = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
+"""Kinds of pydantic's errors whose texts name a class."""
 
 Key = tuple[str | int, ...]
 """Where a value sits in a document: ("nodes", "planner", "parameters", "lead_s")."""
@@ -116,7 +135,7 @@ def parse_value(text: str) -> Any:
 def _tree(text: str) -> Any:
     """The YAML tree of a text, with its comments; raises YAMLError and nothing else."""
     try:
-        _check_depth(text)
+        _check_size(text)
         return YAML(typ="rt", pure=True).load(text)
     except YAMLError:
         raise
@@ -127,19 +146,27 @@ def _tree(text: str) -> Any:
         raise YAMLError(f"holds a value that cannot be read: {error}"[:500]) from error
 
 
-def _check_depth(text: str) -> None:
-    """YAMLError for too many brackets that are open at once, not counting those in comments and
-    strings: the parser's time goes with the square of them and more."""
-    if text.count("[") + text.count("{") <= DEPTH_MAX:
+def _check_size(text: str) -> None:
+    """Refuse a text whose parsing would take long; raises YAMLError.
+
+    The parser's time grows with the square of the depth and more, so tokens are counted first, and
+    that only where the punctuation does not rule too many of them out.
+    """
+    lines = text.splitlines()
+    columns = max((len(line) - len(line.lstrip(" -?\t")) for line in lines), default=0)
+    brackets = sum(map(text.count, "[{"))
+    separators = sum(map(text.count, ":,-?"))
+    if columns + brackets <= MAX_DEPTH and separators < MAX_VALUES:
         return
-    depth = 0
+    depth = values = 0
     for token in YAML(typ="rt", pure=True).scan(text):
-        if isinstance(token, FlowSequenceStartToken | FlowMappingStartToken):
-            depth += 1
-        elif isinstance(token, FlowSequenceEndToken | FlowMappingEndToken):
-            depth -= 1
-        if depth > DEPTH_MAX:
-            raise YAMLError(f"more than {DEPTH_MAX} brackets are open at once")
+        depth += isinstance(token, OPENING_TOKENS)
+        depth -= isinstance(token, CLOSING_TOKENS)
+        values += isinstance(token, VALUE_TOKENS)
+        if depth > MAX_DEPTH:
+            raise YAMLError(f"more than {MAX_DEPTH} lists or mappings are nested")
+        if values > 2 * MAX_VALUES:
+            raise YAMLError(f"more than {MAX_VALUES} values")
 
 
 def parse_json(text: str) -> Any:
@@ -173,8 +200,8 @@ def read_document(path: Path) -> Document:
         ) from error
     except UnicodeDecodeError as error:
         raise BadInputError([Problem(str(path), (), f"is not UTF-8 text: {error}")]) from error
-    if len(text) > TEXT_MAX:
-        what = f"has {len(text)} characters, at most {TEXT_MAX} are read"
+    if len(text) > MAX_TEXT_LENGTH:
+        what = f"has {len(text)} characters, at most {MAX_TEXT_LENGTH} are read"
         raise BadInputError([Problem(str(path), (), what)])
     try:
         tree = _tree(text)
@@ -192,7 +219,7 @@ def read_document(path: Path) -> Document:
     except YAMLError as error:
         raise BadInputError([Problem(str(path), (), f"not YAML: {error}")]) from error
     if not isinstance(tree, CommentedMap):
-        kind = "empty" if tree is None else f"a {type(tree).__name__}"
+        kind = _kind_name(values)
         raise BadInputError([Problem(str(path), (), f"is {kind}", "it must hold keys and values")])
     return Document(path, values, text, dict(_lines(tree, ())))
 
@@ -203,14 +230,14 @@ def plain(tree: Any) -> Any:
     Raises YAMLError for keys that are more than a word or a number, and where aliases stand for
     more values than anybody writes.
     """
-    left = VALUES_MAX
+    left = MAX_VALUES
 
     def convert(value: Any) -> Any:
         nonlocal left
         left -= 1
         if left < 0:
             raise YAMLError(
-                f"more than {VALUES_MAX} values, those that aliases (*) repeat included"
+                f"more than {MAX_VALUES} values, those that aliases (*) repeat included"
             )
         if isinstance(value, Mapping):
             return {key(name): convert(item) for name, item in value.items()}
@@ -224,7 +251,7 @@ def plain(tree: Any) -> Any:
     def key(name: Any) -> Any:
         if name is None or isinstance(name, str | int | float):
             return convert(name)
-        raise YAMLError(f"a key is a {type(name).__name__}, not a word or a number")
+        raise YAMLError("a key is a list or a mapping, not a word or a number")
 
     try:
         return convert(tree)
@@ -246,6 +273,25 @@ def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:
             if position is not None:
                 yield (*key, i), position[0] + 1
             yield from _lines(item, (*key, i))
+
+
+def _kind_name(value: Any) -> str:
+    """What YAML calls a value of this kind."""
+    match value:
+        case None:
+            return "empty"
+        case dict():
+            return "a mapping"
+        case list():
+            return "a list"
+        case str():
+            return "a text"
+        case bool():
+            return "true or false"
+        case int() | float():
+            return "a number"
+        case _:
+            return "a date"
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
@@ -281,6 +327,10 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
             (*at, *inside, name), f'unknown key "{name}"', did_you_mean(name, known)
         )
     key = (*at, *_walk(model, location)[0])
+    if error["type"] in MAPPING_WANTED:
+        return document.problem(
+            key, f"is {_kind_name(error['input'])}", "it must hold keys and values"
+        )
     message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
     return document.problem(key, f"{_shown(error['input'])} does not fit", message)
 

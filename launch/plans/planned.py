@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
 from messages.bus import Source
+from messages.limits import LimitedModel
 from messages.scene import Scene
 
 MAIN = "main"
@@ -23,7 +24,7 @@ RUN_DIRECTORY = "@run"
 """Stands for the run's directory in endpoints and parameters; known only when the run starts."""
 
 
-class Strict(BaseModel):
+class Strict(LimitedModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 

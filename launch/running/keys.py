@@ -19,6 +19,7 @@ from launch.plans.documents import BadInputError, Problem, did_you_mean, read_do
 from launch.plans.hosts import load_keys
 from launch.plans.planned import Plan
 from launch.running.runs import Run, ring_file
+from messages.files import write_file
 from messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
 
 KEYS_VARIABLE = "FLEXSHEET_KEYS"
@@ -103,7 +104,4 @@ def install(launch_file: Path, host: str, key: str) -> None:
     tree["hosts"][host]["key"] = SingleQuotedScalarString(key)
     text = StringIO()
     yaml.dump(tree, text)
-    part = launch_file.with_suffix(".part")
-    part.write_text(text.getvalue(), encoding="utf-8")
-    part.chmod(launch_file.stat().st_mode & 0o777)
-    part.rename(launch_file)
+    write_file(launch_file, text.getvalue(), mode=launch_file.stat().st_mode & 0o777)

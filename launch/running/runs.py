@@ -19,6 +19,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from messages.files import write_file
+
 if TYPE_CHECKING:
     import psutil
 
@@ -121,7 +123,7 @@ def create_run() -> Run:
     begun.directory.mkdir(mode=0o700)
     begun.logs.mkdir()
     marker = {"pid": os.getpid(), "pid_namespace": _pid_namespace()}
-    (begun.directory / _LAUNCHER_FILE).write_text(json.dumps(marker))
+    write_file(begun.directory / _LAUNCHER_FILE, json.dumps(marker))
     begun.directory.rename(run.directory)
     return run
 

@@ -48,6 +48,7 @@ from launch.running.starvation import ProcessorTime, starved_s
 from messages.base import Header
 from messages.bus import Publisher
 from messages.clock import SystemClock
+from messages.files import write_file
 from messages.security import KeyRing, SecurityError
 from messages.topics import topic_named
 from messages.types import NodeProcess
@@ -94,7 +95,7 @@ class Child:
         self._reports = True
         try:
             with_pipe = config.model_copy(update={"ready_fd": ready_write})
-            config_file.write_text(with_pipe.model_dump_json())
+            write_file(config_file, with_pipe.model_dump_json())
             # While Python starts, SIGINT would raise; the node's first statement unblocks it.
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
@@ -568,18 +569,16 @@ class RunningGraph:
     def _write_run_files(self) -> None:
         """What a recorder attaches and what tools find the graph by."""
         directory = self.run.directory
-        (directory / "launch.yaml").write_text(self.plan.launch_text)
-        (directory / "scene.yaml").write_text(self.plan.scene_text)
-        (directory / "git.json").write_text(git_state(ENTRY.parent))
+        write_file(directory / "launch.yaml", self.plan.launch_text)
+        write_file(directory / "scene.yaml", self.plan.scene_text)
+        write_file(directory / "git.json", git_state(ENTRY.parent))
         if self._host is not None:
-            (directory / HOST_FILE).write_text(self._host)
+            write_file(directory / HOST_FILE, self._host)
         if any(port.topic == "scene" for node in self.nodes for port in node.outputs):
             self._write_scenes(directory / "scenes")
         # Last and at once: tools that look for a graph read this file.
         text = self.plan.model_dump_json(indent=1)
-        temporary = self.run.plan_file.with_suffix(".part")
-        temporary.write_text(text)
-        temporary.rename(self.run.plan_file)
+        write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
         """The scenes that a node may publish: those beside the plan's own, checked, as JSON."""
@@ -587,7 +586,7 @@ class RunningGraph:
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
             try:
-                (folder / f"{path.stem}.json").write_text(load_scene(path).model_dump_json())
+                write_file(folder / f"{path.stem}.json", load_scene(path).model_dump_json())
             except BadInputError as error:
                 self._report(LAUNCHER, f"scene {path.name} is left out: {error}")
 

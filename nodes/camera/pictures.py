@@ -191,3 +191,8 @@ def cut(pictures: Pictures, wanted: Regions) -> Pictures:
     return replace(
         pictures, left=images[0], right=images[1], regions=wanted, notes=(*pictures.notes, note)
     )
+
+
+def encode_png(picture: Image) -> bytes:
+    """The PNG file of a picture."""
+    return bytes(cv2.imencode(".png", picture)[1])

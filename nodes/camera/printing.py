@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.calibration import Board
+from messages.files import write_file
 from nodes.camera.corners import CalibrationError, charuco_board, describe
 
 Floats = NDArray[np.float64]
@@ -116,7 +117,7 @@ def write_board(board: Board, path: Path) -> None:
     """Write the board by the path's suffix; raises CalibrationError for one that is neither."""
     suffix = path.suffix.lower()
     if suffix == ".svg":
-        path.write_text(svg(board))
+        write_file(path, svg(board))
     elif suffix == ".png":
         import matplotlib.image  # only here: it is slow to import
 

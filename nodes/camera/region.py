@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import ConfigDict
 
+from messages.limits import LimitedModel
 from messages.scene import Lens, Scene
 from nodes.camera.pictures import DeviceError, Region, Regions
 from nodes.models import camera, rigid
@@ -21,7 +22,7 @@ ALIGN_PX = (16, 2)
 NEAREST_M = 1e-3
 
 
-class ExplicitRegions(BaseModel):
+class ExplicitRegions(LimitedModel):
     """Regions as a launch file gives them: [column, row, width, height] in pixels for each view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from messages.files import write_file
 from nodes.camera.bundle import PARAMETERS, pose_transform
 from nodes.camera.calibration import Calibrated
 from nodes.camera.check import Rig
@@ -183,7 +184,7 @@ def write_report(calibrated: Calibrated, folder: Path) -> Path:
     for name, (draw, text) in drawn.items():
         picture = BytesIO()
         draw(calibrated).savefig(picture, format="png", dpi=DOTS_PER_INCH)
-        (folder / f"{name}.png").write_bytes(picture.getvalue())
+        write_file(folder / f"{name}.png", picture.getvalue())
         coded = base64.b64encode(picture.getvalue()).decode()
         figures.append(
             f'<figure><img alt="{name}" src="data:image/png;base64,{coded}">'
@@ -236,5 +237,5 @@ def write_report(calibrated: Calibrated, folder: Path) -> Path:
         ]
     )
     path = folder / "index.html"
-    path.write_text(page)
+    write_file(path, page)
     return path

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field
 
+from messages.limits import LimitedModel
 from messages.scene import Finite, NonNegative, Positive
 
 
-class Source(BaseModel):
+class Source(LimitedModel):
     """A kind of device, as the parameter `source` names it."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from messages.files import write_file
 from messages.scene import Scene
 from nodes.console.scenes import SceneChoiceError
 
@@ -39,6 +39,4 @@ def load_kept(path: Path) -> Kept | None:
 
 def save_kept(path: Path, kept: Kept) -> None:
     """Write it whole or not at all."""
-    beside = path.with_name(f"{path.name}.new")
-    beside.write_text(kept.model_dump_json())
-    os.replace(beside, path)
+    write_file(path, kept.model_dump_json())

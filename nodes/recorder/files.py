@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import mimetypes
-import os
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from itertools import count
@@ -24,12 +23,6 @@ def free_path(path: Path) -> Path:
         if not candidate.exists():
             return candidate
     raise AssertionError("count() does not end")
-
-
-def free_bytes(folder: Path) -> int:
-    """What is left for us on the disk of a folder; OSError where it is gone."""
-    state = os.statvfs(folder)
-    return state.f_bavail * state.f_frsize
 
 
 def open_bag(

@@ -12,6 +12,7 @@ from launch.bags.report.numbers import numbers_of
 from launch.bags.report.page import MARK, page_of
 from launch.bags.report.session import Progress, Session, read_session
 from messages.bag import BagError
+from messages.files import DISK_ERRORS, write_error
 
 
 def default_output(bag: Path) -> Path:
@@ -72,6 +73,8 @@ def _check(output: Path) -> None:
 
 
 def _unwritable(output: Path, error: OSError) -> BagError:
+    if error.errno in DISK_ERRORS:
+        return BagError(str(write_error(output, error)))
     return BagError(
         f"{output}: cannot be written: {error.strerror or error}; name a file with -o in a folder "
         "that is there and may be written to"

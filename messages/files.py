@@ -1,0 +1,65 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+from contextlib import suppress
+from pathlib import Path
+
+DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
+"""Numbers of errors that are the disk's, wherever they come up."""
+
+
+class FileWriteError(OSError):
+    """A file that cannot be written; the sentence names path, cause, needed and free space."""
+
+    def __str__(self) -> str:
+        return str(self.strerror)
+
+
+def write_file(path: Path, content: str | bytes, *, mode: int | None = None) -> None:
+    """Write a file at once: where it cannot be written, the former one stays, or none.
+
+    mode: permissions; None: as the process creates files.  Raises FileWriteError.
+    """
+    data = content.encode() if isinstance(content, str) else content
+    part = path.with_name(f"{path.name}.part")
+    try:
+        try:
+            with part.open("wb") as file:
+                if mode is not None:
+                    os.fchmod(file.fileno(), mode)
+                file.write(data)
+            part.replace(path)
+        except BaseException:
+            with suppress(OSError):
+                part.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise write_error(path, error, needed_bytes=len(data)) from error
+
+
+def write_error(path: Path, error: OSError, *, needed_bytes: int | None = None) -> FileWriteError:
+    """The error of a file that could not be written, in one sentence."""
+    text = f"{path}: cannot be written: {error.strerror or error}"
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        needed = "" if needed_bytes is None else f"{_shown(needed_bytes)} are needed, "
+        with suppress(OSError):
+            needed += f"{_shown(free_bytes(path.parent))} are free; "
+        text += f"; {needed}make room, or name a file on another disk"
+    elif error.errno == errno.ENOENT:
+        text += "; make its folder first"
+    else:
+        text += "; name another file"
+    return FileWriteError(error.errno, text)
+
+
+def free_bytes(folder: Path) -> int:
+    """What is left for this user on the disk of a folder; OSError where it is gone."""
+    state = os.statvfs(folder)
+    return state.f_bavail * state.f_frsize
+
+
+def _shown(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:.2f} MB" if size_bytes >= 100_000 else f"{size_bytes} bytes"

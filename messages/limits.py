@@ -1,0 +1,171 @@
+"""Limits of numbers that people write into files: scenes, launch files, parameters, calibrations.
+
+A field's name ends in its unit, and the unit has a limit; a few names have one of their own.  The
+limits are wide: they refuse what no apparatus of this kind can have, and what the arithmetic of the
+nodes is not made for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Annotated, Any, get_args, get_origin
+
+import numpy as np
+from annotated_types import Gt
+from pydantic import BaseModel, ValidationInfo, field_validator
+from pydantic.fields import FieldInfo
+
+MAX_LENGTH_M = 10.0
+"""Everything stands in one room."""
+
+MAX_ANGLE_RAD = 7.0
+"""A full rotation, and rounding."""
+
+MAX_DURATION_S = 86_400.0
+MAX_RATE_HZ = 10_000.0
+MAX_IMAGE_PX = 16_384.0
+"""OpenGL's largest texture on common devices; larger than any camera or projector."""
+
+MAX_STRESS_PA = 1.2e12
+"""Young's modulus of diamond."""
+
+MAX_FORCE_N = 10_000.0
+MAX_SPEED_M_PER_S = 10.0
+"""The fastest strokes of a hand."""
+
+MAX_TOOL_SPEED_M_PER_S = 2.2
+"""The RV-1A's own limit, all joints together (its specification)."""
+
+MAX_STRETCH_RATIO = 10.0
+"""Natural rubber breaks below it."""
+
+MAX_NUMBER = 1e9
+"""Of a number without a unit."""
+
+MAX_SEED = 2.0**63
+MAX_BYTES = 2.0**50
+
+MAX_BY_NAME = {
+    "max_tool_speed_m_per_s": MAX_TOOL_SPEED_M_PER_S,
+    "max_stretch_ratio": MAX_STRETCH_RATIO,
+    "min_stretch_ratio": MAX_STRETCH_RATIO,
+    "exposure_s": 1.0,
+    "latency_s": 10.0,
+    "distortion": 1000.0,
+    "gain": 1e6,
+    "seed": MAX_SEED,
+    "workers": 1024.0,
+    "confirm_frames": 1000.0,
+    "window_half_px": 256.0,
+    "most_waiting": 10_000.0,
+}
+
+MAX_BY_UNIT = {
+    "_area_px": MAX_IMAGE_PX**2,
+    "_m_per_s3": 1e6,
+    "_m_per_s2": 1e4,
+    "_m_per_s": MAX_SPEED_M_PER_S,
+    "_rad_per_s3": 1e6,
+    "_rad_per_s2": 1e4,
+    "_rad_per_s": 100.0,
+    "_per_s3": 1e6,
+    "_per_s2": 1e4,
+    "_per_s": 1e3,
+    "_n_per_m": 1e9,
+    "_m": MAX_LENGTH_M,
+    "_rad": MAX_ANGLE_RAD,
+    "_s": MAX_DURATION_S,
+    "_hz": MAX_RATE_HZ,
+    "_px": MAX_IMAGE_PX,
+    "_pa": MAX_STRESS_PA,
+    "_n": MAX_FORCE_N,
+    "_ratio": 1e6,
+    "_bytes": MAX_BYTES,
+}
+"""By the end of a name, the longest first."""
+
+MIN_BY_UNIT = {"_m": 1e-6, "_s": 1e-6, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
+"""Of fields that must be above zero; a fraction of what any device resolves."""
+
+MIN_POSITIVE = 1e-9
+"""Of those without such a unit."""
+
+MAX_ROTATION_ERROR = 1e-4
+"""Of a rotation matrix times its transpose, per element: 0.05 mm at half a metre."""
+
+
+class LimitedModel(BaseModel):
+    """A model of numbers within the limits of their units, and of rigid 4x4 arrays."""
+
+    @field_validator("*", mode="after")
+    @classmethod
+    def _check_limits(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is None or isinstance(value, str | bool | BaseModel):
+            return value
+        name = info.field_name or ""
+        if isinstance(value, np.ndarray):
+            if value.dtype.kind == "f" and value.size:
+                _check_number(float(np.abs(value).max()), name)
+                if value.shape == (4, 4):
+                    check_rigid(value)
+        elif isinstance(value, tuple | list):
+            for one in value:
+                if isinstance(one, int | float):
+                    _check_number(one, name)
+        elif isinstance(value, int | float):
+            _check_number(value, name)
+            if 0.0 < value < min_of(name) and _refuses_zero(cls, name):
+                raise ValueError(f"give at least {min_of(name):g}{_unit_text(name)}, not {value:g}")
+        return value
+
+
+def _check_number(value: float, name: str) -> None:
+    if not abs(value) <= max_of(name):
+        raise ValueError(f"give at most {max_of(name):g}{_unit_text(name)}, and a finite number")
+
+
+def check_rigid(matrix: np.ndarray[Any, Any]) -> None:
+    """Raise ValueError for a 4x4 matrix that is no rigid transform."""
+    if not np.array_equal(matrix[3], (0.0, 0.0, 0.0, 1.0)):
+        raise ValueError("the last row of a rigid transform is [0, 0, 0, 1]")
+    rotation = matrix[:3, :3]
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > MAX_ROTATION_ERROR:
+        raise ValueError("the upper left 3x3 must be a rotation: rows of length 1 at right angles")
+    if np.linalg.det(rotation) < 0.0:
+        raise ValueError("the upper left 3x3 is a reflection; negate one of its axes")
+
+
+@cache
+def max_of(name: str) -> float:
+    """The largest magnitude of a field's numbers."""
+    if name in MAX_BY_NAME:
+        return MAX_BY_NAME[name]
+    return next((MAX_BY_UNIT[unit] for unit in MAX_BY_UNIT if name.endswith(unit)), MAX_NUMBER)
+
+
+@cache
+def min_of(name: str) -> float:
+    """The smallest value of a field that must be above zero."""
+    unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
+    return MIN_BY_UNIT.get(unit, MIN_POSITIVE)
+
+
+def _unit_text(name: str) -> str:
+    unit = next((unit for unit in MAX_BY_UNIT if name.endswith(unit)), "")
+    return f" {unit[1:]}" if unit and unit != "_ratio" else ""
+
+
+@cache
+def _refuses_zero(model: type[BaseModel], name: str) -> bool:
+    field = model.model_fields[name]
+    return any(isinstance(one, Gt) for one in _constraints(field, field.annotation))
+
+
+def _constraints(field: FieldInfo, annotation: Any) -> Iterator[Any]:
+    """The constraints of a field, and of the members of an optional one."""
+    yield from field.metadata
+    for member in get_args(annotation):
+        if get_origin(member) is Annotated:
+            for one in get_args(member)[1:]:
+                yield from one.metadata if isinstance(one, FieldInfo) else (one,)

@@ -1,0 +1,94 @@
+"""Launch files and scenes that are too large, too deep or no text are refused before parsing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from ruamel.yaml import YAML
+
+from launch.plans import documents
+from launch.plans.documents import MAX_VALUES, BadInputError, read_document
+from launch.plans.plan import load_plan
+
+MAX_TOKENS = 20 * MAX_VALUES
+
+HOSTILE = {
+    "many keys": ("".join(f"k{i}: {i}\n" for i in range(20_000)), "more than 5000 values"),
+    "keys in one line": ("{" + ", ".join(f"k{i}: 1" for i in range(20_000)) + "}", "values"),
+    "many items": ("a:\n" + "- 1\n" * 60_000, "values"),
+    "deep brackets": ("a: " + "[" * 5000 + "]" * 5000, "nested"),
+    "deep dashes": ("a:\n  " + "- " * 60_000 + "1", "nested"),
+    "deep indentation": ("\n".join(" " * i + "a:" for i in range(600)), "nested"),
+    "billion laughs": (
+        "a0: &a0 [1,1,1,1,1,1,1,1,1,1]\n"
+        + "".join(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 10)),
+        "values",
+    ),
+    "merged again and again": (
+        "a0: &a0 {k: 1}\n"
+        + "".join(f"a{i}: &a{i} {{<<: *a{i - 1}, k{i}: 1}}\n" for i in range(1, 200)),
+        "values",
+    ),
+    "a value within itself": ("a: &a [*a]\n", ""),
+    "a huge text": ("a: " + "x" * 300_000, "characters"),
+    "a huge number": ("a: " + "9" * 100_000, "cannot be read"),
+    "an odd tag": ("a: !!python/object/apply:os.system [ls]\n", ""),
+    "a key that is a list": ("? [1, 2]\n: 3\n", "a key is a list or a mapping"),
+    "a list": ("- 1\n", "is a list"),
+    "a text": ("hello\n", "is a text"),
+    "nothing": ("", "is empty"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def tokens(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Counts the tokens that a test has read from a file: the work that was done."""
+    counted = [0]
+    scan = YAML.scan
+
+    def count(self: Any, stream: Any) -> Iterator[Any]:
+        for token in scan(self, stream):
+            counted[0] += 1
+            yield token
+
+    monkeypatch.setattr(documents.YAML, "scan", count)
+    return counted
+
+
+@pytest.mark.parametrize("name", list(HOSTILE))
+def test_a_hostile_file_is_refused_with_little_work(
+    tmp_path: Path, tokens: list[int], name: str
+) -> None:
+    text, said = HOSTILE[name]
+    file = tmp_path / "graph.yaml"
+    file.write_text(text)
+    with pytest.raises(BadInputError) as refused:
+        load_plan(file)
+    assert str(file) in str(refused.value)
+    assert said in str(refused.value)
+    assert "Commented" not in str(refused.value)
+    assert len(str(refused.value)) < 1000
+    assert tokens[0] < MAX_TOKENS
+
+
+def test_what_is_no_utf_8_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "graph.yaml"
+    file.write_bytes(b"nodes: {a: \xff\xfe}\n")
+    with pytest.raises(BadInputError, match="is not UTF-8 text"):
+        read_document(file)
+
+
+@pytest.mark.parametrize(
+    "text", ["nodes: 3\n", "nodes: {a: 3}\n", "nodes: {a: {type: clock, restart: [1]}}\n"]
+)
+def test_errors_name_no_class(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "graph.yaml"
+    file.write_text(text)
+    with pytest.raises(BadInputError) as refused:
+        load_plan(file)
+    assert "it must hold keys and values" in str(refused.value)
+    for word in ("instance", "dictionary", "Spec"):
+        assert word not in str(refused.value)

@@ -1,0 +1,186 @@
+"""Every number of a scene, a launch file and a node's parameters has limits that are checked."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pydantic import BaseModel, ValidationError
+from ruamel.yaml import YAML
+
+from launch.plans.documents import BadInputError, read_document, validate
+from launch.plans.launch_file import LaunchFile
+from launch.plans.plan import load_plan, load_scene
+from messages.calibration import StereoCalibration
+from messages.limits import LimitedModel, max_of
+from messages.scene import Scene
+from nodes import NODES, node_class
+from nodes.node import NodeParameters, parameters_of
+
+ROOT = Path(__file__).resolve().parent.parent
+SCENES = sorted((ROOT / "launch" / "scenes").glob("*.yaml"))
+Key = tuple[Any, ...]
+
+
+def numbers_in(value: Any, key: Key = ()) -> Iterator[Key]:
+    """The keys of all numbers in plain values."""
+    match value:
+        case dict():
+            for name, one in value.items():
+                yield from numbers_in(one, (*key, name))
+        case list():
+            for number, one in enumerate(value):
+                yield from numbers_in(one, (*key, number))
+        case bool():
+            return
+        case int() | float():
+            yield key
+
+
+def replaced(values: Any, key: Key, value: object) -> Any:
+    result = copy.deepcopy(values)
+    target = result
+    for part in key[:-1]:
+        target = target[part]
+    target[key[-1]] = value
+    return result
+
+
+SCENE_VALUES = {path.stem: YAML(typ="safe").load(path.read_text()) for path in SCENES}
+SCENE_NUMBERS = [(name, key) for name, one in SCENE_VALUES.items() for key in numbers_in(one)]
+PARAMETERS: dict[str, type[NodeParameters]] = {
+    name: parameters_of(node_class(name)) for name in NODES
+}
+PARAMETER_NUMBERS = [
+    (name, field)
+    for name, model in PARAMETERS.items()
+    for field, one in model.model_fields.items()
+    if {int, float} & {one.annotation, *get_args(one.annotation)}
+    or any("number" in str(part) or "integer" in str(part) for part in [
+        model.model_json_schema()["properties"][field].get("anyOf", [])])
+]  # fmt: skip
+
+ABSURD = st.one_of(
+    st.sampled_from([math.nan, math.inf, -math.inf, 1e300, -1e300, 1e308, 2e16, -2e19, 2**64]),
+    st.floats(min_value=1e20),
+    st.floats(max_value=-1e20),
+)
+quick = settings(
+    max_examples=60,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
+)
+
+
+@quick
+@given(where=st.sampled_from(SCENE_NUMBERS), value=ABSURD)
+def test_an_absurd_number_in_a_scene_is_refused_by_its_key(
+    tmp_path: Path, where: tuple[str, Key], value: float
+) -> None:
+    name, key = where
+    file = tmp_path / "scene.yaml"
+    (tmp_path / "organ.obj").write_bytes((ROOT / "launch/scenes/organ.obj").read_bytes())
+    with file.open("w") as out:
+        YAML().dump(replaced(SCENE_VALUES[name], key, value), out)
+    with pytest.raises(BadInputError) as refused:
+        load_scene(file)
+    # A number in an array is named by the array, `support_angle_rad` by what it is short for.
+    field = next(part for part in reversed(key) if isinstance(part, str))
+    assert f".{field.removeprefix('support_')}" in str(refused.value)
+    assert f"{file}:" in str(refused.value)
+
+
+@quick
+@given(where=st.sampled_from(PARAMETER_NUMBERS), value=ABSURD)
+def test_an_absurd_parameter_is_refused(where: tuple[str, str], value: float) -> None:
+    node, field = where
+    with pytest.raises(ValidationError) as refused:
+        PARAMETERS[node].model_validate({field: value})
+    assert field in {error["loc"][0] for error in refused.value.errors()}
+
+
+@quick
+@given(
+    where=st.sampled_from(SCENE_NUMBERS),
+    value=st.floats(min_value=-1e-12, max_value=1e-12, exclude_min=True, exclude_max=True),
+)
+def test_a_tiny_number_is_refused_or_is_a_coordinate(where: tuple[str, Key], value: float) -> None:
+    """What must be above zero is not accepted below what a device resolves."""
+    name, key = where
+    if name == "organ":
+        return
+    try:
+        scene = Scene.model_validate(replaced(SCENE_VALUES[name], key, value))
+    except ValidationError:
+        return
+    kept: Any = scene
+    for part in key:
+        kept = kept[part] if isinstance(part, int) else getattr(kept, part)
+    zero_allowed = replaced(SCENE_VALUES[name], key, 0.0)
+    Scene.model_validate(zero_allowed)
+    assert float(np.asarray(kept)) == value
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        (("object", "geometry", "radius_m"), 1e300, "object.geometry.radius_m"),
+        (("projector", "width_px"), 2_000_000_000, "projector.width_px"),
+        (("arms", "max_tool_speed_m_per_s"), 1e9, "arms.max_tool_speed_m_per_s"),
+        (("camera", "right_from_left", 3, 3), 0.0, "the last row"),
+        (("camera", "right_from_left", 0, 0), 1.1, "must be a rotation"),
+        (("camera", "right_from_left", 0, 0), -1.0, "reflection"),
+    ],
+)
+def test_what_was_accepted_once(tmp_path: Path, key: Key, value: float, said: str) -> None:
+    scene = tmp_path / "scene.yaml"
+    with scene.open("w") as out:
+        YAML().dump(replaced(SCENE_VALUES["cylinder"], key, value), out)
+    graph = {"scene": "scene.yaml", "nodes": {"arms": {"type": "twin_arms"}}}
+    (tmp_path / "graph.yaml").write_text(json.dumps(graph))
+    with pytest.raises(BadInputError, match=r"scene\.yaml:[0-9]+: ") as refused:
+        load_plan(tmp_path / "graph.yaml")
+    assert said in str(refused.value)
+
+
+def test_an_absurd_rate_in_a_launch_file_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "graph.yaml"
+    file.write_text("nodes:\n  arms:\n    type: twin_arms\n    parameters: {rate_hz: 1.0e+308}\n")
+    said = (
+        r"graph.yaml:4: nodes.arms.parameters.rate_hz: 1e\+308 does not fit; give at most 10000 hz"
+    )
+    with pytest.raises(BadInputError, match=said):
+        load_plan(file)
+    file.write_text("nodes:\n  arms:\n    type: twin_arms\n    start_deadline_s: 1.0e+300\n")
+    with pytest.raises(BadInputError, match=r"start_deadline_s: 1e\+300 does not fit"):
+        validate(LaunchFile, read_document(file))
+
+
+def models_below(base: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    for model in base.__subclasses__():
+        yield model
+        yield from models_below(model)
+
+
+def test_what_files_hold_is_limited() -> None:
+    """The roots; their parts derive from the same class, as they share it."""
+    limited = set(models_below(LimitedModel))
+    assert {LaunchFile, StereoCalibration, *PARAMETERS.values()} <= limited
+    for name, field in Scene.model_fields.items():
+        if isinstance(field.annotation, type) and name not in ("name", "methods"):
+            assert field.annotation in limited, name
+
+
+def test_units_have_their_limits() -> None:
+    assert max_of("radius_m") == 10.0
+    assert max_of("speed_m_per_s") == 10.0
+    assert max_of("max_tool_speed_m_per_s") == 2.2
+    assert max_of("mark_max_area_px") > max_of("width_px")
