@@ -17,7 +17,7 @@ from messages.types import (
 from nodes.console import scenes
 from nodes.console.aim import Aim
 from nodes.console.desk import SETTLE_S, Desk, Files, SceneDesk
-from nodes.console.finger import Finger
+from nodes.console.finger import Finger, FingerIntent
 from tests.console_parts import cylinder
 from tests.plans import scene_with
 
@@ -110,8 +110,10 @@ def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_
     first.scenes.choose("other")
     first.scenes.slide(1.0, young_modulus_pa=9e3)
     first.scenes.settle(2.0)
+    first.finger.push(0.009)
     first.record(True)
     again, sent = desk()
+    assert again.finger.intent == FingerIntent(depth_m=0.009, lifted=False)
     assert again.scenes.sliders == first.scenes.sliders
     taken_up, recording = sent
     assert isinstance(taken_up, Scene)

@@ -266,9 +266,13 @@ class Desk:
         others_may: tuple[str, ...] = (),
     ) -> None:
         self._files, self.others_may = files, others_may
-        first, sliders, self.recording = first_state(files, warn)
-        self.scenes = SceneDesk(self._send_scene, files.scenes, first, sliders)
+        kept = first_state(files, warn)
+        self.recording, sliders = kept.recording, kept.sliders
+        given = None if sliders is None else Sliders(*sliders)
+        self.scenes = SceneDesk(self._send_scene, files.scenes, kept.base, given)
         self.finger = finger
+        if kept.finger is not None:
+            finger.restore(kept.finger)
         self.look = Look(publish, self.scenes.scene)
         self.replay = Replay(files.bags)
         self._publish = publish
@@ -297,7 +301,7 @@ class Desk:
     def record(self, running: bool) -> None:
         self.recording = running
         self._publish(Recording(running=running))
-        self._keep()
+        self.keep()
 
     def mark(self, label: str) -> None:
         self._publish(Moment(label=label.strip() or "moment"))
@@ -305,12 +309,17 @@ class Desk:
     def _send_scene(self, scene: Scene) -> None:
         self._publish(scene)
         self.look.follow(scene)
-        self._keep()
+        self.keep()
 
-    def _keep(self) -> None:
+    def keep(self) -> None:
+        """Write down what a console that is started again goes on with."""
         desk = self.scenes
-        sliders = astuple(desk.sliders) if desk.moved else None
-        kept = Kept(base=desk.base, sliders=sliders, recording=self.recording)
+        kept = Kept(
+            base=desk.base,
+            sliders=astuple(desk.sliders) if desk.moved else None,
+            recording=self.recording,
+            finger=self.finger.intent if self.finger.commanded else None,
+        )
         save_kept(self._files.kept, kept)
 
 
@@ -321,13 +330,11 @@ def others_that_may_reset(plan_file: Path, console: str) -> tuple[str, ...]:
     return () if plan["nodes"][console]["host"] in hosts else hosts
 
 
-def first_state(files: Files, warn: Callable[[str], None]) -> tuple[Scene, Sliders | None, bool]:
-    """The scene to begin with, where the sliders stood, and whether a recording goes on."""
+def first_state(files: Files, warn: Callable[[str], None]) -> Kept:
+    """Return what the console before this one kept, else the first scene alone."""
     try:
         kept = load_kept(files.kept)
     except scenes.SceneChoiceError as error:
         warn(str(error))
         kept = None
-    if kept is None:
-        return scenes.first_scene(files.plan), None, False
-    return kept.base, None if kept.sliders is None else Sliders(*kept.sliders), kept.recording
+    return kept or Kept(base=scenes.first_scene(files.plan))

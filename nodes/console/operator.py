@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from messages.types import (
 )
 from nodes.console import panels
 from nodes.console.controls import Ask
-from nodes.console.desk import Desk
+from nodes.console.desk import SETTLE_S, Desk
 from nodes.console.history import History
 from nodes.console.newest import Newest, Source
 from nodes.console.page import Page
@@ -51,6 +52,7 @@ REPLAYED = (
     "what you see is a replay, and the finger is that of the running graph: press "
     '"Back to the running graph" in Record first'
 )
+MEASURED = "the finger is measured: only a simulated one can be moved from here"
 NO_RECORDER = (
     "there is no recorder in this graph that waits to be told: start it with --console, or give "
     "its recorder the parameter waits: true"
@@ -71,7 +73,8 @@ class Operator:
         with_eye: bool,
     ) -> None:
         """with_finger: the twin's, which the mouse moves.  with_eye: the twin's, which looks."""
-        self._live, self.desk, self._with_eye = live, desk, with_eye
+        self._live, self.desk = live, desk
+        self._with_finger, self._with_eye = with_finger, with_eye
         self._page = Page(server, ask, with_finger=with_finger, others_may=desk.others_may)
         self._history = History()
         self._statuses: dict[str, tuple[Status, float]] = {}
@@ -80,14 +83,15 @@ class Operator:
         self._pictured: Frame | None = None
         self._now_s, self._sent_ns = 0.0, 0
         self._bags_s = -BAGS_EVERY_S
+        self._finger_shown_s = 0.0
         self._looked_s: float | None = None
         self._marked: tuple[str, ...] = ()
         self._take_up_scene()
         self._asked: dict[str, Callable[..., None]] = {
             "touch": self._touch,
-            "place": self._place,
-            "push": desk.finger.push,
-            "lift": desk.finger.lift,
+            "place": partial(self._command_finger, desk.finger.place),
+            "push": partial(self._command_finger, desk.finger.push),
+            "lift": partial(self._command_finger, desk.finger.lift_or_lower),
             "stop": desk.stop,
             "release": desk.release,
             "choose": self._choose,
@@ -142,7 +146,8 @@ class Operator:
         self._now_s, desk = now_s, self.desk
         finger = self._live.newest("fingertip", Fingertip) if looking else None
         seen = finger[0].position_world_m if finger is not None and finger[0].valid else None
-        desk.finger.advance(step_s, seen)
+        if desk.finger.advance(step_s, seen):
+            desk.keep()
         try:
             if desk.scenes.settle(now_s):
                 self._take_up_scene()
@@ -199,6 +204,9 @@ class Operator:
         self._show_state()
         self._tell_eye(now_s)
         finger = self.source.newest("fingertip", Fingertip)
+        if now_s >= self._finger_shown_s:
+            # Not while a slider moves: it is ahead of what has been asked for.
+            self._page.touch.show_intent(self.desk.finger)
         self._page.touch.show_finger(panels.finger(None if finger is None else finger[0]))
         if now_s >= self._bags_s + BAGS_EVERY_S:
             self._bags_s = now_s
@@ -240,16 +248,23 @@ class Operator:
         self._page.eye.show_words(panels.eye(wanted=wanted, possible=self._with_eye, ago_s=ago_s))
 
     def _touch(self, origin: Floats, direction: Floats) -> None:
-        if self.desk.replay.timeline is not None:
-            raise ValueError(REPLAYED)
-        self.desk.finger.touch(origin, direction)
-        if (target := self.desk.finger.target) is not None:
-            self._page.touch.show_aim(float(target[0]), float(target[1]))
+        self._command_finger(self.desk.finger.touch, origin, direction)
+        self._page.touch.show_position(self.desk.finger)
 
-    def _place(self, x_m: float, y_m: float) -> None:
-        if self.desk.replay.timeline is not None:
-            raise ValueError(REPLAYED)
-        self.desk.finger.place(x_m, y_m)
+    def _command_finger(self, command: Callable[..., None], *values: Any) -> None:
+        """Give the finger a command; if it is refused, show what holds.  ValueError."""
+        finger = self.desk.finger
+        self._finger_shown_s = self._now_s + SETTLE_S
+        try:
+            if not self._with_finger:
+                raise ValueError(MEASURED)
+            if self.desk.replay.timeline is not None:
+                raise ValueError(REPLAYED)
+            command(*values)
+        except ValueError:
+            self._page.touch.show_intent(finger)
+            raise
+        self._page.touch.show_lifted(finger)
 
     def _take_up_scene(self) -> None:
         """A scene was sent since the last picture."""
