@@ -102,6 +102,8 @@ class FemSolver(Node):
         self._use([])
         self._forget()
         await self._end_making()
+        if self.is_superseded("scene"):
+            return
         p, maker = self.parameters, self._maker
         method, maker.skin_spacing_m = asked(scene, p.method, p.skin_spacing_m)
         try:
@@ -130,7 +132,7 @@ class FemSolver(Node):
             self._use([best, linear])
 
     def _progress(self, done: int, total: int, need: precompute.Need) -> None:
-        if self._stop.is_set():
+        if self._stop.is_set() or self.is_superseded("scene"):
             raise precompute.Interrupted
         far = self._remaining.text(done, total, self.clock.now_ns() * 1e-9)
         self.note = f"precomputing the soft body: {far} ({need.text()})"

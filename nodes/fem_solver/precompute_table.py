@@ -11,6 +11,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -81,14 +82,16 @@ class TableBudget:
 
 @contextmanager
 def local_processes(count: int) -> Iterator[Executor]:
-    """So many processes of this machine; ended with what they are at when left."""
+    """Provide so many processes of this machine; an exception ends them in mid-push."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     executor = ProcessPoolExecutor(count, context, initializer=_begin, initargs=(stop,))
     try:
         yield executor
-    finally:
+    except BaseException:
         stop.set()
+        raise
+    finally:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
@@ -98,7 +101,16 @@ asked_to_stop: ContextVar[Callable[[], bool]] = ContextVar("asked_to_stop", defa
 
 def _begin(stop: Event) -> None:
     os.nice(NICER)
-    asked_to_stop.set(stop.is_set)
+    threading.Thread(target=_exit_on, args=(stop,), name="stop", daemon=True).start()
+
+
+def _exit_on(stop: Event) -> None:
+    """Exit the worker as soon as it is asked to: one depth of a push takes up to a minute.
+
+    Nothing is lost: whoever asked for the answers keeps them.
+    """
+    stop.wait()
+    os._exit(0)
 
 
 def _solve(job: pushes.PushJob) -> pushes.PushAnswer:
