@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from messages.types import Correction, Display, EStop, Moment, Recording, TwinEy
 from nodes.console import scenes
 from nodes.console.aim import Aim
 from nodes.console.finger import Finger
+from nodes.console.graph_facts import GraphFacts
 from nodes.console.kept import Kept, load_kept, save_kept
 from nodes.console.replay import Timeline, bags_in
 
@@ -44,7 +44,9 @@ class Sliders:
     @staticmethod
     def of(scene: Scene) -> Sliders:
         return Sliders(
-            scene.object.material.young_modulus_pa, max(scene.sheet.min_stretch_ratio, 1.005), 1.0
+            scene.object.material.young_modulus_pa,
+            max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
+            1.0,
         )
 
 
@@ -253,8 +255,7 @@ class Desk:
     """All of it together, and what needs no state: stop, mark, record.
 
     A console that is started again goes on with the scene, the sliders and the recording that its
-    run had; warn is told why it cannot.  others_may: hosts that may reset an e-stop where this
-    console's may not; empty: it may.
+    run had; warn is told why it cannot.
     """
 
     def __init__(
@@ -263,9 +264,9 @@ class Desk:
         files: Files,
         finger: Finger,
         warn: Callable[[str], None],
-        others_may: tuple[str, ...] = (),
+        facts: GraphFacts | None = None,
     ) -> None:
-        self._files, self.others_may = files, others_may
+        self._files, self.facts = files, facts or GraphFacts()
         kept = first_state(files, warn)
         self.recording, sliders = kept.recording, kept.sliders
         given = None if sliders is None else Sliders(*sliders)
@@ -290,10 +291,10 @@ class Desk:
 
     def release(self) -> None:
         """Reset the e-stop; ReleaseError where nobody would take it."""
-        if self.others_may:
+        if others := self.facts.others_may_reset:
             raise ReleaseError(
                 f"this console's host may not reset an e-stop; do it on "
-                f"{' or '.join(self.others_may)}, or let it: may_reset_estop in the launch file"
+                f"{' or '.join(others)}, or let it: may_reset_estop in the launch file"
             )
         self.stopped = None
         self._publish(EStop(engaged=False, reason="reset at the console"))
@@ -321,13 +322,6 @@ class Desk:
             finger=self.finger.intent if self.finger.commanded else None,
         )
         save_kept(self._files.kept, kept)
-
-
-def others_that_may_reset(plan_file: Path, console: str) -> tuple[str, ...]:
-    """The hosts that may reset an e-stop where the console's own may not; empty: it may."""
-    plan = json.loads(plan_file.read_text())
-    hosts = tuple(plan["estop_resetters"])
-    return () if plan["nodes"][console]["host"] in hosts else hosts
 
 
 def first_state(files: Files, warn: Callable[[str], None]) -> Kept:

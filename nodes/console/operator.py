@@ -26,6 +26,7 @@ from messages.types import (
     TwinEye,
 )
 from nodes.console import panels
+from nodes.console.banner import GraphState
 from nodes.console.controls import Ask
 from nodes.console.desk import SETTLE_S, Desk
 from nodes.console.history import History
@@ -46,7 +47,7 @@ LONGEST_STEP_S = 0.2
 
 SIDES = ("left", "right")
 MARKS_SHOWN = 5
-SOLVER, PRECOMPUTING = "fem_solver", "precomputing"
+SOLVER = "fem_solver"
 RECORDER = "recorder"
 REPLAYED = (
     "what you see is a replay, and the finger is that of the running graph: press "
@@ -75,7 +76,9 @@ class Operator:
         """with_finger: the twin's, which the mouse moves.  with_eye: the twin's, which looks."""
         self._live, self.desk = live, desk
         self._with_finger, self._with_eye = with_finger, with_eye
-        self._page = Page(server, ask, with_finger=with_finger, others_may=desk.others_may)
+        self._page = Page(
+            server, ask, with_finger=with_finger, others_may=desk.facts.others_may_reset
+        )
         self._history = History()
         self._statuses: dict[str, tuple[Status, float]] = {}
         self._drawn_scene: Scene | None = None
@@ -218,29 +221,26 @@ class Operator:
             entry = self._live.newest(f"arm_{side}", ArmState)
             if entry is not None:
                 arms[side] = entry[0]
-        stopped = desk.stopped
-        if stopped is None and any(arm.mode == "estop" for arm in arms.values()):
-            stopped = "the arms are still stopped"
         timeline, sheet = desk.replay.timeline, self._live.newest("sheet_target", SheetTarget)
         shown = desk.scenes.scene if self._drawn_scene is None else self._drawn_scene
-        html = panels.banner(
-            shown.name,
-            arms,
-            stopped,
+        state = GraphState(
+            scene=shown.name,
+            arms=arms,
+            estop_reason=desk.stopped,
             sheet=None if sheet is None else sheet[0],
-            busy=self._busy(),
+            solver_note=self._solver_note(),
             replay=None if timeline is None else timeline.path.name,
         )
-        self._page.show_state(html, stopped=stopped is not None)
+        self._page.show_state(state)
         recorder = self._statuses.get(RECORDER)
         note = None if recorder is None else recorder[0].note
         self._page.record.show_state(panels.recorder(note, self._marked), recording=desk.recording)
 
-    def _busy(self) -> str:
-        """What the soft body's solver says while it works one out."""
-        solver = self._statuses.get(SOLVER)
-        working = solver is not None and solver[0].note.startswith(PRECOMPUTING)
-        return solver[0].note if solver is not None and working else ""
+    def _solver_note(self) -> str:
+        """What the soft body's solver reports while it has no skin of this scene; else nothing."""
+        solver, skin = self._statuses.get(SOLVER), self._live.newest("skin", Skin)
+        pending = skin is None or skin[1].source_ns < self._sent_ns
+        return solver[0].note if solver is not None and pending else ""
 
     def _tell_eye(self, now_s: float) -> None:
         ago_s = None if self._looked_s is None else now_s - self._looked_s
@@ -291,21 +291,17 @@ class Operator:
         self.desk.look.picked = correction
         self.desk.look.again()
 
-    def _recorder_waits(self) -> bool | None:
-        """Whether the graph's recorder waits to be told; None where there is none."""
-        entry = self._statuses.get(RECORDER)
-        return None if entry is None else entry[0].note.startswith(("waits", "recorded"))
-
     def _record(self) -> None:
-        if self._recorder_waits() is None:
+        if not self.desk.facts.records_on_request:
             raise ValueError(NO_RECORDER)
         self._marked = () if not self.desk.recording else self._marked
         self.desk.record(not self.desk.recording)
 
     def _mark(self, label: str) -> None:
-        if self._recorder_waits() is None:
+        facts = self.desk.facts
+        if not facts.records:
             raise ValueError(NO_RECORDER)
-        if self._recorder_waits() and not self.desk.recording:
+        if facts.records_on_request and not self.desk.recording:
             raise ValueError(
                 "nothing is recorded now, so there is nothing to mark: start recording"
             )

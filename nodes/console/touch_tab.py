@@ -10,6 +10,7 @@ from messages.scene import Scene
 from nodes.console.controls import Ask, Html, handing, on_value, show_value
 from nodes.console.desk import Sliders
 from nodes.console.finger import Finger
+from nodes.console.scenes import MIN_STRETCH_RATIO, max_stretch_ratio
 from nodes.console.view import LAYERS, VIEWPOINTS, View
 
 REACH_MM = 80.0
@@ -68,8 +69,9 @@ class TouchTab:
         )
         self._tension = gui.add_slider(
             "Tension, %",
-            *(0.5, 12.0, 0.1, 2.0),
-            hint="How much longer than slack the sheet is drawn, at least",
+            *(_percent(MIN_STRETCH_RATIO), 8.0, 0.1, 2.0),
+            hint="How much longer than slack the sheet is drawn, at least; up to what the arms of "
+            "this scene hold",
         )
         self._size = gui.add_slider(
             "Size, %", 50, 150, 1, 100, hint="Of the object; its front stays where it is"
@@ -89,14 +91,15 @@ class TouchTab:
                 box = self._gui.add_checkbox(layer, True)
                 on_value(box, partial(self._ask, "show_layer", layer))
 
-    def show_scene(self, scene: Scene, names: Sequence[str], sliders: Sliders) -> None:
-        """A scene that the graph now works with."""
+    def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
+        """Show a scene that the graph now works with.  base: what the sliders change."""
         if names:
             self._scene.options = tuple(names)
             if scene.name in names:
                 self._scene.value = scene.name
         self._stiffness.value = 1e-3 * sliders.young_modulus_pa
-        self._tension.value = 100.0 * (sliders.stretch_ratio - 1.0)
+        self._tension.max = _percent(max_stretch_ratio(base))
+        self._tension.value = _percent(sliders.stretch_ratio)
         self._size.value = round(100.0 * sliders.size_ratio)
 
     def show_intent(self, finger: Finger) -> None:
@@ -123,3 +126,7 @@ class TouchTab:
 
 def _within(value: float, low: float, high: float, digits: int) -> float:
     return min(max(round(value, digits), low), high)
+
+
+def _percent(ratio: float) -> float:
+    return round(100.0 * (ratio - 1.0), 1)
