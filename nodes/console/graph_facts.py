@@ -27,12 +27,9 @@ class GraphFacts:
         """Read the plan of the run.  console: name of the console's node."""
         plan = json.loads(plan_file.read_text())
         nodes, hosts = plan["nodes"], tuple(plan["estop_resetters"])
-        asked = any(
-            port["topic"] == "recording" for node in nodes.values() for port in node["inputs"]
-        )
-        recorded = any(node["type"] == RECORDER_TYPE for node in nodes.values())
+        recorders = [node for node in nodes.values() if node["type"] == RECORDER_TYPE]
         return cls(
             others_may_reset=() if nodes[console]["host"] in hosts else hosts,
-            records=asked or recorded,
-            records_on_request=asked,
+            records=bool(recorders),
+            records_on_request=any(one["parameters"]["waits"] for one in recorders),
         )
