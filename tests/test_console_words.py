@@ -11,6 +11,7 @@ import pytest
 from messages.types import ArmState, PortStatus, Status
 from nodes.console import banner, dress, panels
 from nodes.console.banner import BannerState, GraphState
+from nodes.console.desk import LookState
 from nodes.console.history import SERIES, WINDOW_S, History
 from nodes.console.page import STOP_COLOR
 from nodes.console.record_tab import RECORDING_COLOR
@@ -173,9 +174,9 @@ def test_words_of_the_tabs() -> None:
     told = panels.finger(fingertip(np.array([-0.012, 0.003, -0.0041])))
     assert "12 mm left and 3 mm above the screen" in told
     assert "4 mm behind" in told
-    assert "twin_eye" in panels.eye(wanted=True, possible=False, ago_s=None)
-    assert "Tick" in panels.eye(wanted=False, possible=True, ago_s=None)
-    assert "Taken 3 s ago" in panels.eye(wanted=True, possible=True, ago_s=3.2)
+    resting: dict[str, Any] = {"state": LookState.RESTING, "waited_s": 1.0, "ago_s": None}
+    assert "twin_eye" in panels.eye(wanted=True, possible=False, **resting)
+    assert "Tick" in panels.eye(wanted=False, possible=True, **resting)
     assert "no recorder" in panels.recorder(None, ())
     assert "Marked: one, &lt;b&gt;." in panels.recorder("waits", ("one", "<b>"))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, replace
+from enum import Enum, auto
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from messages.base import Message
 from messages.methods import chosen
 from messages.scene import Scene
-from messages.types import Correction, Display, EStop, Moment, Recording, TwinEye
+from messages.types import Correction, Display, EStop, Frame, Moment, Recording, TwinEye
 from nodes.console import scenes
 from nodes.console.aim import Aim
 from nodes.console.finger import Finger
@@ -30,7 +31,15 @@ SETTLE_S = 0.4
 
 LOOK_EVERY_S = 6.0
 PIXELS_EVERY = 3
-LOOK_PATIENCE_S = 5.0
+LOOK_LABEL = "console"
+MAX_DRAWING_S = 5.0
+"""The renderer draws many frames in that time, or none."""
+
+CAPTURE_S = 1.0
+"""So long after a frame the simulated eye has all that it needs to trace the picture."""
+
+MAX_TRACING_S = 120.0
+"""A picture that takes longer never comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,79 +128,115 @@ class SceneDesk:
             await asyncio.gather(self._making_aim, return_exceptions=True)
 
 
+class LookState(Enum):
+    """What the next picture through the user's eye waits for."""
+
+    RESTING = auto()
+    DRAWING = auto()
+    TRACING = auto()
+
+
 class Look:
     """Through the user's eye: asks the renderer for a frame with its pixels, now and then.
 
-    What another has set for the display is put back when nobody looks any more; where nobody has,
-    the correction of the scene, or the one that was picked at the console.
+    Once such a frame is drawn, the simulated eye traces its picture, which takes a second of a
+    processor and on a busy computer many: no other picture is asked for meanwhile.  What another
+    has set for the display is put back as soon as the eye has what it needs; where nobody has, the
+    correction of the scene, or the one that was picked at the console.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
         self._publish = publish
         self.wanted = False
         self.picked: Correction | Literal["auto"] = "auto"
+        self.state = LookState.RESTING
         self._by_scene = scene.methods.correction
-        self._holds = False
+        self._holds = self._borrowed = False
         self._number = 0
-        self._asked_s: float | None = None
-        self._again_s = 0.0
+        self._since_s, self._again_s = 0.0, 0.0
         self._others: Display | None = None
 
     @property
     def label(self) -> str:
-        return f"console {self._number}"
+        return f"{LOOK_LABEL} {self._number}"
 
     @property
     def correction(self) -> Correction:
         """As picked at the console, else as the scene says."""
         return chosen(self.picked, self._by_scene, "two_pass")
 
+    def waited_s(self, now_s: float) -> float:
+        """Return how long the present state has lasted."""
+        return now_s - self._since_s
+
     def follow(self, scene: Scene) -> None:
         """Go over to a scene's correction; a renderer that was once told heeds no scene's."""
         self._by_scene = scene.methods.correction
-        if self._holds and self._asked_s is None:
+        if self._holds and not self._borrowed:
             self._put_back()
 
     def heed(self, display: Display) -> None:
         """Another one's display message."""
-        if not display.label.startswith("console "):
+        if not display.label.startswith(f"{LOOK_LABEL} "):
             self._others, self._holds = display, False
 
     def advance(self, now_s: float) -> None:
         """Ask for the next picture if it is time, or give the last one up."""
-        if self._asked_s is not None:
-            if now_s > self._asked_s + LOOK_PATIENCE_S:
-                self._rest(now_s)
-        elif self.wanted and now_s >= self._again_s:
-            self._number += 1
-            self._asked_s = now_s
-            self._publish(
-                Display(
-                    correction=self.correction,
-                    stereo="mono",
-                    marks=False,
-                    pixels_every=PIXELS_EVERY,
-                    label=self.label,
-                )
+        waited_s = self.waited_s(now_s)
+        match self.state:
+            case LookState.RESTING:
+                if self.wanted and now_s >= self._again_s:
+                    self._ask(now_s)
+            case LookState.DRAWING:
+                if waited_s > MAX_DRAWING_S:
+                    self._rest(now_s)
+            case LookState.TRACING:
+                if self._borrowed and waited_s > CAPTURE_S:
+                    self._put_back()
+                if waited_s > MAX_TRACING_S:
+                    self._rest(now_s)
+
+    def _ask(self, now_s: float) -> None:
+        self._number += 1
+        self._enter(LookState.DRAWING, now_s)
+        self._borrowed = True
+        self._publish(
+            Display(
+                correction=self.correction,
+                stereo="mono",
+                marks=False,
+                pixels_every=PIXELS_EVERY,
+                label=self.label,
             )
+        )
 
     def again(self) -> None:
         """Do not wait for the next turn."""
         self._again_s = 0.0
 
+    def on_frame(self, frame: Frame, now_s: float) -> None:
+        """Take a frame that was drawn; the eye traces the first one with the pixels asked for."""
+        if self.state is LookState.DRAWING and frame.label == self.label and frame.pixels:
+            self._enter(LookState.TRACING, now_s)
+
     def got(self, eye: TwinEye, now_s: float) -> bool:
-        """A picture has come; says whether it is ours."""
-        if eye.label != self.label:
-            return False
-        self._rest(now_s)
-        return True
+        """A picture has come; says whether it was for the console, however late."""
+        ours = eye.label.startswith(f"{LOOK_LABEL} ")
+        if eye.label == self.label and self.state is not LookState.RESTING:
+            self._rest(now_s)
+        return ours
+
+    def _enter(self, state: LookState, now_s: float) -> None:
+        self.state, self._since_s = state, now_s
 
     def _rest(self, now_s: float) -> None:
-        self._asked_s, self._again_s = None, now_s + LOOK_EVERY_S
-        self._put_back()
+        self._enter(LookState.RESTING, now_s)
+        self._again_s = now_s + LOOK_EVERY_S
+        if self._borrowed:
+            self._put_back()
 
     def _put_back(self) -> None:
-        self._holds = self._others is None
+        self._borrowed, self._holds = False, self._others is None
         own = Display(correction=self.correction, stereo="side_by_side", label="console rests")
         self._publish(self._others or own)
 

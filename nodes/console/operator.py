@@ -89,6 +89,8 @@ class Operator:
         self._finger_shown_s = 0.0
         self._looked_s: float | None = None
         self._marked: tuple[str, ...] = ()
+        self._bags_before: set[str] = set()
+        self._awaits_bag = False
         self._take_up_scene()
         self._asked: dict[str, Callable[..., None]] = {
             "touch": self._touch,
@@ -191,6 +193,9 @@ class Operator:
             self._page.view.set_skin(rest, skin[0].triangles)
 
     def _show_frame(self) -> None:
+        entry = self._live.newest("frame", Frame)
+        if entry is not None:
+            self.desk.look.on_frame(entry[0], self._now_s)
         entry = self.source.newest("frame", Frame)
         if entry is None or entry[0] is self._pictured or not entry[0].pixels:
             return
@@ -211,9 +216,9 @@ class Operator:
             # Not while a slider moves: it is ahead of what has been asked for.
             self._page.touch.show_intent(self.desk.finger)
         self._page.touch.show_finger(panels.finger(None if finger is None else finger[0]))
-        if now_s >= self._bags_s + BAGS_EVERY_S:
+        if self._awaits_bag or now_s >= self._bags_s + BAGS_EVERY_S:
             self._bags_s = now_s
-            self._page.record.show_bags(self.desk.replay.bags())
+            self._show_bags()
 
     def _show_state(self) -> None:
         desk, arms = self.desk, {}
@@ -243,9 +248,15 @@ class Operator:
         return solver[0].note if solver is not None and pending else ""
 
     def _tell_eye(self, now_s: float) -> None:
-        ago_s = None if self._looked_s is None else now_s - self._looked_s
-        wanted = self.desk.look.wanted
-        self._page.eye.show_words(panels.eye(wanted=wanted, possible=self._with_eye, ago_s=ago_s))
+        look = self.desk.look
+        text = panels.eye(
+            possible=self._with_eye,
+            wanted=look.wanted,
+            state=look.state,
+            waited_s=look.waited_s(now_s),
+            ago_s=None if self._looked_s is None else now_s - self._looked_s,
+        )
+        self._page.eye.show_words(text)
 
     def _touch(self, origin: Floats, direction: Floats) -> None:
         self._command_finger(self.desk.finger.touch, origin, direction)
@@ -294,8 +305,21 @@ class Operator:
     def _record(self) -> None:
         if not self.desk.facts.records_on_request:
             raise ValueError(NO_RECORDER)
-        self._marked = () if not self.desk.recording else self._marked
-        self.desk.record(not self.desk.recording)
+        if self.desk.recording:
+            self.desk.record(False)
+            self._awaits_bag = True
+            self._show_bags()
+        else:
+            self._marked, self._bags_before = (), set(self.desk.replay.bags())
+            self._awaits_bag = False
+            self.desk.record(True)
+
+    def _show_bags(self) -> None:
+        """List the bags, the newest first; one that was just recorded is chosen."""
+        bags = self.desk.replay.bags()
+        made = next((bag for bag in bags if bag not in self._bags_before), None)
+        self._page.record.show_bags(bags, made if self._awaits_bag else None)
+        self._awaits_bag = self._awaits_bag and made is None
 
     def _mark(self, label: str) -> None:
         facts = self.desk.facts

@@ -12,6 +12,7 @@ from math import isnan
 
 from messages.topics import TOPICS
 from messages.types import Fingertip, PortStatus, Status
+from nodes.console.desk import LookState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_SHARE = 0.5
@@ -176,15 +177,30 @@ def finger(fingertip: Fingertip | None) -> str:
     )
 
 
-def eye(*, wanted: bool, possible: bool, ago_s: float | None) -> str:
-    """What to expect of the eye's pictures.  ago_s: since the newest; None: there is none."""
+def eye(
+    *, possible: bool, wanted: bool, state: LookState, waited_s: float, ago_s: float | None
+) -> str:
+    """Return what the eye's pictures wait for.
+
+    waited_s: since `state` began.  ago_s: since the newest picture; None: there is none.
+    """
     if not possible:
         return words("Nothing in this graph looks at the sheet; the twin's eye (twin_eye) would.")
     if not wanted:
         return words("Tick the box to see what the user's eye sees.")
-    if ago_s is None:
-        return words("The first picture takes some seconds.")
-    return words(f"Taken {ago_s:.0f} s ago, one every six seconds.")
+    taken = "" if ago_s is None else f" The last picture came {ago_s:.0f} s ago."
+    match state:
+        case LookState.DRAWING:
+            return words(f"Waits for the renderer to draw a frame: {waited_s:.0f} s.{taken}")
+        case LookState.TRACING:
+            return words(
+                "Waits for the simulated eye to trace the picture, which takes a second of a "
+                f"processor and longer on a busy computer: {waited_s:.0f} s.{taken}"
+            )
+        case LookState.RESTING if ago_s is None:
+            return words("Waits for its turn: no frame or no picture came in time.")
+        case LookState.RESTING:
+            return words(f"Taken {ago_s:.0f} s ago, the next one follows within six seconds.")
 
 
 def recorder(note: str | None, marked: tuple[str, ...]) -> str:
