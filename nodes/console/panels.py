@@ -164,13 +164,17 @@ def topics_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
 
 
 def finger(fingertip: Fingertip | None) -> str:
-    """Where the fingertip is, or why that is not known."""
+    """Where the fingertip is, or why that is not known; always of the same height."""
+    return f'<div class="fs-finger">{words(_finger(fingertip))}</div>'
+
+
+def _finger(fingertip: Fingertip | None) -> str:
     if fingertip is None:
-        return words("No fingertip has come yet.")
+        return "No fingertip has come yet."
     if not fingertip.valid:
-        return words(_mark(WARN, f"not tracked: {fingertip.reason.replace('_', ' ')}"))
+        return _mark(WARN, f"not tracked: {fingertip.reason.replace('_', ' ')}")
     x, y, z = (round(1e3 * metres) for metres in fingertip.position_world_m.tolist())
-    return words(
+    return (
         f"{_mark(GOOD, 'tracked')} {abs(x)} mm {'left' if x < 0 else 'right'} and {abs(y)} mm "
         f"{'below' if y < 0 else 'above'} the screen's middle, {abs(z)} mm "
         f"{'behind' if z < 0 else 'before'} it"
