@@ -13,8 +13,16 @@ from numpy.typing import NDArray
 from messages.scene import Scene
 from nodes.arm_bridge import kinematics
 from nodes.console.arms import PIECES, link_poses, rounded_box
+from nodes.console.creases import split_creases
 from nodes.console.picture import picture_of, ray_vertices, rays
-from nodes.console.sheet import COLUMNS, ROWS, film, hit_by_ray, sheet_points
+from nodes.console.sheet import (
+    COLUMNS,
+    ROWS,
+    film,
+    hit_by_ray,
+    sheet_points,
+    sheet_triangles,
+)
 from nodes.console.view import (
     LINES_LIFT_M,
     SHEET_LIFT_M,
@@ -117,6 +125,25 @@ def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -
         lifted, np.tile([0.0, 0.0, SHEET_LIFT_M], (len(points), 1)), atol=1e-12
     )
     assert LINES_LIFT_M > SHEET_LIFT_M > 0.0
+
+
+def test_sharp_edges_are_split_and_smooth_ones_are_not() -> None:
+    """The smooth normals of a shared vertex drew teeth along the edges of a plane and a box."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    box = np.array(
+        [
+            *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
+            *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
+        ],
+        dtype=np.int32,
+    )
+    source, triangles = split_creases(corners, box)
+    assert np.bincount(source).tolist() == [3] * 8, "a vertex for each of the three faces"
+    np.testing.assert_array_equal(source[triangles], box)
+    points = sheet(np.array([0.02, 0.01, -0.01]))
+    source, triangles = split_creases(points, sheet_triangles())
+    assert sorted(source.tolist()) == list(range(len(points)))
+    np.testing.assert_array_equal(source[triangles], sheet_triangles())
 
 
 def test_rays_that_miss_have_no_segments(scene: Scene) -> None:

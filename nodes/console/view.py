@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
+from nodes.console.creases import split_creases
 from nodes.console.picture import Picture, ray_vertices, rays, transform_of
 from nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
 from nodes.models.rigid import apply, quaternion_from_rotation, transform
@@ -120,9 +121,10 @@ class View:
 
     def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
         """Draw the object with this skin from now on."""
+        self._skin_source, split = split_creases(rest, triangles)
+        corners = _f32(rest[self._skin_source])
         self._object = self._add(
-            "Object",
-            self._scene.add_mesh_simple("/object", _f32(rest), triangles, color=OBJECT),
+            "Object", self._scene.add_mesh_simple("/object", corners, split, color=OBJECT)
         )
         self._skin_shape, self._ray_vertices = rest.shape, ray_vertices(rest)
         self._make_touchable(self._object)
@@ -149,7 +151,7 @@ class View:
                 lines = line_segments(lift_sheet(picture.sheet, LINES_LIFT_M))
                 self._sheet_lines.points = _f32(lines)
             if picture.skin is not None and picture.skin.shape == self._skin_shape:
-                self._object.vertices = _f32(picture.skin)
+                self._object.vertices = _f32(picture.skin[self._skin_source])
             if picture.finger is not None:
                 self._finger.position = picture.finger
                 color = FINGER if picture.finger_valid else FINGER_LOST
