@@ -209,7 +209,9 @@ async def stop_and_release(page: Page, heard: Heard) -> None:
     await page.get_by_role("button", name="E-STOP").click()
     await heard.until(lambda: engaged(heard) == "pressed at the console", "an e-stop")
     await expect(page.get_by_role("status")).to_contain_text("E-STOP is engaged")
-    await page.get_by_role("button", name="Release").press("Enter")
+    release = page.get_by_role("button", name="Release")
+    await expect(release).to_be_enabled()
+    await release.press("Enter")
     await heard.until(lambda: engaged(heard) is None, "a release")
     # viser heeds no hotkey while a text box has the focus.
     await page.get_by_role("textbox", name="Push, mm").press("Escape")

@@ -60,7 +60,7 @@ class Page:
             )
             self._state = Html(self._gui)
             self._release = self._gui.add_button(
-                RELEASE, visible=False, hint="The arms must be at rest"
+                RELEASE, disabled=True, hint="The arms must be at rest"
             )
         # At the bottom: viser's own notices come at the top.
         panel.float(x=14, y=-14, width=STOP_WIDTH)
@@ -83,7 +83,8 @@ class Page:
     def show_state(self, state: GraphState) -> None:
         """The banner, and whether there is an e-stop to release or a fault to reset."""
         self._state.show(banner.render(state))
-        self._release.visible = state.resettable
+        # Always there, so that nothing moves under the pointer.
+        self._release.disabled = not state.resettable
         label = RESET if state.stopped is None else RELEASE
         if self._others_may:
             label = f"{label}: on {' or '.join(self._others_may)}"
