@@ -102,8 +102,6 @@ class FemSolver(Node):
         self._use([])
         self._forget()
         await self._end_making()
-        if self.is_superseded("scene"):
-            return
         p, maker = self.parameters, self._maker
         method, maker.skin_spacing_m = asked(scene, p.method, p.skin_spacing_m)
         try:
