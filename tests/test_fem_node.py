@@ -265,10 +265,11 @@ async def test_a_newer_scene_interrupts_the_precomputation(
     cache: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A cached scene waited for minutes of work on the one that it replaced."""
-    begun, ended = threading.Event(), threading.Event()
+    begun, meshed, ended = threading.Event(), threading.Event(), threading.Event()
 
     def endless(spec: Any, progress: Any, parts: Any = None) -> Any:
         begun.set()
+        meshed.wait()
         try:
             while True:
                 progress(0, 1, precompute.Budget(1, 1, 1, 1))
@@ -289,9 +290,11 @@ async def test_a_newer_scene_interrupts_the_precomputation(
         bench.node.deliver("scene", scene(), header(4))
         async with asyncio.timeout(60):
             await asyncio.gather(*bench.node.mailbox_tasks())
+        meshed.set()
+        assert await asyncio.to_thread(ended.wait, 60), "the abandoned work goes on"
     finally:
+        meshed.set()
         await bench.node.close()
-    assert ended.is_set()
     assert [head.source_ns for name, _, head in bench.sent if name == "skin"] == [1, 4]
     assert "ready" in bench.node.note
     assert bench.node.errors == 0, bench.node.last_error

@@ -19,7 +19,7 @@ from nodes.console.view import View
 
 BRAND = (14, 92, 132)
 STOP_COLOR = (185, 28, 28)
-RELEASE, RESET = "Release the e-stop", "Reset the fault"
+RELEASE, RESET = "Release the stop", "Reset the fault"
 MAIN_WIDTH, STOP_WIDTH = 380, 320
 
 
