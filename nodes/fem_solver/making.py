@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from messages.methods import SoftBodyMethod, chosen
 from messages.scene import Scene
@@ -79,7 +79,7 @@ class Maker:
         return [body.with_table(linear, scene, model, table), linear]
 
     def _model_for(
-        self, spec: precompute.SoftBodySpec, progress: precompute.Progress
+        self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
     ) -> precompute.SoftBodyModel:
         """Return the last model if it is of this body, else load or compute it; an abandoned
         thread may do the same for another body at any moment."""
