@@ -144,6 +144,14 @@ class ArmState(Message):
         default=False, description="it may move: it was told so, and nothing has gone wrong since"
     )
     reason: str = Field(default="", description="why it does not follow; empty otherwise")
+    path_blocked: bool = Field(
+        default=False,
+        description="it stands because no path to the sheet's target is clear and within its "
+        "limits; reason says what blocks it",
+    )
+    auto_arming: bool = Field(
+        default=False, description="it becomes ready by itself, without anybody's word"
+    )
     joints_rad: Vector6
     joints_commanded_rad: Vector6
     world_from_flange: Transform

@@ -373,6 +373,10 @@ class Node:
         self.last_error = f"{what}: {type(error).__name__}: {error}"
         self.log.error("handler failed", what=what, error=str(error), exc_info=error)
 
+    def is_superseded(self, port: str) -> bool:
+        """Return whether a newer message waits for a port's coroutine handler; from any thread."""
+        return self._mailboxes[port].has_waiting
+
     def mailbox_tasks(self) -> list[asyncio.Task[None]]:
         """Tasks in which coroutine handlers run now; for the runner to end."""
         return [box.task for box in self._mailboxes.values() if box.task is not None]
@@ -405,6 +409,11 @@ class Mailbox:
         self._waiting.append((message, header, clock_trouble))
         if self.task is None or self.task.done():
             self.task = asyncio.get_running_loop().create_task(self._drain())
+
+    @property
+    def has_waiting(self) -> bool:
+        """Whether a message waits that no handler has begun with."""
+        return bool(self._waiting)
 
     async def _drain(self) -> None:
         while self._waiting:

@@ -110,6 +110,9 @@ def test_where_only_one_bridge_finds_the_way_clear_neither_moves(barred: int) ->
                 arm.joints = command.joints_rad
             control.take_measurement(arm.joints, ())
     assert arms[barred].control.mode == "hold"
+    assert [arm.control.path_blocked for arm in arms] == [number == barred for number in (0, 1)]
+    arms[barred].control.interrupt()
+    assert not arms[barred].control.path_blocked
     assert arms[1 - barred].control.reason == "waits for the other arm"
     for arm, place in zip(arms, places, strict=True):
         assert arm.joints == pytest.approx(place, abs=1e-12)

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from messages.base import Message
@@ -16,10 +19,14 @@ from messages.types import (
 )
 from nodes.console.aim import HOVER_M, Aim
 from nodes.console.desk import SceneDesk
-from nodes.console.finger import Finger
+from nodes.console.finger import Finger, FingerIntent, Ray
 from tests.console_parts import cylinder
+from tests.plans import scene_with
 
 Floats = NDArray[np.float64]
+
+
+AIMS = [Aim(cylinder()), Aim(scene_with({"shape": "sphere", "radius_m": 0.04}))]
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +39,18 @@ def test_the_mouse_means_a_point_below_the_surface_or_beside_it(scene: Scene) ->
     eye, forward = np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, -2.0])
     np.testing.assert_allclose(aim.under_ray(eye, forward, 0.0), [0.0, 0.0, 0.0], atol=2e-4)
     np.testing.assert_allclose(aim.under_ray(eye, forward, 0.01), [0.0, 0.0, -0.01], atol=2e-4)
-    np.testing.assert_allclose(aim.place(0.03, 0.0, 0.01), [0.03, 0.0, -0.01], atol=2e-4)
     beside = aim.under_ray(eye, np.array([0.0, 0.3, -0.6]), 0.01)
     assert beside[1] > 0.05
     assert (beside >= scene.finger.volume_min_m).all()
     assert (beside <= scene.finger.volume_max_m).all()
-    np.testing.assert_allclose(aim.lifted(np.array([0.0, 0.0, -0.01])), [0, 0, HOVER_M], atol=1e-6)
+    grazing = np.array([0.0, 0.04, -0.6 - scene.object.geometry.radius_m])  # type: ignore[union-attr]  # a cylinder
+    for towards in (forward, grazing):
+        hover = aim.under_ray(eye, towards, -HOVER_M)
+        assert depth_m(scene, hover) == pytest.approx(-HOVER_M, abs=2e-4)
+    finger = Finger(lambda message: None, speed_m_per_s=0.1)
     for bad in (np.zeros(3), np.array([np.nan, 0, 1])):
         with pytest.raises(ValueError, match="direction"):
-            aim.under_ray(eye, bad, 0.0)
+            finger.touch(eye, bad)
 
 
 def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> None:
@@ -68,10 +78,98 @@ def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> No
     assert all(isinstance(path, FingerPath) for path in sent)
 
 
+def moved(finger: Finger, sent: list[FingerPath]) -> Floats:
+    """Where the finger (3,) is once it does not move any more; each step within its speed."""
+    for _ in range(200):
+        count = len(sent)
+        finger.advance(0.05, None)
+        if len(sent) == count:
+            break
+    points = np.array([path.positions_world_m[0] for path in sent])
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    assert steps.max(initial=0.0) <= 0.1 * 0.05 + 1e-9
+    return np.asarray(points[-1])
+
+
+def depth_m(scene: Scene, point: Floats) -> float:
+    """How deep a point is in the cylinder's side."""
+    away = (point - scene.object.world_from_object.position_m)[1:]
+    return float(scene.object.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
+
+
+def test_what_is_wanted_of_the_finger_outlives_scenes_and_lifting(scene: Scene) -> None:
+    """The push was forgotten with each new scene, and by lifting the finger."""
+    sent: list[FingerPath] = []
+    finger = Finger(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
+    finger.use(Aim(scene))
+    finger.advance(0.05, None)
+    assert not sent, "nobody has moved it yet"
+    finger.push(0.018)
+    assert depth_m(scene, moved(finger, sent)) == pytest.approx(0.018, abs=2e-4)
+    thinner = scene_with({"shape": "cylinder", "radius_m": 0.03, "length_m": 0.1})
+    finger.use(None)
+    finger.push(0.008)
+    finger.advance(0.05, None)
+    finger.use(Aim(thinner))
+    assert depth_m(thinner, moved(finger, sent)) == pytest.approx(0.008, abs=2e-4)
+    finger.lift()
+    assert depth_m(thinner, moved(finger, sent)) == pytest.approx(-HOVER_M, abs=2e-4)
+    finger.place(0.02, 0.01)
+    lifted = moved(finger, sent)
+    assert depth_m(thinner, lifted) == pytest.approx(-HOVER_M, abs=2e-4)
+    assert lifted[0] == pytest.approx(0.02)
+    finger.push(0.005)
+    pushed = moved(finger, sent)
+    assert depth_m(thinner, pushed) == pytest.approx(0.005, abs=2e-4)
+    assert pushed[0] == pytest.approx(0.02)
+    assert finger.intent == FingerIntent(Ray.from_front(0.02, 0.01), 0.005, lifted=False)
+    finger.lift_or_lower()
+    finger.lift_or_lower()
+    np.testing.assert_allclose(moved(finger, sent), pushed, atol=1e-6)
+
+
+commands = st.one_of(
+    st.tuples(st.just("push"), st.floats(0.0, 0.03)),
+    st.tuples(st.just("place"), st.floats(-0.05, 0.05), st.floats(-0.03, 0.03)),
+    st.tuples(st.just("lift")),
+    st.tuples(st.just("lift_or_lower")),
+    st.tuples(st.just("scene"), st.booleans()),
+)
+
+
+@given(st.lists(commands, max_size=12))
+def test_the_finger_depends_on_what_is_wanted_and_not_on_how_it_came_about(
+    steps: list[tuple[Any, ...]],
+) -> None:
+    finger = Finger(lambda message: None, speed_m_per_s=1.0)
+    finger.use(AIMS[0])
+    aim, depth, position, lifted = AIMS[0], 0.004, (0.0, 0.0), True
+    commanded = False
+    for name, *values in steps:
+        if name == "scene":
+            aim = AIMS[int(values[0])]
+            finger.use(None)
+            finger.use(aim)
+            continue
+        getattr(finger, name)(*values)
+        commanded = True
+        if name == "push":
+            depth, lifted = values[0], False
+        elif name == "place":
+            position = (values[0], values[1])
+        else:
+            lifted = name == "lift" or not lifted
+    led = np.array([0.0, 0.0, 0.08])
+    if commanded:
+        ray = np.array([*position, 1.5]), np.array([0.0, 0.0, -1.0])
+        led = aim.under_ray(*ray, -HOVER_M if lifted else depth)
+    finger.advance(1000.0, None)
+    assert finger.position_m == position
+    np.testing.assert_allclose(finger._led, led)
+
+
 def test_a_finger_that_cannot_be_moved_says_why(scene: Scene) -> None:
     finger = Finger(lambda message: None, speed_m_per_s=0.1)
-    with pytest.raises(ValueError, match="still being read"):
-        finger.place(0.0, 0.0)
     finger.use(Aim(scene))
     for depth in (-0.001, np.nan, np.inf):
         with pytest.raises(ValueError, match="no depth"):
@@ -85,15 +183,11 @@ async def test_an_object_is_made_ready_to_point_at_beside_the_loop(
     desk = SceneDesk(sent.append, tmp_path, scene)
     finger, failures = Finger(sent.append, speed_m_per_s=1.0), []
     desk.make_aim(finger, failures.append)
-    with pytest.raises(ValueError, match="still being read"):
-        finger.lift()
+    finger.push(0.002)
+    assert not finger.advance(1.0, None), "its shape is not known yet"
     async with asyncio.timeout(20):
-        while not sent:
+        while not finger.advance(1.0, None):  # noqa: ASYNC110  # it is told by a task
             await asyncio.sleep(0)
-            try:
-                finger.lift()
-            except ValueError:
-                continue
-            finger.advance(1.0, None)
     await desk.close()
+    assert sent
     assert not failures

@@ -13,9 +13,23 @@ from numpy.typing import NDArray
 from messages.scene import Scene
 from nodes.arm_bridge import kinematics
 from nodes.console.arms import PIECES, link_poses, rounded_box
+from nodes.console.creases import split_creases
 from nodes.console.picture import picture_of, ray_vertices, rays
-from nodes.console.sheet import COLUMNS, ROWS, film, hit_by_ray, sheet_points
-from nodes.console.view import finger_mesh, line_segments
+from nodes.console.sheet import (
+    COLUMNS,
+    ROWS,
+    film,
+    hit_by_ray,
+    sheet_points,
+    sheet_triangles,
+)
+from nodes.console.view import (
+    LINES_LIFT_M,
+    SHEET_LIFT_M,
+    finger_mesh,
+    lift_sheet,
+    line_segments,
+)
 from nodes.models.rigid import rotation_from_vector, transform
 from tests.arm_states import arm_state
 from tests.console_parts import Shelf, cylinder
@@ -93,6 +107,43 @@ def test_rays_meet_the_flat_sheet_where_the_plane_is(x: float, y: float) -> None
     eye = np.array([0.03, 0.05, 0.4])
     towards = np.array([[x, y, 0.0]]) + 0.3 * (np.array([[x, y, 0.0]]) - eye)
     np.testing.assert_allclose(hit_by_ray(sheet(), eye, towards), [[x, y, 0.0]], atol=1e-9)
+
+
+@pytest.mark.parametrize("tilt_rad", [-1.0, 0.0, 1.0])
+def test_the_sheet_is_drawn_before_the_object_that_it_touches(tilt_rad: float) -> None:
+    """In one plane with a flat object, the sheet and the object were drawn in patches."""
+    turned = transform(rotation_from_vector(np.array([tilt_rad, 0.0, 0.0])), (0.0, 0.0, 0.0))
+    points = sheet_points(
+        *(turned @ edge for edge in edges()),
+        height_m=HEIGHT_M,
+        fingertip=None,
+        finger_radius_m=0.007,
+    )
+    assert points is not None
+    lifted = (lift_sheet(points, SHEET_LIFT_M) - points) @ turned[:3, :3]
+    np.testing.assert_allclose(
+        lifted, np.tile([0.0, 0.0, SHEET_LIFT_M], (len(points), 1)), atol=1e-12
+    )
+    assert LINES_LIFT_M > SHEET_LIFT_M > 0.0
+
+
+def test_sharp_edges_are_split_and_smooth_ones_are_not() -> None:
+    """The smooth normals of a shared vertex drew teeth along the edges of a plane and a box."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    box = np.array(
+        [
+            *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
+            *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
+        ],
+        dtype=np.int32,
+    )
+    source, triangles = split_creases(corners, box)
+    assert np.bincount(source).tolist() == [3] * 8, "a vertex for each of the three faces"
+    np.testing.assert_array_equal(source[triangles], box)
+    points = sheet(np.array([0.02, 0.01, -0.01]))
+    source, triangles = split_creases(points, sheet_triangles())
+    assert sorted(source.tolist()) == list(range(len(points)))
+    np.testing.assert_array_equal(source[triangles], sheet_triangles())
 
 
 def test_rays_that_miss_have_no_segments(scene: Scene) -> None:

@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+import asyncio
 import gzip
+import logging
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
+import viser
+import websockets
 from numpy.typing import NDArray
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from nodes.console.dress import dressed
-from nodes.console.guard import COOKIE, ConsoleError, Guard, read_token
+from nodes.console.guard import (
+    COOKIE,
+    ConsoleError,
+    Guard,
+    page_logger,
+    read_token,
+    start_server,
+)
 from nodes.console.node import ConsoleParameters
 
 Floats = NDArray[np.float64]
@@ -39,6 +52,9 @@ def test_on_loopback_only_the_computers_own_pages_may_ask() -> None:
     assert status_of(guard, asked(Origin="null")) == 403
     assert status_of(guard, asked(host="evil.example:8080")) == 403, "a name bound to loopback"
     assert status_of(guard, asked(host="")) == 403
+    for destination in ("iframe", "frame", "embed", "object"):
+        assert status_of(guard, asked(Sec_Fetch_Dest=destination)) == 403
+    assert status_of(guard, asked(Sec_Fetch_Dest="document")) == 200
     assert status_of(guard, asked(host="[::1")) == 403
 
 
@@ -105,3 +121,101 @@ def test_the_page_is_served_with_our_style_and_script(packed: bool) -> None:
         Response(401, "", Headers()),
     ):
         assert bytes(dressed(other).body) == bytes(other.body)
+
+
+class LogLines(logging.Handler):
+    """Keeps the lines that a handler would have written."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno >= logging.WARNING:
+            self.lines += self.format(record).splitlines()
+
+
+@pytest.fixture(scope="module")
+def page_server() -> Iterator[tuple[int, LogLines]]:
+    """The port of a guarded page, and what its server logs."""
+    lines = LogLines()
+    for logger in (page_logger(), logging.getLogger("websockets.server")):
+        logger.addHandler(lines)
+    server = start_server("127.0.0.1", 0, Guard("127.0.0.1", None), "test")
+    yield server.get_port(), lines
+    server.stop()
+    for logger in (page_logger(), logging.getLogger("websockets.server")):
+        logger.removeHandler(lines)
+
+
+async def answer_to(port: int, sent: bytes) -> tuple[int, dict[str, str]]:
+    """Send bytes and return the status and the headers (lower case) of the answer."""
+    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+    writer.write(sent)
+    async with asyncio.timeout(20):
+        head = await reader.readuntil(b"\r\n\r\n")
+    writer.close()
+    first, *rest = head.decode().split("\r\n")
+    pairs = (line.partition(": ") for line in rest if line)
+    return int(first.split()[1]), {name.lower(): value for name, _, value in pairs}
+
+
+HOST = b"Host: 127.0.0.1\r\n"
+MALFORMED_REQUESTS = {
+    "two hosts": b"GET / HTTP/1.1\r\n" + 2 * HOST + b"\r\n",
+    "no host": b"GET / HTTP/1.1\r\n\r\n",
+    "two origins": b"GET / HTTP/1.1\r\n" + HOST + 2 * b"Origin: http://127.0.0.1\r\n" + b"\r\n",
+    "broken origin": b"GET / HTTP/1.1\r\n" + HOST + b"Origin: http://[\r\n\r\n",
+    "two upgrades": b"GET / HTTP/1.1\r\n" + HOST + 2 * b"Upgrade: websocket\r\n" + b"\r\n",
+    "long path": b"GET /" + 5000 * b"a" + b" HTTP/1.1\r\n" + HOST + b"\r\n",
+    "no HTTP": b"\x16\x03\x01\x02\x00\x01\x00\r\n\r\n",
+    "other method": b"POST / HTTP/1.1\r\n" + HOST + b"\r\n",
+    "other version": b"GET / HTTP/9.9\r\n" + HOST + b"\r\n",
+    "long line": 100_000 * b"x" + b"\r\n\r\n",
+    "broken header": b"GET / HTTP/1.1\r\nno colon\r\n\r\n",
+    "a body": b"GET / HTTP/1.1\r\n" + HOST + b"Content-Length: 3\r\n\r\nabc",
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED_REQUESTS)
+async def test_malformed_request_is_answered_with_a_plain_400(
+    page_server: tuple[int, LogLines], name: str
+) -> None:
+    port, log = page_server
+    logged = len(log.lines)
+    status, headers = await answer_to(port, MALFORMED_REQUESTS[name])
+    assert status == 400
+    assert headers["x-frame-options"] == "DENY"
+    assert len(log.lines) <= logged + 1, log.lines[logged:]
+    assert (await answer_to(port, b"GET / HTTP/1.1\r\n" + HOST + b"\r\n"))[0] == 200
+
+
+async def test_no_answer_may_be_shown_in_a_frame(page_server: tuple[int, LogLines]) -> None:
+    port, _ = page_server
+    for path, more, expected in (
+        (b"/", b"", 200),
+        (b"/none", b"", 404),
+        (b"/", b"Origin: http://evil.example\r\n", 403),
+        (b"/", b"Sec-Fetch-Dest: iframe\r\n", 403),
+    ):
+        request = b"GET " + path + b" HTTP/1.1\r\n" + HOST + more + b"\r\n"
+        status, headers = await answer_to(port, request)
+        assert status == expected
+        assert headers["x-frame-options"] == "DENY"
+        assert headers["content-security-policy"] == "frame-ancestors 'none'"
+
+
+async def test_garbage_after_the_handshake_costs_one_log_line(
+    page_server: tuple[int, LogLines],
+) -> None:
+    port, log = page_server
+    logged = len(log.lines)
+    protocol = websockets.Subprotocol(f"viser-v{viser.__version__}")
+    async with websockets.connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol]) as socket:
+        await socket.send(b"\xc1 no message")
+        async with asyncio.timeout(20):
+            with suppress(websockets.ConnectionClosed):
+                async for _ in socket:
+                    pass
+        assert socket.close_code == websockets.CloseCode.INTERNAL_ERROR
+    assert len(log.lines) <= logged + 1, log.lines[logged:]

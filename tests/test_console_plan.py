@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from launch.plans.documents import BadInputError
 from launch.plans.plan import load_plan
+from nodes.console.graph_facts import GraphFacts
 from tests.console_parts import ROOT
 
 Floats = NDArray[np.float64]
@@ -59,3 +61,15 @@ def test_what_the_file_says_of_console_and_recorder_stays(graph: Path, tmp_path:
     graph.write_text(text)
     with pytest.raises(BadInputError, match="token_file"):
         load_plan(graph, console=True, settings=[open_page])
+
+
+def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path) -> None:
+    def facts(**options: Any) -> GraphFacts:
+        file = tmp_path / "plan.json"
+        file.write_text(load_plan(graph, **options).model_dump_json())
+        return GraphFacts.from_plan(file, "console")
+
+    on_request = GraphFacts(records=True, records_on_request=True)
+    assert facts(console=True) == on_request
+    always = facts(console=True, record=tmp_path / "a.mcap")
+    assert always == GraphFacts(records=True, records_on_request=False)

@@ -9,19 +9,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from launch.plans.plan import load_scene
 from messages.base import Message
 from messages.scene import Scene
 from messages.types import (
     Recording,
 )
+from nodes.arm_bridge.geometry import ArmGeometry
+from nodes.arm_bridge.limiter import sheet_trouble
 from nodes.console import scenes
 from nodes.console.aim import Aim
 from nodes.console.desk import SETTLE_S, Desk, Files, SceneDesk
-from nodes.console.finger import Finger
-from tests.console_parts import cylinder
+from nodes.console.finger import Finger, FingerIntent
+from tests.console_parts import ROOT, cylinder
 from tests.plans import scene_with
 
 Floats = NDArray[np.float64]
+SCENES = ROOT / "launch" / "scenes"
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +65,7 @@ def test_a_larger_object_keeps_its_front(geometry: dict[str, Any]) -> None:
         ("young_modulus_pa", -1.0),
         ("young_modulus_pa", np.nan),
         ("stretch_ratio", 0.9),
+        ("stretch_ratio", 1.09),
         ("size_ratio", 0.0),
         ("size_ratio", np.inf),
     ],
@@ -69,6 +74,20 @@ def test_values_that_make_no_scene_are_refused(scene: Scene, name: str, value: f
     good = {"young_modulus_pa": 4e3, "stretch_ratio": 1.02, "size_ratio": 1.0}
     with pytest.raises(scenes.SceneChoiceError):
         scenes.edited(scene, **good | {name: value})
+
+
+@pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
+    """At more than 8 % the arms of the demo stood still, and the scene's own limit was raised."""
+    scene = load_scene(path)
+    limit = scenes.max_stretch_ratio(scene)
+    tight = scenes.edited(scene, young_modulus_pa=4e3, stretch_ratio=limit, size_ratio=1.0).sheet
+    assert tight.max_stretch_ratio == scene.sheet.max_stretch_ratio
+    assert tight.min_stretch_ratio == limit <= tight.max_stretch_ratio
+    left, right = np.eye(4), np.eye(4)
+    left[0, 3], right[0, 3] = np.array([-0.5, 0.5]) * limit * tight.width_m
+    limits = ArmGeometry(scene, "left").sheet_limits
+    assert sheet_trouble(left, right, left=True, limits=limits) is None
 
 
 async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path) -> None:
@@ -110,8 +129,10 @@ def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_
     first.scenes.choose("other")
     first.scenes.slide(1.0, young_modulus_pa=9e3)
     first.scenes.settle(2.0)
+    first.finger.push(0.009)
     first.record(True)
     again, sent = desk()
+    assert again.finger.intent == FingerIntent(depth_m=0.009, lifted=False)
     assert again.scenes.sliders == first.scenes.sliders
     taken_up, recording = sent
     assert isinstance(taken_up, Scene)

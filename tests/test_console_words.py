@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messages.types import PortStatus, Status
-from nodes.console import dress, panels
+from messages.types import ArmState, PortStatus, Status
+from nodes.console import banner, dress, panels
+from nodes.console.banner import BannerState, GraphState
+from nodes.console.desk import LookState
 from nodes.console.history import SERIES, WINDOW_S, History
 from nodes.console.page import STOP_COLOR
 from nodes.console.record_tab import RECORDING_COLOR
@@ -75,47 +77,112 @@ def test_tables_say_in_words_what_is_wrong() -> None:
     assert "slow" in panels.topics_table(slow)
 
 
-def test_the_banner_shouts_what_matters_most() -> None:
+def rendered(**state: Any) -> str:
+    return banner.render(GraphState(**{"scene": "cylinder"} | state))
+
+
+def arms_in(**changes: Any) -> dict[str, ArmState]:
+    return {side: arm_state(side, **changes) for side in ("left", "right")}
+
+
+FAULTY_ARM = arm_state("left", mode="fault", faults=("joint 3",))
+
+
+@pytest.mark.parametrize(
+    ("state", "expected"),
+    [
+        ({}, BannerState.WAITING),
+        ({"arms": arms_in()}, BannerState.READY),
+        ({"arms": {"left": arm_state("left"), "right": FAULTY_ARM}}, BannerState.FAULT),
+        ({"arms": arms_in(mode="disconnected")}, BannerState.FAULT),
+        ({"arms": arms_in(mode="hold", path_blocked=True)}, BannerState.FAULT),
+        ({"arms": arms_in(mode="hold")}, BannerState.WAITING),
+        ({"arms": arms_in(mode="idle")}, BannerState.WAITING),
+        ({"arms": arms_in(), "overload": "8 jobs a core."}, BannerState.BUSY),
+        ({"arms": {"left": FAULTY_ARM}, "overload": "8 jobs a core."}, BannerState.FAULT),
+        ({"arms": {"left": FAULTY_ARM}, "estop_reason": "why"}, BannerState.ESTOP),
+        ({"arms": arms_in(mode="estop")}, BannerState.ESTOP),
+    ],
+)
+def test_the_banner_shows_the_most_urgent_state(
+    state: dict[str, Any], expected: BannerState
+) -> None:
+    assert GraphState(scene="", **state).banner is expected
+    html = rendered(**state)
+    assert f'data-state="{expected.name.lower()}"' in html
+    assert ("fs-ground-good" in html) == (expected is BannerState.READY)
+    if state.get("overload"):
+        assert "cylinder</b>, live. 8 jobs a core." in html, "the cause comes first"
+
+
+def test_the_banner_says_what_is_wrong_and_what_to_do() -> None:
     follow = {"left": arm_state("left", edge_force_n=5.1), "right": arm_state("right")}
-    assert "5.1 N" in panels.banner("cylinder", follow, None)
-    fault = {"left": arm_state("left", mode="fault", faults=("joint 3",))}
-    assert "left arm: at fault (joint 3)" in panels.banner("cylinder", fault, None)
-    assert "E-STOP is engaged: why" in panels.banner("cylinder", fault, "why")
-    assert "Waiting" in panels.banner("cylinder", {}, None)
+    assert "5.1 N" in rendered(arms=follow)
+    fault = rendered(arms={"left": FAULTY_ARM})
+    assert "left arm: at fault (joint 3)" in fault
+    assert "press Reset the fault" in fault
+    blocked = rendered(arms=arms_in(mode="hold", path_blocked=True, reason="edge force 21 N"))
+    assert "its path is blocked (edge force 21 N)" in blocked
+    assert "Lower Tension" in blocked
+    assert "Check the power" in rendered(arms=arms_in(mode="disconnected"))
+    assert "E-STOP is engaged: why" in rendered(arms={"left": FAULTY_ARM}, estop_reason="why")
+    assert GraphState("", {"left": FAULTY_ARM}).resettable
+    assert not GraphState("", arms_in(mode="hold", path_blocked=True)).resettable
     assert panels.problem("") == ""
     assert "&lt;" in panels.problem("<")
 
 
-def test_a_busy_computer_comes_first_on_the_banner() -> None:
+def test_a_busy_computer_is_named_before_the_arms_that_it_stops() -> None:
     lost = {"left": arm_state("left", mode="disconnected", faults=("no answer",))}
-    why = "the computer main is busy: twin_arms waits for a processor 60% of the time"
-    html = panels.banner("cylinder", lost, None, overloaded=why)
-    heading, _, words = html.partition("fs-words")
+    busy = "The computer main is busy: twin_arms waits for a processor 60% of the time."
+    html = rendered(arms=lost, overload=busy)
+    heading, _, text = html.partition("fs-words")
     assert "The computer is busy. left arm: not connected (no answer)" in heading
-    assert "fs-ground-warn" in heading
-    assert "The computer main is busy: twin_arms waits" in words
-    # The numbers change all the while; what is read aloud does not.
+    assert text.index("The computer main is busy") < text.index("Check the power")
+    # The numbers change every second; a screen reader repeats the heading when it changes.
     assert "60%" not in heading
-    stopped = panels.banner("cylinder", lost, "why", overloaded=why)
-    assert "E-STOP is engaged: why" in stopped
-    assert "The computer is busy." not in stopped
+    assert "busy" not in rendered(arms=lost, estop_reason="why", overload=busy).partition("fs-w")[0]
 
 
-def test_arms_that_start_are_no_trouble() -> None:
-    starting = {"left": arm_state("left", mode="starting")}
-    html = panels.banner("cylinder", starting, None)
+def test_arms_that_start_are_no_fault() -> None:
+    html = rendered(arms={"left": arm_state("left", mode="starting")})
     assert "Arms: starting" in html
-    assert "fs-ground-warn" not in html
+    assert "fs-ground-quiet" in html
+
+
+@pytest.mark.parametrize("auto", [True, False])
+def test_only_arms_that_wait_for_a_word_are_said_to(auto: bool) -> None:
+    stopped = rendered(arms=arms_in(mode="estop", auto_arming=auto), estop_reason="why")
+    faulty = rendered(arms=arms_in(mode="fault", faults=("x",), auto_arming=auto))
+    idle = rendered(arms=arms_in(mode="idle", auto_arming=auto))
+    for html in (stopped, faulty):
+        assert ("the arms then move at once" in html) == auto
+    for html in (stopped, faulty, idle):
+        assert ("flexsheet arms ready" in html) != auto
 
 
 def test_under_the_banner_stands_why_nothing_happens() -> None:
     idle = {"left": arm_state("left", mode="idle", reason="not told <yet>")}
-    assert "The left arm says: not told &lt;yet&gt;." in panels.banner("cylinder", idle, None)
-    busy = panels.banner("cylinder", {}, None, busy="precomputing the soft body: 9 s left")
-    assert "9 s left" in busy
-    replay = panels.banner("sphere", {}, None, replay="a.mcap")
+    assert "The left arm says: not told &lt;yet&gt;." in rendered(arms=idle)
+    assert "9 s left" in rendered(solver_note="precomputing the soft body: 9 s left")
+    replay = rendered(scene="sphere", replay="a.mcap")
     assert "REPLAY" in replay
     assert "live" not in replay.partition("fs-words")[2]
+
+
+def test_names_with_markup_are_shown_as_text() -> None:
+    evil = '<img src=x onerror="alert(1)">'
+    blocked = arms_in(mode="hold", path_blocked=True, reason=evil)
+    for html in (
+        rendered(scene=evil, replay=evil, estop_reason=evil),
+        rendered(arms=arms_in(mode="fault", faults=(evil,), reason=evil)),
+        rendered(arms=blocked, overload=evil, solver_note=evil),
+        panels.nodes_table({evil: (status(evil, note=evil, errors=1, last_error=evil), 0.0)}),
+        panels.topics_table({evil: (status(evil, outputs=(port("stereo"),)), 0.0)}),
+        panels.problem(evil),
+        panels.recorder(evil, (evil,)),
+    ):
+        assert "<img" not in html
 
 
 def test_words_of_the_tabs() -> None:
@@ -125,9 +192,9 @@ def test_words_of_the_tabs() -> None:
     told = panels.finger(fingertip(np.array([-0.012, 0.003, -0.0041])))
     assert "12 mm left and 3 mm above the screen" in told
     assert "4 mm behind" in told
-    assert "twin_eye" in panels.eye(wanted=True, possible=False, ago_s=None)
-    assert "Tick" in panels.eye(wanted=False, possible=True, ago_s=None)
-    assert "Taken 3 s ago" in panels.eye(wanted=True, possible=True, ago_s=3.2)
+    resting: dict[str, Any] = {"state": LookState.RESTING, "waited_s": 1.0, "ago_s": None}
+    assert "twin_eye" in panels.eye(wanted=True, possible=False, **resting)
+    assert "Tick" in panels.eye(wanted=False, possible=True, **resting)
     assert "no recorder" in panels.recorder(None, ())
     assert "Marked: one, &lt;b&gt;." in panels.recorder("waits", ("one", "<b>"))
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import threading
+import time
 from collections.abc import AsyncIterator
 from dataclasses import replace
 from pathlib import Path
@@ -257,6 +259,45 @@ async def test_closing_interrupts_the_precomputation(tmp_path: Path) -> None:
     assert bench.node.errors == 0
     assert bench.sent == []
     assert not any(path.suffix == ".npz" for path in tmp_path.iterdir())  # noqa: ASYNC240
+
+
+async def test_a_newer_scene_interrupts_the_precomputation(
+    cache: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cached scene waited for minutes of work on the one that it replaced."""
+    begun, meshed, ended = threading.Event(), threading.Event(), threading.Event()
+
+    def endless(spec: Any, progress: Any, parts: Any = None) -> Any:
+        begun.set()
+        meshed.wait()
+        try:
+            while True:
+                progress(0, 1, precompute.Budget(1, 1, 1, 1))
+                time.sleep(0.001)
+        finally:
+            ended.set()
+
+    bench = Bench(cache_dir=cache)
+    await bench.node.setup()
+    await bench.node.step("scene", scene(), header(1))
+    monkeypatch.setattr(precompute, "compute", endless)
+    thin = {"shape": "cylinder", "radius_m": 0.031, "length_m": 0.1}
+    thinner = thin | {"radius_m": 0.029}
+    try:
+        bench.node.deliver("scene", scene(geometry=thin), header(2))
+        assert await asyncio.to_thread(begun.wait, 60)
+        bench.node.deliver("scene", scene(geometry=thinner), header(3))
+        bench.node.deliver("scene", scene(), header(4))
+        async with asyncio.timeout(60):
+            await asyncio.gather(*bench.node.mailbox_tasks())
+        meshed.set()
+        assert await asyncio.to_thread(ended.wait, 60), "the abandoned work goes on"
+    finally:
+        meshed.set()
+        await bench.node.close()
+    assert [head.source_ns for name, _, head in bench.sent if name == "skin"] == [1, 4]
+    assert "ready" in bench.node.note
+    assert bench.node.errors == 0, bench.node.last_error
 
 
 async def test_the_same_messages_give_the_same_bytes(cache: str) -> None:

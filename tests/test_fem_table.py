@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
+import time
 from collections.abc import Iterator
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -298,3 +302,11 @@ def test_a_push_that_is_asked_to_stop_does() -> None:
     job = pushes.job_of(SPEC.body.mesh, mesh, site, poisson_ratio=0.45, finger_radius_m=FINGER)
     with pytest.raises(pushes.StoppedError):
         solve_push(job, lambda: True)
+
+
+def test_an_interrupted_computation_ends_its_workers_in_mid_push() -> None:
+    with suppress(Interrupted), local_processes(1) as executor:
+        assert executor.submit(os.getpid).result() != os.getpid()
+        busy = executor.submit(time.sleep, 60)
+        raise Interrupted
+    assert isinstance(busy.exception(), BrokenProcessPool)

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from launch.bags.report.album import MARKED_MOST, Album
-from launch.bags.report.charts import stretches_of
+from launch.bags.report.charts import mark_isolated, stretches_of
 from launch.bags.report.findings import findings_of
 from launch.bags.report.numbers import methods_of, numbers_of
 from launch.bags.report.page import COLOURS, MARK, SECTIONS, page_of
@@ -428,3 +429,17 @@ def test_what_was_lost_before_the_bag_began_is_not_of_the_bag() -> None:
         for gaps in (5, 8):
             port.take("planner", 1, counted(gaps), lived_before=lived_before)
         assert port.totals() == (0, lost, 0)
+
+
+def test_a_single_value_is_a_point_of_the_chart() -> None:
+    """A bag with one frame had a latency chart without anything in it."""
+    nan = np.nan
+    axes: Any = Figure().subplots()
+    seconds = np.arange(6.0)
+    axes.plot(seconds, [nan, 3.0, nan, nan, nan, 4.0], "-")
+    axes.plot(seconds, [nan, 1.0, 2.0, nan, nan, nan], "-")
+    axes.plot(seconds[:1], [1.0], "v")
+    axes.axhline(2.0)
+    mark_isolated(axes)
+    assert [line.get_marker() for line in axes.lines] == [".", "None", "v", "None"]
+    assert axes.lines[0].get_markevery() == [1, 5]

@@ -27,7 +27,8 @@ from messages.security import new_key_pair, write_secret
 from messages.topics import TOPICS
 from messages.types import Arming, EStop
 from nodes import node_class
-from nodes.console.desk import Desk, Files, Finger, ReleaseError, others_that_may_reset
+from nodes.console.desk import Desk, Files, Finger, ReleaseError
+from nodes.console.graph_facts import GraphFacts
 from nodes.node import Node, NodeParameters, Output, parameters_of
 from nodes.runner import Links
 from tests.arm_states import arm_state
@@ -223,9 +224,9 @@ def test_a_console_that_may_not_reset_says_who_may(folder: Path, may: bool | Non
     (folder / "plan.json").write_text(plan.model_dump_json())
     sent: list[Message] = []
     files = Files(folder / "plan.json", folder, folder, folder / "console.json")
-    others = others_that_may_reset(files.plan, "console")
+    facts = GraphFacts.from_plan(files.plan, "console")
     finger = Finger(sent.append, speed_m_per_s=0.1)
-    desk = Desk(sent.append, files, finger, print, others)
+    desk = Desk(sent.append, files, finger, print, facts)
     desk.stop("pressed at the console")
     if may:
         desk.release()

@@ -232,6 +232,16 @@ class ArmControl:
         return (*self.faults, *estop, *lost)
 
     @property
+    def path_blocked(self) -> bool:
+        """Whether it stands because no path to the target is clear."""
+        return self._barred is not None and self.mode == "hold"
+
+    @property
+    def auto_arming(self) -> bool:
+        """Whether it becomes ready without a person's word."""
+        return self._by_itself
+
+    @property
     def at_rest(self) -> bool:
         return float(np.abs(self._velocity).max()) <= REST_RAD_PER_S
 

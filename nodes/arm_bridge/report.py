@@ -50,6 +50,8 @@ def arm_state(
         faults=control.all_faults,
         ready=control.ready,
         reason=control.reason,
+        path_blocked=control.path_blocked,
+        auto_arming=control.auto_arming,
         joints_rad=measured,
         joints_commanded_rad=control.commanded_rad,
         world_from_flange=geometry.world_from_flange(measured),

@@ -1,6 +1,6 @@
 """What all of the page's tabs do with viser's controls.
 
-Every callback runs on viser's own thread; it only hands on what was asked, by name, to the node.
+Every callback runs on viser's own threads; it only hands on what was asked, by name, to the node.
 Of viser's handles only what its stubs do not tell (that values can be set) is used: they are Any.
 """
 
@@ -19,13 +19,22 @@ def handing(ask: Ask, name: str, *values: Any) -> Callable[[Any], None]:
 
 
 def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
-    """Call with the value that a viewer has set; not with what the page is told to show."""
+    """Call with the value that a viewer has set; not with what the page is told to show.
 
-    def on_update(event: Any) -> None:
+    As a coroutine it runs on viser's loop, so that the values come in the order of the changes.
+    """
+
+    async def on_update(event: Any) -> None:
         if event.client_id is not None:
             changed(event.target.value)
 
     handle.on_update(on_update)
+
+
+def show_value(handle: Any, value: Any) -> None:
+    """Set a control's value where it shows another one."""
+    if handle.value != value:
+        handle.value = value
 
 
 class Html:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, replace
+from enum import Enum, auto
 from pathlib import Path
 from typing import Literal
 
@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from messages.base import Message
 from messages.methods import chosen
 from messages.scene import Scene
-from messages.types import Correction, Display, EStop, Moment, Recording, TwinEye
+from messages.types import Correction, Display, EStop, Frame, Moment, Recording, TwinEye
 from nodes.console import scenes
 from nodes.console.aim import Aim
 from nodes.console.finger import Finger
+from nodes.console.graph_facts import GraphFacts
 from nodes.console.kept import Kept, load_kept, save_kept
 from nodes.console.replay import Timeline, bags_in
 
@@ -30,7 +31,15 @@ SETTLE_S = 0.4
 
 LOOK_EVERY_S = 6.0
 PIXELS_EVERY = 3
-LOOK_PATIENCE_S = 5.0
+LOOK_LABEL = "console"
+MAX_DRAWING_S = 5.0
+"""The renderer draws many frames in that time, or none."""
+
+CAPTURE_S = 1.0
+"""So long after a frame the simulated eye has all that it needs to trace the picture."""
+
+MAX_TRACING_S = 120.0
+"""A picture that takes longer never comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +53,9 @@ class Sliders:
     @staticmethod
     def of(scene: Scene) -> Sliders:
         return Sliders(
-            scene.object.material.young_modulus_pa, max(scene.sheet.min_stretch_ratio, 1.005), 1.0
+            scene.object.material.young_modulus_pa,
+            max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
+            1.0,
         )
 
 
@@ -117,79 +128,115 @@ class SceneDesk:
             await asyncio.gather(self._making_aim, return_exceptions=True)
 
 
+class LookState(Enum):
+    """What the next picture through the user's eye waits for."""
+
+    RESTING = auto()
+    DRAWING = auto()
+    TRACING = auto()
+
+
 class Look:
     """Through the user's eye: asks the renderer for a frame with its pixels, now and then.
 
-    What another has set for the display is put back when nobody looks any more; where nobody has,
-    the correction of the scene, or the one that was picked at the console.
+    Once such a frame is drawn, the simulated eye traces its picture, which takes a second of a
+    processor and on a busy computer many: no other picture is asked for meanwhile.  What another
+    has set for the display is put back as soon as the eye has what it needs; where nobody has, the
+    correction of the scene, or the one that was picked at the console.
     """
 
     def __init__(self, publish: Publish, scene: Scene) -> None:
         self._publish = publish
         self.wanted = False
         self.picked: Correction | Literal["auto"] = "auto"
+        self.state = LookState.RESTING
         self._by_scene = scene.methods.correction
-        self._holds = False
+        self._holds = self._borrowed = False
         self._number = 0
-        self._asked_s: float | None = None
-        self._again_s = 0.0
+        self._since_s, self._again_s = 0.0, 0.0
         self._others: Display | None = None
 
     @property
     def label(self) -> str:
-        return f"console {self._number}"
+        return f"{LOOK_LABEL} {self._number}"
 
     @property
     def correction(self) -> Correction:
         """As picked at the console, else as the scene says."""
         return chosen(self.picked, self._by_scene, "two_pass")
 
+    def waited_s(self, now_s: float) -> float:
+        """Return how long the present state has lasted."""
+        return now_s - self._since_s
+
     def follow(self, scene: Scene) -> None:
         """Go over to a scene's correction; a renderer that was once told heeds no scene's."""
         self._by_scene = scene.methods.correction
-        if self._holds and self._asked_s is None:
+        if self._holds and not self._borrowed:
             self._put_back()
 
     def heed(self, display: Display) -> None:
         """Another one's display message."""
-        if not display.label.startswith("console "):
+        if not display.label.startswith(f"{LOOK_LABEL} "):
             self._others, self._holds = display, False
 
     def advance(self, now_s: float) -> None:
         """Ask for the next picture if it is time, or give the last one up."""
-        if self._asked_s is not None:
-            if now_s > self._asked_s + LOOK_PATIENCE_S:
-                self._rest(now_s)
-        elif self.wanted and now_s >= self._again_s:
-            self._number += 1
-            self._asked_s = now_s
-            self._publish(
-                Display(
-                    correction=self.correction,
-                    stereo="mono",
-                    marks=False,
-                    pixels_every=PIXELS_EVERY,
-                    label=self.label,
-                )
+        waited_s = self.waited_s(now_s)
+        match self.state:
+            case LookState.RESTING:
+                if self.wanted and now_s >= self._again_s:
+                    self._ask(now_s)
+            case LookState.DRAWING:
+                if waited_s > MAX_DRAWING_S:
+                    self._rest(now_s)
+            case LookState.TRACING:
+                if self._borrowed and waited_s > CAPTURE_S:
+                    self._put_back()
+                if waited_s > MAX_TRACING_S:
+                    self._rest(now_s)
+
+    def _ask(self, now_s: float) -> None:
+        self._number += 1
+        self._enter(LookState.DRAWING, now_s)
+        self._borrowed = True
+        self._publish(
+            Display(
+                correction=self.correction,
+                stereo="mono",
+                marks=False,
+                pixels_every=PIXELS_EVERY,
+                label=self.label,
             )
+        )
 
     def again(self) -> None:
         """Do not wait for the next turn."""
         self._again_s = 0.0
 
+    def on_frame(self, frame: Frame, now_s: float) -> None:
+        """Take a frame that was drawn; the eye traces the first one with the pixels asked for."""
+        if self.state is LookState.DRAWING and frame.label == self.label and frame.pixels:
+            self._enter(LookState.TRACING, now_s)
+
     def got(self, eye: TwinEye, now_s: float) -> bool:
-        """A picture has come; says whether it is ours."""
-        if eye.label != self.label:
-            return False
-        self._rest(now_s)
-        return True
+        """A picture has come; says whether it was for the console, however late."""
+        ours = eye.label.startswith(f"{LOOK_LABEL} ")
+        if eye.label == self.label and self.state is not LookState.RESTING:
+            self._rest(now_s)
+        return ours
+
+    def _enter(self, state: LookState, now_s: float) -> None:
+        self.state, self._since_s = state, now_s
 
     def _rest(self, now_s: float) -> None:
-        self._asked_s, self._again_s = None, now_s + LOOK_EVERY_S
-        self._put_back()
+        self._enter(LookState.RESTING, now_s)
+        self._again_s = now_s + LOOK_EVERY_S
+        if self._borrowed:
+            self._put_back()
 
     def _put_back(self) -> None:
-        self._holds = self._others is None
+        self._borrowed, self._holds = False, self._others is None
         own = Display(correction=self.correction, stereo="side_by_side", label="console rests")
         self._publish(self._others or own)
 
@@ -253,8 +300,7 @@ class Desk:
     """All of it together, and what needs no state: stop, mark, record.
 
     A console that is started again goes on with the scene, the sliders and the recording that its
-    run had; warn is told why it cannot.  others_may: hosts that may reset an e-stop where this
-    console's may not; empty: it may.
+    run had; warn is told why it cannot.
     """
 
     def __init__(
@@ -263,12 +309,16 @@ class Desk:
         files: Files,
         finger: Finger,
         warn: Callable[[str], None],
-        others_may: tuple[str, ...] = (),
+        facts: GraphFacts | None = None,
     ) -> None:
-        self._files, self.others_may = files, others_may
-        first, sliders, self.recording = first_state(files, warn)
-        self.scenes = SceneDesk(self._send_scene, files.scenes, first, sliders)
+        self._files, self.facts = files, facts or GraphFacts()
+        kept = first_state(files, warn)
+        self.recording, sliders = kept.recording, kept.sliders
+        given = None if sliders is None else Sliders(*sliders)
+        self.scenes = SceneDesk(self._send_scene, files.scenes, kept.base, given)
         self.finger = finger
+        if kept.finger is not None:
+            finger.restore(kept.finger)
         self.look = Look(publish, self.scenes.scene)
         self.replay = Replay(files.bags)
         self._publish = publish
@@ -286,10 +336,10 @@ class Desk:
 
     def release(self) -> None:
         """Reset the e-stop; ReleaseError where nobody would take it."""
-        if self.others_may:
+        if others := self.facts.others_may_reset:
             raise ReleaseError(
                 f"this console's host may not reset an e-stop; do it on "
-                f"{' or '.join(self.others_may)}, or let it: may_reset_estop in the launch file"
+                f"{' or '.join(others)}, or let it: may_reset_estop in the launch file"
             )
         self.stopped = None
         self._publish(EStop(engaged=False, reason="reset at the console"))
@@ -297,7 +347,7 @@ class Desk:
     def record(self, running: bool) -> None:
         self.recording = running
         self._publish(Recording(running=running))
-        self._keep()
+        self.keep()
 
     def mark(self, label: str) -> None:
         self._publish(Moment(label=label.strip() or "moment"))
@@ -305,29 +355,25 @@ class Desk:
     def _send_scene(self, scene: Scene) -> None:
         self._publish(scene)
         self.look.follow(scene)
-        self._keep()
+        self.keep()
 
-    def _keep(self) -> None:
+    def keep(self) -> None:
+        """Write down what a console that is started again goes on with."""
         desk = self.scenes
-        sliders = astuple(desk.sliders) if desk.moved else None
-        kept = Kept(base=desk.base, sliders=sliders, recording=self.recording)
+        kept = Kept(
+            base=desk.base,
+            sliders=astuple(desk.sliders) if desk.moved else None,
+            recording=self.recording,
+            finger=self.finger.intent if self.finger.commanded else None,
+        )
         save_kept(self._files.kept, kept)
 
 
-def others_that_may_reset(plan_file: Path, console: str) -> tuple[str, ...]:
-    """The hosts that may reset an e-stop where the console's own may not; empty: it may."""
-    plan = json.loads(plan_file.read_text())
-    hosts = tuple(plan["estop_resetters"])
-    return () if plan["nodes"][console]["host"] in hosts else hosts
-
-
-def first_state(files: Files, warn: Callable[[str], None]) -> tuple[Scene, Sliders | None, bool]:
-    """The scene to begin with, where the sliders stood, and whether a recording goes on."""
+def first_state(files: Files, warn: Callable[[str], None]) -> Kept:
+    """Return what the console before this one kept, else the first scene alone."""
     try:
         kept = load_kept(files.kept)
     except scenes.SceneChoiceError as error:
         warn(str(error))
         kept = None
-    if kept is None:
-        return scenes.first_scene(files.plan), None, False
-    return kept.base, None if kept.sliders is None else Sliders(*kept.sliders), kept.recording
+    return kept or Kept(base=scenes.first_scene(files.plan))

@@ -1,14 +1,17 @@
 """Who may see the page: loopback by default, a token anywhere else, and no foreign web pages.
 
 A page of another site that is open in somebody's browser can connect to sockets on that computer,
-so a loopback address alone protects nothing: the Host and Origin of every request are looked at.
+so a loopback address alone protects nothing: the Host and Origin of every request are checked, and
+no page may show the console in a frame, where a click could be led to a button nobody sees.
 """
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import http
 import ipaddress
+import logging
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -20,13 +23,31 @@ from urllib.parse import parse_qs, urlsplit
 
 import viser
 import websockets.asyncio.server
-from websockets.datastructures import Headers
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers, MultipleValuesError
+from websockets.exceptions import InvalidHandshake, InvalidMessage
 from websockets.http11 import Request, Response
 
 from nodes.console.dress import dressed
 
 LEAST_TOKEN = 16
 COOKIE = "flexsheet-token"
+
+NEVER_FRAMED = {
+    "X-Frame-Options": "DENY",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+}
+"""Headers of every answer."""
+
+FRAME_DESTINATIONS = ("iframe", "frame", "fencedframe", "embed", "object")
+"""Values of Sec-Fetch-Dest with which a browser asks for a page to show inside another one."""
+
+SINGLE_HEADERS = ("Host", "Origin", "Upgrade", "Accept-Encoding", "Cookie", "Sec-Fetch-Dest")
+"""Headers that are read; a request that repeats one of them is malformed."""
+
+MALFORMED = "the console cannot read this HTTP request; open its address in a browser"
+CLOSE_TIMEOUT_S = 1.0
+"""How long a client has to read why its request was refused."""
 
 PageRequest = Callable[[Any, Request], Response | None]
 
@@ -66,8 +87,20 @@ class Guard:
         self._token = token
 
     def refusal(self, request: Request) -> Response | None:
-        """What to answer instead of the page; None for a request that is welcome."""
-        host = request.headers.get("Host", "")
+        """Return the answer to give instead of the page; None for a request that is welcome."""
+        try:
+            return self._refusal(request)
+        except (ValueError, MultipleValuesError):
+            return bad_request()
+
+    def _refusal(self, request: Request) -> Response | None:
+        """Return as `refusal`; ValueError or MultipleValuesError for a malformed request."""
+        repeated = [name for name in SINGLE_HEADERS if len(request.headers.get_all(name)) > 1]
+        if repeated or "Host" not in request.headers:
+            return bad_request()
+        host = request.headers["Host"]
+        if request.headers.get("Sec-Fetch-Dest") in FRAME_DESTINATIONS:
+            return _page(http.HTTPStatus.FORBIDDEN, "no page may show the console in a frame")
         if not _names_an_address(host):
             return _page(
                 http.HTTPStatus.FORBIDDEN, f"the console is not known as {host!r}; use its address"
@@ -111,6 +144,10 @@ def _cookie(request: Request) -> str:
     return "" if held is None else held.value
 
 
+def bad_request() -> Response:
+    return _page(http.HTTPStatus.BAD_REQUEST, MALFORMED)
+
+
 def _page(status: http.HTTPStatus, text: str, more: dict[str, str] | None = None) -> Response:
     escaped = text.replace("&", "&amp;").replace("<", "&lt;")
     body = (
@@ -127,6 +164,51 @@ def _page(status: http.HTTPStatus, text: str, more: dict[str, str] | None = None
         }
     )
     return Response(status, status.phrase, headers, body)
+
+
+def never_framed(response: Response) -> Response:
+    """Add the headers that keep a browser from showing the answer in a frame."""
+    response.headers.update(NEVER_FRAMED)
+    return response
+
+
+def page_logger() -> logging.Logger:
+    """Return the page server's logger; what a client sends costs it one line, not a traceback."""
+    logger = logging.getLogger("flexsheet.console")
+    if not logger.filters:
+        logger.addFilter(shorten_traceback)
+    return logger
+
+
+def shorten_traceback(record: logging.LogRecord) -> bool:
+    """Replace a record's traceback by its last line."""
+    if record.exc_info and record.exc_info[1] is not None:
+        error = record.exc_info[1]
+        record.msg = f"{record.getMessage()}: {type(error).__name__}: {error}".replace("\n", " ")
+        record.args, record.exc_info, record.exc_text = (), None, None
+    return True
+
+
+class PageConnection(ServerConnection):
+    """Answers what is no HTTP request with a plain 400, where websockets logs a traceback."""
+
+    refused = False
+
+    def send_data(self) -> None:
+        """Send what the protocol has to send; to a malformed request first the refusal."""
+        malformed = isinstance(self.protocol.handshake_exc, InvalidMessage)
+        if malformed and not self.refused and not self.transport.is_closing():
+            self.refused = True
+            self.transport.write(never_framed(bad_request()).serialize())
+        super().send_data()
+
+    async def handshake(self, *arguments: Any, **rest: Any) -> None:
+        """Perform the opening handshake; one that the client got wrong ends the connection."""
+        try:
+            await super().handshake(*arguments, **rest)
+        except InvalidHandshake:
+            # Closed at once, the client might not read the answer.
+            await asyncio.wait([self.connection_lost_waiter], timeout=CLOSE_TIMEOUT_S)
 
 
 def start_server(address: str, port: int, guard: Guard, label: str) -> viser.ViserServer:
@@ -157,15 +239,23 @@ def _guarding(guard: Guard) -> Iterator[list[PageRequest]]:
     guarded: list[PageRequest] = []
 
     def answer(ask_viser: PageRequest, connection: Any, request: Request) -> Response | None:
-        refused = guard.refusal(request)
-        if refused is not None:
-            return refused
-        answered = ask_viser(connection, request)
-        return None if answered is None else dressed(answered)
+        answered = guard.refusal(request)
+        if answered is None:
+            try:
+                answered = ask_viser(connection, request)
+            except (OSError, ValueError):  # a path that no file system takes
+                answered = bad_request()
+        return None if answered is None else never_framed(dressed(answered))
 
     def serve_guarded(*arguments: Any, process_request: PageRequest, **rest: Any) -> Any:
         guarded.append(process_request)
-        return serve(*arguments, process_request=partial(answer, process_request), **rest)
+        return serve(
+            *arguments,
+            process_request=partial(answer, process_request),
+            create_connection=PageConnection,
+            logger=page_logger(),
+            **rest,
+        )
 
     websockets.asyncio.server.serve = serve_guarded  # type: ignore[assignment,misc]  # see start_server
     try:

@@ -8,13 +8,15 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from messages.files import write_file
 from messages.scene import Scene
+from nodes.console.finger import FingerIntent
 from nodes.console.scenes import SceneChoiceError
 
 
 class Kept(BaseModel):
     """base: the scene that was chosen; sliders: what they made of it, None: they rest.
 
-    recording: whether the recorder had been told to record.
+    recording: whether the recorder had been told to record.  finger: what was wanted of the finger,
+    None: nobody had moved it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -22,6 +24,7 @@ class Kept(BaseModel):
     base: Scene
     sliders: tuple[float, float, float] | None = None
     recording: bool = False
+    finger: FingerIntent | None = None
 
 
 def load_kept(path: Path) -> Kept | None:

@@ -15,8 +15,9 @@ from messages.scene import Positive, Scene
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
 from messages.wire import WireError
-from nodes.console.desk import Desk, Files, others_that_may_reset
+from nodes.console.desk import Desk, Files
 from nodes.console.finger import Finger
+from nodes.console.graph_facts import GraphFacts
 from nodes.console.guard import Guard, read_token, start_server
 from nodes.console.newest import Newest
 from nodes.console.operator import Operator
@@ -101,8 +102,8 @@ class Console(Node):
         self.url = f"http://{given.address}:{self._server.get_port()}/"
         finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
         files = Files(given.plan, given.scenes, given.bags, given.kept)
-        others = others_that_may_reset(given.plan, self.name)
-        desk = Desk(self._publish, files, finger, self.log.warning, others)
+        facts = GraphFacts.from_plan(given.plan, self.name)
+        desk = Desk(self._publish, files, finger, self.log.warning, facts)
         has = {"with_finger": given.drives_finger, "with_eye": "in/twin/eye" in self.inputs}
         self.operator = Operator(self._server, self._newest, desk, self._ask, **has)
         desk.begin()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,9 @@ from messages.types import (
     TwinEye,
 )
 from nodes.console import panels
+from nodes.console.banner import GraphState
 from nodes.console.controls import Ask
-from nodes.console.desk import Desk
+from nodes.console.desk import SETTLE_S, Desk
 from nodes.console.history import History
 from nodes.console.newest import Newest, Source
 from nodes.console.page import Page
@@ -47,12 +49,13 @@ LONGEST_STEP_S = 0.2
 
 SIDES = ("left", "right")
 MARKS_SHOWN = 5
-SOLVER, PRECOMPUTING = "fem_solver", "precomputing"
+SOLVER = "fem_solver"
 RECORDER = "recorder"
 REPLAYED = (
     "what you see is a replay, and the finger is that of the running graph: press "
     '"Back to the running graph" in Record first'
 )
+MEASURED = "the finger is measured: only a simulated one can be moved from here"
 NO_RECORDER = (
     "there is no recorder in this graph that waits to be told: start it with --console, or give "
     "its recorder the parameter waits: true"
@@ -73,8 +76,11 @@ class Operator:
         with_eye: bool,
     ) -> None:
         """with_finger: the twin's, which the mouse moves.  with_eye: the twin's, which looks."""
-        self._live, self.desk, self._with_eye = live, desk, with_eye
-        self._page = Page(server, ask, with_finger=with_finger, others_may=desk.others_may)
+        self._live, self.desk = live, desk
+        self._with_finger, self._with_eye = with_finger, with_eye
+        self._page = Page(
+            server, ask, with_finger=with_finger, others_may=desk.facts.others_may_reset
+        )
         self._history = History()
         self._statuses: dict[str, tuple[Status, float]] = {}
         self._hosts: dict[str, HostStatus] = {}
@@ -83,14 +89,17 @@ class Operator:
         self._pictured: Frame | None = None
         self._now_s, self._sent_ns = 0.0, 0
         self._bags_s = -BAGS_EVERY_S
+        self._finger_shown_s = 0.0
         self._looked_s: float | None = None
         self._marked: tuple[str, ...] = ()
+        self._bags_before: set[str] = set()
+        self._awaits_bag = False
         self._take_up_scene()
         self._asked: dict[str, Callable[..., None]] = {
             "touch": self._touch,
-            "place": self._place,
-            "push": desk.finger.push,
-            "lift": desk.finger.lift,
+            "place": partial(self._command_finger, desk.finger.place),
+            "push": partial(self._command_finger, desk.finger.push),
+            "lift": partial(self._command_finger, desk.finger.lift_or_lower),
             "stop": desk.stop,
             "release": desk.release,
             "choose": self._choose,
@@ -147,7 +156,8 @@ class Operator:
         self._now_s, desk = now_s, self.desk
         finger = self._live.newest("fingertip", Fingertip) if looking else None
         seen = finger[0].position_world_m if finger is not None and finger[0].valid else None
-        desk.finger.advance(step_s, seen)
+        if desk.finger.advance(step_s, seen):
+            desk.keep()
         try:
             if desk.scenes.settle(now_s):
                 self._take_up_scene()
@@ -188,6 +198,9 @@ class Operator:
             self._page.view.set_skin(rest, skin[0].triangles)
 
     def _show_frame(self) -> None:
+        entry = self._live.newest("frame", Frame)
+        if entry is not None:
+            self.desk.look.on_frame(entry[0], self._now_s)
         entry = self.source.newest("frame", Frame)
         if entry is None or entry[0] is self._pictured or not entry[0].pixels:
             return
@@ -204,10 +217,13 @@ class Operator:
         self._show_state()
         self._tell_eye(now_s)
         finger = self.source.newest("fingertip", Fingertip)
+        if now_s >= self._finger_shown_s:
+            # Not while a slider moves: it is ahead of what has been asked for.
+            self._page.touch.show_intent(self.desk.finger)
         self._page.touch.show_finger(panels.finger(None if finger is None else finger[0]))
-        if now_s >= self._bags_s + BAGS_EVERY_S:
+        if self._awaits_bag or now_s >= self._bags_s + BAGS_EVERY_S:
             self._bags_s = now_s
-            self._page.record.show_bags(self.desk.replay.bags())
+            self._show_bags()
 
     def _show_state(self) -> None:
         desk, arms = self.desk, {}
@@ -215,47 +231,61 @@ class Operator:
             entry = self._live.newest(f"arm_{side}", ArmState)
             if entry is not None:
                 arms[side] = entry[0]
-        stopped = desk.stopped
-        if stopped is None and any(arm.mode == "estop" for arm in arms.values()):
-            stopped = "the arms are still stopped"
         timeline, sheet = desk.replay.timeline, self._live.newest("sheet_target", SheetTarget)
         shown = desk.scenes.scene if self._drawn_scene is None else self._drawn_scene
-        html = panels.banner(
-            shown.name,
-            arms,
-            stopped,
+        state = GraphState(
+            scene=shown.name,
+            arms=arms,
+            estop_reason=desk.stopped,
             sheet=None if sheet is None else sheet[0],
-            busy=self._busy(),
-            overloaded="; ".join(filter(None, map(describe_busy, self._hosts.values()))),
+            overload=" ".join(
+                f"{one[:1].upper()}{one[1:]}."
+                for one in map(describe_busy, self._hosts.values())
+                if one
+            ),
+            solver_note=self._solver_note(),
             replay=None if timeline is None else timeline.path.name,
         )
-        self._page.show_state(html, stopped=stopped is not None)
+        self._page.show_state(state)
         recorder = self._statuses.get(RECORDER)
         note = None if recorder is None else recorder[0].note
         self._page.record.show_state(panels.recorder(note, self._marked), recording=desk.recording)
 
-    def _busy(self) -> str:
-        """What the soft body's solver says while it works one out."""
-        solver = self._statuses.get(SOLVER)
-        working = solver is not None and solver[0].note.startswith(PRECOMPUTING)
-        return solver[0].note if solver is not None and working else ""
+    def _solver_note(self) -> str:
+        """What the soft body's solver reports while it has no skin of this scene; else nothing."""
+        solver, skin = self._statuses.get(SOLVER), self._live.newest("skin", Skin)
+        pending = skin is None or skin[1].source_ns < self._sent_ns
+        return solver[0].note if solver is not None and pending else ""
 
     def _tell_eye(self, now_s: float) -> None:
-        ago_s = None if self._looked_s is None else now_s - self._looked_s
-        wanted = self.desk.look.wanted
-        self._page.eye.show_words(panels.eye(wanted=wanted, possible=self._with_eye, ago_s=ago_s))
+        look = self.desk.look
+        text = panels.eye(
+            possible=self._with_eye,
+            wanted=look.wanted,
+            state=look.state,
+            waited_s=look.waited_s(now_s),
+            ago_s=None if self._looked_s is None else now_s - self._looked_s,
+        )
+        self._page.eye.show_words(text)
 
     def _touch(self, origin: Floats, direction: Floats) -> None:
-        if self.desk.replay.timeline is not None:
-            raise ValueError(REPLAYED)
-        self.desk.finger.touch(origin, direction)
-        if (target := self.desk.finger.target) is not None:
-            self._page.touch.show_aim(float(target[0]), float(target[1]))
+        self._command_finger(self.desk.finger.touch, origin, direction)
+        self._page.touch.show_position(self.desk.finger)
 
-    def _place(self, x_m: float, y_m: float) -> None:
-        if self.desk.replay.timeline is not None:
-            raise ValueError(REPLAYED)
-        self.desk.finger.place(x_m, y_m)
+    def _command_finger(self, command: Callable[..., None], *values: Any) -> None:
+        """Give the finger a command; if it is refused, show what holds.  ValueError."""
+        finger = self.desk.finger
+        self._finger_shown_s = self._now_s + SETTLE_S
+        try:
+            if not self._with_finger:
+                raise ValueError(MEASURED)
+            if self.desk.replay.timeline is not None:
+                raise ValueError(REPLAYED)
+            command(*values)
+        except ValueError:
+            self._page.touch.show_intent(finger)
+            raise
+        self._page.touch.show_lifted(finger)
 
     def _take_up_scene(self) -> None:
         """A scene was sent since the last picture."""
@@ -282,21 +312,30 @@ class Operator:
         self.desk.look.picked = correction
         self.desk.look.again()
 
-    def _recorder_waits(self) -> bool | None:
-        """Whether the graph's recorder waits to be told; None where there is none."""
-        entry = self._statuses.get(RECORDER)
-        return None if entry is None else entry[0].note.startswith(("waits", "recorded"))
-
     def _record(self) -> None:
-        if self._recorder_waits() is None:
+        if not self.desk.facts.records_on_request:
             raise ValueError(NO_RECORDER)
-        self._marked = () if not self.desk.recording else self._marked
-        self.desk.record(not self.desk.recording)
+        if self.desk.recording:
+            self.desk.record(False)
+            self._awaits_bag = True
+            self._show_bags()
+        else:
+            self._marked, self._bags_before = (), set(self.desk.replay.bags())
+            self._awaits_bag = False
+            self.desk.record(True)
+
+    def _show_bags(self) -> None:
+        """List the bags, the newest first; one that was just recorded is chosen."""
+        bags = self.desk.replay.bags()
+        made = next((bag for bag in bags if bag not in self._bags_before), None)
+        self._page.record.show_bags(bags, made if self._awaits_bag else None)
+        self._awaits_bag = self._awaits_bag and made is None
 
     def _mark(self, label: str) -> None:
-        if self._recorder_waits() is None:
+        facts = self.desk.facts
+        if not facts.records:
             raise ValueError(NO_RECORDER)
-        if self._recorder_waits() and not self.desk.recording:
+        if facts.records_on_request and not self.desk.recording:
             raise ValueError(
                 "nothing is recorded now, so there is nothing to mark: start recording"
             )

@@ -7,7 +7,8 @@ from typing import Any
 import viser
 
 from messages.scene import Scene
-from nodes.console import panels
+from nodes.console import banner, panels
+from nodes.console.banner import GraphState
 from nodes.console.controls import Ask, Html, handing
 from nodes.console.desk import Desk
 from nodes.console.eye_tab import EyeTab
@@ -18,6 +19,7 @@ from nodes.console.view import View
 
 BRAND = (14, 92, 132)
 STOP_COLOR = (185, 28, 28)
+RELEASE, RESET = "Release the stop", "Reset the fault"
 MAIN_WIDTH, STOP_WIDTH = 380, 320
 
 
@@ -27,9 +29,9 @@ class Page:
     def __init__(
         self, server: viser.ViserServer, ask: Ask, *, with_finger: bool, others_may: tuple[str, ...]
     ) -> None:
-        """others_may: see `Desk`."""
+        """others_may: hosts that may reset an e-stop where the console's may not; empty: it may."""
         self._gui: Any = server.gui
-        self._ask = ask
+        self._ask, self._others_may = ask, others_may
         self.view = View(server)
         self.view.on_touch(lambda *ray: ask("touch", *ray), lambda: None)
         self._gui.configure_theme(
@@ -37,7 +39,7 @@ class Page:
         )
         self._gui.main_panel.dock_right()
         self._gui.main_panel.set_width(MAIN_WIDTH)
-        self._add_stop(others_may)
+        self._add_stop()
         self._problem = Html(self._gui)
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Touch", viser.Icon.HAND_FINGER):
@@ -49,7 +51,7 @@ class Page:
         with tabs.add_tab("Record", viser.Icon.PLAYER_RECORD):
             self.record = RecordTab(self._gui, ask)
 
-    def _add_stop(self, others_may: tuple[str, ...]) -> None:
+    def _add_stop(self) -> None:
         """In a window of its own, so that no tab and no scrolling takes it away."""
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
@@ -58,9 +60,7 @@ class Page:
             )
             self._state = Html(self._gui)
             self._release = self._gui.add_button(
-                f"Release: on {' or '.join(others_may)}" if others_may else "Release the e-stop",
-                visible=False,
-                hint="The arms must be at rest. Then they follow, unless they wait for: arms ready",
+                RELEASE, disabled=True, hint="The arms must be at rest"
             )
         # At the bottom: viser's own notices come at the top.
         panel.float(x=14, y=-14, width=STOP_WIDTH)
@@ -74,13 +74,19 @@ class Page:
     def show_scene(self, scene: Scene, desk: Desk) -> None:
         """A scene that the graph now works with, or that a bag holds."""
         self.view.set_scene(scene)
-        self.touch.show_scene(scene, desk.scenes.names, desk.scenes.sliders)
+        self.touch.show_scene(scene, desk.scenes.base, desk.scenes.names, desk.scenes.sliders)
         self.eye.show_correction(desk.look.correction)
 
     def show_problem(self, text: str) -> None:
         self._problem.show(panels.problem(text))
 
-    def show_state(self, html: str, *, stopped: bool) -> None:
-        """The banner, and whether there is an e-stop to release."""
-        self._state.show(html)
-        self._release.visible = stopped
+    def show_state(self, state: GraphState) -> None:
+        """The banner, and whether there is an e-stop to release or a fault to reset."""
+        self._state.show(banner.render(state))
+        # Always there, so that nothing moves under the pointer.
+        self._release.disabled = not state.resettable
+        label = RESET if state.stopped is None else RELEASE
+        if self._others_may:
+            label = f"{label}: on {' or '.join(self._others_may)}"
+        if self._release.label != label:
+            self._release.label = label

@@ -11,7 +11,8 @@ from html import escape
 from math import isnan
 
 from messages.topics import TOPICS
-from messages.types import ArmState, Fingertip, PortStatus, SheetTarget, Status
+from messages.types import Fingertip, PortStatus, Status
+from nodes.console.desk import LookState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_SHARE = 0.5
@@ -20,7 +21,6 @@ SLOW_SHARE = 0.5
 STALE_S = 3.0
 """A node that has not said how it is for so long is called silent."""
 
-FAULTY_MODES = ("fault", "estop", "disconnected", "stopping")
 MODES = {
     "starting": "starting",
     "disconnected": "not connected",
@@ -76,7 +76,8 @@ def _table(
     )
 
 
-def _words(html: str) -> str:
+def words(html: str) -> str:
+    """Return a paragraph of the page."""
     return f'<p class="fs-words">{html}</p>'
 
 
@@ -157,112 +158,62 @@ def topics_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
         rate = "" if topic.rate_hz is None else f"{rate_hz:.0f}"
         rows.append((escape(name), state, rate, oldest, str(dropped), str(lost)))
     head = ("topic", "state", "Hz", "age, ms", "skipped", "lost")
-    return _table("Topics", head, rows, numbers=(2, 3, 4, 5)) + _words(
+    return _table("Topics", head, rows, numbers=(2, 3, 4, 5)) + words(
         "Age: of the message that the slowest reader has, from its exposure. Skipped: a newer one "
         "was there already. Lost: on the way. Both since the start."
     )
 
 
-def banner(
-    scene: str,
-    arms: Mapping[str, ArmState],
-    stopped: str | None,
-    *,
-    sheet: SheetTarget | None = None,
-    busy: str = "",
-    overloaded: str = "",
-    replay: str | None = None,
-) -> str:
-    """What the arms do, over everything else.
-
-    stopped: the reason of an e-stop, or None.  busy: what the object waits for.  overloaded: which
-    computers are too busy for their nodes, and by what.  replay: name of the bag that is shown.
-    """
-    if stopped is not None:
-        text, ground = f"E-STOP is engaged: {stopped}", "bad"
-    elif any(arm.mode in FAULTY_MODES for arm in arms.values()):
-        text, ground = "; ".join(_arm(side, arm) for side, arm in arms.items()), "warn"
-    elif arms:
-        modes = sorted({MODES[arm.mode] for arm in arms.values()})
-        text, ground = f"Arms: {' / '.join(modes)}", "good"
-    else:
-        text, ground = "Waiting for the arms", "quiet"
-    if overloaded and stopped is None:
-        # First, since it is the probable cause of what the arms do.
-        text, ground = f"The computer is busy. {text}", "warn"
-    said = [_arms_hold(arms, sheet)] if stopped is None else []
-    if overloaded:
-        said.insert(0, f"{overloaded[:1].upper()}{overloaded[1:]}.")
-    forces = [arm.edge_force_n for arm in arms.values() if arm.edge_force_n is not None]
-    if forces:
-        said.append(f"The sheet pulls with {max(forces):.1f} N.")
-    if busy:
-        said.append(f"The object appears when its soft body is there: {busy}.")
-    shown = (
-        f"Scene <b>{escape(scene)}</b>, live."
-        if replay is None
-        else f"<b>REPLAY</b> of {escape(replay)}, scene <b>{escape(scene)}</b>: the 3D view shows "
-        "what was, this window what is."
-    )
-    words = " ".join([shown, *(escape(one) for one in said if one)])
-    return (
-        '<div class="fs-state"><div role="status" aria-live="polite" '
-        f'class="fs-banner fs-ground-{ground}">{escape(text)}</div>{_words(words)}</div>'
-    )
-
-
-def _arm(side: str, arm: ArmState) -> str:
-    faults = f" ({', '.join(arm.faults)})" if arm.faults else ""
-    return f"{side} arm: {MODES[arm.mode]}{faults}"
-
-
-def _arms_hold(arms: Mapping[str, ArmState], sheet: SheetTarget | None) -> str:
-    """Why arms that are well do not follow, or what the sheet does."""
-    for side, arm in arms.items():
-        if arm.mode not in ("follow", *FAULTY_MODES) and arm.reason:
-            return f"The {side} arm says: {arm.reason}."
-    if sheet is None or not arms:
-        return ""
-    match sheet.phase:
-        case "contact":
-            return f"The finger pushes {1e3 * sheet.push_depth_m:.1f} mm deep."
-        case "approach":
-            return "The sheet waits in front of the finger."
-        case _:
-            return f"The sheet holds: {sheet.reason}." if sheet.reason else "The sheet holds."
-
-
 def finger(fingertip: Fingertip | None) -> str:
-    """Where the fingertip is, or why that is not known."""
+    """Where the fingertip is, or why that is not known; always of the same height."""
+    return f'<div class="fs-finger">{words(_finger(fingertip))}</div>'
+
+
+def _finger(fingertip: Fingertip | None) -> str:
     if fingertip is None:
-        return _words("No fingertip has come yet.")
+        return "No fingertip has come yet."
     if not fingertip.valid:
-        return _words(_mark(WARN, f"not tracked: {fingertip.reason.replace('_', ' ')}"))
+        return _mark(WARN, f"not tracked: {fingertip.reason.replace('_', ' ')}")
     x, y, z = (round(1e3 * metres) for metres in fingertip.position_world_m.tolist())
-    return _words(
+    return (
         f"{_mark(GOOD, 'tracked')} {abs(x)} mm {'left' if x < 0 else 'right'} and {abs(y)} mm "
         f"{'below' if y < 0 else 'above'} the screen's middle, {abs(z)} mm "
         f"{'behind' if z < 0 else 'before'} it"
     )
 
 
-def eye(*, wanted: bool, possible: bool, ago_s: float | None) -> str:
-    """What to expect of the eye's pictures.  ago_s: since the newest; None: there is none."""
+def eye(
+    *, possible: bool, wanted: bool, state: LookState, waited_s: float, ago_s: float | None
+) -> str:
+    """Return what the eye's pictures wait for.
+
+    waited_s: since `state` began.  ago_s: since the newest picture; None: there is none.
+    """
     if not possible:
-        return _words("Nothing in this graph looks at the sheet; the twin's eye (twin_eye) would.")
+        return words("Nothing in this graph looks at the sheet; the twin's eye (twin_eye) would.")
     if not wanted:
-        return _words("Tick the box to see what the user's eye sees.")
-    if ago_s is None:
-        return _words("The first picture takes some seconds.")
-    return _words(f"Taken {ago_s:.0f} s ago, one every six seconds.")
+        return words("Tick the box to see what the user's eye sees.")
+    taken = "" if ago_s is None else f" The last picture came {ago_s:.0f} s ago."
+    match state:
+        case LookState.DRAWING:
+            return words(f"Waits for the renderer to draw a frame: {waited_s:.0f} s.{taken}")
+        case LookState.TRACING:
+            return words(
+                "Waits for the simulated eye to trace the picture, which takes a second of a "
+                f"processor and longer on a busy computer: {waited_s:.0f} s.{taken}"
+            )
+        case LookState.RESTING if ago_s is None:
+            return words("Waits for its turn: no frame or no picture came in time.")
+        case LookState.RESTING:
+            return words(f"Taken {ago_s:.0f} s ago, the next one follows within six seconds.")
 
 
 def recorder(note: str | None, marked: tuple[str, ...]) -> str:
     """What the recorder says of itself, and the moments that were marked; None: there is none."""
     if note is None:
-        return _words(_mark(WARN, "this graph has no recorder"))
+        return words(_mark(WARN, "this graph has no recorder"))
     moments = f"<br>Marked: {escape(', '.join(marked))}." if marked else ""
-    return _words(f"Recorder: {escape(note)}.{moments}")
+    return words(f"Recorder: {escape(note)}.{moments}")
 
 
 def problem(text: str) -> str:

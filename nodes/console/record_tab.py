@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from nodes.console.controls import Ask, Html, handing, on_value
+from nodes.console.controls import Ask, Html, handing, on_value, show_value
 from nodes.console.desk import Replay
 
 PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
@@ -61,10 +61,13 @@ class RecordTab:
         self._record.label = "Stop recording" if recording else "Start recording"
         self._record.color = RECORDING_COLOR if recording else None
 
-    def show_bags(self, names: Sequence[str]) -> None:
+    def show_bags(self, names: Sequence[str], made: str | None = None) -> None:
+        """List the bags.  made: one to choose, as it has just been recorded."""
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:
             self._bag.options = options
+        if made is not None:
+            show_value(self._bag, made)
 
     def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
         """The timeline's place; `opened`: it is another bag's, or none any more."""

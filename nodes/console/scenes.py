@@ -12,9 +12,14 @@ from pydantic import ValidationError
 
 from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
 from nodes.models.rigid import rotation_from_rpy
+from nodes.models.sheet import stretch_for_edge_force
 
 Floats = NDArray[np.float64]
 Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
+
+
+MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
+"""Of the slider."""
 
 
 class SceneChoiceError(ValueError):
@@ -62,13 +67,34 @@ def edited(
         values["object"] = _with(
             solid, geometry=geometry, material=material, world_from_object=pose
         )
-        most = max(sheet.max_stretch_ratio, stretch_ratio + 0.01)
-        values["sheet"] = _with(sheet, min_stretch_ratio=stretch_ratio, max_stretch_ratio=most)
+        limit = max_stretch_ratio(scene)
+        if stretch_ratio > limit + STRETCH_STEP:
+            raise SceneChoiceError(
+                f"tension: {100 * (stretch_ratio - 1):.1f} % is more than the arms of this scene "
+                f"hold, {100 * (limit - 1):.1f} % (max_stretch_ratio and max_edge_force_n of its "
+                "sheet)"
+            )
+        values["sheet"] = _with(sheet, min_stretch_ratio=min(stretch_ratio, limit))
         return Scene(**values)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(step) for step in first["loc"])
         raise SceneChoiceError(f"{where}: {first['msg']}") from error
+
+
+def max_stretch_ratio(scene: Scene) -> float:
+    """Return the largest least stretch that the arms hold: by the scene's length and its force."""
+    sheet = scene.sheet
+    strongest = stretch_for_edge_force(
+        sheet.max_edge_force_n,
+        young_modulus_pa=sheet.young_modulus_pa,
+        height_m=sheet.height_m,
+        thickness_m=sheet.thickness_m,
+    )
+    limit = min(sheet.max_stretch_ratio, strongest)
+    # Rounded down to the slider's step.  What the scene itself asks for can be shown in any case.
+    steps = np.floor((limit - 1.0) / STRETCH_STEP + 1e-6)
+    return max(1.0 + float(steps) * STRETCH_STEP, sheet.min_stretch_ratio, MIN_STRETCH_RATIO)
 
 
 def _with(part: Any, **changes: Any) -> Any:

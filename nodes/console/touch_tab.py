@@ -7,11 +7,15 @@ from functools import partial
 from typing import Any
 
 from messages.scene import Scene
-from nodes.console.controls import Ask, Html, handing, on_value
+from nodes.console.controls import Ask, Html, handing, on_value, show_value
 from nodes.console.desk import Sliders
+from nodes.console.finger import Finger
+from nodes.console.scenes import MIN_STRETCH_RATIO, max_stretch_ratio
 from nodes.console.view import LAYERS, VIEWPOINTS, View
 
 REACH_MM = 80.0
+DEEPEST_MM = 50.0
+LIFT, LOWER = "Lift the finger (L)", "Put the finger down (L)"
 
 
 class TouchTab:
@@ -19,6 +23,7 @@ class TouchTab:
 
     def __init__(self, gui: Any, ask: Ask, view: View, *, with_finger: bool) -> None:
         self._gui, self._ask, self._view = gui, ask, view
+        self._with_finger = with_finger
         gui.add_markdown(
             "**Drag on the sheet** to stroke the object. Drag beside it to turn the view, scroll "
             "to come nearer."
@@ -36,8 +41,8 @@ class TouchTab:
 
     def _add_finger(self) -> None:
         gui, ask = self._gui, self._ask
-        depth = gui.add_slider(
-            "Push, mm", 0.0, 50.0, 0.5, 4.0, hint="How deep the finger goes into the object"
+        self._depth = gui.add_slider(
+            "Push, mm", 0.0, DEEPEST_MM, 0.5, 4.0, hint="How deep the finger goes into the object"
         )
         self._across = gui.add_slider(
             "Across, mm", -REACH_MM, REACH_MM, 1.0, 0.0, hint="To the right of the screen's middle"
@@ -45,14 +50,16 @@ class TouchTab:
         self._up = gui.add_slider(
             "Up, mm", -REACH_MM, REACH_MM, 1.0, 0.0, hint="Above the screen's middle"
         )
-        lift = gui.add_button("Lift the finger (L)", hint="Off the object. Key: L")
-        on_value(depth, lambda value: ask("push", 1e-3 * value))
+        self._lift = gui.add_button(LOWER, hint="Onto the object, and off it. Key: L")
+        on_value(self._depth, lambda value: ask("push", 1e-3 * value))
         for slider in (self._across, self._up):
             on_value(
                 slider, lambda _: ask("place", 1e-3 * self._across.value, 1e-3 * self._up.value)
             )
-        lift.on_click(handing(ask, "lift"))
-        gui.add_command("Lift the finger", hotkey="L").on_trigger(handing(ask, "lift"))
+        self._lift.on_click(handing(ask, "lift"))
+        gui.add_command("Lift the finger, or put it down", hotkey="L").on_trigger(
+            handing(ask, "lift")
+        )
 
     def _add_scene(self) -> None:
         gui, ask = self._gui, self._ask
@@ -62,8 +69,9 @@ class TouchTab:
         )
         self._tension = gui.add_slider(
             "Tension, %",
-            *(0.5, 12.0, 0.1, 2.0),
-            hint="How much longer than slack the sheet is drawn, at least",
+            *(_percent(MIN_STRETCH_RATIO), 8.0, 0.1, 2.0),
+            hint="How much longer than slack the sheet is drawn, at least; up to what the arms of "
+            "this scene hold",
         )
         self._size = gui.add_slider(
             "Size, %", 50, 150, 1, 100, hint="Of the object; its front stays where it is"
@@ -83,20 +91,42 @@ class TouchTab:
                 box = self._gui.add_checkbox(layer, True)
                 on_value(box, partial(self._ask, "show_layer", layer))
 
-    def show_scene(self, scene: Scene, names: Sequence[str], sliders: Sliders) -> None:
-        """A scene that the graph now works with."""
+    def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
+        """Show a scene that the graph now works with.  base: what the sliders change."""
         if names:
             self._scene.options = tuple(names)
             if scene.name in names:
                 self._scene.value = scene.name
         self._stiffness.value = 1e-3 * sliders.young_modulus_pa
-        self._tension.value = 100.0 * (sliders.stretch_ratio - 1.0)
+        self._tension.max = _percent(max_stretch_ratio(base))
+        self._tension.value = _percent(sliders.stretch_ratio)
         self._size.value = round(100.0 * sliders.size_ratio)
 
-    def show_aim(self, across_m: float, up_m: float) -> None:
-        """Where the mouse has led the finger; beyond the sliders: their nearest end."""
-        for slider, value_m in ((self._across, across_m), (self._up, up_m)):
-            slider.value = float(round(min(max(1e3 * value_m, -REACH_MM), REACH_MM)))
+    def show_intent(self, finger: Finger) -> None:
+        """Show all that is wanted of the finger."""
+        if self._with_finger:
+            show_value(self._depth, _within(1e3 * finger.intent.depth_m, 0.0, DEEPEST_MM, 1))
+            self.show_position(finger)
+            self.show_lifted(finger)
+
+    def show_position(self, finger: Finger) -> None:
+        """Show where the finger is wanted; beyond the sliders: at their nearest end."""
+        for slider, value_m in zip((self._across, self._up), finger.position_m, strict=True):
+            show_value(slider, _within(1e3 * value_m, -REACH_MM, REACH_MM, 0))
+
+    def show_lifted(self, finger: Finger) -> None:
+        """Offer to lift the finger, or to put it down."""
+        label = LOWER if finger.intent.lifted else LIFT
+        if self._lift.label != label:
+            self._lift.label = label
 
     def show_finger(self, html: str) -> None:
         self._finger.show(html)
+
+
+def _within(value: float, low: float, high: float, digits: int) -> float:
+    return min(max(round(value, digits), low), high)
+
+
+def _percent(ratio: float) -> float:
+    return round(100.0 * (ratio - 1.0), 1)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
+from nodes.console.creases import split_creases
 from nodes.console.picture import Picture, ray_vertices, rays, transform_of
 from nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
 from nodes.models.rigid import apply, quaternion_from_rotation, transform
@@ -32,6 +33,10 @@ EYE: Color = (250, 250, 250)
 GRID: Color = (176, 181, 189)
 GRID_SECTION: Color = (128, 135, 146)
 """Seen on a light and on a dark page."""
+
+SHEET_LIFT_M, LINES_LIFT_M = 0.0006, 0.0009
+"""How far the sheet and its lines are drawn before where they are: a flat object lies in the same
+plane as the sheet that touches it, and the graphics card could not tell which is in front."""
 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
@@ -116,9 +121,10 @@ class View:
 
     def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
         """Draw the object with this skin from now on."""
+        self._skin_source, split = split_creases(rest, triangles)
+        corners = _f32(rest[self._skin_source])
         self._object = self._add(
-            "Object",
-            self._scene.add_mesh_simple("/object", _f32(rest), triangles, color=OBJECT),
+            "Object", self._scene.add_mesh_simple("/object", corners, split, color=OBJECT)
         )
         self._skin_shape, self._ray_vertices = rest.shape, ray_vertices(rest)
         self._make_touchable(self._object)
@@ -141,10 +147,11 @@ class View:
                     _place(handle, pose)
                 _place(self._links[side][-1], picture.edges[side])
             if picture.sheet is not None:
-                self._sheet.vertices = _f32(picture.sheet)
-                self._sheet_lines.points = _f32(line_segments(picture.sheet))
+                self._sheet.vertices = _f32(lift_sheet(picture.sheet, SHEET_LIFT_M))
+                lines = line_segments(lift_sheet(picture.sheet, LINES_LIFT_M))
+                self._sheet_lines.points = _f32(lines)
             if picture.skin is not None and picture.skin.shape == self._skin_shape:
-                self._object.vertices = _f32(picture.skin)
+                self._object.vertices = _f32(picture.skin[self._skin_source])
             if picture.finger is not None:
                 self._finger.position = picture.finger
                 color = FINGER if picture.finger_valid else FINGER_LOST
@@ -220,7 +227,7 @@ class View:
             "Sheet",
             self._scene.add_mesh_simple(
                 "/sheet",
-                _f32(points),
+                _f32(lift_sheet(points, SHEET_LIFT_M)),
                 sheet_triangles(),
                 color=SHEET,
                 opacity=0.5,
@@ -229,7 +236,8 @@ class View:
                 receive_shadow=False,
             ),
         )
-        lines = self._lines("/sheet_lines", line_segments(points), SHEET_LINES, 1.0)
+        segments = line_segments(lift_sheet(points, LINES_LIFT_M))
+        lines = self._lines("/sheet_lines", segments, SHEET_LINES, 1.0)
         self._sheet_lines = self._add("Sheet", lines)
         self._make_touchable(self._sheet)
 
@@ -336,6 +344,14 @@ class View:
 
         handle.on_drag("left")(dragged)
         handle.on_click(clicked)
+
+
+def lift_sheet(points: Floats, lift_m: float) -> Floats:
+    """Return the sheet's points (n, 3), moved towards the user along its mean normal."""
+    first, last = points[0], points[-1]
+    right, left = points[COLUMNS - 1], points[-COLUMNS]
+    normal = np.cross(right - left, last - first)
+    return np.asarray(points + lift_m * normal / np.linalg.norm(normal))
 
 
 def line_segments(points: Floats) -> Floats:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from messages.methods import SoftBodyMethod, chosen
 from messages.scene import Scene
@@ -61,13 +61,11 @@ class Maker:
         """The soft body by each method that is at hand, the best first; errors as
         `load_or_compute` and `scene_body`."""
         spec = body.spec_of(scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0)
-        if self._model is None or self._model[0] != spec.key():
-            model = precompute.load_or_compute(spec, self.cache_dir, progress)
-            self._model = spec.key(), model
+        model = self._model_for(spec, progress)
         linear = body.scene_body(
             scene,
             spec,
-            self._model[1],
+            model,
             linear_depth_m=self.linear_depth_m,
             largest_depth_m=self.largest_depth_m,
             friction_ratio=self.friction_ratio,
@@ -78,7 +76,17 @@ class Maker:
         table = precompute_table.load_table(body.table_spec_of(scene, spec), self.cache_dir)
         if table is None:
             return [linear]
-        return [body.with_table(linear, scene, self._model[1], table), linear]
+        return [body.with_table(linear, scene, model, table), linear]
+
+    def _model_for(
+        self, spec: precompute.SoftBodySpec, progress: Callable[[int, int, Any], None]
+    ) -> precompute.SoftBodyModel:
+        """Return the last model if it is of this body, else load or compute it; an abandoned
+        thread may do the same for another body at any moment."""
+        last, key = self._model, spec.key()
+        if last is None or last[0] != key:
+            last = self._model = key, precompute.load_or_compute(spec, self.cache_dir, progress)
+        return last[1]
 
     def lacking(self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]) -> str:
         """What a note goes on with where the scene chose a table that nobody made yet, else
@@ -97,17 +105,17 @@ class Maker:
     ) -> body.SceneBody:
         """The body of `bodies` by its nonlinear table, which is computed and kept; errors as
         `compute_table` and `lab_workers`."""
-        assert self._model is not None
+        model = self._model_for(linear.spec, progress)
         with self._executor() as (executor, workers):
             table = precompute_table.compute_table(
                 body.table_spec_of(scene, linear.spec),
-                self._model[1],
+                model,
                 self.cache_dir,
                 executor,
                 progress,
                 workers=workers,
             )
-        return body.with_table(linear, scene, self._model[1], table)
+        return body.with_table(linear, scene, model, table)
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:

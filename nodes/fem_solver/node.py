@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import threading
+from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Literal
 
 from pydantic import Field
@@ -15,6 +16,7 @@ from messages.types import Fingertip, Skin, SoftBody
 from nodes import cache
 from nodes.fem_solver import body, precompute
 from nodes.fem_solver.contact import Response
+from nodes.fem_solver.interruption import run_unless_superseded
 from nodes.fem_solver.making import GIVEN, SKIN_SPACING_M, Maker, MethodChoice, asked
 from nodes.fem_solver.pace import Pace
 from nodes.fem_solver.place import Entry
@@ -65,7 +67,7 @@ class FemSolver(Node):
     soft_body: Output[SoftBody]
 
     async def setup(self) -> None:
-        self._stop = threading.Event()
+        self._stop = Event()
         folder = self.parameters.cache_dir or cache.default_cache_dir()
         self._maker = Maker(SKIN_SPACING_M, folder, **self.parameters.model_dump(include=GIVEN))
         self._making: asyncio.Task[None] | None = None
@@ -95,8 +97,7 @@ class FemSolver(Node):
         if self._making is not None:
             self._stop.set()
             await self._making
-            self._making = None
-            self._stop = threading.Event()
+            self._making, self._stop = None, Event()
 
     async def on_scene(self, scene: Scene, header: Header) -> None:
         self._use([])
@@ -105,7 +106,8 @@ class FemSolver(Node):
         p, maker = self.parameters, self._maker
         method, maker.skin_spacing_m = asked(scene, p.method, p.skin_spacing_m)
         try:
-            bodies = await asyncio.to_thread(maker.bodies, scene, method, self._progress)
+            make, newer = partial(maker.bodies, scene, method), partial(self.is_superseded, "scene")
+            bodies = await run_unless_superseded(make, self._progress, newer)
         except precompute.Interrupted:
             self.note = "precomputation interrupted"
             return
@@ -121,7 +123,8 @@ class FemSolver(Node):
     async def _make_table(self, scene: Scene, linear: body.SceneBody) -> None:
         """While the linear method answers, make what answers better."""
         try:
-            best = await asyncio.to_thread(self._maker.tabulated, scene, linear, self._progress)
+            progress = partial(self._progress, self._stop)
+            best = await asyncio.to_thread(self._maker.tabulated, scene, linear, progress)
         except precompute.Interrupted:
             self.note = "making of the nonlinear table interrupted; it goes on from there next time"
         except Exception as error:
@@ -129,8 +132,8 @@ class FemSolver(Node):
         else:
             self._use([best, linear])
 
-    def _progress(self, done: int, total: int, need: precompute.Need) -> None:
-        if self._stop.is_set():
+    def _progress(self, stop: Event, done: int, total: int, need: precompute.Need) -> None:
+        if stop.is_set() or self._stop.is_set():
             raise precompute.Interrupted
         far = self._remaining.text(done, total, self.clock.now_ns() * 1e-9)
         self.note = f"precomputing the soft body: {far} ({need.text()})"
@@ -150,11 +153,7 @@ class FemSolver(Node):
         elif self._last is None:
             response = current.at_rest()
         else:
-            response = body.faded(
-                self._last,
-                (header.source_ns - self._last_ns) * 1e-9,
-                hold_s=self.parameters.hold_s,
-                relax_s=self.parameters.relax_s,
-            )
+            p, since_s = self.parameters, (header.source_ns - self._last_ns) * 1e-9
+            response = body.faded(self._last, since_s, hold_s=p.hold_s, relax_s=p.relax_s)
         answer = current.message(response, lead_s=self.parameters.lead_s)
         self.soft_body.publish(answer, source_ns=header.source_ns)

@@ -10,6 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -79,14 +81,16 @@ class TableBudget:
 
 @contextmanager
 def local_processes(count: int) -> Iterator[Executor]:
-    """So many processes of this machine; ended with what they are at when left."""
+    """Provide so many processes of this machine; an exception ends them in mid-push."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     executor = ProcessPoolExecutor(count, context, initializer=_begin, initargs=(stop,))
     try:
         yield executor
-    finally:
+    except BaseException:
         stop.set()
+        raise
+    finally:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
@@ -96,7 +100,16 @@ asked_to_stop: ContextVar[Callable[[], bool]] = ContextVar("asked_to_stop", defa
 
 def _begin(stop: Event) -> None:
     enter_background()
-    asked_to_stop.set(stop.is_set)
+    threading.Thread(target=_exit_on, args=(stop,), name="stop", daemon=True).start()
+
+
+def _exit_on(stop: Event) -> None:
+    """Exit the worker as soon as it is asked to: one depth of a push takes up to a minute.
+
+    Nothing is lost: whoever asked for the answers keeps them.
+    """
+    stop.wait()
+    os._exit(0)
 
 
 def _solve(job: pushes.PushJob) -> pushes.PushAnswer:

@@ -76,8 +76,23 @@ def _figure(rows: int, columns: int, height_in: float) -> tuple[Figure, NDArray[
 
 
 def _over_time(axes: Axes, session: Session) -> None:
+    """Set the axes to the bag's time, once their lines are there."""
+    mark_isolated(axes)
     axes.set_xlim(0.0, session.info.duration_s)
     axes.grid(visible=True, alpha=0.2)
+
+
+def mark_isolated(axes: Axes) -> None:
+    """Mark each value of a line that no line leads to or from: else it would not be seen."""
+    for line in axes.lines:
+        known = np.isfinite(np.asarray(line.get_ydata(), dtype=float))
+        beside = np.zeros_like(known)
+        beside[1:] |= known[:-1]
+        beside[:-1] |= known[1:]
+        isolated = np.flatnonzero(known & ~beside).tolist()
+        if isolated and line.get_marker() == "None":
+            line.set_marker(".")
+            line.set_markevery(isolated)
 
 
 def timeline(session: Session) -> Chart | None:

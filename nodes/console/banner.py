@@ -1,0 +1,179 @@
+"""The banner over everything else: how the arms are, what to do about it, and what is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from html import escape
+
+from messages.types import ArmMode, ArmState, SheetTarget
+from nodes.console.panels import MODES, words
+
+
+class BannerState(IntEnum):
+    """What the banner shows, the most urgent last."""
+
+    READY = 0
+    WAITING = 1
+    BUSY = 2
+    FAULT = 3
+    ESTOP = 4
+
+
+GROUNDS = {
+    BannerState.READY: "good",
+    BannerState.WAITING: "quiet",
+    BannerState.BUSY: "warn",
+    BannerState.FAULT: "bad",
+    BannerState.ESTOP: "bad",
+}
+"""Class of the banner's background in page.css."""
+
+FAULTY_MODES: tuple[ArmMode, ...] = ("fault", "estop", "disconnected")
+STILL_STOPPED = "the arms are still stopped"
+
+
+@dataclass(frozen=True, slots=True)
+class GraphState:
+    """What the banner is made of.
+
+    arms: by side.  estop_reason: None without an e-stop.  overload: the sentence that says by how
+    much the computer is overloaded, empty: it is not.  solver_note: of the soft body's solver while
+    it has not answered for this scene yet.  replay: name of the bag that is shown.
+    """
+
+    scene: str
+    arms: Mapping[str, ArmState] = field(default_factory=dict)
+    estop_reason: str | None = None
+    sheet: SheetTarget | None = None
+    overload: str = ""
+    solver_note: str = ""
+    replay: str | None = None
+
+    @property
+    def stopped(self) -> str | None:
+        """The reason of an e-stop that holds, as far as the console knows it."""
+        if self.estop_reason is None and any(arm.mode == "estop" for arm in self.arms.values()):
+            return STILL_STOPPED
+        return self.estop_reason
+
+    @property
+    def banner(self) -> BannerState:
+        """The most urgent state that holds."""
+        if self.stopped is not None:
+            return BannerState.ESTOP
+        if any(map(is_faulty, self.arms.values())):
+            return BannerState.FAULT
+        if self.overload:
+            return BannerState.BUSY
+        if self.arms and all(arm.mode == "follow" for arm in self.arms.values()):
+            return BannerState.READY
+        return BannerState.WAITING
+
+    @property
+    def resettable(self) -> bool:
+        """Whether there is something that a reset clears."""
+        return self.stopped is not None or any(arm.faults for arm in self.arms.values())
+
+
+def is_faulty(arm: ArmState) -> bool:
+    """Return whether an arm does not follow because of a fault or a blocked path."""
+    return bool(arm.faults) or arm.mode in FAULTY_MODES or arm.path_blocked
+
+
+def render(state: GraphState) -> str:
+    """Return the banner and the text under it as HTML."""
+    shown = state.banner
+    sentences = [state.overload, _remedy(state, shown), _explain(state, shown)]
+    forces = [arm.edge_force_n for arm in state.arms.values() if arm.edge_force_n is not None]
+    if forces:
+        sentences.append(f"The sheet pulls with {max(forces):.1f} N.")
+    if state.solver_note:
+        sentences.append(f"No object is shown yet, its solver reports: {state.solver_note}.")
+    scene = f"<b>{escape(state.scene)}</b>"
+    source = f"Scene {scene}, live."
+    if state.replay is not None:
+        source = (
+            f"<b>REPLAY</b> of {escape(state.replay)}, scene {scene}: the 3D view shows what was, "
+            "this window what is."
+        )
+    text = " ".join([source, *(escape(one) for one in sentences if one)])
+    return (
+        '<div class="fs-state" tabindex="0" role="group" aria-label="State of the arms">'
+        f'<div role="status" aria-live="polite" data-state="{shown.name.lower()}" '
+        f'class="fs-banner fs-ground-{GROUNDS[shown]}">{escape(_title(state, shown))}</div>'
+        f"{words(text)}</div>"
+    )
+
+
+def _title(state: GraphState, shown: BannerState) -> str:
+    match shown:
+        case BannerState.ESTOP:
+            return f"E-STOP is engaged: {state.stopped}"
+        case BannerState.FAULT:
+            faults = "; ".join(_describe(side, arm) for side, arm in state.arms.items())
+            # First, since it is the probable cause of the faults.
+            return f"The computer is busy. {faults}" if state.overload else faults
+        case BannerState.BUSY:
+            return "The computer is busy"
+        case _ if state.arms:
+            modes = sorted({MODES[arm.mode] for arm in state.arms.values()})
+            return f"Arms: {' / '.join(modes)}"
+        case _:
+            return "Waiting for the arms"
+
+
+def _describe(side: str, arm: ArmState) -> str:
+    if arm.path_blocked and not arm.faults:
+        return f"{side} arm: its path is blocked ({arm.reason})"
+    faults = f" ({', '.join(arm.faults)})" if arm.faults else ""
+    return f"{side} arm: {MODES[arm.mode]}{faults}"
+
+
+def _remedy(state: GraphState, shown: BannerState) -> str:
+    """What a person can do; empty where nothing is to be done."""
+    arms = state.arms.values()
+    if shown is BannerState.ESTOP:
+        return f"Release the stop once the arms rest; {_after_reset(state)}."
+    if shown is BannerState.FAULT:
+        if any(arm.path_blocked and not arm.faults for arm in arms):
+            return (
+                "Lower Tension or Size, choose another scene, or move the finger: "
+                "then the arms look for a path again."
+            )
+        if all(arm.mode == "disconnected" for arm in arms if is_faulty(arm)):
+            return "Check the power and the cable of the arm; it is connected again by itself."
+        return f"Remove the cause, then press Reset the fault; {_after_reset(state)}."
+    if shown is BannerState.WAITING and any(_awaits_person(arm) for arm in arms):
+        return "The arms stay where they are until: flexsheet arms ready."
+    return ""
+
+
+def _awaits_person(arm: ArmState) -> bool:
+    return not arm.ready and not arm.auto_arming
+
+
+def _after_reset(state: GraphState) -> str:
+    if state.arms and all(arm.auto_arming for arm in state.arms.values()):
+        return "the arms then move at once"
+    return "the arms then stay where they are until: flexsheet arms ready"
+
+
+def _explain(state: GraphState, shown: BannerState) -> str:
+    """Why arms without a fault do not follow, or what the sheet does."""
+    if shown is BannerState.ESTOP:
+        return ""
+    for side, arm in state.arms.items():
+        if arm.mode != "follow" and not is_faulty(arm) and arm.reason:
+            return f"The {side} arm says: {arm.reason}."
+    sheet = state.sheet
+    if sheet is None or not state.arms:
+        return ""
+    match sheet.phase:
+        case "contact":
+            return f"The finger pushes {1e3 * sheet.push_depth_m:.1f} mm deep."
+        case "approach":
+            return "The sheet waits in front of the finger."
+        case _:
+            return f"The sheet holds: {sheet.reason}." if sheet.reason else "The sheet holds."

@@ -1,0 +1,44 @@
+"""Meshes with sharp edges, for a viewer that shades every vertex by one normal."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Triangles = NDArray[np.int32]
+
+CREASE_RAD = 0.7
+"""An edge whose two triangles turn by more is sharp."""
+
+
+def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.int64], Triangles]:
+    """Give the triangles on both sides of a sharp edge vertices of their own.
+
+    vertices (n, 3), triangles (t, 3).  Return the index (k,) of the vertex that each of k >= n
+    vertices is a copy of, and triangles (t, 3) of the copies.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    # Corner i of triangle t has number 3 t + i; its edge leads to the triangle's next corner.
+    corners = np.arange(triangles.size)
+    after = corners - corners % 3 + (corners + 1) % 3
+    start, end = triangles.ravel()[corners], triangles.ravel()[after]
+    order = np.lexsort((np.maximum(start, end), np.minimum(start, end)))
+    first, second = order[:-1], order[1:]
+    shared = (start[first] == end[second]) & (end[first] == start[second])
+    first, second = first[shared], second[shared]
+    smooth = (normals[first // 3] * normals[second // 3]).sum(axis=1) > np.cos(CREASE_RAD)
+    first, second = first[smooth], second[smooth]
+    # Across a smooth edge the corners at both of its ends are one vertex.
+    one = np.concatenate([first, after[first]])
+    other = np.concatenate([after[second], second])
+    graph = coo_matrix((np.ones(len(one)), (one, other)), shape=(len(corners), len(corners)))
+    count, label = connected_components(graph, directed=False)
+    source = np.empty(count, dtype=np.int64)
+    source[label] = triangles.ravel()
+    return source, label.reshape(-1, 3).astype(np.int32)

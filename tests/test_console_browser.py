@@ -1,0 +1,232 @@
+"""The page in Chromium without a graph: markup in names, a layout at rest, charts, frames."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+from playwright.async_api import Page as BrowserTab
+from playwright.async_api import async_playwright, expect
+
+from messages.types import FingertipReason
+from nodes.console import panels
+from nodes.console.banner import GraphState
+from nodes.console.desk import Sliders
+from nodes.console.guard import Guard, start_server
+from nodes.console.history import History
+from nodes.console.page import Page
+from tests.arm_states import arm_state
+from tests.browser import BROWSER_MARKS, CHROMIUM, DEADLINE_S, DRAWN_WITHOUT_GPU, TWO_FRAMES
+from tests.console_parts import Shelf, cylinder
+from tests.fingertips import fingertip
+from tests.test_console_words import port, status
+
+pytestmark = BROWSER_MARKS
+
+MARKUP = '<img src=x onerror="window.ran=1"> **bold** [x](javascript:ran=1)'
+TABS = ("Touch", "Graph", "Eye", "Record")
+INKED_POINTS = """() => {
+    const canvas = document.querySelector(".uplot canvas");
+    const ratio = devicePixelRatio, {width, height} = canvas;
+    const data = canvas.getContext("2d").getImageData(0, 0, width, height).data;
+    let inked = 0;
+    for (let i = 0; i < data.length; i += 4)
+        if (data[i] === 36 && data[i + 1] === 133 && data[i + 2] === 181) inked += 1;
+    return inked / ratio;
+}"""
+"""How many pixels of the chart have the first line's colour."""
+
+
+@dataclass
+class Findings:
+    """What one visit to the page found."""
+
+    ran: list[Any] = field(default_factory=list)
+    texts: dict[str, str] = field(default_factory=dict)
+    options: list[str] = field(default_factory=list)
+    slider_boxes: dict[str, Any] = field(default_factory=dict)
+    stop_boxes: dict[str, Any] = field(default_factory=dict)
+    single_sample_ink: float = 0.0
+    framed: dict[str, str] = field(default_factory=dict)
+
+
+@asynccontextmanager
+async def browser_tab() -> AsyncIterator[BrowserTab]:
+    async with async_playwright() as play:
+        browser = await play.chromium.launch(
+            executable_path=str(CHROMIUM), args=list(DRAWN_WITHOUT_GPU)
+        )
+        tab = await browser.new_page(viewport={"width": 1000, "height": 700})
+        tab.set_default_timeout(1e3 * DEADLINE_S)
+        expect.set_options(timeout=1e3 * DEADLINE_S)
+        yield tab
+        await browser.close()
+
+
+async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -> None:
+    """Put markup wherever the page shows a name or a text that others choose."""
+    scene = cylinder().model_copy(update={"name": MARKUP})
+    faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
+    page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.of(scene))
+    page.show_state(GraphState(MARKUP, faulty, overload=MARKUP, solver_note=MARKUP, replay=MARKUP))
+    page.show_problem(MARKUP)
+    page.record.show_bags((f"{MARKUP}.mcap",))
+    page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)
+    broken = status(MARKUP, note=MARKUP, errors=1, last_error=MARKUP, outputs=(port("stereo"),))
+    statuses = {MARKUP: (broken, 0.0)}
+    tables = panels.topics_table(statuses) + panels.nodes_table(statuses)
+    page.graph.show(tables, History().columns())
+    await expect(tab.get_by_role("status")).to_contain_text(MARKUP)
+    found.texts["banner"] = await tab.locator(".fs-state").inner_text()
+    found.texts["problem"] = await tab.locator(".fs-problem").inner_text()
+    for name in TABS:
+        await tab.get_by_role("tab", name=name).click()
+        await tab.evaluate(TWO_FRAMES)
+        found.texts[name] = await tab.locator("#root").inner_text()
+        found.ran.append(await tab.evaluate("() => window.ran"))
+        if name == "Touch":
+            await tab.get_by_role("combobox", name="Scene").click()
+            found.options.append(await tab.get_by_role("option").first.inner_text())
+            await tab.keyboard.press("Tab")
+        if name == "Record":
+            found.options.append(await tab.get_by_role("combobox", name="Bag").input_value())
+    found.ran.append(await tab.evaluate("() => window.ran"))
+    page.show_problem("")
+    await expect(tab.locator(".fs-problem")).to_have_count(0)
+
+
+async def measure_layout(page: Page, tab: BrowserTab, found: Findings) -> None:
+    """Note where a slider and the e-stop are while the texts change."""
+    await tab.get_by_role("tab", name="Touch").click()
+    slider = tab.get_by_role("textbox", name="Stiffness, kPa")
+    stop = tab.get_by_role("button", name="E-STOP")
+    here = fingertip(np.array([-0.112, 0.103, -0.041]))
+    tips = {"none": None, "ok": here} | {
+        reason: here.model_copy(update={"valid": False, "reason": reason})
+        for reason in get_args(FingertipReason)
+        if reason != "ok"
+    }
+    for name, tip in tips.items():
+        page.touch.show_finger(panels.finger(tip))
+        expected = "tracked" if tip is not None else "No fingertip"
+        await expect(tab.locator(".fs-finger")).to_contain_text(expected)
+        await tab.evaluate(TWO_FRAMES)
+        found.slider_boxes[name] = await slider.bounding_box()
+    follow = {side: arm_state(side, edge_force_n=5.0) for side in ("left", "right")}
+    reason = "flanges 149 mm apart, at least 150 mm; " * 4
+    blocked = {"left": arm_state("left", mode="hold", path_blocked=True, reason=reason)}
+    states = {
+        "waiting": GraphState("cylinder"),
+        "ready": GraphState("cylinder", follow),
+        "fault": GraphState("cylinder", blocked),
+        "estop": GraphState("cylinder", follow, estop_reason="pressed at the console " * 4),
+        "busy": GraphState("cylinder", follow, overload="Each core has 8 programs to run."),
+    }
+    for name, state in states.items():
+        page.show_state(state)
+        await expect(tab.locator(f"[data-state={name}]")).to_be_visible()
+        await tab.evaluate(TWO_FRAMES)
+        found.stop_boxes[name] = await stop.bounding_box()
+
+
+async def draw_a_single_sample(page: Page, tab: BrowserTab, found: Findings) -> None:
+    history = History()
+    history.take(0.0, Shelf(fingertip=fingertip(np.zeros(3))))
+    page.graph.show("<p id=single>single</p>", history.columns())
+    await tab.get_by_role("tab", name="Graph").click()
+    await expect(tab.locator("#single")).to_be_visible()
+    for _ in range(3):
+        await tab.evaluate(TWO_FRAMES)
+    found.single_sample_ink = await tab.evaluate(INKED_POINTS)
+
+
+class Framing(BaseHTTPRequestHandler):
+    """A page of another site that shows the console in a frame."""
+
+    def __init__(self, inner: str, *arguments: Any) -> None:
+        self._inner = inner
+        super().__init__(*arguments)
+
+    def do_GET(self) -> None:
+        tag = self.path.strip("/")
+        source = "data" if tag == "object" else "src"
+        body = f'<!doctype html><{tag} {source}="{self._inner}" width=400 height=300></{tag}>'
+        self.send_response(200)
+        self.send_header("Content-Type", "text/html")
+        self.end_headers()
+        self.wfile.write(body.encode())
+
+    def log_message(self, *_: Any) -> None:
+        """Write nothing."""
+
+
+async def open_in_frames(url: str, tab: BrowserTab, found: Findings) -> None:
+    """Show the console inside pages of another origin, and note what their frames hold."""
+    site = ThreadingHTTPServer(("127.0.0.1", 0), partial(Framing, url))
+    Thread(target=site.serve_forever, daemon=True).start()
+    try:
+        for tag in ("iframe", "object", "embed"):
+            await tab.goto(f"http://localhost:{site.server_port}/{tag}", wait_until="load")
+            held = [await frame.content() for frame in tab.frames if frame != tab.main_frame]
+            found.framed[tag] = " ".join(held)
+    finally:
+        await asyncio.to_thread(site.shutdown)
+        site.server_close()
+
+
+async def visit() -> Findings:
+    found = Findings()
+    server = start_server("127.0.0.1", 0, Guard("127.0.0.1", None), "flexsheet")
+    page = Page(server, lambda *_: None, with_finger=True, others_may=(MARKUP,))
+    url = f"http://127.0.0.1:{server.get_port()}/"
+    try:
+        async with browser_tab() as tab:
+            await tab.goto(url)
+            await expect(tab.get_by_role("button", name="E-STOP")).to_be_visible()
+            await show_names_with_markup(page, tab, found)
+            await measure_layout(page, tab, found)
+            await draw_a_single_sample(page, tab, found)
+            await open_in_frames(url, tab, found)
+    finally:
+        await asyncio.to_thread(server.stop)
+    return found
+
+
+@pytest.fixture(scope="module")
+def found() -> Findings:
+    return asyncio.run(visit())
+
+
+def test_markup_in_names_is_shown_as_text_and_not_run(found: Findings) -> None:
+    assert found.ran == [None] * (len(TABS) + 1)
+    assert found.options == [MARKUP, f"{MARKUP}.mcap"]
+    assert found.texts["banner"].count(MARKUP) >= 5
+    assert MARKUP in found.texts["problem"]
+    assert found.texts["Graph"].count(MARKUP) >= 3
+    assert found.texts["Record"].count(MARKUP) >= 2
+    assert f"Reset the fault: on {MARKUP}" in found.texts["Touch"]
+
+
+def test_nothing_moves_while_texts_change(found: Findings) -> None:
+    """ "unconfirmed" is shorter than a position, and the sliders below jumped while one dragged."""
+    assert len(found.slider_boxes) > 3
+    assert len({str(box) for box in found.slider_boxes.values()}) == 1, found.slider_boxes
+    assert len(found.stop_boxes) == 5
+    assert len({str(box) for box in found.stop_boxes.values()}) == 1, found.stop_boxes
+
+
+def test_a_single_sample_is_a_point_of_the_chart(found: Findings) -> None:
+    assert found.single_sample_ink > 4
+
+
+def test_the_console_is_not_shown_in_a_frame(found: Findings) -> None:
+    assert set(found.framed) == {"iframe", "object", "embed"}
+    assert "E-STOP" not in "".join(found.framed.values())
