@@ -18,6 +18,7 @@ from nodes.console.aim import HOVER_M, Aim
 from nodes.console.desk import SceneDesk
 from nodes.console.finger import Finger
 from tests.console_parts import cylinder
+from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
 
@@ -87,7 +88,7 @@ async def test_an_object_is_made_ready_to_point_at_beside_the_loop(
     desk.make_aim(finger, failures.append)
     with pytest.raises(ValueError, match="still being read"):
         finger.lift()
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(DEADLINE_S):
         while not sent:
             await asyncio.sleep(0)
             try:

@@ -28,6 +28,7 @@ from messages.bus import Subscriber
 from messages.topics import topic_named
 from messages.types import EStop, FingerPath, Moment, Recording, TwinFinger
 from nodes.node import PortCounts
+from tests.waiting import DEADLINE_S
 
 CHROMIUM = Path("/usr/bin/chromium")
 DRAWN_WITHOUT_GPU = (
@@ -38,7 +39,6 @@ DRAWN_WITHOUT_GPU = (
     "--ignore-gpu-blocklist",
 )
 ROOT = Path(__file__).resolve().parent.parent
-DEADLINE_S = 40.0
 OBJECT_PX = (244, 162)
 """Where the object's middle is, behind the sheet, in the page of 860 x 420 pixels."""
 TWO_FRAMES = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
