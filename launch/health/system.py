@@ -79,8 +79,10 @@ TABLE = (
     ),
     SystemPackages(
         "window tests",
-        ("xvfb", "libgl1", "libglx-mesa0"),
-        lambda: missing_files(programs=["Xvfb"], libraries=["libGL.so.1", "libGLX_mesa.so.0"]),
+        ("xvfb", "libgl1", "libglx-mesa0", "libxrandr2"),
+        lambda: missing_files(
+            programs=["Xvfb"], libraries=["libGL.so.1", "libGLX_mesa.so.0", "libXrandr.so.2"]
+        ),
     ),
     SystemPackages(
         "network namespace tests",
