@@ -22,16 +22,19 @@ from launch.bags.report.write import result_of
 from launch.commands.experiment import print_followed
 from launch.experiments import ExperimentError, stroke
 from launch.experiments.demo import followed_on
+from launch.plans.plan import load_scene
 from messages.bag import BagWriter
 from messages.scene import Plane, Sphere
 from messages.types import TwinArms, TwinFinger
-from nodes.models.rigid import rotation_from_vector
-from nodes.models.shapes import CylinderShape
+from nodes.models.rigid import apply, inverse, rotation_from_vector
+from nodes.models.shapes import CylinderShape, make_shape
+from nodes.twin.paths import over_surface
 from tests import sessions
 from tests.arm_states import arm_state
 
 Floats = NDArray[np.float64]
 
+ROOT = Path(__file__).resolve().parent.parent
 SECONDS, RATE_HZ = 2.0, 50
 LABEL = "hand"
 
@@ -255,3 +258,28 @@ def test_the_general_definition_is_the_papers_on_a_cylinder(
     centre = 1.01 * radius_m * normal + [[0.05, 0.0, 0.0]]
     found = stroke.presented_on_surface(shape.closest(finger), centre, normal)
     np.testing.assert_allclose(found, 1.01 * radius_m * normal, atol=3e-6)
+
+
+@pytest.mark.parametrize("name", ["ellipsoid", "organ"])
+def test_a_sheet_that_lags_on_a_curved_object_is_off_by_the_chord(name: str) -> None:
+    scene = load_scene(ROOT / "launch" / "scenes" / f"{name}.yaml")
+    count, lag = 200, 4
+    ways = np.column_stack([np.linspace(-0.02, 0.02, count), np.linspace(-0.01, 0.03, count)])
+    points = over_surface(scene, np.column_stack([ways, np.zeros(count)]))
+    world_from_object = stroke.object_pose(scene)
+    shape = make_shape(dict(scene.object.geometry))
+    foot = shape.closest(apply(inverse(world_from_object), points))
+    normals = foot.normal @ world_from_object[:3, :3].T
+    across = np.cross([0.0, 1.0, 0.0], normals)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along = np.cross(normals, across)
+    times = np.arange(count, dtype=np.int64) * 10_000_000
+    late = np.maximum(np.arange(count) - lag, 0)
+    left, right = (
+        stroke.Track(times, np.hstack([points + half * across, along, normals])[late])
+        for half in (-0.12, 0.12)
+    )
+    finger = stroke.Track(times, points)
+    delta_d, _ = stroke.sheet_errors(scene, finger, (left, right), times, shape=shape)
+    chord = np.linalg.norm(points - points[late], axis=1)
+    np.testing.assert_allclose(delta_d[lag:], chord[lag:], rtol=0.1)
