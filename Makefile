@@ -6,6 +6,7 @@ STAMP := $(VENV)/.installed
 DEV_STAMP := $(VENV)/.installed-dev
 INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check
 LOCK := build/pip-tools
+SKIPPED := $(CURDIR)/build/skipped.txt
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
@@ -57,10 +58,19 @@ lint: $(DEV_STAMP)
 	$(BIN)/mypy
 
 # Threads of BLAS would only spin against the processes that tests start.  Tests that keep time with
-# other processes have the machine for themselves; the others share its cores.
-test: setup $(DEV_STAMP) lint
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m "not alone" --numprocesses auto --dist worksteal
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -m alone
+# other processes have the machine for themselves; the others share its cores.  Both parts run, even
+# if the first fails; the last lines say what was skipped in either, and why.
+test: $(DEV_STAMP) lint
+	@$(BIN)/python -m launch.health.system --tests
+	@mkdir -p build && : > $(SKIPPED)
+	@status=0; \
+	export OPENBLAS_NUM_THREADS=1 SKIPPED_FILE=$(SKIPPED); set -x; \
+	$(BIN)/pytest -m "not alone" --numprocesses auto --dist worksteal || status=$$?; \
+	$(BIN)/pytest -m alone || status=$$?; \
+	{ set +x; } 2> /dev/null; \
+	if [ -s $(SKIPPED) ]; then echo "skipped tests:"; sort $(SKIPPED) | uniq -c; \
+	else echo "no test was skipped"; fi; \
+	exit $$status
 
 # Longer than the tests: what docs/messaging.md, docs/image-correction.md and docs/results.md hold.
 bench: setup $(DEV_STAMP)

@@ -23,6 +23,7 @@ from messages.scene import Lens, Scene
 from messages.topics import Topic
 from messages.types import StereoPair
 from nodes.camera.node import Camera, CameraParameters
+from tests.waiting import until
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 WIDTH, HEIGHT, FRAMES = 160, 120, 6
@@ -87,9 +88,7 @@ class Bench:
         self.changed.set()
 
     async def until(self, true: Callable[[], bool]) -> None:
-        async with asyncio.timeout(20):
-            while not true():  # noqa: ASYNC110  # notes and errors come without an event
-                await asyncio.sleep(0.005)
+        await until(true)
 
     def numbers(self) -> list[tuple[int, int]]:
         return [(told(pair.left), told(pair.right) - 5) for pair, _ in self.sent]

@@ -1,7 +1,31 @@
-"""What holds for all tests."""
+"""Settings for all tests."""
 
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
 from hypothesis import settings
 
-# A deadline would assert wall-clock time, and fail on a busy machine.
-settings.register_profile("flexsheet", deadline=None)
-settings.load_profile("flexsheet")
+# A deadline would assert wall-clock time, and fail on a busy machine.  The examples are the same in
+# each run, so that a failure is due to a change: `--hypothesis-profile random` draws others.
+settings.register_profile("fixed", deadline=None, derandomize=True, database=None)
+settings.register_profile("random", deadline=None, print_blob=True)
+settings.load_profile("fixed")
+
+SKIPPED_FILE = "SKIPPED_FILE"
+"""Environment variable: the file that gets a line for each skipped test.  `make test` prints it."""
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Append "FILE: REASON" for each skipped test to the file that SKIPPED_FILE names."""
+    path = os.environ.get(SKIPPED_FILE)
+    if path is None or hasattr(terminalreporter.config, "workerinput"):
+        return
+    lines = [
+        f"{report.nodeid.partition('::')[0]}: {report.longrepr[2].removeprefix('Skipped: ')}\n"
+        for report in terminalreporter.stats.get("skipped", ())
+    ]
+    with Path(path).open("a", encoding="utf-8") as file:
+        file.writelines(lines)

@@ -38,6 +38,7 @@ from messages.topics import topic_named
 from messages.types import ArmState, FingerPath, HostStatus, TwinFinger
 from nodes.models.rigid import apply
 from nodes.node import PortCounts
+from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 SETTINGS = ROOT / "launch" / "systemd" / "90-flexsheet.conf"
@@ -199,11 +200,11 @@ class Lab:
                 self._stroking.cancel()
                 await asyncio.gather(self._stroking, return_exceptions=True)
             self._close_subscribers(*self._subscribers)
-            running = [one for one in self.launchers.values() if one.poll() is None]
-            for process in running:
+            running = {host: one for host, one in self.launchers.items() if one.poll() is None}
+            for process in running.values():
                 process.send_signal(signal.SIGINT)
-            for process in running:
-                await asyncio.to_thread(process.wait, 40)
+            deaf = [host for host, one in running.items() if not await _ends(one)]
+            assert not deaf, f"launchers on {deaf} did not end after SIGINT and were killed"
         finally:
             await self.network.__aexit__()
             shutil.rmtree(self.folder)
@@ -391,7 +392,7 @@ class Lab:
         return {arm.mode if isinstance(arm, ArmState) else "none" for arm in arms}
 
     async def until(
-        self, condition: Callable[[], bool], what: str, *, within_s: float = 60.0
+        self, condition: Callable[[], bool], what: str, *, within_s: float = DEADLINE_S
     ) -> None:
         loop = asyncio.get_running_loop()
         end_s = loop.time() + within_s
@@ -418,6 +419,17 @@ class Lab:
 
 def _only_data(folder: str, names: list[str]) -> list[str]:
     return [name for name in names if name.endswith(".py") or name in ("__pycache__", "commands")]
+
+
+async def _ends(process: subprocess.Popen[bytes]) -> bool:
+    """Whether a process ends by itself; it is killed after DEADLINE_S, and its nodes follow it."""
+    try:
+        await asyncio.to_thread(process.wait, DEADLINE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        await asyncio.to_thread(process.wait)
+        return False
+    return True
 
 
 def _ip(*arguments: str) -> None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import shutil
 import subprocess
 import threading
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import glfw
@@ -21,6 +20,7 @@ from nodes.renderer.monitors import WindowError, chosen_monitor, start_glfw
 from nodes.renderer.output import pack
 from nodes.renderer.window import CLOSED, ProjectorWindow
 from tests.test_renderer import Bench
+from tests.waiting import until
 
 pytestmark = pytest.mark.skipif(
     shutil.which("Xvfb") is None, reason="no Xvfb: apt-get install xvfb libgl1 libglx-mesa0"
@@ -91,13 +91,6 @@ class WindowBench(Bench):
         await self.finger(0.0, 0.0, 0.1)
         await until(lambda: len(self.sent) > before)
         return self.sent[-1][0]
-
-
-async def until(true: Callable[[], bool]) -> None:
-    """Wait for what another thread or process does, and tells of by its state alone."""
-    async with asyncio.timeout(20):
-        while not true():  # noqa: ASYNC110
-            await asyncio.sleep(0.002)
 
 
 @pytest.fixture

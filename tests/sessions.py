@@ -48,11 +48,11 @@ ENDS_S = 3.0
 SCENE: Scene = load_scene(Path("launch/scenes/cylinder.yaml"))
 
 
-def target(pose: Floats, phase: Any = "contact") -> SheetTarget:
+def target(pose: Floats, phase: Any = "contact", valid_at_ns: int = 0) -> SheetTarget:
     return SheetTarget(
         phase=phase,
         reason="",
-        valid_at_ns=0,
+        valid_at_ns=valid_at_ns,
         world_from_sheet=pose,
         twist_world=np.zeros(6),
         stretch_ratio=1.02,
@@ -147,7 +147,8 @@ def _write_step(desk: Desk, i: int, seconds: float, begin_s: float, finish_s: fl
         desk.write("fingertip", fingertip(tip), recorded_s, age_s=LATENCY_S)
     else:
         desk.skip("fingertip")
-    desk.write("sheet_target", target(pose), recorded_s, age_s=LATENCY_S)
+    sheet_target = target(pose, valid_at_ns=START_NS + round(seconds * 1e9))
+    desk.write("sheet_target", sheet_target, recorded_s, age_s=LATENCY_S)
     for side in ("left", "right"):
         desk.write(f"arm_{side}", _arm(side, seconds, pose), seconds + 1e-3, age_s=1e-3)
     arms = TwinArms(joints_left_rad=np.zeros(6), joints_right_rad=np.zeros(6),

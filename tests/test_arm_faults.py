@@ -11,7 +11,6 @@ import zlib
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -32,11 +31,10 @@ from tests.test_arm_loop import (
     play_finger,
     running_rig,
 )
-from tests.test_arm_loop import until as until_within
+from tests.waiting import until
 
 pytestmark = pytest.mark.alone
 
-until = partial(until_within, within_s=25.0)
 LONGEST_M = 0.24 * 1.09
 TIMEOUT_S, LATE_S = 0.25, 0.4
 PATIENT = {"timeout_s": TIMEOUT_S, "hold_after_s": 0.1, "stop_after_s": 0.6}

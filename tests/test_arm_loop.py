@@ -28,6 +28,7 @@ from nodes.planner.parameters import PlannerParameters
 from nodes.twin.arms import STATE_MOVING, STATE_STOPPED
 from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from tests.fingertips import fingertip
+from tests.waiting import until
 
 pytestmark = pytest.mark.alone
 
@@ -154,15 +155,6 @@ async def running_rig(
         for name in ("left", "right", "planner", "twin"):
             await nodes[name].close()
         await asyncio.sleep(0.02)
-
-
-async def until(condition: Callable[[], bool], *, within_s: float = 6.0) -> None:
-    """Wait until the condition holds; fails the test after `within_s`."""
-    loop = asyncio.get_running_loop()
-    end_s = loop.time() + within_s
-    while not condition():
-        assert loop.time() < end_s, "the condition did not come true"
-        await asyncio.sleep(0.005)
 
 
 Path3 = Callable[[float], Floats]

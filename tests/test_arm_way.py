@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import threading
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
@@ -33,10 +32,9 @@ from tests.test_arm_control import (
     sheet_at,
 )
 from tests.test_arm_loop import Rig, running_rig
-from tests.test_arm_loop import until as until_within
+from tests.waiting import until
 
 Floats = NDArray[np.float64]
-until = partial(until_within, within_s=25.0)
 LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
 FAR = replace(HOME, world_from_sheet=transform_from_rpy([0.12, 0.0, 0.0], [0.0, 0.0, 0.0]))
 """The sheet so far to the right that the left arm's J3 ends."""

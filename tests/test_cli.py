@@ -10,7 +10,6 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from messages.base import Header
 from messages.topics import TOPICS
 from messages.types import Display, EStop, Status
 from nodes import NODES
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
 GRAPH: dict[str, Any] = {
@@ -150,10 +150,7 @@ def recorded(running: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         write(folder, GRAPH), "--record", folder / "a.mcap", "--set", "beacon.ready_after_s=2.0"
     )
     # The listener hears the tenth beat a fifth of a second after the start, and says so by and by.
-    deadline = time.monotonic() + 30.0
-    while not told_of_its_stop(folder / "a.mcap"):
-        assert time.monotonic() < deadline, "the listener's stop was not recorded"
-        time.sleep(0.05)
+    wait_until(lambda: told_of_its_stop(folder / "a.mcap"), "the listener's stop in the bag")
     assert launched.stop() == 0
     return folder / "a.mcap"
 

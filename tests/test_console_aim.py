@@ -22,6 +22,7 @@ from nodes.console.desk import SceneDesk
 from nodes.console.finger import Finger, FingerIntent, Ray
 from tests.console_parts import cylinder
 from tests.plans import scene_with
+from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
 
@@ -185,7 +186,7 @@ async def test_an_object_is_made_ready_to_point_at_beside_the_loop(
     desk.make_aim(finger, failures.append)
     finger.push(0.002)
     assert not finger.advance(1.0, None), "its shape is not known yet"
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(DEADLINE_S):
         while not finger.advance(1.0, None):  # noqa: ASYNC110  # it is told by a task
             await asyncio.sleep(0)
     await desk.close()

@@ -27,8 +27,9 @@ from messages.bus import Subscriber
 from messages.topics import topic_named
 from messages.types import EStop, FingerPath, Moment, Recording, TwinFinger
 from nodes.node import PortCounts
-from tests.browser import BROWSER_MARKS, CHROMIUM, DEADLINE_S, DRAWN_WITHOUT_GPU, TWO_FRAMES
+from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
 from tests.fingertips import fingertip
+from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 OBJECT_PX = (244, 162)

@@ -48,9 +48,9 @@ from messages.types import (
     Status,
 )
 from tests.hosts import Hosts, hosts
+from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
-DEADLINE_S = 30.0
 BEACON = {"type": "tests.launch_nodes:Beacon"}
 # Of this process's own: ports follow from names, and tests may run beside each other.
 NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
@@ -28,8 +28,8 @@ from messages.types import EStop
 from nodes.arm_bridge.control import ArmControl, Patience
 from nodes.node import PortCounts
 from tests.arm_states import arm_state
+from tests.waiting import DEADLINE_S, NOTHING_COMES_S, until
 
-DEADLINE_S = 20.0
 STOP = EStop(engaged=True, reason="hand in the sheet")
 RESET = EStop(engaged=False, reason="")
 BRIDGE = {"type": "arm_bridge", "parameters": {"side": "left"},
@@ -121,8 +121,12 @@ class Launchers:
                    self.plan.hash),
         )  # fmt: skip
 
-    async def heard_late(self) -> set[str]:
-        """Reasons of the e-stops that a bridge hears which is started only now."""
+    async def heard_late(self, expected: str | None) -> set[str]:
+        """Reasons of the e-stops that a bridge hears which is started only now.
+
+        Waits for a reason with the expected text; without one, for a while in which none shall
+        come.
+        """
         found: set[str] = set()
         others = [one for one in self.plan.sources_to_read("estop") if one.writer != "tools"]
         subscriber = Subscriber(
@@ -132,34 +136,31 @@ class Launchers:
             PortCounts(),
         )
         subscriber.start()
-        await asyncio.sleep(0.3)
+        if expected is None:
+            await asyncio.sleep(NOTHING_COMES_S)
+        else:
+            await until(lambda: any(expected in reason for reason in found), found)
         subscriber.close()
         return found
-
-
-async def until(condition: Callable[[], bool], what: object = "") -> None:
-    loop = asyncio.get_running_loop()
-    end_s = loop.time() + DEADLINE_S
-    while not condition():
-        assert loop.time() < end_s, what
-        await asyncio.sleep(0.01)
 
 
 def files(folder: Path) -> list[str]:
     return sorted(path.name for path in (folder / "state").glob("*"))
 
 
-async def test_a_stop_outlives_all_launchers_until_it_is_reset(folder: Path) -> None:
+async def test_a_stop_outlives_all_launchers_until_it_is_reset(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plan = plan_of(folder)
     async with Launchers(folder, plan) as first:
-        await asyncio.sleep(0.3)
+        # The topic is latched: who connects later gets it, too.
         first.say(STOP)
         await until(lambda: len(files(folder)) == 2, first.said)
     async with Launchers(folder, plan) as second:
-        assert await second.heard_late() == {STOP.reason}
+        assert await second.heard_late(STOP.reason) == {STOP.reason}
         # What a console said last before all this is no answer to it.
         second.say(RESET, before_ns=10**10)
-        await asyncio.sleep(0.3)
+        await asyncio.sleep(NOTHING_COMES_S)
         assert len(files(folder)) == 2
         modes = {"left": "estop", "right": "idle"}
         arms = asyncio.create_task(second.arms(modes))
@@ -168,12 +169,13 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(folder: Path) -> 
         await until(lambda: sum("e-stop kept: arm_left" in line for line in second.said) == 2)
         assert len(files(folder)) == 2
         modes["left"] = "idle"
+        monkeypatch.setattr("launch.running.host.RESET_WITHIN_S", DEADLINE_S)
         second.say(RESET)
         await until(lambda: files(folder) == [], second.said)
-        assert await second.heard_late() == set()
+        assert await second.heard_late(None) == set()
         arms.cancel()
     async with Launchers(folder, plan) as third:
-        assert await third.heard_late() == set()
+        assert await third.heard_late(None) == set()
 
 
 async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
@@ -205,7 +207,7 @@ async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:
     file.path.parent.mkdir()
     file.path.write_text("[" * 100_000)
     async with Launchers(folder, plan) as launchers:
-        assert any("cannot be read" in reason for reason in await launchers.heard_late())
+        await launchers.heard_late("cannot be read")
         assert any("arms reset" in line for line in launchers.said)
 
 
@@ -213,20 +215,18 @@ async def test_what_cannot_be_written_is_said_kept_and_tried_again(folder: Path)
     plan = plan_of(folder)
     (folder / "state").write_text("no folder")
     async with Launchers(folder, plan) as launchers:
-        await asyncio.sleep(0.3)
         launchers.say(STOP)
         await until(lambda: any("cannot be written" in line for line in launchers.said))
-        assert STOP.reason in await launchers.heard_late()
+        await launchers.heard_late(STOP.reason)
         (folder / "state").unlink()
         await until(lambda: len(files(folder)) == 2)
 
 
 async def test_a_reason_without_end_is_cut(folder: Path) -> None:
     async with Launchers(folder, plan_of(folder)) as launchers:
-        await asyncio.sleep(0.3)
         launchers.say(EStop(engaged=True, reason="a" * 1_000_000))
         await until(lambda: len(files(folder)) == 2, launchers.said)
-        assert await launchers.heard_late() == {"a" * REASON_LENGTH}
+        assert await launchers.heard_late("a") == {"a" * REASON_LENGTH}
 
 
 def test_graphs_of_other_arms_keep_stops_of_their_own(folder: Path) -> None:

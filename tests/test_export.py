@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
 
 from launch.bags.export import ExportError, export
 from launch.cli import main
@@ -23,8 +24,6 @@ from messages.types import ArmState, EStop, Skin, SoftBody, StereoPair
 from nodes.models.rigid import transform
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
-
-pytest.importorskip("foxglove", reason="foxglove-sdk is not installed: pip install -e '.[dev]'")
 
 SCENE = load_scene(Path("launch/scenes/cylinder.yaml"))
 STARTED, STARTED_NS = "2026-11-22T10:00:00+00:00", 5_000_000_000
@@ -69,16 +68,15 @@ def bag(tmp_path: Path) -> Path:
 
 def opened(path: Path) -> dict[str, list[tuple[int, Any]]]:
     """Per channel (time, message): JSON as it is, protobuf by the schema that the file carries."""
-    protobuf = pytest.importorskip("mcap_protobuf.decoder", reason="mcap-protobuf-support: no")
     found: dict[str, list[tuple[int, Any]]] = {}
     with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[protobuf.DecoderFactory()])
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
             if channel.message_encoding == "json":
                 value = json.loads(message.data)
             else:
-                decode = protobuf.DecoderFactory().decoder_for("protobuf", schema)
+                decode = DecoderFactory().decoder_for("protobuf", schema)
                 value = decode(message.data)
             found.setdefault(channel.topic, []).append((message.log_time, value))
     return found
@@ -129,7 +127,7 @@ def test_a_channel_tells_its_fields_before_a_message_is_opened(bag: Path, tmp_pa
 def test_rerun_finds_nothing_wrong(bag: Path, tmp_path: Path) -> None:
     rerun = shutil.which("rerun", path=str(Path(sys.executable).parent))
     if rerun is None:
-        pytest.skip("rerun-sdk is not installed: pip install rerun-sdk")
+        pytest.skip("rerun-sdk (170 MB, not in requirements-dev.lock): pip install rerun-sdk")
     output = export(bag, tmp_path / "out.mcap").output
     checked = subprocess.run([rerun, "mcap", "check", output], capture_output=True, text=True,
                              check=False)  # fmt: skip

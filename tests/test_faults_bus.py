@@ -17,7 +17,8 @@ from messages.bus import queue_length
 from messages.topics import TOPICS, Delivery
 from messages.types import StereoPair
 from messages.wire import decode, encode
-from tests.test_messages_bus import Room, connected, finger, header, room, until
+from tests.test_messages_bus import Room, connected, finger, header, room
+from tests.waiting import until
 
 __all__ = ["room"]
 

@@ -21,7 +21,8 @@ from messages.types import TwinFinger
 from nodes.node import PortCounts
 from tests.hosts import hosts
 from tests.network import Computers
-from tests.test_messages_bus import Room, connected, finger, header, pictures, room, stop, until
+from tests.test_messages_bus import Room, connected, finger, header, pictures, room, stop
+from tests.waiting import until
 
 __all__ = ["room"]
 
@@ -169,7 +170,6 @@ def established(pid: int, port: int) -> int:
     return sum(row[2].endswith(wanted) and row[3] == ESTABLISHED for row in rows)
 
 
-@pytest.mark.timeout(120)
 async def test_a_computer_that_loses_its_power_in_mid_stream_is_missed_and_heard_again() -> None:
     """Its messages come so often that libzmq's heartbeats would not notice."""
     if why := Computers.missing():

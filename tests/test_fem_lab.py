@@ -22,6 +22,7 @@ from nodes.fem_solver.mesh import boundary_faces
 from nodes.fem_solver.precompute_table import LostWorkersError, solve_all
 from nodes.fem_solver.pushes import PushJob, Site, solve_push
 from tests.solids import box
+from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -160,4 +161,4 @@ def test_a_push_that_is_given_up_ends_in_the_lab(lab: Lab, tmp_path: Path) -> No
     with lab_workers(lab.address) as executor, pytest.raises(GivenUpError):
         solve_all(long, executor, Parts(tmp_path / "parts"), give_up)
     with lab_workers(lab.address) as executor:
-        assert executor.submit(pow, 2, 3).result(timeout=20) == 8
+        assert executor.submit(pow, 2, 3).result(timeout=DEADLINE_S) == 8

@@ -212,6 +212,8 @@ def test_each_gesture_has_its_own_window(tmp_path: Path) -> None:
     eight, tap = gestures.gestures_result(bag, ["eight", "tap"])["gestures"]
     assert eight["error_mm"]["max"] < 1e-9
     assert tap["error_mm"]["rms"] == pytest.approx(0.5)
+    # Nobody held a sheet.
+    assert eight["followed"] is tap["followed"] is None
     path = gestures.gesture_path("eight", SCENE)
     assert eight["seconds"] == pytest.approx(path.times_s[-1], abs=0.05)
 

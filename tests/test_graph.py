@@ -27,7 +27,8 @@ from launch.running.runs import RUN_VARIABLE
 from launch.running.supervisor import RunningGraph
 from messages.bag import BagReader
 from messages.topics import TOPICS
-from messages.types import ArmState, Frame, Status, TwinFinger
+from messages.types import ArmState, Fingertip, Frame, SheetTarget, Status, TwinFinger
+from tests.waiting import DEADLINE_S
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(300)]
 
@@ -191,11 +192,32 @@ def test_sequences_in_the_bag_have_no_gaps(session: Session) -> None:
         newest[key] = header.sequence
 
 
-def test_data_is_fresh_where_it_is_used(recording: stroke.Recording) -> None:
-    """Medians, generous: this asserts the wiring (no queue builds up), not the machine's speed."""
-    assert np.median(recording.delays_s["fingertip"]) < 0.1
-    assert np.median(recording.arm_delays_s()) < 0.15
-    assert np.median(recording.delays_s["frame drawn"]) < 0.5
+def test_no_queue_builds_up_where_data_is_used(session: Session) -> None:
+    """What was used is nearly the newest that had been published, however slow the machine is."""
+    published: dict[str, list[tuple[int, int]]] = {"fingertip": [], "sheet_target": []}
+    used: dict[str, list[tuple[int, int]]] = {"planner": [], "arms": [], "renderer": []}
+    for topic, message, header, _ in BagReader(session.bag):
+        match message:
+            case Fingertip() | SheetTarget():
+                published[topic].append((header.source_ns, header.publish_ns))
+            case ArmState() if message.target_source_ns and message.command_sent_ns:
+                used["arms"].append((message.target_source_ns, message.command_sent_ns))
+            case Frame():
+                begun_ns = message.drawn_ns - round(message.draw_s * 1e9)
+                used["renderer"].append((header.source_ns, begun_ns))
+            case _:
+                pass
+    used["planner"] = published["sheet_target"]
+    for reader, topic in (
+        ("planner", "fingertip"), ("arms", "sheet_target"), ("renderer", "sheet_target")
+    ):  # fmt: skip
+        sources_ns, publish_ns = np.array(sorted(published[topic])).T
+        source_ns, at_ns = np.array(used[reader]).T
+        newer = np.searchsorted(publish_ns, at_ns, "right") - np.searchsorted(
+            sources_ns, source_ns, "right"
+        )
+        assert len(newer) > 20, reader
+        assert np.median(newer) <= 2, reader
 
 
 def test_the_sheet_follows_the_finger(recording: stroke.Recording) -> None:
@@ -273,7 +295,7 @@ def end(process: subprocess.Popen[str], number: int) -> tuple[int, str]:
     assert process.stderr is not None
     rest = process.stderr.read()
     process.stderr.close()
-    return process.wait(timeout=30), rest
+    return process.wait(timeout=DEADLINE_S), rest
 
 
 def assert_nothing_is_left(runs: Path) -> None:

@@ -7,7 +7,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +21,8 @@ from launch.running.host import devices_of
 from launch.running.supervisor import RunningGraph
 from launch.running.tools import ToolsWriter, subscriber_to
 from messages.types import EStop, HostStatus
+from tests.waiting import DEADLINE_S, NOTHING_COMES_S, until
 
-DEADLINE_S = 30.0
 BEACON = {"type": "tests.launch_nodes:Beacon"}
 # Of this process's own: ports follow from names, and tests may run beside each other.
 NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"
@@ -44,24 +44,24 @@ def plan_of(folder: Path, nodes: dict[str, Any]) -> Plan:
     return load_plan(path)
 
 
-async def until(condition: Callable[[], bool], what: str) -> None:
-    loop = asyncio.get_running_loop()
-    end_s = loop.time() + DEADLINE_S
-    while not condition():
-        assert loop.time() < end_s, what
-        await asyncio.sleep(0.02)
+async def heard_late(
+    plan: Plan, graph: RunningGraph, expected: dict[str, EStop]
+) -> dict[str, EStop]:
+    """The e-stops, by writer, that somebody hears who comes only now.
 
-
-async def heard_late(plan: Plan, graph: RunningGraph, seconds: float) -> list[tuple[str, EStop]]:
-    """The e-stops that somebody hears who comes only now."""
-    heard: list[tuple[str, EStop]] = []
+    Waits for the expected ones; without any, for a while in which none shall come.
+    """
+    heard: dict[str, EStop] = {}
     subscriber = subscriber_to(
         "estop", plan, graph.run,
-        lambda message, header: heard.append((header.writer, message)),
+        lambda message, header: heard.update({header.writer: message}),
         on_problem=pytest.fail,
     )  # fmt: skip
     subscriber.start()
-    await asyncio.sleep(seconds)
+    if expected:
+        await until(lambda: heard.keys() >= expected.keys(), "the e-stops that are kept")
+    else:
+        await asyncio.sleep(NOTHING_COMES_S)
     subscriber.close()
     return heard
 
@@ -73,18 +73,17 @@ async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -
         await graph.wait_ready(DEADLINE_S)
 
         async def say(estop: EStop, answer: str) -> None:
+            # The topic is latched: a launcher that connects later gets it, too.
             writer = ToolsWriter(plan, graph.run, ["estop"])
-            await asyncio.sleep(0.6)
             writer.publish("estop", estop)
             await until(lambda: sum(answer in line for line in said) == 2, answer)
             writer.close()
 
         await say(STOP, "kept until it is reset")
-        assert dict(await heard_late(plan, graph, 1.0)) == {
-            launcher_on(host): STOP for host in HOSTS
-        }
+        kept = {launcher_on(host): STOP for host in HOSTS}
+        assert await heard_late(plan, graph, kept) == kept
         await say(RESET, "reset by tools")
-        assert await heard_late(plan, graph, 1.0) == []
+        assert await heard_late(plan, graph, {}) == {}
 
 
 async def test_each_host_says_how_it_is_and_how_its_nodes_are(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,12 +30,12 @@ from launch.running.priority import min_nice_step
 from launch.running.starvation import ProcessorTime, starved_s
 from launch.running.supervisor import NodeFailedError, RunningGraph
 from messages.bag import BagReader
+from tests.waiting import DEADLINE_S, wait_until
 
 pytestmark = pytest.mark.alone
 
 ROOT = Path(__file__).resolve().parent.parent
 FLEXSHEET = [sys.executable, str(ROOT / "flexsheet.py")]
-DEADLINE_S = 30.0
 
 
 @pytest.fixture(autouse=True)
@@ -79,13 +79,6 @@ def processes_of(run_id: str) -> list[psutil.Process]:
 
 def sockets_in(folder: Path) -> list[Path]:
     return [path for path in folder.rglob("*") if path.is_socket()]
-
-
-def wait_until(condition: Callable[[], Any], what: str) -> None:
-    end = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < end, f"waited in vain: {what}"
-        time.sleep(0.02)
 
 
 def assert_nothing_left(folder: Path) -> None:

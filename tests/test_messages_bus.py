@@ -22,8 +22,7 @@ from messages.bus import BusError, Publisher, Subscriber, queue_length
 from messages.topics import TOPICS, Delivery, Topic
 from messages.types import EStop, StereoPair, TwinArms, TwinFinger
 from messages.wire import WireError, encode
-
-DEADLINE_S = 20.0
+from tests.waiting import until
 
 
 @dataclass
@@ -54,15 +53,6 @@ def finger(x: float) -> TwinFinger:
 def pictures(value: int) -> StereoPair:
     image = np.full((48, 64), value, np.uint8)
     return StereoPair(device="test", exposure_s=0.001, dropped_frames=0, left=image, right=image)
-
-
-async def until(condition: Callable[[], object], what: str = "the condition") -> None:
-    deadline = asyncio.get_running_loop().time() + DEADLINE_S
-    while asyncio.get_running_loop().time() < deadline:
-        if condition():
-            return
-        await asyncio.sleep(0.001)
-    pytest.fail(f"{what} did not come true in {DEADLINE_S} s")
 
 
 class Ear:

@@ -26,6 +26,7 @@ from nodes.node import (
 )
 from nodes.runner import end_tasks, status_of
 from tests.fingertips import fingertip as even_fingertip
+from tests.waiting import DEADLINE_S
 
 
 class EchoParameters(NodeParameters):
@@ -145,7 +146,7 @@ async def test_a_slow_handler_skips_what_was_superseded_and_counts_it() -> None:
     for sequence in (2, 3, 4):
         node.deliver("fingertip", fingertip(), header(sequence))
     node.go_on.set()
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(DEADLINE_S):
         await node.second.wait()
     assert node.seen == [1, 4]
     assert node.inputs["fingertip"].counts.dropped == 2
@@ -165,7 +166,7 @@ async def test_a_task_that_swallows_its_cancellation_is_ended_all_the_same() -> 
 
     task = asyncio.create_task(stubborn())
     await asyncio.sleep(0)
-    async with asyncio.timeout(5):
+    async with asyncio.timeout(DEADLINE_S):
         await end_tasks([task])
     assert task.cancelled()
     assert cancellations == 2

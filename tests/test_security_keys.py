@@ -30,8 +30,8 @@ from messages.security import (
 )
 from messages.types import TwinFinger
 from tests.test_cli import Command
-from tests.test_launch_supervisor import DEADLINE_S, LISTENER, beacon, write
-from tests.test_messages_bus import until
+from tests.test_launch_supervisor import LISTENER, beacon, write
+from tests.waiting import DEADLINE_S, until
 
 # Of this process's own: ports follow from names, and tests may run beside each other.
 NET = f"127.{1 + os.getpid() % 250}.{os.getpid() // 250 % 250}"

@@ -32,8 +32,8 @@ from nodes.console.graph_facts import GraphFacts
 from nodes.node import Node, NodeParameters, Output, parameters_of
 from nodes.runner import Links
 from tests.arm_states import arm_state
-from tests.test_messages_bus import until
 from tests.test_security import target
+from tests.waiting import until
 
 LAUNCH = Path(__file__).resolve().parent.parent / "launch"
 # Of this process's own: ports follow from names, and tests may run beside each other.

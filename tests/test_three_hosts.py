@@ -32,7 +32,7 @@ MARGIN_NS = 1_500_000_000
 PATIENT: dict[str, Any] = {"timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
 """A test's computers are busier than a lab's."""
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = pytest.mark.timeout(600)
 
 
 @dataclass

@@ -12,6 +12,7 @@ from launch.commands.experiment import (
     LaunchOption,
     OutputOption,
     SettingsOption,
+    print_followed,
     print_strokes,
     result_folder,
 )
@@ -52,6 +53,7 @@ def demo(
         print_json(
             {
                 "strokes": result.strokes,
+                "followed": result.followed,
                 "bag": str(result.bag),
                 "pictures": [str(picture) for picture in result.pictures],
             }
@@ -59,6 +61,8 @@ def demo(
         return
     if result.strokes:
         print_strokes(result.strokes)
+    if result.followed is not None:
+        print_followed([result.followed])
     words.print(f"bag: {result.bag}")
     for picture in result.pictures:
         words.print(f"picture: {picture}")

@@ -261,6 +261,7 @@ def gestures(
         print_json(result)
     else:
         _print_gestures(result["gestures"])
+        print_followed([one["followed"] for one in result["gestures"] if one["followed"]])
         words.print(f"bag: {bag}")
 
 
@@ -281,6 +282,26 @@ def _print_gestures(results: list[dict[str, Any]]) -> None:
         row += [shown(result["jump"]["max_sigmas"], ".1f"), shown(now["lag_ms"], ".1f")]
         for each in ahead:
             row += [shown(each["rms"], ".3f"), shown(each["lag_ms"], ".1f")]
+        rows.append(row)
+    print_table(columns, rows)
+
+
+def print_followed(results: list[dict[str, Any]]) -> None:
+    """A line for each path: how well the true sheet followed the true finger in contact."""
+
+    def shown(values: dict[str, float] | None) -> list[str]:
+        if values is None:
+            return ["-", "-", "-"]
+        return [f"{values[key]:.3f}" for key in ("mean", "p95", "max")]
+
+    columns = ["path", "in contact", "followed", "drop-outs", "true Δd, mm: mean", "95 %", "max"]
+    columns += ["true Δθ, °: mean", "95 %", "max"]
+    rows = []
+    for result in results:
+        ratio, contact = result["following_ratio"], result["contact"]
+        row = [result["path"], f"{result['contact_ratio']:.1%}"]
+        row += ["-" if ratio is None else f"{ratio:.1%}", str(result["drop_outs"])]
+        row += shown(contact["true_delta_d_mm"]) + shown(contact["true_delta_theta_deg"])
         rows.append(row)
     print_table(columns, rows)
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from launch.experiments import image, stroke
+from launch.bags.report.strokes import read_followed
+from launch.experiments import ExperimentError, image, stroke
 from launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from launch.experiments.run import (
     Progress,
@@ -33,11 +34,15 @@ PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass"
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """What the demo leaves: its folder and bag, the strokes' figures, the pictures."""
+    """What the demo leaves: folder and bag, the strokes' figures, the pictures.
+
+    followed: how well the finger given by a path was followed; None without one.
+    """
 
     folder: Path
     bag: Path
     strokes: list[dict[str, Any]]
+    followed: dict[str, Any] | None
     pictures: list[Path]
 
 
@@ -59,10 +64,26 @@ def run_demo(
     coarse = settings_of_type(launch_file, "twin_eye", f"metres_per_px={METRES_PER_PX}")
     run_experiment(launch_file, [*coarse, *settings], bag, procedure, progress)
     progress("reading the bag and drawing")
-    return summarize(bag, folder, strokes=() if path is not None else SECONDS)
+    if path is None:
+        return summarize(bag, folder, strokes=SECONDS)
+    return summarize(bag, folder, strokes=(), path_label=path.label)
 
 
-def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoResult:
+def followed_on(bag: Path, label: str) -> dict[str, Any]:
+    """Return how well the finger was followed along the path with that label.
+
+    Raises ExperimentError when the bag does not have it.
+    """
+    runs = {run["path"]: run for run in read_followed(bag)}
+    if label not in runs:
+        have = ", ".join(runs) or "none"
+        raise ExperimentError(f'the bag has no finger on a path "{label}"; it has: {have}')
+    return runs[label]
+
+
+def summarize(
+    bag: Path, folder: Path, *, strokes: tuple[float, ...], path_label: str | None = None
+) -> DemoResult:
     """Compute the demo's figures from its bag and draw its pictures into `folder`."""
     recording = stroke.read_recording(bag)
     photographs = image.read_pictures(bag)
@@ -90,4 +111,8 @@ def summarize(bag: Path, folder: Path, *, strokes: tuple[float, ...]) -> DemoRes
         stroke.stroke_result(recording, one, seconds, bag) for seconds, one in errors.items()
     ]
     write_file(folder / "stroke.json", json.dumps(results, indent=1) + "\n")
-    return DemoResult(folder=folder, bag=bag, strokes=results, pictures=pictures)
+    followed = None
+    if path_label is not None:
+        followed = followed_on(bag, path_label)
+        write_file(folder / "followed.json", json.dumps(followed, indent=1) + "\n")
+    return DemoResult(folder=folder, bag=bag, strokes=results, followed=followed, pictures=pictures)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
+from launch.bags.report.strokes import read_followed
 from launch.experiments import ExperimentError, stroke
 from launch.experiments.driver import Driver
 from launch.experiments.lag import lag_s
@@ -281,6 +282,11 @@ def _prediction(
 
 
 def gestures_result(bag: Path, names: Sequence[str]) -> dict[str, Any]:
-    """The figures of `experiment gestures --json`, from its bag."""
+    """The figures of `experiment gestures --json`, from its bag.
+
+    followed: how well the sheet followed; None where the bag lacks arms or scene.
+    """
     recorded = read_gestures(bag)
-    return {"gestures": [gesture_result(recorded, name) for name in names], "bag": str(bag)}
+    followed = {run["path"]: run for run in read_followed(bag)}
+    results = [{**gesture_result(recorded, name), "followed": followed.get(name)} for name in names]
+    return {"gestures": results, "bag": str(bag)}

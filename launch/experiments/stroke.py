@@ -14,7 +14,7 @@ from launch.experiments import ExperimentError
 from launch.experiments.lag import lag_s
 from messages.bag import BagReader
 from messages.base import Header, Message
-from messages.scene import ArmSpec, Scene, cylinder_of
+from messages.scene import ArmSpec, Cylinder, Scene, cylinder_of
 from messages.types import (
     ArmState,
     FingerPath,
@@ -27,6 +27,7 @@ from messages.types import (
     TwinFinger,
 )
 from nodes.models.rigid import apply, inverse, transform_from_rpy
+from nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
 
 Floats = NDArray[np.float64]
 
@@ -293,14 +294,12 @@ def read_recording(bag: Path) -> Recording:
     )
 
 
-def presented(
-    edges: tuple[Track, Track], world_from_object: Floats, times_ns: NDArray[np.int64], x_m: Floats
+def sheet_planes(
+    edges: tuple[Track, Track], world_from_object: Floats, times_ns: NDArray[np.int64]
 ) -> tuple[Floats, Floats]:
-    """What the sheet presents: points D' (n, 3) in the object's frame, and angles (n,).
+    """The sheet's centres (n, 3) m and unit normals (n, 3), in the object's frame.
 
-    The sheet is the plane through both edges.  It presents the cylinder point whose tangent plane
-    it is, so D' is the plane's point nearest to the cylinder's axis (its x there: `x_m` (n,)), and
-    the angle is that of the plane's normal about the axis.
+    The sheet is the plane through both edges.
     """
     object_from_world = inverse(world_from_object)
     left, right = (
@@ -317,10 +316,43 @@ def presented(
     across = right[:, :3] - left[:, :3]
     normal = np.cross(across, left[:, 3:6] + right[:, 3:6])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    centre = 0.5 * (left[:, :3] + right[:, :3])
+    return 0.5 * (left[:, :3] + right[:, :3]), normal
+
+
+def presented(
+    edges: tuple[Track, Track], world_from_object: Floats, times_ns: NDArray[np.int64], x_m: Floats
+) -> tuple[Floats, Floats]:
+    """What the sheet presents: points D' (n, 3) in the object's frame, and angles (n,).
+
+    It presents the cylinder point whose tangent plane it is, so D' is the plane's point nearest to
+    the cylinder's axis (its x there: `x_m` (n,)), and the angle is that of the plane's normal about
+    the axis.
+    """
+    centre, normal = sheet_planes(edges, world_from_object, times_ns)
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
     distance = np.einsum("ij,ij->i", centre - axis_point, normal)
     return axis_point + distance[:, None] * normal, np.arctan2(normal[:, 1], normal[:, 2])
+
+
+MIN_CURVATURE_PER_M = 1.0
+"""A surface that bends less counts as flat: a normal does not identify one of its points."""
+
+
+def presented_on_surface(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
+    """Points D' (n, 3) that planes through `centre` with `normal` (n, 3) present near `foot`.
+
+    As on the cylinder: the surface point whose normal is the plane's, projected onto the plane.
+    Along a flat direction it is the foot itself.  Second order in the angle between both normals.
+    """
+    curvatures, directions = principal_curvatures(foot.shape_operator, foot.normal)
+    slopes = np.einsum("nki,ni->nk", directions, normal)
+    curved = np.abs(curvatures) > MIN_CURVATURE_PER_M
+    ways_m = np.divide(slopes, curvatures, out=np.zeros_like(slopes), where=curved)
+    drop_m = 0.5 * (curvatures * ways_m**2).sum(axis=1)
+    point = foot.point + np.einsum("nk,nki->ni", ways_m, directions)
+    point -= drop_m[:, None] * foot.normal
+    gap_m = np.einsum("ni,ni->n", point - centre, normal)
+    return np.asarray(point - gap_m[:, None] * normal)
 
 
 def sheet_errors(
@@ -329,15 +361,27 @@ def sheet_errors(
     edges: tuple[Track, Track],
     times_ns: NDArray[np.int64],
     retreat_m: Floats | float = 0.0,
+    *,
+    shape: Shape | None = None,
 ) -> tuple[Floats, Floats]:
-    """Delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`.
+    """Delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for an object of any shape.
 
-    D is the cylinder's point nearest to the finger: the sheet presents the undeformed surface, so
+    D is the object's point nearest to the finger: the sheet presents the undeformed surface, so
     how deep the finger pushes is not an error of its.  retreat_m (n,): how far below that surface
-    the sheet is meant to be, where it yields as the object would.
+    the sheet is meant to be, where it complies as the object would.  On a cylinder, delta theta is
+    the angle about its axis, as in the paper; on others the angle between both normals.  shape:
+    the scene's, where the caller has made it.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.at(times_ns))
+    if not isinstance(scene.object.geometry, Cylinder):
+        foot = (shape or make_shape(dict(scene.object.geometry))).closest(points)
+        centre, normal = sheet_planes(edges, world_from_object, times_ns)
+        on_surface = foot.point - np.broadcast_to(retreat_m, len(points))[:, None] * foot.normal
+        sine = np.linalg.norm(np.cross(foot.normal, normal), axis=1)
+        cosine = np.einsum("ni,ni->n", foot.normal, normal)
+        off = on_surface - presented_on_surface(foot, centre, normal)
+        return np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)
     angles = np.arctan2(points[:, 1], points[:, 2])
     radius = cylinder_of(scene).radius_m - retreat_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])

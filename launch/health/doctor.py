@@ -13,7 +13,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
-from launch.health.system import MANUAL, opengl_problem
+from launch.health.system import OPENGL, opengl_problem
 from launch.plans.documents import BadInputError
 from launch.plans.plan import load_plan
 from launch.running.cpu import CpuWatch
@@ -123,7 +123,7 @@ def check_opengl() -> Finding:
     problem = opengl_problem()
     if problem is None:
         return Finding("opengl", "ok", "a headless context can be made (EGL)")
-    return Finding("opengl", "failed", problem, f"on Debian: {MANUAL}")
+    return Finding("opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
 
 
 def check_cores() -> Finding:

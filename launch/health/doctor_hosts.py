@@ -17,7 +17,7 @@ from typing import Literal
 import psutil
 
 from launch.health.doctor import LEAST_DISK_BYTES, check_libraries
-from launch.health.system import MANUAL, opengl_problem
+from launch.health.system import OPENGL, opengl_problem
 from launch.health.visits import Reach, Visit
 from launch.plans.hosts import is_loopback
 from launch.plans.planned import Plan, PlannedNode
@@ -373,7 +373,7 @@ def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
         else:
             remedy = {
                 "camera": "docs/camera.md; does another program hold it?",
-                "picture": f"OpenGL: there, flexsheet doctor; on Debian: {MANUAL}",
+                "picture": f"OpenGL: there, flexsheet doctor; on Debian: {OPENGL.manual}",
             }[check]
             yield HostFinding(host, check, "failed", what, remedy)
     for node in nodes:
@@ -507,7 +507,7 @@ def before_start(plan: Plan, here: str, key_problem: str | None) -> Iterator[Hos
         if problem is None:
             yield HostFinding(here, "opengl", "ok", "a headless context can be made (EGL)")
         else:
-            yield HostFinding(here, "opengl", "failed", problem, f"on Debian: {MANUAL}")
+            yield HostFinding(here, "opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
     for node in nodes:
         if node.type == "arm_bridge":
             yield _controller(here, node)

@@ -1,23 +1,48 @@
-"""Sees to the system libraries that headless OpenGL needs: `python -m launch.health.system`.
+"""Check the system packages, and install them where that is possible.
 
-Debian and its kin: installed when we are root; otherwise one line says what to install.
+`python -m launch.health.system`: what the nodes need.  `--tests`: also what the tests need.
+As root on Debian and its kin, missing packages are installed; otherwise one line names them.
 """
 
 from __future__ import annotations
 
+import argparse
+import ctypes
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
-PACKAGES = ("libegl1", "libgl1-mesa-dri")
-MANUAL = f"sudo apt-get install -y {' '.join(PACKAGES)}"
+SYSTEM_PATHS = ("/usr/sbin", "/sbin")
+"""Not in every user's PATH, and `ip` lives there."""
+
+APT_OPTIONS = ("-qq", "-o", "DPkg::Lock::Timeout=120", "-o", "Acquire::Retries=2")
+
+
+@dataclass(frozen=True, slots=True)
+class SystemPackages:
+    """Debian packages for one purpose.
+
+    problem: returns why the purpose cannot be served; None if it can.
+    """
+
+    purpose: str
+    packages: tuple[str, ...]
+    problem: Callable[[], str | None]
+    tests_only: bool = True
+
+    @property
+    def manual(self) -> str:
+        """The command that installs the packages."""
+        return f"sudo apt-get install -y {' '.join(self.packages)}"
 
 
 def opengl_problem() -> str | None:
-    """Why no headless OpenGL context can be made; None when one can.
+    """Return why no headless OpenGL context can be made; None when one can.
 
-    Asked in a process of its own: a driver that failed to load once stays failed in its process.
+    A driver that failed to load once stays failed in its process, so another process tries.
     """
     code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
     result = subprocess.run(
@@ -29,31 +54,101 @@ def opengl_problem() -> str | None:
     return lines[-1] if lines else f"exit code {result.returncode}"
 
 
-def install_packages() -> None:
-    """Install the libraries with apt-get; raises CalledProcessError with its output shown."""
-    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-    for command in (
-        ["apt-get", "update", "-qq"],
-        ["apt-get", "install", "-y", "-qq", "--no-install-recommends", *PACKAGES],
-    ):
-        subprocess.run(command, env=environment, stdout=sys.stderr, check=True)
-
-
-def main() -> int:
-    problem = opengl_problem()
-    if problem is None:
-        return 0
-    if os.geteuid() == 0 and shutil.which("apt-get"):
-        print(f"headless OpenGL is missing; installing {' '.join(PACKAGES)}", file=sys.stderr)
+def missing_files(*, programs: Sequence[str] = (), libraries: Sequence[str] = ()) -> str | None:
+    """Return which programs and shared libraries are missing; None when all are there."""
+    path = os.pathsep.join([os.environ.get("PATH", os.defpath), *SYSTEM_PATHS])
+    missing = [name for name in programs if shutil.which(name, path=path) is None]
+    for name in libraries:
         try:
-            install_packages()
-        except subprocess.CalledProcessError as error:
-            print(f"{' '.join(error.cmd)} ended with {error.returncode}", file=sys.stderr)
-        problem = opengl_problem()
-        if problem is None:
-            return 0
-    print(f"headless OpenGL does not work ({problem}); on Debian: {MANUAL}", file=sys.stderr)
-    return 1
+            ctypes.CDLL(name)
+        except OSError:
+            missing.append(name)
+    return f"no {', no '.join(missing)}" if missing else None
+
+
+OPENGL = SystemPackages(
+    "headless OpenGL", ("libegl1", "libgl1-mesa-dri"), opengl_problem, tests_only=False
+)
+
+TABLE = (
+    OPENGL,
+    SystemPackages(
+        "browser tests",
+        ("chromium",),
+        lambda: missing_files(programs=["chromium"]),
+    ),
+    SystemPackages(
+        "window tests",
+        ("xvfb", "libgl1", "libglx-mesa0", "libxrandr2"),
+        lambda: missing_files(
+            programs=["Xvfb"], libraries=["libGL.so.1", "libGLX_mesa.so.0", "libXrandr.so.2"]
+        ),
+    ),
+    SystemPackages(
+        "network namespace tests",
+        ("iproute2",),
+        lambda: missing_files(programs=["ip"]),
+    ),
+    SystemPackages(
+        "tests of systemd units",
+        ("systemd",),
+        lambda: missing_files(programs=["systemd-analyze"]),
+    ),
+)
+"""What must be there, for what, and what provides it on Debian."""
+
+
+def can_install() -> bool:
+    """Whether this process may install Debian packages."""
+    return os.geteuid() == 0 and shutil.which("apt-get") is not None
+
+
+def run_apt(*arguments: str) -> bool:
+    """Run apt-get; return whether it succeeded.  Its output goes to stderr."""
+    command = ["apt-get", *APT_OPTIONS, *arguments]
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    try:
+        done = subprocess.run(
+            command, env=environment, stdin=subprocess.DEVNULL, stdout=sys.stderr, check=False
+        )
+    except OSError as error:
+        _report(f"{' '.join(command)}: {error}")
+        return False
+    if done.returncode:
+        _report(f"{' '.join(command)} failed with exit code {done.returncode}")
+    return done.returncode == 0
+
+
+def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
+    """Install the packages of each purpose; return the purposes that still cannot be served.
+
+    One transaction per purpose: a package that cannot be had does not keep out the others.
+    """
+    run_apt("update")
+    for one in missing:
+        _report(f"{one.purpose}: installing {' '.join(one.packages)}")
+        run_apt("install", "-y", "--no-install-recommends", *one.packages)
+    return [one for one in missing if one.problem() is not None]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Return 1 if the nodes miss something.  With --tests, 0: the tests show what is missing."""
+    parser = argparse.ArgumentParser(description="Check the system packages.")
+    parser.add_argument("--tests", action="store_true", help="also what the tests need")
+    tests = parser.parse_args(arguments).tests
+    wanted = [one for one in TABLE if tests or not one.tests_only]
+    missing = [one for one in wanted if one.problem() is not None]
+    if missing and can_install():
+        missing = install(missing)
+    if missing:
+        reasons = "; ".join(f"{one.purpose} ({one.problem()})" for one in missing)
+        packages = " ".join(package for one in missing for package in one.packages)
+        _report(f"cannot be used: {reasons}; on Debian: sudo apt-get install -y {packages}")
+    return int(bool(missing) and not tests)
+
+
+def _report(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 if __name__ == "__main__":

@@ -40,7 +40,8 @@ CHECKED = (
     "the bag's end, its types and the state of the code; e-stops, faults and modes of the arms; "
     "joint speed, tool speed and edge force against their limits; nodes' errors and restarts; "
     "each topic's rate, silences, losses and refusals; latency, sheet position and the soft body's "
-    "range against the scene's tolerances; the finger's being seen; late frames"
+    "range against the scene's tolerances; whether the finger was seen and, in contact, followed; "
+    "late frames"
 )
 
 
@@ -199,6 +200,14 @@ def _of_the_finger(numbers: dict[str, Any]) -> Iterator[Finding]:
         share = sum(missed.values()) / total
         text = f"In {share:.1%} of the pictures there was no valid finger, mostly: {worst}."
         yield Finding("doubtful", text, "sheet")
+    for path in numbers["sheet"]["followed"]:
+        if path["drop_outs"]:
+            times = "once" if path["drop_outs"] == 1 else f"{path['drop_outs']} times"
+            text = (
+                f'The finger on its path "{path["path"]}" was not followed in contact {times}; '
+                f"it was followed for {path['following_ratio']:.1%} of its contact."
+            )
+            yield Finding("doubtful", text, "sheet")
     frames = numbers["frames"]
     if frames["late"]:
         text = f"{frames['late']} of {frames['count']} frames were late by more than half a frame."

@@ -9,7 +9,7 @@ import numpy as np
 
 from launch.bags.report.series import Range, Spread, States
 from launch.bags.report.session import Arm, HostLoad, NodeSaid, Session
-from launch.bags.report.strokes import Stroke
+from launch.bags.report.strokes import FingerRun
 from messages.busy import describe_busy
 from messages.methods import Methods
 from messages.scene import Scene
@@ -65,7 +65,12 @@ def numbers_of(session: Session) -> dict[str, Any]:
                 "true_delta_d_mm": session.errors.contact["true_d"].summary(1e3),
                 "true_delta_theta_deg": session.errors.contact["true_theta"].summary(DEGREES),
             },
-            "strokes": [_stroke(session, one) for one in session.errors.strokes if one.sums],
+            "strokes": [_stroke(session, one) for one in session.errors.runs if one.sums],
+            "followed": [
+                {"begins_s": session.seconds(one.zero_ns), **one.figures()}
+                for one in session.errors.runs
+                if one.followed.exposures
+            ],
             "push_mm": _most(session.push, 1e3),
         },
         "soft_body": {
@@ -166,11 +171,11 @@ def _arm(arm: Arm) -> dict[str, Any]:
     }
 
 
-def _stroke(session: Session, stroke: Stroke) -> dict[str, Any]:
+def _stroke(session: Session, stroke: FingerRun) -> dict[str, Any]:
     scales = {"delta_d": ("mm", 1e3), "delta_theta": ("deg", DEGREES)}
     row: dict[str, Any] = {
-        "seconds": stroke.seconds,
-        "begins_s": session.seconds(stroke.window_ns[0]),
+        "seconds": stroke.stroke_s,
+        "begins_s": session.seconds(stroke.stroke_window_ns[0]),
     }
     for name, (unit, scale) in scales.items():
         for prefix in ("", "true_"):

@@ -305,13 +305,9 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
             )],
         )  # fmt: skip
     else:
-        scene = numbers["scene"]
-        why = (
-            "the paper defines its errors for a cylinder, this scene shows another shape"
-            if scene and scene["shape"] != "cylinder"
-            else "the bag holds no contact with scene, finger and both arms recorded"
+        yield _missing(
+            "No Δd and Δθ: the bag holds no contact with scene, finger and both arms recorded."
         )
-        yield _missing(f"No Δd and Δθ: {why}.")
     if strokes:
         yield table(
             "Strokes of the experiment: means (and greatest), as flexsheet experiment stroke has "
@@ -322,6 +318,24 @@ def _sheet(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterator[
                 (one["seconds"], one["begins_s"], *(_mean(one[key]) for key in (
                     "delta_d_mm", "delta_theta_deg", "true_delta_d_mm", "true_delta_theta_deg")))
                 for one in strokes
+            ],
+        )  # fmt: skip
+    if followed := numbers["sheet"]["followed"]:
+        yield table(
+            "The true finger along each path. In contact: at most 1 mm above the object. Followed: "
+            "both arms followed a target that followed the finger. Δd and Δθ: of the true sheet, "
+            "in contact, mean (95 %, greatest)",
+            ("path", "begins at, s", "lasted, s", "in contact, %", "followed in contact, %",
+             "drop-outs", "true Δd, mm", "true Δθ, degrees"),
+            [
+                (
+                    one["path"], one["begins_s"], one["seconds"], 100.0 * one["contact_ratio"],
+                    None if one["following_ratio"] is None else 100.0 * one["following_ratio"],
+                    one["drop_outs"],
+                    *(_sizes(one["contact"][key]) for key in (
+                        "true_delta_d_mm", "true_delta_theta_deg")),
+                )
+                for one in followed
             ],
         )  # fmt: skip
     reasons = numbers["finger"]["reasons"]
@@ -493,6 +507,12 @@ def _summary(name: str, values: Mapping[str, float] | None) -> tuple[Any, ...]:
 
 def _mean(values: Mapping[str, float] | None) -> str:
     return "–" if values is None else f"{values['mean']:.3g} ({values['max']:.3g})"
+
+
+def _sizes(values: Mapping[str, float] | None) -> str:
+    if values is None:
+        return "–"
+    return f"{values['mean']:.3g} ({values['p95']:.3g}, {values['max']:.3g})"
 
 
 def _missing(text: str) -> str:

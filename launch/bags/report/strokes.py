@@ -1,54 +1,84 @@
-"""The paper's errors (its Fig. 9) at every exposure at which the sheet touches, a block at a time.
+"""Compute the paper's errors (its Fig. 9) at every exposure in contact, a block at a time.
 
-The definitions are those of `launch.experiments.stroke`; here they are applied to any session of a
-cylinder, in memory that does not grow with it.  Where the planner lets the sheet yield, it is
-judged by how far it was to; in the experiment's own strokes by the surface, as the paper does.
+The definitions are those of `launch.experiments.stroke`; here they are applied to any session, in
+memory that does not grow with it.  Where the planner has the sheet comply, the reference is the
+object's surface lowered by the commanded `retreat_m`.  In the experiment's own strokes it is the
+surface itself, as in the paper.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from launch.bags.report.followed import FollowedFinger
 from launch.bags.report.series import Grid, Moments, Range
 from launch.experiments.stroke import (
     Track,
     edge_row,
+    object_pose,
     sheet_errors,
     stroke_label,
     stroke_window_s,
     track,
 )
-from messages.scene import ArmSpec, Cylinder, Scene
+from messages.bag import BagReader
+from messages.scene import ArmSpec, Scene
 from messages.types import ArmState, Fingertip, SheetTarget, TwinArms, TwinFinger
-from nodes.models.rigid import transform_from_rpy
+from nodes.models.rigid import apply, inverse, transform_from_rpy
+from nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
 
 BLOCK = 2000
 """Samples of the finger that are worked out together."""
 
+TOPICS_READ = ("scene", "sheet_target", "twin/finger", "arm_left", "arm_right", "twin/arms")
+"""That the true finger is compared by; a simulator's bag has them on one clock."""
+
 SAME_RUN_NS = 1_000_000_000
+
+SILENT_NS = 100_000_000
+"""An arm that reported nothing for longer does not follow."""
 
 
 @dataclass(slots=True)
-class Stroke:
-    """One stroke of the experiment: when (ns), and its sums, measured and true."""
+class FingerRun:
+    """One run of the simulator's finger along a path.
 
-    seconds: float
+    zero_ns: when the path began.  done_ns: the last exposure on the path.  end_ns: the last
+    exposure that names the path.  sums: errors of a stroke of the experiment, measured and true.
+    """
+
+    label: str
     zero_ns: int
+    done_ns: int
     end_ns: int
     sums: dict[str, Moments] = field(default_factory=dict)
+    followed: FollowedFinger = field(default_factory=FollowedFinger)
 
     @property
-    def window_ns(self) -> tuple[int, int]:
-        """As `stroke_span_ns` has it."""
-        begin_s, finish_s = stroke_window_s(self.seconds)
+    def stroke_s(self) -> float | None:
+        """The moving time of a stroke of the experiment; None for another path."""
+        return seconds_of(self.label)
+
+    @property
+    def stroke_window_ns(self) -> tuple[int, int]:
+        """The stroke's time as `stroke_span_ns` computes it; empty for another path."""
+        if self.stroke_s is None:
+            return self.zero_ns, self.zero_ns
+        begin_s, finish_s = stroke_window_s(self.stroke_s)
         finish_ns = self.zero_ns + round(finish_s * 1e9)
         return self.zero_ns + round(begin_s * 1e9), min(finish_ns, self.end_ns)
+
+    def figures(self) -> dict[str, Any]:
+        """Return how well the finger was followed; see `FollowedFinger.figures`."""
+        seconds = (self.done_ns - self.zero_ns) * 1e-9
+        return {"path": self.label, "seconds": seconds, **self.followed.figures()}
 
 
 class Side:
@@ -79,37 +109,40 @@ class SheetErrors:
     def __init__(self, grid: Grid) -> None:
         self._grid = grid
         self._scene: Scene | None = None
+        self._shape: Shape | None = None
         self._edge_poses: dict[str, Floats] = {}
         self.measured, self.true = Side(), Side()
         self._contact: list[tuple[int, Floats]] = []
+        self._following: list[tuple[int, Floats]] = []
+        self._arms: dict[str, tuple[int, bool]] = {}
+        self._target_holds = True
         self.distance = {"measured": Range(grid), "true": Range(grid)}
         self.angle = {"measured": Range(grid), "true": Range(grid)}
         self.contact = {name: Moments() for name in ("d", "theta", "true_d", "true_theta")}
-        self.strokes: list[Stroke] = []
-
-    @property
-    def shape(self) -> str | None:
-        """Of the object, as far as one is known."""
-        return None if self._scene is None else self._scene.object.geometry.shape
+        self.runs: list[FingerRun] = []
 
     def take(self, message: Any, source_ns: int) -> None:
         """Heed a message; all stamps are of one clock."""
         match message:
             case Scene():
                 self.finish()
-                self._scene = message
+                self._scene, self._shape = message, make_shape(dict(message.object.geometry))
                 arms = message.arms
                 self._edge_poses = {"left": _edge(arms.left), "right": _edge(arms.right)}
-                self.measured, self.true, self._contact = Side(), Side(), []
+                self.measured, self.true = Side(), Side()
+                self._contact, self._following = [], []
             case SheetTarget():
                 touches = float(message.phase == "contact")
-                self._contact.append((source_ns, np.array([touches, message.retreat_m])))
+                self._contact.append((message.valid_at_ns, np.array([touches, message.retreat_m])))
+                self._target_holds = message.phase in ("hold", "wait")
             case Fingertip() if message.valid:
                 self.measured.finger.append((source_ns, message.position_world_m))
             case TwinFinger():
                 self.true.finger.append((source_ns, message.position_world_m))
-                self._follow_stroke(message, source_ns)
+                self._following.append((source_ns, np.array([self._follows(source_ns)])))
+                self._take_run(message, source_ns)
             case ArmState():
+                self._arms[message.side] = source_ns, message.mode == "follow"
                 self._take_edge(self.measured, message.side, message.world_from_flange, source_ns)
             case TwinArms():
                 self._take_edge(self.true, "left", message.world_from_flange_left, source_ns)
@@ -122,22 +155,34 @@ class SheetErrors:
             row = edge_row(flange, self._edge_poses[name])
             side.edges[name == "right"].append((source_ns, row))
 
-    def _follow_stroke(self, finger: TwinFinger, source_ns: int) -> None:
-        seconds = seconds_of(finger.path_label)
-        if seconds is None:
+    def _follows(self, at_ns: int) -> float:
+        """1 if both arms follow a target that follows the finger, else 0."""
+        arms = [self._arms.get(side) for side in ("left", "right")]
+        both = all(arm is not None and arm[1] and at_ns - arm[0] <= SILENT_NS for arm in arms)
+        return float(both and not self._target_holds)
+
+    def _take_run(self, finger: TwinFinger, source_ns: int) -> None:
+        if not finger.path_label or finger.path_time_s < 0.0:
             return
         zero_ns = source_ns - round(finger.path_time_s * 1e9)
-        last = self.strokes[-1] if self.strokes else None
-        if last is None or last.seconds != seconds or abs(last.zero_ns - zero_ns) > SAME_RUN_NS:
-            last = Stroke(seconds, zero_ns, source_ns)
-            self.strokes.append(last)
+        last = self.runs[-1] if self.runs else None
+        if (
+            last is None
+            or last.label != finger.path_label
+            or (abs(last.zero_ns - zero_ns) > SAME_RUN_NS)
+        ):
+            last = FingerRun(finger.path_label, zero_ns, zero_ns, source_ns)
+            self.runs.append(last)
         last.zero_ns, last.end_ns = zero_ns, source_ns
+        if not finger.path_done:
+            last.done_ns = source_ns
 
     def finish(self) -> None:
         """Work out what is ripe."""
-        scene = self._scene
-        if scene is None or not isinstance(scene.object.geometry, Cylinder):
-            self.measured, self.true, self._contact = Side(), Side(), []
+        scene, shape = self._scene, self._shape
+        if scene is None or shape is None:
+            self.measured, self.true = Side(), Side()
+            self._contact, self._following = [], []
             return
         for name, side in (("measured", self.measured), ("true", self.true)):
             ripe = side.ripe()
@@ -147,14 +192,19 @@ class SheetErrors:
                 continue
             finger, edges, times_ns = ripe
             if len(times_ns):
-                self._add_strokes(name, times_ns, *sheet_errors(scene, finger, edges, times_ns))
-                touched_ns, retreat_m = self._touched(times_ns)
-                if len(touched_ns):
-                    found = sheet_errors(scene, finger, edges, touched_ns, retreat_m)
-                    self._add(name, touched_ns, *found)
+                if any(run.stroke_s is not None for run in self.runs):
+                    found = sheet_errors(scene, finger, edges, times_ns, shape=shape)
+                    self._add_strokes(name, times_ns, *found)
+                touches, retreat_m = self._touched(times_ns)
+                found = sheet_errors(scene, finger, edges, times_ns, retreat_m, shape=shape)
+                self._add(name, times_ns[touches], found[0][touches], found[1][touches])
+                if name == "true":
+                    local = apply(inverse(object_pose(scene)), finger.at(times_ns))
+                    self._add_followed(times_ns, *found, shape.closest(local).height_m)
         for edges_of in (*self.measured.edges, *self.true.edges):
             del edges_of[: -10 * BLOCK]
         del self._contact[: -2 * BLOCK]
+        del self._following[: -2 * BLOCK]
 
     def _add(self, name: str, times_ns: NDArray[np.int64], d: Floats, theta: Floats) -> None:
         prefix = "true_" if name == "true" else ""
@@ -171,21 +221,39 @@ class SheetErrors:
         self, name: str, times_ns: NDArray[np.int64], d: Floats, theta: Floats
     ) -> None:
         prefix = "true_" if name == "true" else ""
-        for stroke in self.strokes:
-            begin_ns, finish_ns = stroke.window_ns
+        for run in self.runs:
+            begin_ns, finish_ns = run.stroke_window_ns
             inside = (times_ns >= begin_ns) & (times_ns <= finish_ns)
-            if inside.any():
-                stroke.sums.setdefault(f"{prefix}delta_d", Moments()).take(d[inside])
-                stroke.sums.setdefault(f"{prefix}delta_theta", Moments()).take(theta[inside])
+            if run.stroke_s is not None and inside.any():
+                run.sums.setdefault(f"{prefix}delta_d", Moments()).take(d[inside])
+                run.sums.setdefault(f"{prefix}delta_theta", Moments()).take(theta[inside])
 
-    def _touched(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], Floats]:
-        """Those of the times at which the sheet was in contact, and how far it was to yield."""
+    def _add_followed(
+        self, times_ns: NDArray[np.int64], d: Floats, theta: Floats, heights: Floats
+    ) -> None:
+        following = track(self._following, "twin/finger").at(times_ns)[:, 0] > 0.5
+        for run in self.runs:
+            inside = (times_ns >= run.zero_ns) & (times_ns <= run.done_ns)
+            if inside.any():
+                run.followed.add(d[inside], theta[inside], heights[inside], following[inside])
+
+    def _touched(self, times_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], Floats]:
+        """Whether the target was in contact (n,), and the commanded retreat (n,) m, else 0."""
         if len(self._contact) < 2:
-            return times_ns[:0], np.empty(0)
+            return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
         contact = track(self._contact, "sheet_target")
         touches, retreat_m = contact.at(times_ns).T
-        inside = (touches > 0.999) & contact.covers(times_ns)
-        return times_ns[inside], retreat_m[inside]
+        covered = contact.covers(times_ns)
+        return (touches > 0.999) & covered, np.where(covered, retreat_m, 0.0)
+
+
+def read_followed(bag: Path) -> list[dict[str, Any]]:
+    """Return how well the finger was followed along each path of a bag, in order."""
+    errors = SheetErrors(Grid(0, 1.0, 1))
+    for _, message, header, _ in BagReader(bag, topics=TOPICS_READ):
+        errors.take(message, header.source_ns)
+    errors.finish()
+    return [run.figures() for run in errors.runs if run.followed.exposures]
 
 
 def seconds_of(label: str) -> float | None:

@@ -1,0 +1,85 @@
+"""Measure how well the sheet followed the simulator's finger along one path."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from launch.bags.report.series import Grid, Moments, Spread
+
+Floats = NDArray[np.float64]
+
+MAX_CONTACT_HEIGHT_M = 0.001
+"""At most so far above the undeformed object, the true finger is in contact: a fingertip's pad is
+that soft, and the stroke's wander has a standard deviation of half of it."""
+
+
+class Sizes:
+    """Mean, 95 % quantile (to 2.3 %) and maximum of positive values that are not stored."""
+
+    def __init__(self) -> None:
+        self._moments, self._spread = Moments(), Spread(Grid(0, 1.0, 1))
+
+    def add(self, values: Floats) -> None:
+        """Add values (n,)."""
+        self._moments.take(values)
+        for value in values.tolist():
+            self._spread.take(0, value)
+
+    def summary(self, scale: float) -> dict[str, float] | None:
+        """Return the three figures times `scale`; None without a value."""
+        found, p95 = self._moments.summary(scale), self._spread.quantile_s(0.95)
+        if found is None or p95 is None:
+            return None
+        return {"mean": found["mean"], "p95": scale * p95, "max": found["max"]}
+
+
+class FollowedFinger:
+    """Accumulates the errors of the true sheet against the true finger, exposure by exposure.
+
+    A drop-out is a time without following that overlaps contact.
+    """
+
+    def __init__(self) -> None:
+        self.exposures = self.drop_outs = 0
+        self._in_contact = self._followed = 0
+        self._distance, self._angle = Sizes(), Sizes()
+        self._dropped = False
+
+    def add(
+        self, delta_d_m: Floats, delta_theta_rad: Floats, heights_m: Floats, following: Any
+    ) -> None:
+        """Add consecutive exposures (n,).
+
+        heights_m: of the true finger above the undeformed object, negative below.  following: bool
+        (n,), whether both arms follow a target that follows the finger.
+        """
+        contact = heights_m <= MAX_CONTACT_HEIGHT_M
+        self.exposures += len(contact)
+        self._in_contact += int(contact.sum())
+        self._followed += int((contact & following).sum())
+        self._distance.add(delta_d_m[contact])
+        self._angle.add(delta_theta_rad[contact])
+        for touches, follows in zip(contact.tolist(), following.tolist(), strict=True):
+            if follows:
+                self._dropped = False
+            elif touches and not self._dropped:
+                self._dropped = True
+                self.drop_outs += 1
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures; None where the finger was never in contact.
+
+        contact_ratio: of the exposures on the path.  following_ratio: of those in contact.
+        """
+        return {
+            "contact_ratio": self._in_contact / self.exposures if self.exposures else None,
+            "following_ratio": self._followed / self._in_contact if self._in_contact else None,
+            "drop_outs": self.drop_outs,
+            "contact": {
+                "true_delta_d_mm": self._distance.summary(1e3),
+                "true_delta_theta_deg": self._angle.summary(float(np.degrees(1.0))),
+            },
+        }
