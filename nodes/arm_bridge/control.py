@@ -846,7 +846,13 @@ class ArmControl:
         )
 
     def _restart_at(self, measured: Floats) -> None:
-        """Forget the last commanded joints: the next command goes on from the measured ones."""
+        """Forget the last commanded joints: the next command goes on from the measured ones.
+
+        A decision to do so for an arm that does not stand still is a fault, and they are kept.
+        """
+        if not self._stands_still(measured) or self._restart_doubt(measured) is not None:
+            self.faults = self.faults or ("commanded: a start before the arm stands still",)
+            return
         self._forget_motion()
         self.commanded_rad = measured.copy()
         self._standstill.has_jumped = False
