@@ -21,6 +21,7 @@ import pytest
 
 from launch.running import runs, stopping
 from launch.running.stopping import KILL_AFTER_S, StopAttempt, StopOutcome, StopPath, stop_arms
+from nodes import stop_socket
 from nodes.stop_socket import MAX_CONNECTIONS, StopSocket
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -187,6 +188,19 @@ async def test_all_are_asked_at_once_and_others_may_not_connect(sockets: Sockets
         one.close()
         one.close()
     assert list(sockets.folder.iterdir()) == []
+
+
+async def test_another_user_stops_nothing(
+    sockets: Sockets, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sockets.open("launcher", "launch")
+    stranger = os.getuid() + 1
+    monkeypatch.setattr(stop_socket, "peer_of", lambda connection: (1, stranger))
+    attempts = await sockets.stop()
+    assert [one.worked for one in attempts] == [False]
+    assert sockets.reasons == []
+    for one in sockets.opened:
+        one.close()
 
 
 async def test_what_is_no_stop_stops_nothing_and_keeps_nobody_waiting(sockets: Sockets) -> None:

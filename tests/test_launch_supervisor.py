@@ -128,7 +128,7 @@ async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Pa
         assert graph.pids.keys() == {"beacon", "listener"}
         assert all(os.getsid(pid) == pid for pid in graph.pids.values())
         assert [run.id for run in runs.live_runs()] == [graph.run.id]
-        assert len(sockets_in(runs_root)) == 6
+        assert len(sockets_in(runs_root)) == 7
     assert graph.exit_codes == {"beacon": 0, "listener": 0}
     assert_nothing_left(runs_root)
     wait_until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors, "ZeroMQ's descriptors")
