@@ -28,10 +28,10 @@ from numpy.typing import NDArray
 from launch.plans.plan import load_scene
 from messages.scene import Scene
 from messages.types import Display, Skin, SoftBody
-from nodes.fem_solver.mesh.from_scene import mesh_of_scene, world_from_mesh
+from nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
 from nodes.models.rigid import apply
 from nodes.models.sheet import edge_poses
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 from nodes.renderer.gl import headless_context
 from nodes.renderer.sheet import Sheet, sheet_between
 from nodes.renderer.stage import Stage
@@ -126,7 +126,7 @@ def stage_of(scene: Scene, triangles: int) -> Stage:
             scene,
             headless_context(),
             spacing_m=spacing_m,
-            dents=dent_cache.load_or_solve(scene, None),
+            dents=deflection_cache.load_or_compute(scene, None),
         )
         have = len(stage._surface.triangles)
         if abs(have - triangles) < 0.05 * triangles:
@@ -137,7 +137,7 @@ def stage_of(scene: Scene, triangles: int) -> Stage:
 
 def skin_of(scene: Scene) -> Skin:
     """The solver's skin, as fine as the demo's."""
-    mesh = mesh_of_scene(scene, SKIN_SPACING_M)
+    mesh = mesh_scene(scene, SKIN_SPACING_M)
     points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
     return Skin(
         mesh_id="bench",

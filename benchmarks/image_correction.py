@@ -28,7 +28,7 @@ from messages.scene import Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 from nodes.renderer.families import (
     METHODS,
     SIZES_PX,
@@ -60,7 +60,7 @@ class Bench:
 
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
-        dents = dent_cache.load_or_solve(scene, None)
+        dents = deflection_cache.load_or_compute(scene, None)
         self.stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
         self._proper = proper(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
@@ -220,7 +220,7 @@ def print_stretches(bench: Bench) -> None:
 
 def print_frames(scene: Scene) -> None:
     """Wall time of a stereo frame: the median over rounds in which every method has its turn."""
-    dents, context = dent_cache.load_or_solve(scene, None), headless_context()
+    dents, context = deflection_cache.load_or_compute(scene, None), headless_context()
     print(f"\n{context.info['GL_RENDERER']}")
     heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")
     for size in SIZES_PX:

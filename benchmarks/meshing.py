@@ -31,7 +31,7 @@ from messages.scene import (
 )
 from nodes.fem_solver.elasticity import quadrature, shape_gradients
 from nodes.fem_solver.mesh import SolidMesh, build_mesh, mesh_budget, mesh_spec
-from nodes.fem_solver.mesh.quality import least_dihedral_rad, least_jacobians, radius_ratios
+from nodes.fem_solver.mesh.quality import least_dihedral_rad, min_jacobian_ratios, radius_ratios
 from nodes.models.shapes import make_shape
 from nodes.models.shapes.triangles import volume_m3
 
@@ -82,12 +82,12 @@ def meshed_volume(mesh: SolidMesh) -> float:
 
 def spacing_mm(mesh: SolidMesh) -> float:
     """Root of the touchable skin's area per node."""
-    corners = mesh.nodes[mesh.touch][mesh.touch_faces]
+    corners = mesh.nodes[mesh.contact_nodes][mesh.contact_faces]
     area = 0.0
     for i, j, k in ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)):
         cross = np.cross(corners[:, j] - corners[:, i], corners[:, k] - corners[:, i])
         area += 0.5 * float(np.linalg.norm(cross, axis=1).sum())
-    return 1e3 * float(np.sqrt(area / len(mesh.touch)))
+    return 1e3 * float(np.sqrt(area / len(mesh.contact_nodes)))
 
 
 def measure(name: str, scene: Scene, spacing_m: float) -> None:
@@ -100,10 +100,10 @@ def measure(name: str, scene: Scene, spacing_m: float) -> None:
     dihedral = np.degrees(least_dihedral_rad(mesh.nodes, mesh.elements).min())
     print(
         f"| {name} | {1e3 * spacing_m:g} mm | {len(mesh.nodes)} ({budget.nodes})"
-        f" | {len(mesh.elements)} | {len(mesh.skin)}, {len(mesh.touch)}"
+        f" | {len(mesh.elements)} | {len(mesh.skin)}, {len(mesh.contact_nodes)}"
         f" | {spacing_mm(mesh):.2f} mm | {took_s:.1f} s"
         f" | {radius_ratios(mesh.nodes, mesh.elements).min():.2f}"
-        f" | {dihedral:.0f}° | {least_jacobians(mesh.nodes, mesh.elements).min():.2f}"
+        f" | {dihedral:.0f}° | {min_jacobian_ratios(mesh.nodes, mesh.elements).min():.2f}"
         f" | {100 * (meshed_volume(mesh) / wanted - 1):+.2f} % |",
         flush=True,
     )

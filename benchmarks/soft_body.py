@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 from launch.plans.plan import load_scene
 from messages.scene import Scene, cylinder_of
 from nodes.cache import default_cache_dir
-from nodes.fem_solver import body, precompute, pushes
-from nodes.fem_solver.carried import Hull
-from nodes.fem_solver.making import Maker
+from nodes.fem_solver import body, precompute, snapshots
+from nodes.fem_solver.closest_contact import ContactQuery, locate
 from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.place import Push, locate
+from nodes.fem_solver.snapshot_interpolator import SurfaceLocator
+from nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from nodes.fem_solver.table import TableSoftBody
 
 Floats = NDArray[np.float64]
@@ -70,10 +70,10 @@ def places(heading_rad: float) -> Iterator[tuple[float, float]]:
 
 def judge_table(scene: Scene, spacing_m: float) -> None:
     """Make or load the table, compare it with full Newton, slide over it, print."""
-    maker = Maker(
+    maker = SoftBodyFactory(
         skin_spacing_m=spacing_m,
         linear_depth_m=0.006,
-        largest_depth_m=0.010,
+        max_depth_m=0.010,
         friction_ratio=0.0,
         cache_dir=default_cache_dir(),
         workers=0,
@@ -81,7 +81,7 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
     start = time.perf_counter()
     bodies = maker.bodies(scene, "auto", lambda *_: None)
     if len(bodies) == 1:
-        bodies.insert(0, maker.tabulated(scene, bodies[0], say))
+        bodies.insert(0, maker.build_table(scene, bodies[0], say))
     best, linear = bodies
     print(f"ready after {time.perf_counter() - start:.1f} s, {len(best.rest)} skin nodes")
     if isinstance(best.method, TableSoftBody):
@@ -94,13 +94,13 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
     mesh, radius_m = build_mesh(best.spec.mesh), cylinder_of(scene).radius_m
     for along, angle in JUDGED_AT:
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])
-        site = pushes.Site(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
-        judge_push(scene, mesh, site, best, linear)
+        sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
+        judge_push(scene, mesh, sample, best, linear)
     for depth_m in DEPTHS_M:
         say_slides(scene, slide(best, radius_m, depth_m), depth_m)
 
 
-def say(done: int, total: int, need: precompute.Need) -> None:
+def say(done: int, total: int, need: precompute.WorkBudget) -> None:
     """Progress, on one line."""
     print(f"\r{100 * done // total:3d} % of {need.text()}", end="", file=sys.stderr, flush=True)
 
@@ -108,42 +108,42 @@ def say(done: int, total: int, need: precompute.Need) -> None:
 def judge_push(
     scene: Scene,
     mesh: SolidMesh,
-    site: pushes.Site,
+    sample: snapshots.SamplePoint,
     best: body.SceneBody,
     linear: body.SceneBody,
 ) -> None:
     """Largest error off the finger and error of the force, depth by depth."""
-    job = pushes.job_of(
+    job = snapshots.make_snapshot_job(
         best.spec.mesh,
         mesh,
-        site,
+        sample,
         poisson_ratio=best.spec.poisson_ratio,
         finger_radius_m=scene.finger.radius_m,
         spacing_m=JUDGE_RATIO * scene.finger.radius_m,
     )
-    solved = pushes.solve_push(job)
-    nodes, weights = Hull(solved.rest, solved.faces).weights(best.rest)
-    away = np.linalg.norm(best.rest - site.place, axis=1) > 1.5 * scene.finger.radius_m
-    print(f"\nagainst Newton at {1e3 * site.place[0]:.0f} mm, normal {site.normal.round(2)}:")
+    solved = snapshots.solve_snapshot(job)
+    nodes, weights = SurfaceLocator(solved.rest, solved.faces).weights(best.rest)
+    away = np.linalg.norm(best.rest - sample.point, axis=1) > 1.5 * scene.finger.radius_m
+    print(f"\nagainst Newton at {1e3 * sample.point[0]:.0f} mm, normal {sample.normal.round(2)}:")
     for level in range(solved.reached):
         depth_m = float(solved.depths_m[level])
         wanted = np.einsum("qa,qai->qi", weights, solved.moved[level][nodes])
         modulus = scene.object.material.young_modulus_pa
-        force_n = modulus * float(solved.force_n[level] @ site.normal)
+        force_n = modulus * float(solved.force_n[level] @ sample.normal)
         texts = []
         for one in (best, linear):
-            answer = one.method.respond(Push(site.place, site.normal, depth_m))
+            answer = one.method.respond(ContactQuery(sample.point, sample.normal, depth_m))
             error = np.linalg.norm(answer.displacement - wanted, axis=1)
             texts.append(
                 f"{one.method.name} {1e3 * error[away].max():.3f} mm,"
-                f" force {100 * (answer.force_n @ site.normal / force_n - 1):+.1f} %"
+                f" force {100 * (answer.force_n @ sample.normal / force_n - 1):+.1f} %"
             )
         print(f"{1e3 * depth_m:5.1f} mm: {'; '.join(texts)}")
 
 
 def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
     """Slide in every direction at one depth."""
-    forces, stiffness, took, jump = [], [], [], 0.0
+    forces, stiffness, durations, jump = [], [], [], 0.0
     for heading in HEADINGS_RAD:
         before: NDArray[np.float32] | None = None
         for along, around in places(float(heading)):
@@ -153,14 +153,14 @@ def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
             start = time.perf_counter()
             push, _ = locate(built.shape, point, None)
             answer = built.method.respond(push)
-            took.append(time.perf_counter() - start)
+            durations.append(time.perf_counter() - start)
             forces.append(answer.force_n @ normal)
             stiffness.append(answer.stiffness_n_per_m)
             if before is not None:
                 moved = np.linalg.norm(answer.displacement - before, axis=1).max()
                 jump = max(jump, float(moved))
             before = answer.displacement
-    return Slides(np.array(forces), np.array(stiffness), np.array(took), jump)
+    return Slides(np.array(forces), np.array(stiffness), np.array(durations), jump)
 
 
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
@@ -173,7 +173,7 @@ def hertz_force_n(scene: Scene, depth_m: float) -> float:
 
 def measure(scene: Scene, spacing_m: float) -> None:
     """Precompute one mesh, cold and warm, slide over it, print."""
-    spec = body.spec_of(scene, spacing_m)
+    spec = body.make_soft_body_spec(scene, spacing_m)
     if spacing_m == min(SPACINGS_M):
         mesh = replace(spec.mesh, touch_angle_rad=FINEST_TOUCH_ANGLE_RAD)
         spec = replace(spec, mesh=mesh)
@@ -183,11 +183,11 @@ def measure(scene: Scene, spacing_m: float) -> None:
             model = precompute.load_or_compute(spec, Path(folder), lambda *_: None)
             times.append(time.perf_counter())
     cold_s, warm_s = np.diff(times)
-    built = body.scene_body(scene, spec, model, linear_depth_m=0.006, largest_depth_m=0.010)
+    built = body.build_scene_body(scene, spec, model, linear_depth_m=0.006, max_depth_m=0.010)
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     print(
         f"\n{1e3 * spacing_m:g} mm: {len(model.response.rest)} skin nodes,"
-        f" {len(model.response.touch)} loads, cold {cold_s:.1f} s, warm {warm_s:.2f} s,"
+        f" {len(model.response.contact_nodes)} loads, cold {cold_s:.1f} s, warm {warm_s:.2f} s,"
         f" peak {peak_mib:.0f} MiB",
         flush=True,
     )

@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 
 from launch.plans.plan import load_scene
 from messages.scene import Scene
-from nodes.fem_solver.body import SceneBody, scene_body, spec_of
+from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
 from nodes.fem_solver.contact import LinearSoftBody
 from nodes.fem_solver.elasticity import element_stiffness
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.mesh.quality import least_jacobians
-from nodes.fem_solver.multifrontal import Dissection
-from nodes.fem_solver.place import Entry, Push
+from nodes.fem_solver.mesh.quality import min_jacobian_ratios
+from nodes.fem_solver.multifrontal import NestedDissection
 from nodes.fem_solver.precompute import SoftBodyModel, compute
-from nodes.fem_solver.pushes import PushAnswer, PushJob, Site, solve_push
+from nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob, solve_snapshot
 from nodes.fem_solver.table import END_SPAN_M
 from nodes.models import rigid
 
@@ -43,7 +43,7 @@ CYLINDER = {"shape": "cylinder", "radius_m": RADIUS_M, "length_m": 0.05}
 STRIP = {"kind": "strip", "angle_rad": 1.57}
 DEPTHS_M = tuple(1e-3 * d for d in range(1, 36))
 STEP_M = 2e-5
-LINEAR_DEPTH_M, LARGEST_DEPTH_M = 0.006, 0.010
+LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,28 +82,28 @@ def cylinder(**changes: float) -> Scene:
 
 def body_of(scene: Scene, spacing_m: float = SPACING_M, *, meshed_for: Scene | None = None) -> Body:
     """meshed_for: the scene whose finger's size decides whether the mesh is fine enough."""
-    spec = spec_of(meshed_for or scene, spacing_m)
+    spec = make_soft_body_spec(meshed_for or scene, spacing_m)
     model = compute(spec, lambda *_: None)
-    soft = scene_body(
-        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, largest_depth_m=LARGEST_DEPTH_M
+    soft = build_scene_body(
+        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, max_depth_m=MAX_DEPTH_M
     )
     return Body(scene, soft, model, build_mesh(spec.mesh))
 
 
-def site_of(body: Body, x: float = 0.002, y: float = 0.0015) -> Site:
+def site_of(body: Body, x: float = 0.002, y: float = 0.0015) -> SamplePoint:
     found = body.soft.shape.closest(body.soft.front + np.array([x, y, 0.0]))
-    return Site(found.point, found.normal)
+    return SamplePoint(found.point, found.normal)
 
 
-def newton(body: Body, site: Site, depths_m: tuple[float, ...] = DEPTHS_M) -> PushAnswer:
+def newton(body: Body, sample: SamplePoint, depths_m: tuple[float, ...] = DEPTHS_M) -> Snapshot:
     """Full Newton on the body's own mesh."""
-    return solve_push(
-        PushJob(
+    return solve_snapshot(
+        SnapshotJob(
             nodes=body.mesh.nodes,
             elements=body.mesh.elements,
             fixed=body.mesh.fixed,
-            faces=body.mesh.touch[body.mesh.touch_faces],
-            site=site,
+            faces=body.mesh.contact_nodes[body.mesh.contact_faces],
+            sample=sample,
             poisson_ratio=body.soft.spec.poisson_ratio,
             finger_radius_m=body.scene.finger.radius_m,
             depths_m=depths_m,
@@ -111,7 +111,7 @@ def newton(body: Body, site: Site, depths_m: tuple[float, ...] = DEPTHS_M) -> Pu
     )
 
 
-def deepest_mm(answer: PushAnswer) -> float:
+def deepest_mm(answer: Snapshot) -> float:
     return 1e3 * float(answer.depths_m[answer.reached - 1]) if answer.reached else 0.0
 
 
@@ -130,21 +130,23 @@ def overturned(body: Body, moved: NDArray[Any]) -> int:
     return int(((normals(rest) * normals(rest + moved)).sum(axis=1) <= 0.0).sum())
 
 
-def linear_inversion_mm(body: Body, site: Site) -> float:
+def linear_inversion_mm(body: Body, sample: SamplePoint) -> float:
     """The depth at which the linear field, not held back, first turns a corner of an element."""
     mesh, nu = body.mesh, body.soft.spec.poisson_ratio
     matrices = element_stiffness(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=nu)
-    factors = Dissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices)
+    factors = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices)
     method = body.soft.method
     assert isinstance(method, LinearSoftBody)
     for depth in DEPTHS_M:
-        contact = method.contact.solve(Push(site.place, site.normal, depth), depth)
+        contact = method.contact.solve(ContactQuery(sample.point, sample.normal, depth), depth)
         assert contact is not None
         loads = np.zeros_like(mesh.nodes)
         forces = contact.forces / body.scene.object.material.young_modulus_pa
-        loads[mesh.touch[contact.nodes]] = -forces[:, None] * mesh.touch_normals[contact.nodes]
+        loads[mesh.contact_nodes[contact.nodes]] = (
+            -forces[:, None] * mesh.contact_normals[contact.nodes]
+        )
         moved = factors.solve(loads.ravel()).reshape(-1, 3)
-        if least_jacobians(mesh.nodes + moved, mesh.elements).min() <= 0.0:
+        if min_jacobian_ratios(mesh.nodes + moved, mesh.elements).min() <= 0.0:
             return 1e3 * depth
     return np.inf
 
@@ -162,10 +164,10 @@ def incompressible() -> None:
         except ValueError as error:
             row(nu, "-", "-", "-", error)
             continue
-        site = site_of(body)
-        force = body.soft.method.respond(Push(site.place, site.normal, 0.003)).force_n
-        end = deepest_mm(newton(body, site))
-        newtons = f"{1e3 * float(force @ site.normal):.1f} mN"
+        sample = site_of(body)
+        force = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.003)).force_n
+        end = deepest_mm(newton(body, sample))
+        newtons = f"{1e3 * float(force @ sample.normal):.1f} mN"
         row(nu, newtons, f"{end:g} mm", f"{table_mm(end):g} mm", "")
 
 
@@ -174,14 +176,14 @@ def inversion() -> None:
     row("skin spacing", "linear field inverts at", "Newton: to", "shown at 50 mm", "overturned")
     for spacing in (0.005, 0.004, 0.003):
         body = body_of(cylinder(), spacing)
-        site = site_of(body)
-        end = "not run" if spacing <= 0.003 else f"{deepest_mm(newton(body, site)):g} mm"
-        answer = body.soft.method.respond(Push(site.place, site.normal, 0.050))
+        sample = site_of(body)
+        end = "not run" if spacing <= 0.003 else f"{deepest_mm(newton(body, sample)):g} mm"
+        answer = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.050))
         largest = 1e3 * float(np.linalg.norm(answer.displacement, axis=1).max())
         flag = "in range" if answer.in_range else "flagged"
         row(
             f"{1e3 * spacing:g} mm",
-            f"{linear_inversion_mm(body, site):g} mm",
+            f"{linear_inversion_mm(body, sample):g} mm",
             end,
             f"skin moves {largest:.1f} mm, {flag}",
             overturned(body, answer.displacement),
@@ -191,7 +193,7 @@ def inversion() -> None:
 def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float, float, int]:
     """Largest move (mm) of a skin node in a step of 0.02 mm across a body, the share of the steps
     that is flagged, and the most triangles overturned; the finger keeps its depth."""
-    held: Entry | None = None
+    held: ContactAnchor | None = None
     before: NDArray[Any] | None = None
     jump, flagged, most = 0.0, 0, 0
     steps = 1000
@@ -217,7 +219,7 @@ def rim() -> None:
         body = body_of(scene_of(box, STRIP, height_m=0.015))
         start = np.array([0.018, 0.001, 0.03])
         found = body.soft.shape.closest(np.array([0.030, 0.001, 0.015]))
-        end = deepest_mm(newton(body, Site(found.point, found.normal), DEPTHS_M[:15]))
+        end = deepest_mm(newton(body, SamplePoint(found.point, found.normal), DEPTHS_M[:15]))
         for depth in (0.002, 0.006):
             jump, flagged, most = slide(body, depth, np.array([1.0, 0.0, -0.6]), start)
             row(
@@ -241,14 +243,14 @@ def two_supports() -> None:
         except ValueError as error:
             row(name, "-", f"refused: {error}", "-", "-")
             continue
-        site = site_of(body)
-        answer = body.soft.method.respond(Push(site.place, site.normal, 0.005))
+        sample = site_of(body)
+        answer = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.005))
         row(
             name,
             int(body.mesh.fixed.sum()),
-            f"{1e3 * float(answer.force_n @ site.normal):.0f} mN",
+            f"{1e3 * float(answer.force_n @ sample.normal):.0f} mN",
             f"{1e3 * float(np.linalg.norm(answer.displacement, axis=1).max()):.1f} mm",
-            f"{deepest_mm(newton(body, site)):g} mm",
+            f"{deepest_mm(newton(body, sample)):g} mm",
         )
 
 
@@ -256,17 +258,17 @@ def slivers() -> None:
     """Elements flattened: the nodes inside the cylinder drawn towards a plane."""
     row("flattened to", "least height over edge", "Newton: force at 3 mm", "Newton: to")
     base = body_of(cylinder())
-    site = site_of(base)
+    sample = site_of(base)
     for share in (1.0, 0.3, 0.1, 0.03, 0.01, 0.001, 0.0):
         nodes = flattened(base.mesh, share)
         try:
             NeoHookeanSolid(nodes, base.mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
-            force = force_n(base, nodes, site)
+            force = force_n(base, nodes, sample)
         except ValueError as error:
             row(share, "-", f"refused: {error}", "-")
             continue
         mesh = replace(base.mesh, nodes=nodes)
-        end = deepest_mm(newton(replace(base, mesh=mesh), site))
+        end = deepest_mm(newton(replace(base, mesh=mesh), sample))
         row(share, f"{thinnest(nodes, base.mesh):.2g}", f"{1e3 * force:.1f} mN", f"{end:g} mm")
 
 
@@ -309,19 +311,19 @@ def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
     return float((volume / largest / np.linalg.norm(edges, axis=2).max(axis=1)).min())
 
 
-def force_n(body: Body, nodes: Floats, site: Site) -> float:
+def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
     """Of the finger 3 mm deep by Newton on these nodes; NaN where it cannot follow."""
     mesh = replace(body.mesh, nodes=nodes)
-    answer = newton(replace(body, mesh=mesh), site, (0.003,))
+    answer = newton(replace(body, mesh=mesh), sample, (0.003,))
     modulus = body.scene.object.material.young_modulus_pa
-    return modulus * float(answer.force_n[0] @ site.normal) if answer.reached else np.nan
+    return modulus * float(answer.force_n[0] @ sample.normal) if answer.reached else np.nan
 
 
 def teleport() -> None:
     """A finger that is somewhere else in every frame, against one that came straight there."""
     row("finger", "skin differs from that of a finger fresh from outside by at most")
     body, rng = body_of(cylinder()), np.random.default_rng(4)
-    held: Entry | None = None
+    held: ContactAnchor | None = None
     worst, kept = {"near": 0.0, "across": 0.0}, 0
     for _ in range(600):
         x, angle, depth = rng.uniform([-0.02, -1.0, -0.005], [0.02, 1.0, 0.012])
@@ -338,10 +340,10 @@ def teleport() -> None:
     row(
         f"by more ({kept} of 600 jumps): the place it entered by stays", f"{worst['across']:.0f} mm"
     )
-    site, forces = site_of(body), []
+    sample, forces = site_of(body), []
     for steps in (1, 40):
         depths = tuple(float(d) for d in np.linspace(0.0, 0.006, steps + 1)[1:])
-        forces.append(float(newton(body, site, depths).force_n[-1] @ site.normal))
+        forces.append(float(newton(body, sample, depths).force_n[-1] @ sample.normal))
     row("Newton, 6 mm in one step or 40", f"force {100 * abs(forces[1] / forces[0] - 1):.1g} %")
 
 
@@ -350,15 +352,16 @@ def small_tip() -> None:
     row("tip radius", "over spacing", "depth", "linear: force over Hertz", "Newton: over Hertz")
     for radius in (0.007, 0.003, 0.0015, 0.0007, 0.0003):
         body = body_of(cylinder(finger_m=radius), meshed_for=cylinder())
-        site, depth = site_of(body), 0.5 * radius
+        sample, depth = site_of(body), 0.5 * radius
         modulus = body.scene.object.material.young_modulus_pa
         bend = np.sqrt(1.0 / radius * (1.0 / radius + 1.0 / RADIUS_M))
         hertz = 4.0 / 3.0 * modulus / (1.0 - 0.45**2) * np.sqrt(1.0 / bend) * depth**1.5
         force = float(
-            body.soft.method.respond(Push(site.place, site.normal, depth)).force_n @ site.normal
+            body.soft.method.respond(ContactQuery(sample.point, sample.normal, depth)).force_n
+            @ sample.normal
         )
-        answer = newton(body, site, (depth,))
-        pushed = modulus * float(answer.force_n[0] @ site.normal)
+        answer = newton(body, sample, (depth,))
+        pushed = modulus * float(answer.force_n[0] @ sample.normal)
         row(
             f"{1e3 * radius:g} mm",
             f"{radius / SPACING_M:.2g}",

@@ -30,7 +30,7 @@ def cylinder_spec(
         skin_spacing_m=skin_spacing_m,
         towards_user=(0.0, 0.0, 1.0),
         down=(0.0, 0.0, 0.0),
-        turn_rad=0.0,
+        rotation_rad=0.0,
         slab_depth_m=0.0,
     )
     return SoftBodySpec(mesh, poisson_ratio, sticking)

@@ -251,8 +251,8 @@ def test_charts_are_gathered_on_a_page_and_drawn_anew(
     points = [measure(trial, repeats=3) for trial in family.trials(SCENE)]
     result = chart_result(family, SCENE, points)
     result["family"] = "made-up"
-    older = {name: value for name, value in result.items() if name not in ("along", "code")}
-    older["points"] = [{k: v for k, v in point.items() if k not in ("also", "doubts")}
+    older = {name: value for name, value in result.items() if name not in ("sweep_key", "code")}
+    older["points"] = [{k: v for k, v in point.items() if k not in ("extra_metrics", "reference_uncertainty")}
                        for point in result["points"]]  # fmt: skip
     (tmp_path / "made-up.json").write_text(json.dumps(older))
     outcome = CliRunner().invoke(app, ["chart", "--redraw", "--output", str(tmp_path)])

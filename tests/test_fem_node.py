@@ -18,7 +18,7 @@ from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
 from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver import precompute, pushes
+from nodes.fem_solver import precompute, snapshots
 from nodes.fem_solver.body import SceneBody
 from nodes.fem_solver.node import FemSolver, FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
@@ -275,10 +275,10 @@ async def test_the_same_messages_give_the_same_bytes(cache: str) -> None:
 
 @pytest.fixture
 def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pushes, "DEPTHS_M", (0.0015, 0.003, 0.006))
-    monkeypatch.setattr(pushes, "SPACING_RATIO", 1.0)
-    monkeypatch.setattr(pushes, "STATIONS", (0.0,))
-    monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
+    monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.003, 0.006))
+    monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
+    monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
+    monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
 
 
 async def test_the_table_is_made_while_the_linear_method_answers(

@@ -14,9 +14,10 @@ from scipy.interpolate import LinearNDInterpolator
 from launch.bench.twin_sheet import twin_points
 from launch.plans.plan import load_scene
 from messages.types import Correction, Display
+from nodes.cache import load_cached
 from nodes.models.rigid import apply, rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.shape_families import sheet_shape_family
 from nodes.renderer.sheet import Sheet, sheet_between
@@ -180,26 +181,26 @@ def test_dent_shapes_are_kept_and_found_again(
         solves.append(rubber)
         return few_dents()
 
-    monkeypatch.setattr(dent_cache, "solve_dents", solve_few)
-    assert dent_cache.load(SCENE, tmp_path) is None
-    dent_cache.load_or_solve(SCENE, tmp_path)
-    kept = dent_cache.load_or_solve(SCENE, tmp_path)
+    monkeypatch.setattr(deflection_cache, "solve_dents", solve_few)
+    assert load_cached(deflection_cache.shapes_cache(SCENE), tmp_path) is None
+    deflection_cache.load_or_compute(SCENE, tmp_path)
+    kept = deflection_cache.load_or_compute(SCENE, tmp_path)
     assert len(solves) == 1
     at = (1.05, (0.01, 0.02), 0.01)
     same = replace(few_dents(), deepest_m=kept.deepest_m)
     assert kept.offsets(*at) == pytest.approx(same.offsets(*at), abs=1e-6)
     assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
-    path = dent_cache.file_of(SCENE, tmp_path)
+    path = deflection_cache.shapes_cache(SCENE).path(tmp_path)
     path.write_bytes(path.read_bytes()[:1000])
-    assert dent_cache.load(SCENE, tmp_path) is None
-    dent_cache.load_or_solve(SCENE, tmp_path)
+    assert load_cached(deflection_cache.shapes_cache(SCENE), tmp_path) is None
+    deflection_cache.load_or_compute(SCENE, tmp_path)
     assert len(solves) == 2
 
 
 def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(
     tmp_path: Path,
 ) -> None:
-    own = dent_cache.file_of(SCENE, tmp_path)
+    own = deflection_cache.shapes_cache(SCENE).path(tmp_path)
     for part, change, differs in (
         ("sheet", {"width_m": 0.26}, True),
         ("sheet", {"max_stretch_ratio": 1.1}, True),
@@ -207,12 +208,14 @@ def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(
         ("sheet", {"young_modulus_pa": 2e6}, False),
     ):
         changed = getattr(SCENE, part).model_copy(update=change)
-        other = dent_cache.file_of(SCENE.model_copy(update={part: changed}), tmp_path)
+        other = deflection_cache.shapes_cache(SCENE.model_copy(update={part: changed})).path(
+            tmp_path
+        )
         assert (other != own) == differs
 
 
 def test_the_family_of_shapes_tells_them_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dent_cache, "load_or_solve", lambda scene, folder: few_dents())
+    monkeypatch.setattr(deflection_cache, "load_or_compute", lambda scene, folder: few_dents())
     shallow = SCENE.working_range.model_copy(update={"push_depth_m": 0.02})
     spec = SCENE.sheet.model_copy(update={"min_stretch_ratio": 1.04, "max_stretch_ratio": 1.06})
     scene = SCENE.model_copy(update={"working_range": shallow, "sheet": spec})

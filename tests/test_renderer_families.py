@@ -9,7 +9,7 @@ import pytest
 from launch.bench.twin_sheet import twin_errors
 from launch.plans.plan import load_scene
 from nodes.methods import Point, measure, pareto_front
-from nodes.renderer import dent_cache, families
+from nodes.renderer import deflection_cache, families
 from nodes.renderer.families import correction_family, covers, with_projector_of
 from nodes.renderer.stage import projector_homography
 from tests.dent_shapes import few_dents
@@ -21,7 +21,7 @@ SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.y
 def points() -> list[Point]:
     family = correction_family(twin_errors)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(dent_cache, "load_or_solve", lambda scene, folder: few_dents())
+        patch.setattr(deflection_cache, "load_or_compute", lambda scene, folder: few_dents())
         patch.setattr(families, "CASES", ((-50, 0), (0, 25)))
         patch.setattr(families, "scene_cases", lambda scene: ())
         patch.setattr(families, "SIZES_PX", ((640, 480),))

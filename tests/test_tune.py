@@ -25,7 +25,7 @@ from messages.clock import VirtualClock
 from messages.methods import Methods, SoftBodyChoice
 from messages.scene import Scene
 from nodes.arm_bridge.kinematics import KINEMATICS
-from nodes.fem_solver.making import Maker, asked
+from nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from nodes.methods import Case, Family, Point, Trial
 from nodes.planner.force_table import law_by
 from nodes.triangulator.families import TRIANGULATION
@@ -448,19 +448,19 @@ async def test_a_node_follows_the_scene_where_it_is_told_auto() -> None:
 
 
 def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path: Path) -> None:
-    assert asked(SCENE_BARE, "auto", "auto") == ("auto", 0.003)
+    assert choose_method(SCENE_BARE, "auto", "auto") == ("auto", 0.003)
     linear = with_methods(soft_body={"method": "linear", "skin_spacing_m": 0.006})
-    assert asked(linear, "auto", "auto") == ("linear", 0.006)
-    assert asked(linear, "nonlinear_table", 0.0045) == ("nonlinear_table", 0.0045)
+    assert choose_method(linear, "auto", "auto") == ("linear", 0.006)
+    assert choose_method(linear, "nonlinear_table", 0.0045) == ("nonlinear_table", 0.0045)
     table = with_methods(soft_body={"method": "nonlinear_table", "skin_spacing_m": 0.0045})
-    assert asked(table, "auto", "auto") == ("auto", 0.0045)
+    assert choose_method(table, "auto", "auto") == ("auto", 0.0045)
     for by_hand_m, effective in (("auto", "0.0045"), (0.003, "0.003")):
-        method, spacing_m = asked(table, "auto", by_hand_m)
-        said = Maker(spacing_m, tmp_path).lacking(table, method, [])
+        method, spacing_m = choose_method(table, "auto", by_hand_m)
+        said = SoftBodyFactory(spacing_m, tmp_path).pending_note(table, method, [])
         assert said.endswith(f"--skin-spacing {effective})")
-        dragging = Maker(spacing_m, tmp_path, friction_ratio=0.3)
-        assert dragging.lacking(table, method, []) == "", "there never is a table"
-    assert Maker(0.006, tmp_path).lacking(linear, "auto", []) == ""
+        dragging = SoftBodyFactory(spacing_m, tmp_path, friction_ratio=0.3)
+        assert dragging.pending_note(table, method, []) == "", "there never is a table"
+    assert SoftBodyFactory(0.006, tmp_path).pending_note(linear, "auto", []) == ""
 
 
 SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})

@@ -29,7 +29,7 @@ FAMILIES: dict[str, str] = {
     "triangulation": "nodes.triangulator.families:TRIANGULATION",
     "tracking": "launch.methods.families:TRACKING",
     "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
-    "soft-body": "nodes.fem_solver.families:SOFT_BODY",
+    "soft-body": "nodes.fem_solver.benchmarks:SOFT_BODY",
     "correction": "launch.methods.families:CORRECTION",
     "sheet-force": "launch.methods.families:SHEET_FORCE",
     "sheet-shape": "launch.methods.families:SHEET_SHAPE",
@@ -126,7 +126,7 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
         "reference": family.reference,
         "scene": scene.name,
         "tolerance": family.tolerance(scene),
-        "along": family.along,
+        "sweep_key": family.sweep_key,
         "machine": machine_name(),
         "load": os.getloadavg()[0],
         "code": json.loads(git_state(ROOT)),
@@ -144,9 +144,11 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
     from matplotlib.figure import Figure
 
     also = (
-        [] if result["along"] is None else sorted({k for p in result["points"] for k in p["also"]})
+        []
+        if result["sweep_key"] is None
+        else sorted({k for p in result["points"] for k in p["extra_metrics"]})
     )
-    panels = 1 if result["along"] is None else 2 + len(also)
+    panels = 1 if result["sweep_key"] is None else 2 + len(also)
     with drawn_for_pages():
         columns = min(panels, 2)
         rows = math.ceil(panels / columns)
@@ -207,14 +209,20 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     """One figure over the case, a line for each method, hollow out of its range; grey: what the
     reference itself does not know."""
-    along, points = result["along"], result["points"]
+    along, points = result["sweep_key"], result["points"]
 
     def value(point: dict[str, Any]) -> float | None:
-        found: float | None = point["error"] if name == "error" else point["also"].get(name)
+        found: float | None = (
+            point["error"] if name == "error" else point["extra_metrics"].get(name)
+        )
         return found
 
     doubts = sorted(
-        {p["case"][along]: p["doubts"][name] for p in points if name in p["doubts"]}.items()
+        {
+            p["case"][along]: p["reference_uncertainty"][name]
+            for p in points
+            if name in p["reference_uncertainty"]
+        }.items()
     )
     if doubts:
         at, doubt = zip(*doubts, strict=True)
@@ -283,8 +291,10 @@ def kept_charts(folder: Path) -> list[dict[str, Any]]:
 
 def _as_today(result: dict[str, Any]) -> dict[str, Any]:
     """Numbers of earlier code, with what they did not have yet."""
-    points = [{"also": {}, "doubts": {}, **point} for point in result["points"]]
-    return {"along": None, "code": None, **result, "points": points}
+    points = [
+        {"extra_metrics": {}, "reference_uncertainty": {}, **point} for point in result["points"]
+    ]
+    return {"sweep_key": None, "code": None, **result, "points": points}
 
 
 def write_overview(folder: Path) -> Path:

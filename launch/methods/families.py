@@ -54,7 +54,7 @@ def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
 
 TRACKING = tracking_family(finger_motions)
 true_force = lru_cache(maxsize=1024)(twin_force)
-SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_make(scene, None))
+SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_compute(scene, None))
 SHEET_LAWS = sheet_force_family(true_force, None)
 """Those that are at hand at once."""
 SHEET_SHAPE = sheet_shape_family(twin_points)

@@ -121,8 +121,8 @@ TUNABLES = (
         "soft-body",
         "soft_body",
         (
-            "nodes.fem_solver.families:SOFT_BODY_LINEAR",
-            "nodes.fem_solver.families:SOFT_BODY_TABLES",
+            "nodes.fem_solver.benchmarks:SOFT_BODY_LINEAR",
+            "nodes.fem_solver.benchmarks:SOFT_BODY_TABLES",
         ),
         {
             "linear, coarse": _soft_body("linear", 0.006),

@@ -1,4 +1,4 @@
-"""The soft body: deforms the scene's object where the finger pushes it."""
+"""Deform the scene's object where the finger pushes it: the soft body's node."""
 
 from __future__ import annotations
 
@@ -13,50 +13,73 @@ from messages.base import Header
 from messages.scene import NonNegative, Positive, Scene
 from messages.types import Fingertip, Skin, SoftBody
 from nodes import cache
+from nodes.cache import EtaEstimator
 from nodes.fem_solver import body, precompute
+from nodes.fem_solver.closest_contact import ContactAnchor
 from nodes.fem_solver.contact import Response
-from nodes.fem_solver.making import GIVEN, SKIN_SPACING_M, Maker, MethodChoice, asked
-from nodes.fem_solver.pace import Pace
-from nodes.fem_solver.place import Entry
-from nodes.fem_solver.remaining import Remaining
+from nodes.fem_solver.deadline_fallback import DeadlineFallback
+from nodes.fem_solver.soft_body_factory import (
+    FACTORY_PARAMETERS,
+    SKIN_SPACING_M,
+    MethodChoice,
+    SoftBodyFactory,
+    choose_method,
+)
 from nodes.node import Input, Node, NodeParameters, Output
 
 
 class FemSolverParameters(NodeParameters):
     method: MethodChoice = Field(
         default="auto",
-        description="auto: the scene's, else the nonlinear table if it is in the cache, else "
-        "linear; nonlinear_table makes it, in minutes, in the background, if it is not there",
+        description="Method of the soft body. auto: the scene's, else the nonlinear table if it is "
+        "cached, else linear. nonlinear_table: computed in the background, in minutes, if it is "
+        "not cached.",
     )
     skin_spacing_m: Positive | Literal["auto"] = Field(
         default="auto",
-        description="between skin nodes where fingers go; auto: the scene's, else 0.003",
+        description="Distance of skin nodes where fingers touch. auto: the scene's, else 0.003.",
     )
-    linear_depth_m: Positive = Field(default=0.006, description="deeper pushes are out of range")
-    largest_depth_m: Positive = Field(default=0.010, description="the skin never goes deeper")
+    linear_depth_m: Positive = Field(
+        default=0.006,
+        description="Maximum depth of the linear method; deeper pushes are reported out of range.",
+    )
+    max_depth_m: Positive = Field(
+        default=0.010,
+        description="Depth that the skin approaches in deeper pushes with the linear method.",
+    )
     friction_ratio: NonNegative = Field(
         default=0.0,
-        description="the finger sticks until it pulls along the skin by more than this share of "
-        "its pressure, then slips; 0: it slides; above 0 the linear method answers",
+        description="Friction coefficient above which a sticking finger slips. 0: it slides "
+        "without friction. Above 0 the linear method is used.",
     )
     step_budget_s: Positive = Field(
-        default=0.004, description="answers later than this, five running, change the method"
+        default=0.004,
+        description="Maximum duration of a step; five consecutive longer ones change the method.",
     )
-    workers: int = Field(default=0, ge=0, description="processes that make a table; 0: one a core")
+    workers: int = Field(
+        default=0, ge=0, description="Number of processes that compute a table. 0: one per core."
+    )
     scheduler: str | None = Field(
         default=None,
-        description="a dask.distributed one, as tcp://host:8786, whose workers make the table",
+        description="Address of a dask.distributed scheduler, such as tcp://host:8786, whose "
+        "workers compute the table. null: this machine's cores.",
     )
-    lead_s: NonNegative = Field(default=0.0, description="finger is predicted this far ahead")
-    hold_s: NonNegative = Field(default=0.1, description="a lost finger keeps its dent this long")
-    relax_s: Positive = Field(default=0.15, description="time constant of springing back after it")
+    lead_s: NonNegative = Field(
+        default=0.0, description="Time by which the fingertip is predicted ahead."
+    )
+    hold_s: NonNegative = Field(
+        default=0.1, description="Time for which the indentation of a lost finger remains."
+    )
+    relax_s: Positive = Field(
+        default=0.15, description="Time constant of the skin's recovery after that."
+    )
     cache_dir: Path | None = Field(
-        default=None, description="of precomputations; null: the user's cache"
+        default=None, description="Folder of precomputed results. null: the user's cache."
     )
 
 
 class FemSolver(Node):
-    """Publishes the skin at rest once it is precomputed, then its displacement per fingertip."""
+    """Publish the skin at rest once it is precomputed, then its displacement for each fingertip."""
 
     parameters: FemSolverParameters
     scene: Input[Scene]
@@ -67,9 +90,11 @@ class FemSolver(Node):
     async def setup(self) -> None:
         self._stop = threading.Event()
         folder = self.parameters.cache_dir or cache.default_cache_dir()
-        self._maker = Maker(SKIN_SPACING_M, folder, **self.parameters.model_dump(include=GIVEN))
+        self._maker = SoftBodyFactory(
+            SKIN_SPACING_M, folder, **self.parameters.model_dump(include=FACTORY_PARAMETERS)
+        )
         self._making: asyncio.Task[None] | None = None
-        self._remaining = Remaining()
+        self._remaining = EtaEstimator()
         self._use([])
         self._forget()
         self.note = "waiting for a scene"
@@ -77,13 +102,13 @@ class FemSolver(Node):
     def _forget(self) -> None:
         self._last: Response | None = None
         self._last_ns = 0
-        self._entry: Entry | None = None
+        self._entry: ContactAnchor | None = None
 
     def _use(self, bodies: list[body.SceneBody]) -> None:
-        """Answer by these from now on, the best first; by none before a scene."""
+        """Answer with these bodies from now on, the best first; with none before a scene."""
         self._bodies = {one.method.name: one for one in bodies}
         if bodies:
-            self._pace = Pace(list(self._bodies), self.parameters.step_budget_s)
+            self._pace = DeadlineFallback(list(self._bodies), self.parameters.step_budget_s)
             nodes = len(bodies[0].skin.vertices_world_m)
             self.note = f"soft body ready, {self._pace.name}, {nodes} skin nodes"
 
@@ -103,7 +128,7 @@ class FemSolver(Node):
         self._forget()
         await self._end_making()
         p, maker = self.parameters, self._maker
-        method, maker.skin_spacing_m = asked(scene, p.method, p.skin_spacing_m)
+        method, maker.skin_spacing_m = choose_method(scene, p.method, p.skin_spacing_m)
         try:
             bodies = await asyncio.to_thread(maker.bodies, scene, method, self._progress)
         except precompute.Interrupted:
@@ -113,23 +138,23 @@ class FemSolver(Node):
             self.note = f"no soft body: {error}"
             raise
         self._use(bodies)
-        self.note += maker.lacking(scene, method, bodies)
+        self.note += maker.pending_note(scene, method, bodies)
         self.skin.publish(bodies[0].skin, source_ns=header.source_ns)
         if method == "nonlinear_table" and not p.friction_ratio and len(bodies) == 1:
             self._making = asyncio.create_task(self._make_table(scene, bodies[0]))
 
     async def _make_table(self, scene: Scene, linear: body.SceneBody) -> None:
-        """While the linear method answers, make what answers better."""
+        """Compute the nonlinear table while the linear method answers."""
         try:
-            best = await asyncio.to_thread(self._maker.tabulated, scene, linear, self._progress)
+            best = await asyncio.to_thread(self._maker.build_table, scene, linear, self._progress)
         except precompute.Interrupted:
-            self.note = "making of the nonlinear table interrupted; it goes on from there next time"
+            self.note = "nonlinear table interrupted; the next start continues it"
         except Exception as error:
             self.report_error("nonlinear_table", error)
         else:
             self._use([best, linear])
 
-    def _progress(self, done: int, total: int, need: precompute.Need) -> None:
+    def _progress(self, done: int, total: int, need: precompute.WorkBudget) -> None:
         if self._stop.is_set():
             raise precompute.Interrupted
         far = self._remaining.text(done, total, self.clock.now_ns() * 1e-9)
@@ -141,16 +166,16 @@ class FemSolver(Node):
         current = self._bodies[self._pace.name]
         if fingertip.valid:
             begun_ns = self.clock.now_ns()
-            point = body.position_at(fingertip, self.parameters.lead_s)
+            point = body.predict_position(fingertip, self.parameters.lead_s)
             response, self._entry = current.respond(point, self._entry)
             self._last, self._last_ns = response, header.source_ns
-            if self._pace.took((self.clock.now_ns() - begun_ns) * 1e-9):
-                late = f", {current.method.name} was late" if self._pace.dropped else ""
+            if self._pace.record((self.clock.now_ns() - begun_ns) * 1e-9):
+                late = f", {current.method.name} was late" if self._pace.is_fallback else ""
                 self.note = f"soft body by {self._pace.name}{late}"
         elif self._last is None:
             response = current.at_rest()
         else:
-            response = body.faded(
+            response = body.fade_response(
                 self._last,
                 (header.source_ns - self._last_ns) * 1e-9,
                 hold_s=self.parameters.hold_s,

@@ -21,7 +21,7 @@ from nodes.methods import Case, Family, Trial
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.shapes import make_shape
 from nodes.models.sheet import edge_poses
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.output import Image
 from nodes.renderer.sheet import Sheet, sheet_between
@@ -144,7 +144,7 @@ def with_projector_of(scene: Scene, width_px: int, height_px: int) -> Scene:
 
 
 def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
-    dents = dent_cache.load_or_solve(scene, None) if solved else None
+    dents = deflection_cache.load_or_compute(scene, None) if solved else None
     context = headless_context()
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
     for size in SIZES_PX:

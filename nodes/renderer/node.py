@@ -17,8 +17,9 @@ from messages.types import (
     Skin,
     SoftBody,
 )
+from nodes.cache import load_cached
 from nodes.node import Input, Node, Output, periodic
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 from nodes.renderer.lead import Lead
 from nodes.renderer.painter import Painter, Ports
 from nodes.renderer.parameters import RendererParameters
@@ -71,7 +72,7 @@ class Renderer(Node):
             self._screen.context,
             spacing_m=given.spacing_m,
             samples=given.samples,
-            dents=dent_cache.load(scene, given.cache_dir),
+            dents=load_cached(deflection_cache.shapes_cache(scene), given.cache_dir),
             sheet_shape=chosen(given.sheet_shape, scene.methods.sheet_shape, "dents"),
         )
         lead = Lead(first_s=given.lead_s, light_s=given.light_s, period_s=self._screen.period_s)

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
 from messages.scene import Scene
-from nodes.methods import Case, Family, Trial, up_to
+from nodes.methods import Case, Family, Trial, clip_range
 from nodes.models.sheet import edge_poses
 from nodes.models.sheet.dents import triangles_of
 from nodes.models.sheet.membrane import push_path
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 from nodes.renderer.sheet import Sheet, sheet_between
 from nodes.renderer.sheet_mesh import (
     FLAT_TO_M,
@@ -61,12 +61,12 @@ def sheet_shape_family(judge: Judge, *, solved: bool = True) -> Family:
 
 
 def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
-    dents = dent_cache.load_or_solve(scene, None) if solved else None
-    rubber, _ = dent_cache.wanted(scene)
+    dents = deflection_cache.load_or_compute(scene, None) if solved else None
+    rubber, _ = deflection_cache.required_shapes(scene)
     spec = scene.sheet
     middle = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio)
     stretches = (spec.min_stretch_ratio, middle, spec.max_stretch_ratio)
-    depths_m = up_to(scene.working_range.push_depth_m, DEPTHS_M)
+    depths_m = clip_range(scene.working_range.push_depth_m, DEPTHS_M)
     for stretch, depth, (where, x, y) in product(stretches, depths_m, PLACES):
         if where != "centre" and stretch != middle:
             continue

@@ -1,4 +1,4 @@
-"""Makes a scene's soft body, from the cache or anew: the linear method at once, the table later."""
+"""Build a scene's soft body from the cache or by computation: first linear, later the table."""
 
 from __future__ import annotations
 
@@ -12,22 +12,23 @@ from typing import Literal
 
 from messages.methods import SoftBodyMethod, chosen
 from messages.scene import Scene
+from nodes.cache import load_cached
 from nodes.fem_solver import body, precompute, precompute_table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
-"""`auto`: the nonlinear table if it is kept, else linear."""
+"""`auto`: the nonlinear table if it is cached, else linear."""
 
 SKIN_SPACING_M = 0.003
-"""Where neither a parameter nor the scene says another."""
+"""Default where neither a parameter nor the scene gives another."""
 
 
-def asked(
+def choose_method(
     scene: Scene, method: MethodChoice, skin_spacing_m: float | Literal["auto"]
 ) -> tuple[MethodChoice, float]:
-    """Method and skin spacing (m) for a scene, from a node's parameters.
+    """Return method and skin spacing (m) for a scene, from a node's parameters.
 
-    A scene that chose the linear method gets it, even where a table is kept; one that chose the
-    table gets that where it is kept: minutes of work are begun by a parameter only.
+    A scene that chose the linear method gets it, even where a table is cached. A scene that chose
+    the table gets it where it is cached: only a parameter starts minutes of computation.
     """
     choice = scene.methods.soft_body
     by_scene_m = None if choice is None else choice.skin_spacing_m
@@ -38,18 +39,18 @@ def asked(
 
 
 @dataclass(slots=True)
-class Maker:
-    """How soft bodies are made; keeps the last model, which scenes may have in common.
+class SoftBodyFactory:
+    """Build soft bodies, and store the last model, which several scenes may share.
 
-    workers: processes that make a table, 0: one for every core; scheduler: address of a lab's,
-    whose workers make it instead.  Everything here takes seconds to minutes when the cache does
-    not hold it.
+    workers: processes that compute a table, 0: one per core. scheduler: address of a dask scheduler
+    whose workers compute the table instead. Every method takes seconds to minutes when the cache is
+    empty.
     """
 
     skin_spacing_m: float
     cache_dir: Path
     linear_depth_m: float = 0.006
-    largest_depth_m: float = 0.010
+    max_depth_m: float = 0.010
     friction_ratio: float = 0.0
     workers: int = 0
     scheduler: str | None = None
@@ -58,64 +59,76 @@ class Maker:
     def bodies(
         self, scene: Scene, method: MethodChoice, progress: precompute.Progress
     ) -> list[body.SceneBody]:
-        """The soft body by each method that is at hand, the best first; errors as
-        `load_or_compute` and `scene_body`."""
-        spec = body.spec_of(scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0)
+        """Return the soft body by each method that is available, the best first.
+
+        Errors as `load_or_compute` and `build_scene_body`.
+        """
+        spec = body.make_soft_body_spec(
+            scene, self.skin_spacing_m, sticking=self.friction_ratio > 0.0
+        )
         if self._model is None or self._model[0] != spec.key():
             model = precompute.load_or_compute(spec, self.cache_dir, progress)
             self._model = spec.key(), model
-        linear = body.scene_body(
+        linear = body.build_scene_body(
             scene,
             spec,
             self._model[1],
             linear_depth_m=self.linear_depth_m,
-            largest_depth_m=self.largest_depth_m,
+            max_depth_m=self.max_depth_m,
             friction_ratio=self.friction_ratio,
         )
-        # the table knows no drag
+        # The table has no tangential response.
         if method == "linear" or spec.sticking:
             return [linear]
-        table = precompute_table.load_table(body.table_spec_of(scene, spec), self.cache_dir)
+        table = load_cached(
+            precompute_table.table_cache(body.make_table_spec(scene, spec)), self.cache_dir
+        )
         if table is None:
             return [linear]
-        return [body.with_table(linear, scene, self._model[1], table), linear]
+        return [body.attach_table(linear, scene, self._model[1], table), linear]
 
-    def lacking(self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]) -> str:
-        """What a note goes on with where the scene chose a table that nobody made yet, else
-        nothing; with friction there is no table to wait for."""
+    def pending_note(
+        self, scene: Scene, method: MethodChoice, made: Sequence[body.SceneBody]
+    ) -> str:
+        """Return the end of a note where the scene's table is not computed yet, else an empty text.
+
+        With friction there is no table to wait for.
+        """
         choice = scene.methods.soft_body
         wanted = choice is not None and choice.method == "nonlinear_table" and method == "auto"
         if not wanted or self.friction_ratio > 0.0 or len(made) > 1:
             return ""
         return (
-            "; the scene's nonlinear table is not made yet (flexsheet prepare SCENE "
+            "; the scene's nonlinear table is not computed yet (flexsheet prepare SCENE "
             f"--skin-spacing {self.skin_spacing_m:g})"
         )
 
-    def tabulated(
+    def build_table(
         self, scene: Scene, linear: body.SceneBody, progress: precompute_table.Progress
     ) -> body.SceneBody:
-        """The body of `bodies` by its nonlinear table, which is computed and kept; errors as
-        `compute_table` and `lab_workers`."""
+        """Return the body with its nonlinear table, which is computed and cached.
+
+        Errors as `compute_table` and `connect_workers`.
+        """
         assert self._model is not None
         with self._executor() as (executor, workers):
             table = precompute_table.compute_table(
-                body.table_spec_of(scene, linear.spec),
+                body.make_table_spec(scene, linear.spec),
                 self._model[1],
                 self.cache_dir,
                 executor,
                 progress,
                 workers=workers,
             )
-        return body.with_table(linear, scene, self._model[1], table)
+        return body.attach_table(linear, scene, self._model[1], table)
 
     @contextmanager
     def _executor(self) -> Iterator[tuple[Executor, int]]:
-        """Who solves the pushes, and how many of them do so on this machine."""
+        """Yield the executor of the snapshots, and how many of its workers run on this machine."""
         if self.scheduler is not None:
-            from nodes.fem_solver.lab import lab_workers  # late: it is slow to import
+            from nodes.fem_solver.dask_executor import connect_workers  # late: it is slow to import
 
-            with lab_workers(self.scheduler) as executor:
+            with connect_workers(self.scheduler) as executor:
                 yield executor, 0
             return
         workers = self.workers or os.cpu_count() or 1
@@ -123,5 +136,8 @@ class Maker:
             yield executor, workers
 
 
-GIVEN = {one.name for one in fields(Maker) if one.init} - {"cache_dir", "skin_spacing_m"}
-"""What a maker takes of a node's parameters as it stands there."""
+FACTORY_PARAMETERS = {one.name for one in fields(SoftBodyFactory) if one.init} - {
+    "cache_dir",
+    "skin_spacing_m",
+}
+"""Parameters of the node that the factory takes under the same name."""
