@@ -33,8 +33,8 @@ from nodes.models.rigid import apply
 from nodes.models.sheet import edge_poses
 from nodes.renderer import deflection_cache
 from nodes.renderer.gl import headless_context
-from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.stage import Stage
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose, estimate_sheet
 
 Floats = NDArray[np.float64]
 
@@ -118,11 +118,11 @@ def shrunk(scene: Scene, share: float) -> Scene:
     return scene.model_copy(update={"projector": projector.model_copy(update=changes)})
 
 
-def stage_of(scene: Scene, triangles: int) -> Stage:
+def stage_of(scene: Scene, triangles: int) -> SceneRenderer:
     """A stage whose surface has about so many triangles."""
     spacing_m = 0.0025
     for _ in range(4):
-        stage = Stage(
+        stage = SceneRenderer(
             scene,
             headless_context(),
             spacing_m=spacing_m,
@@ -164,10 +164,10 @@ def bodies(skin: Skin) -> Iterator[SoftBody]:
         )
 
 
-def believed(scene: Scene, edges: tuple[Floats, Floats], number: int) -> Sheet:
+def select_eyes(scene: Scene, edges: tuple[Floats, Floats], number: int) -> SheetPose:
     """The sheet between two edges, pushed here and there."""
     tip = np.array([0.02 * np.sin(0.1 * number), 0.02 * np.cos(0.1 * number), -0.015])
-    sheet = sheet_between(
+    sheet = estimate_sheet(
         *edges,
         height_m=scene.sheet.height_m,
         twist_world=np.zeros(6),
@@ -178,10 +178,12 @@ def believed(scene: Scene, edges: tuple[Floats, Floats], number: int) -> Sheet:
     return sheet
 
 
-def measure(scene: Scene, *, triangles: int, frames: int) -> tuple[Stage, list[dict[str, float]]]:
+def measure(
+    scene: Scene, *, triangles: int, frames: int
+) -> tuple[SceneRenderer, list[dict[str, float]]]:
     """Seconds of each frame by name."""
     stage, skin = stage_of(scene, triangles), skin_of(scene)
-    stage.follow(skin)
+    stage.set_skin(skin)
     shown = Display(correction="two_pass", stereo="side_by_side")
     edges = edge_poses(np.eye(4), STRETCH * scene.sheet.width_m)
     rows = []
@@ -192,11 +194,11 @@ def measure(scene: Scene, *, triangles: int, frames: int) -> tuple[Stage, list[d
         for number, body in zip(range(frames + 20), bodies(skin), strict=False):
             clock.spent = defaultdict(float)
             with clock.span("sheet believed"):
-                sheet = believed(scene, edges, number)
+                sheet = select_eyes(scene, edges, number)
             with clock.span("object shaped"):
-                stage.shape(body)
+                stage.deform(body)
             with clock.span("look and marks"):
-                look = stage.look(shown, sheet.pushed_point, None)
+                look = stage.draw_style(shown, sheet.pushed_point, None)
             with clock.span("two eyes drawn"):
                 stage.draw(shown, sheet, look, read=False)
             rows.append(dict(clock.spent))

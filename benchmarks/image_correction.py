@@ -29,17 +29,17 @@ from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
 from nodes.renderer import deflection_cache
-from nodes.renderer.families import (
+from nodes.renderer.benchmarks import (
     METHODS,
     SIZES_PX,
+    draw_coordinate_ramps,
     draw_stereo,
-    places_pictures,
-    rolled_on,
-    with_projector_of,
+    roll_sheet,
+    scale_projector,
 )
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.stage import Stage
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose, estimate_sheet
 from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen, tilt_sizes
 from nodes.twin.membrane import DeformedSheet, NotConvergedError
 from nodes.twin.places import ErrorMap, error_map
@@ -61,7 +61,7 @@ class Bench:
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
         dents = deflection_cache.load_or_compute(scene, None)
-        self.stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
+        self.stage = SceneRenderer(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
         self._proper = proper(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
         unmoved = self.situation(np.eye(4), None)
@@ -69,52 +69,52 @@ class Bench:
 
     def situation(
         self, world_from_sheet: Floats, tip: Floats | None, *, stretch: float | None = None
-    ) -> tuple[Sheet, DeformedSheet]:
+    ) -> tuple[SheetPose, DeformedSheet]:
         """The sheet as the renderer believes it to be, and as it is."""
         sheet = self.scene.sheet
         edges = edge_poses(world_from_sheet, sheet.width_m * (stretch or self.stretch))
-        believed = sheet_between(
+        predicted = estimate_sheet(
             *edges,
             height_m=sheet.height_m,
             twist_world=np.zeros(6),
             ahead_s=0.0,
             finger_tip=tip,
         )
-        assert believed is not None
-        return believed, true_sheet(self.scene, *edges, tip)
+        assert predicted is not None
+        return predicted, true_sheet(self.scene, *edges, tip)
 
     def pushed(
         self, depth_m: float, *, tilt_deg: float = 0.0, place_m: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Floats, Floats | None]:
         """world_from_sheet that touches the cylinder with that place, and the fingertip there."""
-        pose = rolled_on(self.scene, -np.radians(tilt_deg), place_m)
+        pose = roll_sheet(self.scene, -np.radians(tilt_deg), place_m)
         touched = pose[:3, 3] + pose[:3, :3] @ [*place_m, 0.0]
         return pose, touched - depth_m * pose[:3, 2] if depth_m else None
 
     def size_errors(
         self,
         correction: Correction,
-        believed: Sheet,
+        predicted: SheetPose,
         truth: DeformedSheet,
         sizes: Callable[[Image, float], Sequence[float]],
     ) -> Floats:
         """Of each size (m), against the proper picture; the drawn object is not deformed."""
         shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
-        projected = self.stage.draw(shown, believed, Look(True, "object"), read=True)
+        projected = self.stage.draw(shown, predicted, DrawStyle(True, "object"), read=True)
         assert projected is not None
         picture = seen(projected, truth, self.scene, eye=self._eye)
         wanted = np.array(sizes(self._proper, METRES_PER_PX))
         return np.asarray(np.abs(np.array(sizes(picture, METRES_PER_PX)) - wanted))
 
-    def errors(self, method: str, believed: Sheet, truth: DeformedSheet) -> ErrorMap:
+    def errors(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> ErrorMap:
         """At all points that the eye sees."""
-        pictures = places_pictures(self.stage, method, believed)
+        pictures = draw_coordinate_ramps(self.stage, method, predicted)
         x, y = (seen(each, truth, self.scene, eye=self._eye) for each in pictures)
         return error_map(x, y, METRES_PER_PX)
 
-    def cell(self, method: str, believed: Sheet, truth: DeformedSheet) -> str:
+    def cell(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> str:
         """Mean / 95 % / maximum of the errors, mm, and how much of the object is seen."""
-        sizes = 1e3 * self.errors(method, believed, truth).sizes_m
+        sizes = 1e3 * self.errors(method, predicted, truth).sizes_m
         if len(sizes) == 0:
             return "dark"
         figures = f"{sizes.mean():.2f} / {np.quantile(sizes, 0.95):.2f} / {sizes.max():.2f}"
@@ -142,7 +142,7 @@ def print_sizes(bench: Bench) -> None:
         for degrees in (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50):
             tilt = -np.radians(degrees)
             turned = transform(rotation_from_vector([tilt, 0.0, 0.0]), np.zeros(3))
-            pose = rolled_on(bench.scene, tilt) if name == "rolls" else turned
+            pose = roll_sheet(bench.scene, tilt) if name == "rolls" else turned
             situation = bench.situation(pose, None)
             for correction in TILT_CORRECTIONS:
                 errors = 1e3 * bench.size_errors(correction, *situation, tilt_sizes)
@@ -163,7 +163,7 @@ def print_sizes(bench: Bench) -> None:
 def print_tilts(bench: Bench) -> None:
     heading("tilt, °", *TILT_CORRECTIONS)
     for degrees in (*range(-80, -50, 5), *range(-50, 60, 25), *range(55, 85, 5)):
-        situation = bench.situation(rolled_on(bench.scene, -np.radians(degrees)), None)
+        situation = bench.situation(roll_sheet(bench.scene, -np.radians(degrees)), None)
         usable = bench.stage.usable(situation[0])
         row(
             f"{degrees:+d}{'' if usable else ' (held)'}",
@@ -224,11 +224,11 @@ def print_frames(scene: Scene) -> None:
     print(f"\n{context.info['GL_RENDERER']}")
     heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")
     for size in SIZES_PX:
-        shown = with_projector_of(scene, *size)
-        bench_stage = Stage(shown, context, spacing_m=0.0025, dents=dents)
+        shown = scale_projector(scene, *size)
+        bench_stage = SceneRenderer(shown, context, spacing_m=0.0025, dents=dents)
         edges = edge_poses(np.eye(4), scene.sheet.width_m * 1.05)
         tip = np.array([0.0, 0.0, -0.03])
-        sheet = sheet_between(
+        sheet = estimate_sheet(
             *edges,
             height_m=scene.sheet.height_m,
             twist_world=np.zeros(6),

@@ -9,6 +9,7 @@ and the error of the volume.  FILE: an STL or OBJ to mesh as well.  Some minutes
 
 from __future__ import annotations
 
+import itertools
 import resource
 import sys
 import time
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from launch.objects.meshes import read_mesh
 from launch.plans.plan import load_scene
@@ -31,7 +33,7 @@ from messages.scene import (
 )
 from nodes.fem_solver.elasticity import quadrature, shape_gradients
 from nodes.fem_solver.mesh import SolidMesh, build_mesh, mesh_budget, mesh_spec
-from nodes.fem_solver.mesh.quality import least_dihedral_rad, min_jacobian_ratios, radius_ratios
+from nodes.fem_solver.mesh.quality import min_jacobian_ratios, radius_ratios
 from nodes.models.shapes import make_shape
 from nodes.models.shapes.triangles import volume_m3
 
@@ -46,6 +48,24 @@ GEOMETRIES: dict[str, Geometry] = {
     ),
     "plane, 100 × 80 mm": Plane(width_m=0.1, height_m=0.08),
 }
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def min_dihedral_rad(points: Floats, tetrahedra: Ints) -> Floats:
+    """Return the smallest angle between two faces of each straight tetrahedron (e,)."""
+    corners = points[tetrahedra[:, :4]]
+    normals = []
+    for i in range(4):
+        a, b, c = (corners[:, j] for j in range(4) if j != i)
+        normal = np.cross(b - a, c - a)
+        inwards = ((corners[:, i] - a) * normal).sum(axis=1, keepdims=True) > 0.0
+        normal = np.where(inwards, -normal, normal)
+        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
+    cosines = [-(a * b).sum(axis=1) for a, b in itertools.combinations(normals, 2)]
+    smallest: Floats = np.arccos(np.clip(np.max(cosines, axis=0), -1.0, 1.0))
+    return smallest
 
 
 def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
@@ -97,7 +117,7 @@ def measure(name: str, scene: Scene, spacing_m: float) -> None:
     mesh = build_mesh(spec)
     took_s = time.perf_counter() - start
     wanted = volume_of(spec.geometry, spec.slab_depth_m)
-    dihedral = np.degrees(least_dihedral_rad(mesh.nodes, mesh.elements).min())
+    dihedral = np.degrees(min_dihedral_rad(mesh.nodes, mesh.elements).min())
     print(
         f"| {name} | {1e3 * spacing_m:g} mm | {len(mesh.nodes)} ({budget.nodes})"
         f" | {len(mesh.elements)} | {len(mesh.skin)}, {len(mesh.contact_nodes)}"

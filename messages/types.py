@@ -31,7 +31,9 @@ from messages.scene import Finite, NonNegative, Part, Positive
 
 Correction = methods.Correction
 Side = Literal["left", "right"]
-Pattern = Literal["object", "grid", "checker", "white", "black", "places_x", "places_y"]
+Pattern = Literal[
+    "object", "grid", "checker", "white", "black", "coordinate_ramp_x", "coordinate_ramp_y"
+]
 Shading = Literal["soft", "flat"]
 StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "anaglyph"]
 
@@ -178,7 +180,7 @@ class SoftBody(Message):
         description="of the object where the finger is, whether it touches or not: rows of depth "
         "(m) and force (N), both from 0 and never falling; empty: not known",
     )
-    lead_s: NonNegative = Field(
+    prediction_horizon_s: NonNegative = Field(
         default=0.0, description="how long after the exposure the finger is that it answers to"
     )
     displacement_world_m: Points3
@@ -205,7 +207,7 @@ class Display(Message):
     pattern: Pattern = Field(
         default="object",
         description="grid, checker, white: 300 mm square on the imaginary screen, every 20 mm a "
-        "line or a change; places_x, places_y: the object, painted with where it should be seen",
+        "line or a change; coordinate_ramp_x, coordinate_ramp_y: the object, painted with where it should be seen",
     )
     marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
     pixels_every: int = Field(
@@ -244,7 +246,7 @@ class Frame(Message):
         default_factory=lambda: np.zeros((0, 3)),
         description="where the finger was taken to be at `predicted_to_ns`; none: not known",
     )
-    lost_share: NonNegative = Field(
+    occluded_fraction: NonNegative = Field(
         default=0.0, description="of the sheet, folded so that it gets no light"
     )
     pixels: tuple[ColorImage, ...] = Field(

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from messages.base import Header
 from messages.types import Display, Frame, StereoMode
-from nodes.renderer.monitors import WindowError, chosen_monitor, start_glfw
+from nodes.renderer.monitors import WindowError, find_monitor, start_glfw
 from nodes.renderer.output import pack
-from nodes.renderer.window import CLOSED, ProjectorWindow
+from nodes.renderer.output_window import CLOSED, ProjectorWindow
 from tests.test_renderer import Bench
 
 pytestmark = pytest.mark.skipif(
@@ -213,9 +213,9 @@ async def test_a_monitor_that_is_not_there_is_named_with_those_that_are(
 ) -> None:
     start_glfw()
     with pytest.raises(WindowError, match=r"'beamer': there is none; monitors: 0: \"screen\" 800x"):
-        chosen_monitor("beamer")
-    assert chosen_monitor("screen") is not None
-    assert chosen_monitor("0") is not None
+        find_monitor("beamer")
+    assert find_monitor("screen") is not None
+    assert find_monitor("0") is not None
     bench = WindowBench(output="window", monitor=0)
     await bench.node.setup()
     small = bench.scene.projector.model_copy(update={"width_px": 801})

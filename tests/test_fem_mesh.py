@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.spatial import cKDTree
 
+from benchmarks.meshing import min_dihedral_rad
 from launch.objects.meshes import read_mesh
 from messages.scene import Mesh, Scene
 from nodes.fem_solver.elasticity import (
@@ -45,7 +46,6 @@ from nodes.fem_solver.mesh.fitted import _find_pinches, _remove_pinches, hull_fa
 from nodes.fem_solver.mesh.quality import (
     MIN_JACOBIAN_RATIO,
     MIN_RADIUS_RATIO,
-    least_dihedral_rad,
     min_jacobian_ratios,
     radius_ratios,
     signed_volumes,
@@ -176,7 +176,7 @@ def expected(geometry: dict[str, Any]) -> tuple[float, float]:
 def require_sound(solid: SolidMesh) -> None:
     """Valid elements, a closed hull of the sphere's topology, parts that fit one another."""
     assert radius_ratios(solid.nodes, solid.elements).min() > MIN_RADIUS_RATIO
-    assert np.degrees(least_dihedral_rad(solid.nodes, solid.elements).min()) > 8
+    assert np.degrees(min_dihedral_rad(solid.nodes, solid.elements).min()) > 8
     assert min_jacobian_ratios(solid.nodes, solid.elements).min() > 0.99 * MIN_JACOBIAN_RATIO
     faces = boundary_faces(solid.elements)
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -611,7 +611,7 @@ def test_ratios_of_known_tetrahedra() -> None:
     regular = np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     cells = orient_tetrahedra(regular, np.array([[0, 1, 2, 3]]))
     assert radius_ratios(regular, cells) == pytest.approx([1.0])
-    assert np.degrees(least_dihedral_rad(regular, cells)) == pytest.approx([70.52878])
+    assert np.degrees(min_dihedral_rad(regular, cells)) == pytest.approx([70.52878])
     assert radius_ratios(regular, cells[:, [1, 0, 2, 3]]) == pytest.approx([-1.0])
     sliver = np.array([[0.0, 0, 0], [1, 1, 1e-6], [1, 0, 0], [0, 1, 0]])
     assert abs(radius_ratios(sliver, np.array([[0, 1, 2, 3]]))[0]) < 1e-5

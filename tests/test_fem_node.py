@@ -170,7 +170,7 @@ async def test_a_lost_finger_is_held_and_then_the_body_springs_back(bench: Bench
 
 
 async def test_lead_moves_the_finger_along_its_velocity(cache: str, bench: Bench) -> None:
-    ahead = Bench(cache_dir=cache, lead_s=0.1)
+    ahead = Bench(cache_dir=cache, prediction_horizon_s=0.1)
     await ahead.node.setup()
     await ahead.node.step("scene", scene(), header())
     moving = await ahead.push(fingertip((0.0, 0.0, -0.002), velocity=(0.0, 0.0, -0.02)))

@@ -13,8 +13,8 @@ from messages.scene import Cylinder, Scene
 from messages.types import FingerPath
 from nodes.planner import force_table
 from nodes.planner.sheet_force import sheet_force_family
-from nodes.renderer.families import correction_family
-from nodes.renderer.shape_families import sheet_shape_family
+from nodes.renderer.benchmarks import correction_family
+from nodes.renderer.sheet_shape_benchmark import sheet_shape_family
 from nodes.triangulator.tracking_family import Motion, tracking_family
 from nodes.twin.finger import FingerMotion
 from nodes.twin.gestures import GESTURES

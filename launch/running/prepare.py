@@ -36,8 +36,8 @@ def prepare_plan(plan: Plan, progress: Progress) -> None:
 
 def _takes_dents(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
     """Whether a renderer takes a pushed sheet for what the membrane makes of it."""
-    shape: SheetShapeMethod = chosen(requested, scene.methods.sheet_shape, "dents")
-    return shape == "dents"
+    shape: SheetShapeMethod = chosen(requested, scene.methods.sheet_shape, "reduced_order")
+    return shape == "reduced_order"
 
 
 def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress) -> Path:

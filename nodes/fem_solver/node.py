@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from pathlib import Path
-from typing import Literal
-
-from pydantic import Field
 
 from messages.base import Header
-from messages.scene import NonNegative, Positive, Scene
+from messages.scene import Scene
 from messages.types import Fingertip, Skin, SoftBody
 from nodes import cache
 from nodes.cache import EtaEstimator
@@ -18,64 +14,14 @@ from nodes.fem_solver import body, precompute
 from nodes.fem_solver.closest_contact import ContactAnchor
 from nodes.fem_solver.contact import Response
 from nodes.fem_solver.deadline_fallback import DeadlineFallback
+from nodes.fem_solver.parameters import FemSolverParameters
 from nodes.fem_solver.soft_body_factory import (
     FACTORY_PARAMETERS,
     SKIN_SPACING_M,
-    MethodChoice,
     SoftBodyFactory,
     choose_method,
 )
-from nodes.node import Input, Node, NodeParameters, Output
-
-
-class FemSolverParameters(NodeParameters):
-    method: MethodChoice = Field(
-        default="auto",
-        description="Method of the soft body. auto: the scene's, else the nonlinear table if it is "
-        "cached, else linear. nonlinear_table: computed in the background, in minutes, if it is "
-        "not cached.",
-    )
-    skin_spacing_m: Positive | Literal["auto"] = Field(
-        default="auto",
-        description="Distance of skin nodes where fingers touch. auto: the scene's, else 0.003.",
-    )
-    linear_depth_m: Positive = Field(
-        default=0.006,
-        description="Maximum depth of the linear method; deeper pushes are reported out of range.",
-    )
-    max_depth_m: Positive = Field(
-        default=0.010,
-        description="Depth that the skin approaches in deeper pushes with the linear method.",
-    )
-    friction_ratio: NonNegative = Field(
-        default=0.0,
-        description="Friction coefficient above which a sticking finger slips. 0: it slides "
-        "without friction. Above 0 the linear method is used.",
-    )
-    step_budget_s: Positive = Field(
-        default=0.004,
-        description="Maximum duration of a step; five consecutive longer ones change the method.",
-    )
-    workers: int = Field(
-        default=0, ge=0, description="Number of processes that compute a table. 0: one per core."
-    )
-    scheduler: str | None = Field(
-        default=None,
-        description="Address of a dask.distributed scheduler, such as tcp://host:8786, whose "
-        "workers compute the table. null: this machine's cores.",
-    )
-    lead_s: NonNegative = Field(
-        default=0.0, description="Time by which the fingertip is predicted ahead."
-    )
-    hold_s: NonNegative = Field(
-        default=0.1, description="Time for which the indentation of a lost finger remains."
-    )
-    relax_s: Positive = Field(
-        default=0.15, description="Time constant of the skin's recovery after that."
-    )
-    cache_dir: Path | None = Field(
-        default=None, description="Folder of precomputed results. null: the user's cache."
-    )
+from nodes.node import Input, Node, Output
 
 
 class FemSolver(Node):
@@ -166,7 +112,7 @@ class FemSolver(Node):
         current = self._bodies[self._pace.name]
         if fingertip.valid:
             begun_ns = self.clock.now_ns()
-            point = body.predict_position(fingertip, self.parameters.lead_s)
+            point = body.predict_position(fingertip, self.parameters.prediction_horizon_s)
             response, self._entry = current.respond(point, self._entry)
             self._last, self._last_ns = response, header.source_ns
             if self._pace.record((self.clock.now_ns() - begun_ns) * 1e-9):
@@ -181,5 +127,7 @@ class FemSolver(Node):
                 hold_s=self.parameters.hold_s,
                 relax_s=self.parameters.relax_s,
             )
-        answer = current.message(response, lead_s=self.parameters.lead_s)
+        answer = current.message(
+            response, prediction_horizon_s=self.parameters.prediction_horizon_s
+        )
         self.soft_body.publish(answer, source_ns=header.source_ns)

@@ -33,12 +33,12 @@ GRAZING_SINE = 0.05
 NEAR_M = 0.02
 """Object points nearer to the eye's own depth than this are not drawn."""
 
-LEAST_PUSH_M = 1e-4
+MIN_PUSH_M = 1e-4
 """Below this depth the four triangles are the plane."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class ScreenPlane:
     """A point of the plane (3,) and its unit normal (3,), which points to the user."""
 
     point: Floats
@@ -46,7 +46,7 @@ class Plane:
 
 
 @dataclass(frozen=True, slots=True)
-class Screen:
+class ProjectionScreen:
     """The actual screen: four planes through one point, told apart by where the corners are.
 
     point: r_s (3,), common to all four.
@@ -61,7 +61,7 @@ class Screen:
 
 
 @dataclass(frozen=True, slots=True)
-class Corrected:
+class CorrectedPoints:
     """points: A' (n, 3); on_screen: C' (n, 3); valid: (n,).  Points that are not valid hold A."""
 
     points: Floats
@@ -69,33 +69,35 @@ class Corrected:
     valid: Bools
 
 
-IMAGINARY_SCREEN = Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+IMAGINARY_SCREEN = ScreenPlane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
 """The world frame is the imaginary screen's: r_o, n_o."""
 
 
-def flat_screen(plane: Plane) -> Screen:
+def make_flat_screen(plane: ScreenPlane) -> ProjectionScreen:
     """The screen that is one plane."""
-    return Screen(plane.point, np.tile(plane.normal, (4, 1)), None)
+    return ProjectionScreen(plane.point, np.tile(plane.normal, (4, 1)), None)
 
 
-def pushed_screen(pushed_point: Floats, corners: Floats, plane: Plane) -> Screen:
+def make_pushed_screen(
+    pushed_point: Floats, corners: Floats, plane: ScreenPlane
+) -> ProjectionScreen:
     """The four triangles between the pushed point and the sheet's corners (section III-C 3).
 
     pushed_point: (3,).  corners: (4, 3), left bottom, right bottom, right top, left top.
     plane: of the sheet at rest; stands in for triangles without area, and for all four when the
     push is less than `LEAST_PUSH_M`.
     """
-    if abs((pushed_point - plane.point) @ plane.normal) < LEAST_PUSH_M:
-        return flat_screen(plane)
+    if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
+        return make_flat_screen(plane)
     spokes = corners - pushed_point
     normals = np.cross(spokes, np.roll(spokes, -1, axis=0))
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
     smallest = 1e-6 * float(np.max(np.sum(spokes**2, axis=1)))
     normals = np.where(areas > smallest, normals / np.maximum(areas, smallest), plane.normal)
-    return Screen(pushed_point, normals, corners)
+    return ProjectionScreen(pushed_point, normals, corners)
 
 
-def sector_normals(screen: Screen, eye: Floats) -> Floats:
+def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
     """(4, 3) unit normals of the planes through the eye, the pushed point and each corner.
 
     Seen from the eye the four spokes divide the picture into sectors; a direction d lies in the
@@ -109,7 +111,7 @@ def sector_normals(screen: Screen, eye: Floats) -> Floats:
     return np.where(lengths > 1e-9, normals / np.maximum(lengths, 1e-9), 0.0)
 
 
-def triangle_of(points: Floats, screen: Screen, eye: Floats) -> NDArray[np.intp]:
+def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> NDArray[np.intp]:
     """Which triangle (n,) each point belongs to: the one that the line V-A crosses.
 
     It is the sector in which the line lies deepest.  Inside the sheet's outline that is the
@@ -136,7 +138,7 @@ def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple
 
 
 def imaginary_point(
-    on_actual: Floats, projector: Floats, n_s: Floats, imaginary: Plane
+    on_actual: Floats, projector: Floats, n_s: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
     """C' (n, 3) by equations (3) and (4), and where the projector lights the screen's back."""
     light = on_actual - projector
@@ -150,7 +152,7 @@ def imaginary_point(
 
 
 def shifted_point(
-    points: Floats, on_imaginary: Floats, eye: Floats, imaginary: Plane
+    points: Floats, on_imaginary: Floats, eye: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
     """A' (n, 3) by equations (5) and (6), and where A is in front of the eye."""
     normal = imaginary.normal
@@ -165,9 +167,9 @@ def correct(
     *,
     eye: Floats,
     projector: Floats,
-    screen: Screen,
-    imaginary: Plane = IMAGINARY_SCREEN,
-) -> Corrected:
+    screen: ProjectionScreen,
+    imaginary: ScreenPlane = IMAGINARY_SCREEN,
+) -> CorrectedPoints:
     """A' of every point A (n, 3) by equations (1)-(6); the shader `object.vert.glsl` does the same.
 
     The eye must stand before the imaginary screen and the projector behind it (ValueError).
@@ -176,16 +178,18 @@ def correct(
         raise ValueError(f"the eye {eye} is not in front of the imaginary screen")
     if (projector - imaginary.point) @ imaginary.normal >= 0.0:
         raise ValueError(f"the projector {projector} is not behind the imaginary screen")
-    n_s = screen.normals[triangle_of(points, screen, eye)]
+    n_s = screen.normals[select_triangles(points, screen, eye)]
     on_actual, seen = actual_point(points, eye, screen.point, n_s)
     on_imaginary, lit = imaginary_point(on_actual, projector, n_s, imaginary)
     shifted, in_front = shifted_point(points, on_imaginary, eye, imaginary)
     valid = seen & lit & in_front
     keep = valid[:, None]
-    return Corrected(np.where(keep, shifted, points), np.where(keep, on_imaginary, points), valid)
+    return CorrectedPoints(
+        np.where(keep, shifted, points), np.where(keep, on_imaginary, points), valid
+    )
 
 
-def plane_is_usable(plane: Plane, eye: Floats, projector: Floats) -> bool:
+def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
     """Whether the eye sees the front and the projector lights the back at the plane's point."""
     to_eye, light = eye - plane.point, plane.point - projector
     return bool(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nodes.renderer.correction import (
     GRAZING_SINE,
     NEAR_M,
-    Screen,
+    ProjectionScreen,
     sector_normals,
 )
 from nodes.renderer.lens import ClipLens
@@ -29,7 +29,7 @@ GRID_PITCH_M = 0.02
 SCREEN_PATTERNS = {"grid": 1, "checker": 2, "white": 3}
 """Those that lie on the imaginary screen, and their numbers in the shader."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
-PLACES_AXES = {"places_x": 1, "places_y": 2}
+RAMP_AXES = {"coordinate_ramp_x": 1, "coordinate_ramp_y": 2}
 MARK_RADIUS_M = 0.003
 
 
@@ -38,7 +38,7 @@ class NoOpenGLError(RuntimeError):
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class EyeView:
     """What one eye's picture is drawn with.
 
     eye, projector: (3,) world.  screen: None draws without correction.
@@ -47,13 +47,13 @@ class View:
 
     eye: Floats
     projector: Floats
-    screen: Screen | None
+    screen: ProjectionScreen | None
     clip_from_screen: Floats
     lens: ClipLens | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class DrawStyle:
     """How the object is painted; marks are points of the object at rest, or None."""
 
     flat: bool
@@ -63,7 +63,7 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Paint:
+class Material:
     """The object's own colour and texture.
 
     colour: red, green, blue, 0 to 1.  pitch_m: of the procedural textures.  image: (height, width,
@@ -102,10 +102,10 @@ class Canvas:
         # The same picture, to draw into without samples.  Resolving would copy a depth too.
         self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-        self._object: _Mesh | None = None
+        self._object: _MeshBuffers | None = None
         self._image: moderngl.Texture | None = None
-        self.set_paint(Paint())
-        self._grid = _Mesh(self.context, *_grid_mesh())
+        self.set_material(Material())
+        self._grid = _MeshBuffers(self.context, *_grid_mesh())
 
     def release(self) -> None:
         """Free the frame and the meshes; the context stays."""
@@ -122,7 +122,7 @@ class Canvas:
             self._image.release()
         self._program.release()
 
-    def set_paint(self, paint: Paint) -> None:
+    def set_material(self, paint: Material) -> None:
         """The object's colour and texture from now on."""
         if self._image is not None:
             self._image.release()
@@ -149,7 +149,7 @@ class Canvas:
         outward triangles."""
         if self._object is not None:
             self._object.release()
-        self._object = _Mesh(self.context, rest, triangles, normals)
+        self._object = _MeshBuffers(self.context, rest, triangles, normals)
 
     def set_shape(self, positions: Floats, normals: Floats) -> None:
         """Where the vertices are now, and the unit normals there, both (vertices, 3)."""
@@ -163,17 +163,17 @@ class Canvas:
             raise RuntimeError("set_mesh comes before set_moved")
         self._object.move(moved)
 
-    def draw(self, view: View, look: Look) -> None:
+    def draw(self, view: EyeView, look: DrawStyle) -> None:
         """Draw and wait until it is drawn."""
-        self.paint(self._frame, view, look)
+        self.draw_into(self._frame, view, look)
         self.finish()
 
-    def draw_unresolved(self, view: View, look: Look) -> None:
+    def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
         """The least that any drawing takes, to compare with; its picture cannot be read."""
-        self.paint(self._frame, view, look)
+        self.draw_into(self._frame, view, look)
         self.context.finish()
 
-    def paint(self, frame: moderngl.Framebuffer, view: View, look: Look) -> None:
+    def draw_into(self, frame: moderngl.Framebuffer, view: EyeView, look: DrawStyle) -> None:
         """Draw the object, or the pattern, into a frame."""
         frame.use()
         frame.clear(0.0, 0.0, 0.0, 1.0)
@@ -204,7 +204,7 @@ class Canvas:
         rows = np.frombuffer(data, np.uint8).reshape(self.height_px, self.width_px, 3)
         return np.ascontiguousarray(rows[::-1])
 
-    def shifted_points(self, view: View) -> Floats:
+    def shifted_points(self, view: EyeView) -> Floats:
         """(vertices, 4): A' of each vertex as the shader moves it, and 1 where it is valid."""
         if self._object is None:
             raise RuntimeError("set_mesh comes before shifted_points")
@@ -217,12 +217,12 @@ class Canvas:
         self._object.array(program, indexed=False).transform(captured, moderngl.POINTS)
         return np.frombuffer(captured.read(), np.float32).reshape(-1, 4).astype(np.float64)
 
-    def _set_look(self, look: Look) -> None:
+    def _set_look(self, look: DrawStyle) -> None:
         self._uniforms.set(
             flat_shading=look.flat,
             screen_pattern=SCREEN_PATTERNS.get(look.pattern, 0),
             grid_pitch_m=GRID_PITCH_M,
-            places_axis=PLACES_AXES.get(look.pattern, 0),
+            ramp_axis=RAMP_AXES.get(look.pattern, 0),
             light_direction=tuple(LIGHT.tolist()),
             fingertip_mark=_mark(look.fingertip_mark),
             target_mark=_mark(look.target_mark),
@@ -248,7 +248,7 @@ class Uniforms:
                 self._program[name] = last[name] = value
 
 
-def set_view(uniforms: Uniforms, view: View) -> None:
+def set_view(uniforms: Uniforms, view: EyeView) -> None:
     """Hand a view to the vertex shader; uniforms that it does not use are optimised away."""
     screen = view.screen
     uniforms.set(
@@ -271,7 +271,7 @@ def set_view(uniforms: Uniforms, view: View) -> None:
         uniforms.set(lens=view.lens.focal_centre, lens_distortion=view.lens.distortion)
 
 
-class _Mesh:
+class _MeshBuffers:
     """Vertex buffers of one mesh: what is fixed, and what moves each frame."""
 
     def __init__(

@@ -60,7 +60,7 @@ def monitor_names() -> list[str]:
     return [_text(glfw.get_monitor_name(monitor)) for monitor in glfw.get_monitors()]
 
 
-def chosen_monitor(monitor: str | int) -> Any:
+def find_monitor(monitor: str | int) -> Any:
     """GLFW's monitor of that number or name; WindowError lists those that there are."""
     monitors, names = glfw.get_monitors(), monitor_names()
     wanted = monitor

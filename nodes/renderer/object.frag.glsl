@@ -6,7 +6,7 @@
 uniform bool flat_shading;
 uniform int screen_pattern;  // 0: the object, 1: grid, 2: checker, 3: white
 uniform float grid_pitch_m;
-uniform int places_axis;  // 1 or 2: paint each point with the x or y at which the eye should see it
+uniform int ramp_axis;  // 1 or 2: colour each point by the x or y at which the eye should see it
 uniform vec3 eye;
 uniform vec3 light_direction;
 uniform vec3 object_colour;
@@ -26,8 +26,8 @@ in float valid;
 
 out vec4 colour;
 
-const float PLACES_PERIOD_M = 0.02;
-const float PLACES_RANGE_M = 0.24;
+const float RAMP_PERIOD_M = 0.02;
+const float RAMP_RANGE_M = 0.24;
 
 const float WRAP = 0.35;  // light reaches round the edge of the lit side: cosine down to -0.35
 const float AMBIENT = 0.25;
@@ -116,12 +116,12 @@ void main() {
         colour = vec4(on_screen(rest_point.xy), 1.0);
         return;
     }
-    if (places_axis > 0) {
+    if (ramp_axis > 0) {
         // On the imaginary screen, coded: fine by a phase in red and green, coarse in blue.
         vec2 seen = eye.xy + (true_point.xy - eye.xy) * (eye.z / (eye.z - true_point.z));
-        float place = places_axis == 1 ? seen.x : seen.y;
-        float phase = 6.283185307 * place / PLACES_PERIOD_M;
-        float coarse = clamp(place / PLACES_RANGE_M + 0.5, 0.0, 1.0);
+        float place = ramp_axis == 1 ? seen.x : seen.y;
+        float phase = 6.283185307 * place / RAMP_PERIOD_M;
+        float coarse = clamp(place / RAMP_RANGE_M + 0.5, 0.0, 1.0);
         colour = vec4(0.5 + 0.5 * cos(phase), 0.5 + 0.5 * sin(phase), 0.2 + 0.8 * coarse, 1.0);
         return;
     }

@@ -14,11 +14,11 @@ Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 WhichEye = Literal["both", "left", "right"]
 
-NEAREST_EYE_M = 0.05
+MIN_EYE_DISTANCE_M = 0.05
 """An eye nearer to the imaginary screen than this is not believed: nothing can be drawn for it."""
 
 
-def believed(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
+def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
     """The eyes to draw for, the unit direction (3,) from left to right, and why not as tracked.
 
     tracked: the newest `eye` message, or None when there is none or it is stale.
@@ -33,7 +33,7 @@ def believed(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
         return eyes, across, "eye.right_world is zero: eyes taken to be where the scene has them"
     across = np.asarray(tracked.right_world / length, dtype=np.float64)
     reach = 0.5 * eyes.interocular_m * abs(float(across[2]))
-    if tracked.centre_world_m[2] - reach < NEAREST_EYE_M:
+    if tracked.centre_world_m[2] - reach < MIN_EYE_DISTANCE_M:
         where = f"{tracked.centre_world_m[2] - reach:.3f} m"
         return (
             eyes,
@@ -65,7 +65,9 @@ def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
     return "left" if number % 2 else "right"
 
 
-def drawn_for(pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool) -> Floats:
+def select_drawn_eyes(
+    pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool
+) -> Floats:
     """(1 or 2, 3): the eyes of a pair (2, 3) that a frame draws, each a picture.
 
     One that is for one eye only shows the other's picture where the eyes are swapped: the glasses

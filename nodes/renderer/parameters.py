@@ -16,7 +16,7 @@ from nodes.renderer.gl import SAMPLES
 
 class RendererParameters(NodeParameters):
     rate_hz: Positive = Field(default=30.0, description="most frames a second")
-    still_rate_hz: Positive = Field(
+    idle_rate_hz: Positive = Field(
         default=1.0, description="of frames while nobody touches and nothing moves"
     )
     output: Literal["headless", "window"] = "headless"
@@ -27,16 +27,16 @@ class RendererParameters(NodeParameters):
     swap_interval: int = Field(
         default=1, ge=0, le=4, description="the projector's refreshes to a swap; 0: none, tears"
     )
-    lead_s: NonNegative = Field(
+    prediction_horizon_s: NonNegative = Field(
         default=0.016,
         description="from the start of drawing to the middle of the light, until it is measured",
     )
-    light_s: NonNegative = Field(
+    display_latency_s: NonNegative = Field(
         default=0.008,
         description="from the swap (without a window: the end of drawing) to the middle of the "
         "light: half a frame, and the projector's own delay",
     )
-    stale_s: Positive = Field(
+    max_age_s: Positive = Field(
         default=0.1, description="older poses, fingertips, eyes and soft bodies are not used"
     )
     spacing_m: Positive = Field(default=0.0025, description="between vertices of the drawn surface")

@@ -23,7 +23,7 @@ from nodes.renderer.monitors import WindowError, glfw_errors
 
 SLOTS = 3
 IDLE_S = 0.1
-REDRAWN = 4
+REDRAW_COUNT = 4
 """Swaps after a resize: a driver's buffers may take their new size two swaps later."""
 
 _NO_WINDOW: Any = None
@@ -102,7 +102,7 @@ class Presenter:
     def redraw(self, framebuffer_px: tuple[int, int]) -> None:
         """Show the same once more: the window was resized or uncovered."""
         with self._changed:
-            self.framebuffer_px, self._again = framebuffer_px, REDRAWN
+            self.framebuffer_px, self._again = framebuffer_px, REDRAW_COUNT
             self._changed.notify()
 
     def stop(self) -> None:

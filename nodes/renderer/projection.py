@@ -14,7 +14,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.renderer.gl import SAMPLES, Canvas, Look, Uniforms, View, set_view, shader_text
+from nodes.renderer.gl import SAMPLES, Canvas, DrawStyle, EyeView, Uniforms, set_view, shader_text
 from nodes.renderer.sheet_mesh import SheetMesh
 
 Floats = NDArray[np.float64]
@@ -24,7 +24,7 @@ CLIP_DISTANCE_0, CLIP_PLANES = 0x3000, 5
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ScreenRectangle:
     """A rectangle on the imaginary screen, metres."""
 
     left: float
@@ -44,7 +44,7 @@ class Window:
         )
 
 
-class Projection:
+class TwoPassProjector:
     """The frame of the first pass, and the sheet that the second one draws."""
 
     def __init__(
@@ -72,11 +72,16 @@ class Projection:
         self._triangles: NDArray[np.int32] | None = None
 
     def draw(
-        self, canvas: Canvas, sheet: SheetMesh, view: View, look: Look, window: Window
+        self,
+        canvas: Canvas,
+        sheet: SheetMesh,
+        view: EyeView,
+        look: DrawStyle,
+        window: ScreenRectangle,
     ) -> None:
         """Draw one eye's picture onto the sheet, into the canvas's frame; wait until it is done."""
         seen = replace(view, screen=None, clip_from_screen=window.clip_from_screen, lens=None)
-        canvas.paint(self._frame, seen, look)
+        canvas.draw_into(self._frame, seen, look)
         self._context.copy_framebuffer(self._resolved, self._frame)
         array = self._sheet_array(sheet)
         set_view(self._uniforms, view)

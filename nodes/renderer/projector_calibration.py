@@ -25,7 +25,7 @@ from nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from nodes.renderer.gray_code import DecodeError, Image, decoded, places
+from nodes.renderer.gray_code import DecodeError, Image, decode_patterns, find_pixels
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -33,13 +33,13 @@ Indices = NDArray[np.intp]
 GRID_PX = 20
 """Between the projector pixels that are looked for."""
 
-LEAST_POSES, LEAST_POINTS = 3, 200
-LEAST_DEPTH_M = 0.03
-LEAST_COVERAGE = 0.25
-WORST_RMS_PX = 0.7
+MIN_POSES, MIN_POINTS = 3, 200
+MIN_DEPTH_RANGE_M = 0.03
+MIN_COVERAGE = 0.25
+MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
-STRAY_RATIO = 4.0
-USUAL_OFF = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
+OUTLIER_RATIO = 4.0
+TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
 """How far a projector is from a scene's by tape measure: turn (rad), place (m), focal length (as a
 share), principal point (px).  Only the ratios count."""
 
@@ -49,7 +49,7 @@ class ProjectorError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class ProjectorPoints:
     """World points (n, 3), the projector's pixels (n, 2) that light them, the pose (n,) of each.
 
     skew_m: (n,) how far the two cameras' rays pass one another.
@@ -62,7 +62,7 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class ProjectorFit:
     """A calibrated projector and what it leaves, in projector pixels and, on the sheet, metres.
 
     held_out_rms_px: of poses that it was fitted without.  before_rms_px: of the projector that it
@@ -78,14 +78,14 @@ class Fit:
     depth_range_m: float
     poses: int
     points: int
-    strays: int
+    outliers: int
 
 
-def measured(
+def measure_points(
     poses: Sequence[tuple[Sequence[Image], Sequence[Image]]],
     camera: StereoCamera,
     projector: Projector,
-) -> Points:
+) -> ProjectorPoints:
     """Triangulate what the projector's pixels light: left and right pictures of each pose.
 
     camera: its optics as calibrated, `world_from_left` from the scene.  ProjectorError names the
@@ -99,17 +99,17 @@ def measured(
         found = []
         for side, pictures in zip(("left", "right"), views, strict=True):
             try:
-                found.append(places(decoded(pictures, *size), wanted))
+                found.append(find_pixels(decode_patterns(pictures, *size), wanted))
             except DecodeError as error:
                 raise ProjectorError(f"pose {number + 1}, {side} camera: {error}") from error
         both = found[0][1] & found[1][1]
-        world, skew_m = triangulated(found[0][0][both], found[1][0][both], camera)
+        world, skew_m = triangulate_points(found[0][0][both], found[1][0][both], camera)
         parts.append((world, wanted[both], np.full(int(both.sum()), number), skew_m))
     world, pixels, pose, skew = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return Points(world, pixels, pose, skew)
+    return ProjectorPoints(world, pixels, pose, skew)
 
 
-def triangulated(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
+def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
     """World points (n, 3) midway between the rays of pixels (n, 2), and the rays' distance (n,)."""
     from_right = inverse(camera.right_from_left)
     slopes = [
@@ -133,7 +133,7 @@ def triangulated(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Flo
     return apply(world_from_left, 0.5 * (on_a + on_b)), np.linalg.norm(on_a - on_b, axis=1)
 
 
-def projected(projector: Projector, world: Floats) -> Floats:
+def project_points(projector: Projector, world: Floats) -> Floats:
     """The projector's pixels (n, 2) that light world points (n, 3)."""
     lens, pose = projector.lens, projector.world_from_projector
     local = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), world)
@@ -141,7 +141,7 @@ def projected(projector: Projector, world: Floats) -> Floats:
     return project(local, matrix, np.array(lens.distortion))
 
 
-def calibrated(points: Points, guess: Projector) -> Fit:
+def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
     """The projector that lights the points, fitted from a rough one.
 
     ProjectorError where the points are too few, too alike in depth, cover too little of the
@@ -150,30 +150,30 @@ def calibrated(points: Points, guess: Projector) -> Fit:
     kept = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _depth_range(points, guess)
     coverage = _coverage(points.pixels, guess)
-    if poses < LEAST_POSES or len(points.world) < LEAST_POINTS:
+    if poses < MIN_POSES or len(points.world) < MIN_POINTS:
         raise ProjectorError(
-            f"{len(points.world)} points in {poses} poses: hold the sheet in {LEAST_POSES} or "
-            f"more, lit and seen by both cameras, for {LEAST_POINTS} points at least"
+            f"{len(points.world)} points in {poses} poses: hold the sheet in {MIN_POSES} or "
+            f"more, lit and seen by both cameras, for {MIN_POINTS} points at least"
         )
-    if depth_m < LEAST_DEPTH_M:
+    if depth_m < MIN_DEPTH_RANGE_M:
         raise ProjectorError(
             f"all points lie within {1e3 * depth_m:.0f} mm along the light: tilt the sheet and "
-            f"hold it nearer and farther, over {1e3 * LEAST_DEPTH_M:.0f} mm at least"
+            f"hold it nearer and farther, over {1e3 * MIN_DEPTH_RANGE_M:.0f} mm at least"
         )
-    if coverage < LEAST_COVERAGE:
+    if coverage < MIN_COVERAGE:
         raise ProjectorError(
             f"the points cover {100 * coverage:.0f} % of the projector's picture, "
-            f"{100 * LEAST_COVERAGE:.0f} % are needed: the lens is not told elsewhere"
+            f"{100 * MIN_COVERAGE:.0f} % are needed: the lens is not told elsewhere"
         )
     for _ in range(3):
         projector = _fitted(points, kept, guess)
-        off = np.linalg.norm(projected(projector, points.world) - points.pixels, axis=1)
-        now = off <= STRAY_RATIO * np.median(off)
+        off = np.linalg.norm(project_points(projector, points.world) - points.pixels, axis=1)
+        now = off <= OUTLIER_RATIO * np.median(off)
         if (now == kept).all():
             break
         kept = now
     rms = _rms(off[kept])
-    if rms > WORST_RMS_PX or kept.mean() < 0.8:
+    if rms > MAX_RMS_PX or kept.mean() < 0.8:
         raise ProjectorError(
             f"{rms:.2f} px rms and {int((~kept).sum())} strays of {len(kept)} points: not one "
             "projector, or the sheet moved between its pictures; hold it still, check the cameras "
@@ -181,7 +181,7 @@ def calibrated(points: Points, guess: Projector) -> Fit:
         )
     held_out = [
         np.linalg.norm(
-            projected(_fitted(points, kept & (points.pose != pose), guess), points.world[here])
+            project_points(_fitted(points, kept & (points.pose != pose), guess), points.world[here])
             - points.pixels[here],
             axis=1,
         )
@@ -190,8 +190,8 @@ def calibrated(points: Points, guess: Projector) -> Fit:
     ]
     position = projector.world_from_projector.position_m
     distance_m = float(np.median(np.linalg.norm(points.world - position, axis=1)))
-    before = np.linalg.norm(projected(guess, points.world) - points.pixels, axis=1)
-    return Fit(
+    before = np.linalg.norm(project_points(guess, points.world) - points.pixels, axis=1)
+    return ProjectorFit(
         projector=projector,
         rms_px=rms,
         held_out_rms_px=_rms(np.concatenate(held_out)),
@@ -201,7 +201,7 @@ def calibrated(points: Points, guess: Projector) -> Fit:
         depth_range_m=depth_m,
         poses=poses,
         points=int(kept.sum()),
-        strays=int((~kept).sum()),
+        outliers=int((~kept).sum()),
     )
 
 
@@ -209,7 +209,7 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _depth_range(points: Points, guess: Projector) -> float:
+def _depth_range(points: ProjectorPoints, guess: Projector) -> float:
     """How far (m) the points reach along the projector's axis, the middle nine tenths of them."""
     pose = guess.world_from_projector
     along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
@@ -222,7 +222,7 @@ def _coverage(pixels: Floats, projector: Projector) -> float:
     return len(np.unique(cells, axis=0)) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
 
 
-def _fitted(points: Points, kept: NDArray[np.bool_], guess: Projector) -> Projector:
+def _fitted(points: ProjectorPoints, kept: NDArray[np.bool_], guess: Projector) -> Projector:
     """The projector of least squared pixels: square pixels, k1, k2, p1, p2; k3 as guessed.
 
     OpenCV's own fit refuses a principal point outside the picture, where lens shift puts it; its
@@ -281,7 +281,7 @@ def _projector(
 
 def keystone(
     corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector
-) -> Fit:
+) -> ProjectorFit:
     """The projector whose pixels (4, 2) light the corners of a rectangle on the imaginary screen.
 
     corners_px: left bottom, right bottom, right top, left top, as the user sees them.  The picture
@@ -303,7 +303,7 @@ def keystone(
     start = transform_from_rpy(pose.position_m, pose.rpy_rad)
 
     def projector(numbers: Floats) -> Projector:
-        x = numbers * USUAL_OFF
+        x = numbers * TYPICAL_ERRORS
         turned = transform(rotation_from_vector(x[:3]), x[3:6])
         focal = np.exp(x[6])
         matrix = camera_matrix(
@@ -312,20 +312,20 @@ def keystone(
         return _projector(guess, matrix, np.array(lens.distortion), start @ turned)
 
     def residuals(numbers: Floats) -> Floats:
-        off = projected(projector(numbers), world) - corners_px
+        off = project_points(projector(numbers), world) - corners_px
         return np.concatenate([off.ravel(), 1e-2 * numbers])
 
     solved = least_squares(residuals, np.zeros(9), x_scale="jac", max_nfev=60)
     found = projector(solved.x)
-    off = np.linalg.norm(projected(found, world) - corners_px, axis=1)
-    before = np.linalg.norm(projected(guess, world) - corners_px, axis=1)
-    if _rms(off) > WORST_RMS_PX:
+    off = np.linalg.norm(project_points(found, world) - corners_px, axis=1)
+    before = np.linalg.norm(project_points(guess, world) - corners_px, axis=1)
+    if _rms(off) > MAX_RMS_PX:
         raise ProjectorError(
             f"no projector near the scene's lights these corners ({_rms(off):.1f} px left): "
             "check their order, and the pose in the scene"
         )
     distance_m = float(np.linalg.norm(found.world_from_projector.position_m))
-    return Fit(
+    return ProjectorFit(
         projector=found,
         rms_px=_rms(off),
         held_out_rms_px=float("nan"),
@@ -335,5 +335,5 @@ def keystone(
         depth_range_m=0.0,
         poses=1,
         points=4,
-        strays=0,
+        outliers=0,
     )

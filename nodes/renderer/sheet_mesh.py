@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from nodes.models.rigid import apply, inverse
 from nodes.models.sheet.dents import DentShapes, triangles_of
-from nodes.renderer.correction import GRAZING_SINE, LEAST_PUSH_M
-from nodes.renderer.sheet import Sheet
+from nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
+from nodes.renderer.sheet import SheetPose
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-FLAT_TO_M, TRIANGLES_TO_M = 0.0005, 0.0035
+MAX_TRIANGLES_DEPTH_M = 0.0035
 """To these pushes the sheet is flat, or a pyramid, as far as a picture tells it."""
 
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
@@ -35,20 +35,20 @@ class SheetMesh:
     note: str = ""
 
 
-def flat_mesh(sheet: Sheet) -> SheetMesh:
+def flat_mesh(sheet: SheetPose) -> SheetMesh:
     """The sheet that nothing pushes: its corners, and its middle, so that a twist is halved."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
 
-def pyramid_mesh(sheet: Sheet) -> SheetMesh:
+def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
     """The paper's four triangles between the corners and the fingertip."""
     if sheet.pushed_point is None:
         return flat_mesh(sheet)
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
-def finer(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
+def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
     """The same surface in smaller triangles, so that a lens can bend what was straight."""
     vertices, triangles = mesh.vertices, mesh.triangles
     for _ in range(halvings):
@@ -68,7 +68,7 @@ _grid_triangles = cache(triangles_of)
 """The same array for the same grid, so that nobody need compare it."""
 
 
-def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
+def deflected_mesh(sheet: SheetPose, dents: DentShapes) -> SheetMesh:
     """The sheet as it narrows by its stretch and dents by its fingertip.
 
     Edges that are turned to one another turn the flat sheet evenly between them; the dent is added
@@ -81,7 +81,7 @@ def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
         depth_m = max(0.0, -z)
     place = (x, y)
     flat = dents.grid(stretch, place)
-    offsets = dents.offsets(stretch, place, depth_m if depth_m >= LEAST_PUSH_M else 0.0)
+    offsets = dents.offsets(stretch, place, depth_m if depth_m >= MIN_PUSH_M else 0.0)
     rows, columns = flat.shape[:2]
     across = (flat[..., 0] / sheet.edge_distance_m + 0.5).ravel()
     up = (flat[..., 1] / dents.rubber.height_m + 0.5).ravel()
@@ -99,7 +99,7 @@ def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
     )
 
 
-def lost_share(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
+def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
     """About what share of the sheet, by its area as the eye sees it, folds keep the light from.
 
     Lost is what the projector sees turned away or edge-on, within `GRAZING_SINE`, and as much again

@@ -55,21 +55,6 @@ def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
     return ratio
 
 
-def least_dihedral_rad(points: Floats, tetrahedra: Ints) -> Floats:
-    """The smallest angle between two faces of each straight tetrahedron (e,)."""
-    corners = points[tetrahedra[:, :4]]
-    normals = []
-    for i in range(4):
-        a, b, c = (corners[:, j] for j in range(4) if j != i)
-        normal = np.cross(b - a, c - a)
-        inwards = ((corners[:, i] - a) * normal).sum(axis=1, keepdims=True) > 0.0
-        normal = np.where(inwards, -normal, normal)
-        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    cosines = [-(a * b).sum(axis=1) for a, b in itertools.combinations(normals, 2)]
-    least: Floats = np.arccos(np.clip(np.max(cosines, axis=0), -1.0, 1.0))
-    return least
-
-
 def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
     """Return a lower bound of each 10-node tetrahedron's Jacobian over the straight one's, (e,).
 

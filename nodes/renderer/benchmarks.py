@@ -22,32 +22,31 @@ from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.shapes import make_shape
 from nodes.models.sheet import edge_poses
 from nodes.renderer import deflection_cache
-from nodes.renderer.gl import Look, headless_context
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.object_surface import make_surface
 from nodes.renderer.output import Image
-from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.sheet_mesh import SheetMesh, flat_mesh, pyramid_mesh
-from nodes.renderer.stage import Stage, transform_of
-from nodes.renderer.surface import surface_of
+from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from nodes.renderer.sheet import SheetPose, estimate_sheet
+from nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
 
 Floats = NDArray[np.float64]
 
-Judgement = Callable[[Image, Image], Floats]
-"""Projector's pictures of the patterns `places_x` and `places_y` to the errors (n,), m, at all
+ErrorMeasure = Callable[[Image, Image], Floats]
+"""Projector's pictures of the patterns `coordinate_ramp_x` and `coordinate_ramp_y` to the errors (n,), m, at all
 points of the object that the eye sees."""
 
-Judge = Callable[[Scene, Floats, Floats, Floats | None], Judgement]
+ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure]
 """Makes a `Judgement` for a scene whose sheet has its left and right edge at two poses (4, 4) and
 is pushed by a fingertip (3,), or by none."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
-SHAPES: dict[str, Callable[[Sheet], SheetMesh]] = {
-    "two_pass_flat": flat_mesh,
+SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
     "two_pass_triangles": pyramid_mesh,
 }
 """Two passes onto cheaper shapes than the dent's own."""
 FLOOR = "floor"
 METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
-UNSOLVED = tuple(method for method in METHODS if method != "two_pass")
+WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
 CASES: tuple[tuple[float, float], ...] = (
     *((tilt, 0) for tilt in (-50, -30, 30, 50)),
     *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
@@ -59,24 +58,24 @@ STRETCH = 1.05
 SPACING_M = 0.0025
 
 
-def correction_family(judge: Judge, *, solved: bool = True) -> Family:
+def correction_family(judge: ReferenceFactory, *, solved: bool = True) -> Family:
     """Every correction over the tilts and pushes of the paper's figures 11 and 13, and to the ends
     of the scene's; without `solved`, those alone that no dent shapes need be solved for."""
     return Family(
         name="correction",
         unit="mm",
         reference="rms error at the points the eye sees on the twin's sheet",
-        methods=METHODS if solved else UNSOLVED,
+        methods=METHODS if solved else WITHOUT_SHAPES,
         trials=partial(_trials, judge, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
 
-TRIANGLES_TO_MM = 3.5
+MAX_TRIANGLES_DEPTH_MM = 3.5
 """To this push a pyramid leaves half a millimetre (rms) of a true dent."""
 
 
-def covers(method: str, *, tilt_deg: float, push_mm: float) -> bool:
+def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
     """A method's stated range: `none` is for the sheet on the imaginary screen, `one_plane` for a
     flat one, `four_triangles` for one that is pushed no deeper than `TRIANGLES_TO_MM`; two passes
     reach as far as their shape does, and to 50 degrees of tilt."""
@@ -84,14 +83,14 @@ def covers(method: str, *, tilt_deg: float, push_mm: float) -> bool:
         return tilt_deg == 0 and push_mm == 0
     deepest_mm = {
         FLOOR: -1.0,
-        "four_triangles": TRIANGLES_TO_MM,
-        "two_pass_triangles": TRIANGLES_TO_MM,
+        "four_triangles": MAX_TRIANGLES_DEPTH_MM,
+        "two_pass_triangles": MAX_TRIANGLES_DEPTH_MM,
         "two_pass": 60.0,
     }.get(method, 0.0)
     return push_mm <= deepest_mm and abs(tilt_deg) <= 50.0
 
 
-def rolled_on(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None = None) -> Floats:
+def roll_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None = None) -> Floats:
     """world_from_sheet tangent to the cylinder there.
 
     place_m: (x, y) of the sheet where it touches; None: where it would if it had rolled there
@@ -99,20 +98,20 @@ def rolled_on(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None
     farthest, and by the sheet's middle.
     """
     if not isinstance(scene.object.geometry, Cylinder):
-        return _laid_on(scene, tilt_rad, place_m or (0.0, 0.0))
+        return _lay_sheet(scene, tilt_rad, place_m or (0.0, 0.0))
     radius = cylinder_of(scene).radius_m
-    axis = transform_of(scene.object.world_from_object)[:3, 3]
+    axis = pose_matrix(scene.object.world_from_object)[:3, 3]
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
     x, y = (0.0, -radius * tilt_rad) if place_m is None else place_m
     return transform(rotation, axis + rotation @ np.array([-x, -y, radius]))
 
 
-def _laid_on(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> Floats:
+def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> Floats:
     geometry = scene.object.geometry
-    skin = surface_of(
+    skin = make_surface(
         geometry,
         make_shape(dict(geometry)),
-        world_from_object=transform_of(scene.object.world_from_object),
+        world_from_object=pose_matrix(scene.object.world_from_object),
         spacing_m=SPACING_M,
     ).rest_world_m
     rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
@@ -126,7 +125,7 @@ def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
     return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 
 
-def with_projector_of(scene: Scene, width_px: int, height_px: int) -> Scene:
+def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
     """The scene with a projector of other pixels that lights the same width, and its middle."""
     projector = scene.projector
     lens, scale = projector.lens, width_px / projector.width_px
@@ -143,13 +142,13 @@ def with_projector_of(scene: Scene, width_px: int, height_px: int) -> Scene:
     return scene.model_copy(update={"projector": projector.model_copy(update=size)})
 
 
-def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
+def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
     dents = deflection_cache.load_or_compute(scene, None) if solved else None
     context = headless_context()
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
     for size in SIZES_PX:
-        shown = with_projector_of(scene, *size)
-        stage = Stage(shown, context, spacing_m=SPACING_M, dents=dents)
+        shown = scale_projector(scene, *size)
+        stage = SceneRenderer(shown, context, spacing_m=SPACING_M, dents=dents)
         cases = (*CASES, *scene_cases(scene)) if size == SIZES_PX[0] else LARGE_CASES
         for tilt_deg, push_mm in dict.fromkeys(cases):
             if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
@@ -162,13 +161,13 @@ def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
             }
             sheet, judgement = _situation(shown, judge, tilt_deg=tilt_deg, push_mm=push_mm)
             in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
-            for method in METHODS if solved else UNSOLVED:
+            for method in METHODS if solved else WITHOUT_SHAPES:
                 yield Trial(
                     method=method,
                     case=case,
                     run=partial(draw_stereo, stage, method, sheet),
                     error=partial(_error_mm, stage, method, sheet, judgement),
-                    in_range=covers(method, tilt_deg=tilt_deg, push_mm=push_mm),
+                    in_range=is_in_range(method, tilt_deg=tilt_deg, push_mm=push_mm),
                     in_scene=in_scene,
                 )
         stage.release()
@@ -176,27 +175,27 @@ def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
 
 
 def _situation(
-    scene: Scene, judge: Judge, *, tilt_deg: float, push_mm: float
-) -> tuple[Sheet, Callable[[], Judgement]]:
+    scene: Scene, judge: ReferenceFactory, *, tilt_deg: float, push_mm: float
+) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
     """The sheet as it is believed to be, and, worked out when it is first asked for, its judge."""
-    pose = rolled_on(scene, np.radians(tilt_deg))
+    pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
-    believed = sheet_between(
+    predicted = estimate_sheet(
         *edges,
         height_m=scene.sheet.height_m,
         twist_world=np.zeros(6),
         ahead_s=0.0,
         finger_tip=tip,
     )
-    assert believed is not None
-    return believed, cache(lambda: judge(scene, *edges, tip))
+    assert predicted is not None
+    return predicted, cache(lambda: judge(scene, *edges, tip))
 
 
-def draw_stereo(stage: Stage, method: str, sheet: Sheet) -> None:
+def draw_stereo(stage: SceneRenderer, method: str, sheet: SheetPose) -> None:
     """One stereo frame by a method, or the floor."""
-    display = Display(correction=_correction_of(method), stereo="side_by_side")
-    look = Look(flat=False, pattern="object")
+    display = Display(correction=_correction_name(method), stereo="side_by_side")
+    look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:
         for eye in stage.eyes(display):
             stage.canvas.draw_unresolved(stage.view(eye), look)
@@ -206,12 +205,14 @@ def draw_stereo(stage: Stage, method: str, sheet: Sheet) -> None:
         stage.draw(display, sheet, look, read=False)
 
 
-def places_pictures(stage: Stage, method: str, sheet: Sheet) -> tuple[Image, Image]:
+def draw_coordinate_ramps(
+    stage: SceneRenderer, method: str, sheet: SheetPose
+) -> tuple[Image, Image]:
     """The projector's pictures of both patterns of places, for the scene's point of view."""
     pictures = []
-    for pattern in PLACES:
-        display = Display(correction=_correction_of(method), stereo="mono", pattern=pattern)
-        look = Look(flat=True, pattern=pattern)
+    for pattern in COORDINATE_RAMPS:
+        display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)
+        look = DrawStyle(flat=True, pattern=pattern)
         if method in SHAPES:
             picture = stage.draw_onto(display, SHAPES[method](sheet), look, read=True)
         else:
@@ -221,18 +222,22 @@ def places_pictures(stage: Stage, method: str, sheet: Sheet) -> tuple[Image, Ima
     return pictures[0], pictures[1]
 
 
-PLACES: tuple[Pattern, Pattern] = ("places_x", "places_y")
+COORDINATE_RAMPS: tuple[Pattern, Pattern] = ("coordinate_ramp_x", "coordinate_ramp_y")
 
 
 def _error_mm(
-    stage: Stage, method: str, sheet: Sheet, judgement: Callable[[], Judgement], _drawn: None
+    stage: SceneRenderer,
+    method: str,
+    sheet: SheetPose,
+    judgement: Callable[[], ErrorMeasure],
+    _drawn: None,
 ) -> float:
     """Root mean square of all points seen; infinite when none is.  The floor corrects nothing."""
-    errors_m = judgement()(*places_pictures(stage, method, sheet))
+    errors_m = judgement()(*draw_coordinate_ramps(stage, method, sheet))
     return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
 
 
-def _correction_of(method: str) -> Correction:
+def _correction_name(method: str) -> Correction:
     for correction in CORRECTIONS:
         if method == correction:
             return correction

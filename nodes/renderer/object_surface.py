@@ -26,14 +26,14 @@ Indices = NDArray[np.int32]
 Real = TypeVar("Real", np.float32, np.float64)
 Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
 
-FEWEST_AROUND = 128
+MIN_AROUND = 128
 """Vertices around a cylinder, sphere or ellipsoid: its outline must not show corners."""
 CANDIDATES = 16
 """Sample points of a skin, next to a drawn vertex, whose triangles may hold the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class ObjectSurface:
     """The object at rest, world frame.
 
     rest_world_m, normals_world: (vertices, 3); along a sharp edge vertices are doubled.
@@ -47,18 +47,18 @@ class Surface:
     @staticmethod
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
-    ) -> Surface:
+    ) -> ObjectSurface:
         """A surface given in the object's frame."""
-        return Surface(
+        return ObjectSurface(
             apply(world_from_object, points),
             normals @ world_from_object[:3, :3].T,
             triangles.astype(np.int32),
         )
 
 
-def surface_of(
+def make_surface(
     geometry: Geometry, shape: Shape, *, world_from_object: Floats, spacing_m: float
-) -> Surface:
+) -> ObjectSurface:
     """The surface of a scene's geometry, whose shape is `shape`; vertices about `spacing_m` apart.
 
     Of a plane only the touchable rectangle is drawn, of a mesh the smooth surface that it stands
@@ -85,20 +85,20 @@ def surface_of(
             found = shape.closest(points)
             points, normals = found.point, found.normal
         case _:
-            points, triangles = _blown_cuboid(geometry, shape, spacing_m)
+            points, triangles = _inflate_cuboid(geometry, shape, spacing_m)
             normals = shape.closest(points).normal
-    return Surface.placed(points, normals, triangles, world_from_object)
+    return ObjectSurface.placed(points, normals, triangles, world_from_object)
 
 
 def cylinder_surface(
     *, radius_m: float, length_m: float, world_from_object: Floats, spacing_m: float
-) -> Surface:
+) -> ObjectSurface:
     """A closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
 
     Its side comes first, ring by ring; then each end cap, with a rim of its own and a centre.
     """
     rings = int(np.ceil(length_m / spacing_m)) + 1
-    around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), FEWEST_AROUND)
+    around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), MIN_AROUND)
     x = np.linspace(-0.5 * length_m, 0.5 * length_m, rings)
     angle = 2.0 * np.pi * np.arange(around) / around
     outward = np.column_stack([np.zeros(around), np.sin(angle), np.cos(angle)])
@@ -122,7 +122,7 @@ def cylinder_surface(
             np.column_stack([np.full(around, last + around), last + after, last + j]),
         ]
     )
-    return Surface.placed(points, normals, triangles, world_from_object)
+    return ObjectSurface.placed(points, normals, triangles, world_from_object)
 
 
 def _cells(length_m: float, spacing_m: float) -> int:
@@ -145,7 +145,7 @@ def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
     return np.column_stack([u.ravel(), v.ravel()]), triangles
 
 
-def _blown_cuboid(
+def _inflate_cuboid(
     geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape, spacing_m: float
 ) -> tuple[Floats, NDArray[np.int64]]:
     """A cuboid's surface grid drawn onto a rounder solid: points (n, 3), triangles (t, 3).
@@ -159,7 +159,7 @@ def _blown_cuboid(
     else:
         axes = geometry.semi_axes_m if isinstance(geometry, Ellipsoid) else (geometry.radius_m,) * 3
         half = np.array(axes)
-        quarter = max(_cells(0.5 * np.pi * float(half.max()), spacing_m), FEWEST_AROUND // 4)
+        quarter = max(_cells(0.5 * np.pi * float(half.max()), spacing_m), MIN_AROUND // 4)
         cells = [quarter] * 3
     points, triangles, count = [], [], 0
     for axis in range(3):
@@ -181,12 +181,12 @@ def _blown_cuboid(
     return onto, joined.ravel()[np.concatenate(triangles)]
 
 
-def normals_of(surface: Surface, positions: Floats) -> Floats:
+def normals_of(surface: ObjectSurface, positions: Floats) -> Floats:
     """Smooth unit normals (vertices, 3) of the surface moved to `positions` (vertices, 3)."""
-    return _Normals(surface.triangles, len(positions))(positions)
+    return VertexNormals(surface.triangles, len(positions))(positions)
 
 
-class _Normals:
+class VertexNormals:
     """Unit normals at the vertices of moving triangles: their triangles' mean, by area."""
 
     def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
@@ -214,29 +214,31 @@ class _Normals:
         return total
 
 
-class Follower:
+class DeformationTransfer:
     """A drawn surface that moves as a skin does.
 
     A drawn vertex moves as the nearest point of the skin; its normal, exact at rest, turns as the
     skin's own smooth normals there turn on the mean.
     """
 
-    def __init__(self, surface: Surface, skin_vertices: Floats, skin_triangles: Indices) -> None:
+    def __init__(
+        self, surface: ObjectSurface, skin_vertices: Floats, skin_triangles: Indices
+    ) -> None:
         """skin_vertices: (s, 3) at rest, world; skin_triangles: (t, 3), outward.
 
         ValueError for a skin without triangles, or with places that are not finite.
         """
         self.vertices = len(skin_vertices)
-        self._weights = follow_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
+        self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
         self._skin = skin_vertices.astype(np.float32)
-        self._normals = _Normals(skin_triangles, len(skin_vertices))
+        self._normals = VertexNormals(skin_triangles, len(skin_vertices))
         self._rest_normals = self._normals(self._skin)
         self._rest = np.concatenate(
             [surface.rest_world_m, surface.normals_world], axis=1, dtype=np.float32
         )
         self._moves = np.empty((self.vertices, 6), np.float32)
 
-    def moved(self, displacement: Singles | None) -> Singles:
+    def apply(self, displacement: Singles | None) -> Singles:
         """Positions and normals, not of unit length, side by side (vertices, 6).
 
         displacement: (s, 3) of the skin; None for the rest.  ValueError for one of another skin, or
@@ -257,7 +259,7 @@ class Follower:
         return result
 
 
-def follow_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
+def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
     """(points, skin vertices), float32: interpolates what the skin's vertices carry at the points.
 
     Each point takes the barycentric weights of the nearest point of the skin; triangles without

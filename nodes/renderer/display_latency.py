@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import deque
 from statistics import median
 
-KEPT = 31
+HISTORY = 31
 """Pictures that the delays are taken from: half a second at 60 Hz, and one slow one is outvoted."""
 
 VSYNC_MARGIN_S = 0.0005
 """A picture drawn this shortly before a swap is due still makes it."""
 
-LATE_SHARE = 0.85
+ON_TIME_FRACTION = 0.85
 """Share of the pictures that are to make the swap that is foretold for them."""
 
 
-class Lead:
+class DisplayLatencyEstimator:
     """Foretells the middle of the light of a picture from how long drawing and showing took.
 
     All times are of one clock, ns.  Without a window the light is said to begin when the picture is
@@ -23,19 +23,19 @@ class Lead:
     the next one that the picture will make is counted on from the last.
     """
 
-    def __init__(self, *, first_s: float, light_s: float, period_s: float = 0.0) -> None:
+    def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:
         """first_s: from the begin to the middle of the light, until a picture has been measured.
 
         light_s: from a swap (or the end of drawing) to the middle of its light.  period_s: of the
         projector's refresh; 0 when nothing waits for it.
         """
-        self._first_ns, self._light_ns = round(first_s * 1e9), round(light_s * 1e9)
+        self._first_ns, self._light_ns = round(first_s * 1e9), round(display_latency_s * 1e9)
         self._period_ns = round(period_s * 1e9)
-        self._draws_ns: deque[int] = deque(maxlen=KEPT)
-        self._shows_ns: deque[int] = deque(maxlen=KEPT)
+        self._draws_ns: deque[int] = deque(maxlen=HISTORY)
+        self._shows_ns: deque[int] = deque(maxlen=HISTORY)
         self._last_swap_ns = 0
 
-    def light_ns(self, begun_ns: int) -> int:
+    def predict_light_ns(self, begun_ns: int) -> int:
         """The middle of the light of a picture that is begun at `begun_ns`."""
         if not self._shows_ns:
             return begun_ns + self._first_ns
@@ -43,18 +43,18 @@ class Lead:
         if not self._period_ns or not self._last_swap_ns:
             return usual_ns
         ordered = sorted(self._draws_ns)
-        draw_ns = ordered[min(int(LATE_SHARE * len(ordered)), len(ordered) - 1)]
+        draw_ns = ordered[min(int(ON_TIME_FRACTION * len(ordered)), len(ordered) - 1)]
         ready_ns = begun_ns + draw_ns + round(VSYNC_MARGIN_S * 1e9)
         swaps = -(-(ready_ns - self._last_swap_ns) // self._period_ns)
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
-    def drawn(self, begun_ns: int, drawn_ns: int) -> int:
+    def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
         """Take in a picture that no window shows; returns the middle of its light."""
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(drawn_ns - begun_ns)
         return drawn_ns + self._light_ns
 
-    def shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
+    def record_shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
         """Take in a picture that was swapped to the front; returns the middle of its light."""
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(swapped_ns - begun_ns)

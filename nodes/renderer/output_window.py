@@ -11,7 +11,7 @@ import moderngl
 from messages.types import Display
 from nodes.renderer.gl import headless_context
 from nodes.renderer.monitors import (
-    chosen_monitor,
+    find_monitor,
     hidden_window,
     open_window,
     refresh_period_s,
@@ -23,7 +23,7 @@ from nodes.renderer.presenter import SLOTS, Presenter, Shown, Slot, make_slot
 CLOSED = "the window was closed: what is drawn is seen by nobody; restart the node to open it"
 
 
-class Screen(Protocol):
+class OutputWindow(Protocol):
     """Takes eyes' pictures; `context` is the one to draw in, current in the caller's thread."""
 
     context: moderngl.Context
@@ -42,7 +42,7 @@ class Screen(Protocol):
     def close(self) -> None: ...
 
 
-class Offscreen:
+class OffscreenOutput:
     """Nothing is shown: frames are drawn for whoever reads them."""
 
     is_seen = shows_both = False
@@ -68,10 +68,12 @@ class Offscreen:
         self.context.release()
 
 
-def open_screen(parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown) -> Screen:
+def open_output(
+    parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown
+) -> OutputWindow:
     """The screen that the parameters ask for; WindowError or NoOpenGLError if there is none."""
     if parameters.output == "headless":
-        return Offscreen()
+        return OffscreenOutput()
     return ProjectorWindow(
         monitor=parameters.monitor,
         swap_interval=parameters.swap_interval,
@@ -100,7 +102,7 @@ class ProjectorWindow:
         display or such a monitor.
         """
         start_glfw()
-        self._monitor = None if monitor is None else chosen_monitor(monitor)
+        self._monitor = None if monitor is None else find_monitor(monitor)
         self._swap_interval, self._now_ns, self._shown = swap_interval, now_ns, shown
         self._hidden = hidden_window()
         glfw.make_context_current(self._hidden)

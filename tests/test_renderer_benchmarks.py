@@ -10,8 +10,8 @@ from launch.bench.twin_sheet import twin_errors
 from launch.plans.plan import load_scene
 from nodes.methods import Point, measure, pareto_front
 from nodes.renderer import deflection_cache, families
-from nodes.renderer.families import correction_family, covers, with_projector_of
-from nodes.renderer.stage import projector_homography
+from nodes.renderer.benchmarks import correction_family, is_in_range, scale_projector
+from nodes.renderer.scene_renderer import projector_homography
 from tests.dent_shapes import few_dents
 
 SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
@@ -35,7 +35,7 @@ def error(points: list[Point], method: str, tilt_deg: int, push_mm: int) -> floa
         if point.method == method
         and (point.case["tilt_deg"], point.case["push_mm"]) == (tilt_deg, push_mm)
     ]
-    assert point.in_range == covers(point.method, tilt_deg=tilt_deg, push_mm=push_mm)
+    assert point.in_range == is_in_range(point.method, tilt_deg=tilt_deg, push_mm=push_mm)
     return point.error
 
 
@@ -57,11 +57,11 @@ def test_only_two_passes_onto_the_dents_shape_hold_a_dent(points: list[Point]) -
 def test_the_floor_corrects_nothing_and_is_no_choice(points: list[Point]) -> None:
     assert error(points, "floor", 0, 25) == pytest.approx(error(points, "none", 0, 25))
     assert "floor" not in pareto_front(points)
-    assert not covers("floor", tilt_deg=0, push_mm=0)
+    assert not is_in_range("floor", tilt_deg=0, push_mm=0)
 
 
 def test_a_projector_of_other_pixels_lights_the_same_place() -> None:
-    large = with_projector_of(SCENE, 1280, 720)
+    large = scale_projector(SCENE, 1280, 720)
     middle = projector_homography(large) @ [0.0, 0.0, 1.0]
     assert middle[:2] / middle[2] == pytest.approx([639.5, 359.5])
     small, other = projector_homography(SCENE), projector_homography(large)

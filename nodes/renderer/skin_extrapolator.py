@@ -12,32 +12,32 @@ from collections import deque
 from messages.base import Header
 from messages.types import SoftBody
 
-KEPT = 8
-LEAST_BASE_S, MOST_BASE_S = 0.02, 0.06
+HISTORY = 8
+MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
 """Between the two answers: with less, noise is carried on enlarged; with more, the past counts."""
 
-MOST_AHEAD_S = 0.06
+MAX_EXTRAPOLATION_S = 0.06
 """The skin is carried on no farther: a finger may turn by then."""
 
 
-class DentAhead:
+class SkinExtrapolator:
     """Keeps the solver's last answers."""
 
     def __init__(self) -> None:
-        self._kept: deque[tuple[int, SoftBody]] = deque(maxlen=KEPT)
+        self._kept: deque[tuple[int, SoftBody]] = deque(maxlen=HISTORY)
         self._clock_id = ""
 
-    def take(self, body: SoftBody, header: Header) -> None:
+    def add(self, body: SoftBody, header: Header) -> None:
         """A new answer; those of another skin, method or clock are forgotten."""
         last = self._kept[-1][1] if self._kept else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
-        at_ns = header.source_ns + round(body.lead_s * 1e9)
+        at_ns = header.source_ns + round(body.prediction_horizon_s * 1e9)
         if other or header.clock_id != self._clock_id or (last and at_ns <= self._kept[-1][0]):
             self._kept.clear()
         self._clock_id = header.clock_id
         self._kept.append((at_ns, body))
 
-    def at(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
+    def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
         """The skin at `at_ns` of that clock, and the instant (ns) that it was carried on to.
 
         The newest answer as it is where that is of another clock, later than `at_ns`, or alone;
@@ -46,12 +46,12 @@ class DentAhead:
         if not self._kept:
             return None, 0
         newest_ns, newest = self._kept[-1]
-        ahead_s = min((at_ns - newest_ns) * 1e-9, MOST_AHEAD_S)
+        ahead_s = min((at_ns - newest_ns) * 1e-9, MAX_EXTRAPOLATION_S)
         if clock_id != self._clock_id or ahead_s <= 0.0:
             return newest, newest_ns
         for before_ns, before in self._kept:
             base_s = (newest_ns - before_ns) * 1e-9
-            if LEAST_BASE_S <= base_s <= MOST_BASE_S:
+            if MIN_BASE_S <= base_s <= MAX_BASE_S:
                 moved = newest.displacement_world_m - before.displacement_world_m
                 carried = newest.displacement_world_m + moved * moved.dtype.type(ahead_s / base_s)
                 body = newest.model_copy(update={"displacement_world_m": carried})
