@@ -167,11 +167,11 @@ ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
 
 
 class SoftBody(Message):
-    """The skin's answer to the finger."""
+    """The response of the skin to the finger."""
 
     mesh_id: str
     method: str
-    in_range: bool = Field(description="false: the push exceeds what the method is good for")
+    in_range: bool = Field(description="false: the push is outside the method's range")
     push_depth_m: NonNegative
     force_world_n: Vector3 = Field(description="of the object on the finger")
     stiffness_n_per_m: NonNegative = Field(description="of the object where the finger is")
@@ -181,7 +181,7 @@ class SoftBody(Message):
         "(m) and force (N), both from 0 and never falling; empty: not known",
     )
     prediction_horizon_s: NonNegative = Field(
-        default=0.0, description="how long after the exposure the finger is that it answers to"
+        default=0.0, description="from the exposure to the predicted finger of this response"
     )
     displacement_world_m: Points3
 
@@ -207,7 +207,8 @@ class Display(Message):
     pattern: Pattern = Field(
         default="object",
         description="grid, checker, white: 300 mm square on the imaginary screen, every 20 mm a "
-        "line or a change; coordinate_ramp_x, coordinate_ramp_y: the object, painted with where it should be seen",
+        "line or a change; coordinate_ramp_x, coordinate_ramp_y: the object, coloured by the "
+        "position at which the eye should see it",
     )
     marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
     pixels_every: int = Field(
@@ -247,7 +248,7 @@ class Frame(Message):
         description="where the finger was taken to be at `predicted_to_ns`; none: not known",
     )
     occluded_fraction: NonNegative = Field(
-        default=0.0, description="of the sheet, folded so that it gets no light"
+        default=0.0, description="fraction of the sheet's visible area without light, in folds"
     )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, one (mono or packed)"

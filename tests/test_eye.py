@@ -18,7 +18,7 @@ from messages.types import Correction, Display, Frame, TwinArms, TwinEye
 from nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
 from nodes.models.sheet import edge_poses, flange_pose
 from nodes.renderer.benchmarks import roll_sheet
-from nodes.renderer.sheet import Sheet
+from nodes.renderer.sheet import SheetPose
 from nodes.twin.eye import (
     METRES_PER_PX,
     Image,
@@ -198,7 +198,7 @@ def test_what_cannot_be_measured_is_said(what: str) -> None:
         tilt_sizes(picture, 1.0)
 
 
-Situation = tuple[Sheet, DeformedSheet]
+Situation = tuple[SheetPose, DeformedSheet]
 Sizes = Callable[[Image, float], Sequence[float]]
 
 

@@ -20,7 +20,8 @@ from messages.topics import Topic
 from messages.types import Fingertip, Skin, SoftBody
 from nodes.fem_solver import precompute, snapshots
 from nodes.fem_solver.body import SceneBody
-from nodes.fem_solver.node import FemSolver, FemSolverParameters
+from nodes.fem_solver.node import FemSolver
+from nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
 
 SCENES = Path(__file__).parents[1] / "launch" / "scenes"

@@ -19,7 +19,8 @@ from messages.topics import Topic
 from messages.types import Skin, SoftBody
 from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
 from nodes.fem_solver.contact import Response
-from nodes.fem_solver.node import FemSolver, FemSolverParameters
+from nodes.fem_solver.node import FemSolver
+from nodes.fem_solver.parameters import FemSolverParameters
 from nodes.fem_solver.precompute import compute, estimate_budget
 from nodes.models import rigid
 from tests.fingertips import fingertip

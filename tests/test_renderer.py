@@ -18,10 +18,10 @@ from messages.types import Display, Frame, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses, flange_pose
 from nodes.renderer import gl
-from nodes.renderer.correction import Plane, correct, make_flat_screen, make_pushed_screen
+from nodes.renderer.correction import ScreenPlane, correct, make_flat_screen, make_pushed_screen
 from nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
 from nodes.renderer.node import Renderer, RendererParameters
-from nodes.renderer.object_surface import cylinder_surface, normals_of, transfer_matrix
+from nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
 from nodes.renderer.output import pack
 from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from nodes.renderer.sheet import estimate_sheet
@@ -58,7 +58,7 @@ def random_screens(scene: Scene) -> list[object]:
     screens: list[object] = [None]
     for _ in range(4):
         normal = rotation_from_vector(rng.uniform(-1.2, 1.2, 3) * [1, 1, 0])[:, 2]
-        plane = Plane(rng.uniform(-0.03, 0.03, 3), normal)
+        plane = ScreenPlane(rng.uniform(-0.03, 0.03, 3), normal)
         screens += [
             make_flat_screen(plane),
             make_pushed_screen(rng.uniform(-0.05, 0, 3), corners, plane),
@@ -205,7 +205,7 @@ def test_surface_is_closed_round_and_outward() -> None:
     volume = np.sum(corners[:, 0] * cross) / 6.0
     assert np.isclose(volume, np.pi * 0.03**2 * 0.1, rtol=1e-3)
     assert (np.sum(cross * corners.mean(axis=1), axis=1) > 0).all()
-    normals = normals_of(surface, surface.rest_world_m)
+    normals = VertexNormals(surface.triangles, len(surface.rest_world_m))(surface.rest_world_m)
     assert np.allclose(normals, surface.normals_world, atol=0.02)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
 

@@ -9,7 +9,7 @@ import pytest
 from launch.bench.twin_sheet import twin_errors
 from launch.plans.plan import load_scene
 from nodes.methods import Point, measure, pareto_front
-from nodes.renderer import deflection_cache, families
+from nodes.renderer import benchmarks, deflection_cache
 from nodes.renderer.benchmarks import correction_family, is_in_range, scale_projector
 from nodes.renderer.scene_renderer import projector_homography
 from tests.dent_shapes import few_dents
@@ -22,9 +22,9 @@ def points() -> list[Point]:
     family = correction_family(twin_errors)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(deflection_cache, "load_or_compute", lambda scene, folder: few_dents())
-        patch.setattr(families, "CASES", ((-50, 0), (0, 25)))
-        patch.setattr(families, "scene_cases", lambda scene: ())
-        patch.setattr(families, "SIZES_PX", ((640, 480),))
+        patch.setattr(benchmarks, "CASES", ((-50, 0), (0, 25)))
+        patch.setattr(benchmarks, "scene_cases", lambda scene: ())
+        patch.setattr(benchmarks, "SIZES_PX", ((640, 480),))
         return [measure(trial, repeats=1) for trial in family.trials(SCENE)]
 
 
@@ -41,7 +41,7 @@ def error(points: list[Point], method: str, tilt_deg: int, push_mm: int) -> floa
 
 def test_a_plane_is_corrected_by_all_but_none(points: list[Point]) -> None:
     assert error(points, "none", -50, 0) > 5.0
-    for method in families.METHODS[2:]:
+    for method in benchmarks.METHODS[2:]:
         assert error(points, method, -50, 0) < 0.2
 
 

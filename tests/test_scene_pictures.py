@@ -21,7 +21,7 @@ from nodes.models.rigid import inverse
 from nodes.models.sheet import edge_poses
 from nodes.renderer.gl import headless_context
 from nodes.renderer.node import Renderer, RendererParameters
-from nodes.renderer.object_surface import DeformationTransfer, normals_of
+from nodes.renderer.object_surface import DeformationTransfer, VertexNormals
 from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from nodes.twin.true_object import TrueBody
@@ -123,7 +123,7 @@ def test_a_dent_is_followed_with_no_triangle_turned_over(case: Case) -> None:
     assert (after[front, 2] > 0.0).all()
     assert np.ptp(surface.rest_world_m[:, 2] - moved[:, 2]) > 0.015
     # The interpolated normals are those of the drawn triangles, but for the skin's facets.
-    exact = normals_of(surface, moved[:, :3])
+    exact = VertexNormals(surface.triangles, len(moved))(moved[:, :3])
     used = np.unique(surface.triangles[front])
     fast = moved[used, 3:] / np.linalg.norm(moved[used, 3:], axis=1, keepdims=True)
     cosines = np.clip(np.einsum("ij,ij->i", fast, exact[used]), -1.0, 1.0)

@@ -111,9 +111,8 @@ class SceneBody:
             in_range=True,
         )
 
-    def message(self, response: Response, *, prediction_horizon_s: float = 0.0) -> SoftBody:
-        """Return the response as a message; prediction_horizon_s: the time from exposure to the predicted
-        finger."""
+    def message(self, response: Response, *, horizon_s: float = 0.0) -> SoftBody:
+        """Return the response as a message; horizon_s: from exposure to the predicted finger."""
         rotation = self.world_from_mesh[:3, :3]
         rotated = response.displacement @ rotation.T.astype(np.float32)
         return SoftBody(
@@ -124,7 +123,7 @@ class SceneBody:
             force_world_n=rotation @ response.force_n,
             stiffness_n_per_m=response.stiffness_n_per_m,
             force_curve=response.force_curve,
-            prediction_horizon_s=prediction_horizon_s,
+            prediction_horizon_s=horizon_s,
             displacement_world_m=np.ascontiguousarray(rotated),
         )
 
@@ -203,6 +202,6 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
     )
 
 
-def predict_position(fingertip: Fingertip, prediction_horizon_s: float) -> Floats:
-    """Return the expected fingertip position (3,), m, world, `prediction_horizon_s` after its exposure."""
-    return path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, prediction_horizon_s)[0]
+def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
+    """Return the expected fingertip position (3,), m, world, `horizon_s` after its exposure."""
+    return path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, horizon_s)[0]

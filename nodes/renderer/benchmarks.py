@@ -1,9 +1,9 @@
-"""The image correction's method family: how long a stereo frame takes, how far off its picture is.
+"""Measure the image correction's methods: the time of a stereo frame, and its image error.
 
-What is timed is a whole stereo frame, both eyes drawn and the drawing waited for; nothing is read.
-`floor` is the least that any of them does: clear, draw the same triangles once for each eye, with
-as many samples.  What is judged is the error at each point that the eye sees on the true sheet; the
-judge shares no code with the renderer, and whoever asks for the family brings it along.
+The time is that of a whole stereo frame: both eyes are drawn and the drawing is waited for; nothing
+is read. `floor` is the minimum of any method: clear, draw the same triangles once for each eye,
+with as many samples. The error is measured at each point that the eye sees on the true sheet. The
+reference shares no code with the renderer; the caller provides it.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
 Floats = NDArray[np.float64]
 
 ErrorMeasure = Callable[[Image, Image], Floats]
-"""Projector's pictures of the patterns `coordinate_ramp_x` and `coordinate_ramp_y` to the errors (n,), m, at all
+"""Projector images of `coordinate_ramp_x` and `coordinate_ramp_y` to the errors (n,), m, at all
 points of the object that the eye sees."""
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure]
-"""Makes a `Judgement` for a scene whose sheet has its left and right edge at two poses (4, 4) and
-is pushed by a fingertip (3,), or by none."""
+"""Returns an `ErrorMeasure` for a scene whose sheet has its left and right edge at two poses (4, 4)
+and is pushed by a fingertip (3,), or by none."""
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
     "two_pass_triangles": pyramid_mesh,
 }
-"""Two passes onto cheaper shapes than the dent's own."""
+"""Two passes onto cheaper shapes than the deflected sheet's own."""
 FLOOR = "floor"
 METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
 WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
@@ -59,8 +59,11 @@ SPACING_M = 0.0025
 
 
 def correction_family(judge: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Every correction over the tilts and pushes of the paper's figures 11 and 13, and to the ends
-    of the scene's; without `solved`, those alone that no dent shapes need be solved for."""
+    """Return every correction over the tilts and pushes of the paper's figures 11 and 13.
+
+    The ends of the scene's working range are included. Without `solved`, only methods that need no
+    deflection shapes.
+    """
     return Family(
         name="correction",
         unit="mm",
@@ -72,13 +75,16 @@ def correction_family(judge: ReferenceFactory, *, solved: bool = True) -> Family
 
 
 MAX_TRIANGLES_DEPTH_MM = 3.5
-"""To this push a pyramid leaves half a millimetre (rms) of a true dent."""
+"""For this push a pyramid leaves half a millimetre (rms) of the true deflection."""
 
 
 def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
-    """A method's stated range: `none` is for the sheet on the imaginary screen, `one_plane` for a
-    flat one, `four_triangles` for one that is pushed no deeper than `TRIANGLES_TO_MM`; two passes
-    reach as far as their shape does, and to 50 degrees of tilt."""
+    """Return whether a method's stated range covers a case.
+
+    `none` is for the sheet on the imaginary screen, `one_plane` for a flat one, `four_triangles`
+    for a push up to `MAX_TRIANGLES_DEPTH_MM`. Two passes have the range of their shape, up to 50
+    degrees of tilt.
+    """
     if method == "none":
         return tilt_deg == 0 and push_mm == 0
     deepest_mm = {
@@ -91,11 +97,10 @@ def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
 
 
 def roll_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None = None) -> Floats:
-    """world_from_sheet tangent to the cylinder there.
+    """Return world_from_sheet tangent to the cylinder at a tilt.
 
-    place_m: (x, y) of the sheet where it touches; None: where it would if it had rolled there
-    without slip from the upright pose.  Any other object is touched where its skin reaches out
-    farthest, and by the sheet's middle.
+    place_m: (x, y) of the sheet where it touches; None: after rolling without slip from the upright
+    pose. Any other object is touched at its farthest skin point, by the sheet's middle.
     """
     if not isinstance(scene.object.geometry, Cylinder):
         return _lay_sheet(scene, tilt_rad, place_m or (0.0, 0.0))
@@ -120,13 +125,14 @@ def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> F
 
 
 def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
-    """The ends of the scene's working range, as `CASES`."""
+    """Return the ends of the scene's working range, as `CASES`."""
     tilt = round(float(np.degrees(scene.working_range.tilt_rad)), 1)
     return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
 
 
 def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
-    """The scene with a projector of other pixels that lights the same width, and its middle."""
+    """Return the scene with a projector of other pixels that lights the same width, and its
+    middle."""
     projector = scene.projector
     lens, scale = projector.lens, width_px / projector.width_px
     cut = 0.5 * (projector.height_px * scale - height_px)
@@ -177,7 +183,8 @@ def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Tri
 def _situation(
     scene: Scene, judge: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
-    """The sheet as it is believed to be, and, worked out when it is first asked for, its judge."""
+    """Return the predicted sheet, and a function that computes its error measure at the first
+    call."""
     pose = roll_sheet(scene, np.radians(tilt_deg))
     edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
     tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
@@ -193,7 +200,7 @@ def _situation(
 
 
 def draw_stereo(stage: SceneRenderer, method: str, sheet: SheetPose) -> None:
-    """One stereo frame by a method, or the floor."""
+    """Draw one stereo frame by a method, or the floor."""
     display = Display(correction=_correction_name(method), stereo="side_by_side")
     look = DrawStyle(flat=False, pattern="object")
     if method == FLOOR:
@@ -208,7 +215,7 @@ def draw_stereo(stage: SceneRenderer, method: str, sheet: SheetPose) -> None:
 def draw_coordinate_ramps(
     stage: SceneRenderer, method: str, sheet: SheetPose
 ) -> tuple[Image, Image]:
-    """The projector's pictures of both patterns of places, for the scene's point of view."""
+    """Return the projector's images of both coordinate ramps, for the scene's point of view."""
     pictures = []
     for pattern in COORDINATE_RAMPS:
         display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)
@@ -232,7 +239,10 @@ def _error_mm(
     judgement: Callable[[], ErrorMeasure],
     _drawn: None,
 ) -> float:
-    """Root mean square of all points seen; infinite when none is.  The floor corrects nothing."""
+    """Return the root mean square error of all points seen; infinite when none is.
+
+    The floor corrects nothing.
+    """
     errors_m = judgement()(*draw_coordinate_ramps(stage, method, sheet))
     return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
 

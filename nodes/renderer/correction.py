@@ -1,17 +1,17 @@
-"""Correction of the projected picture for a moved or pushed sheet: equations (1)-(6) of the paper.
+"""Correct the projected image for a moved or pushed sheet: equations (1)-(6) of the paper.
 
-V is the eye, P the projector, A a point of the object.  C is where the line V-A meets the actual
-screen (the sheet), C' where the line C-P meets the imaginary screen, and A' the point of the line
-V-C' at A's depth.  Drawn at A', the object is seen at A.
+V is the eye, P the projector, A a point of the object. C is where the line V-A meets the actual
+screen (the sheet). C' is where the line C-P meets the imaginary screen, and A' the point of the
+line V-C' at A's depth. Drawn at A', the object is seen at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
-corners.  All points are in the world frame, metres.  What cannot be corrected is masked (`valid`
-false), never moved somewhere:
+corners. All points are in the world frame, metres. What cannot be corrected is masked (`valid`
+false), never moved:
 
 - a screen seen edge-on by the eye or the projector, within `GRAZING_SINE`, or from its other side;
 - a point level with the eye or behind it, or one whose C is behind the eye or the projector.
 
-A triangle without area takes the plane of the whole sheet, and so does a push below `LEAST_PUSH_M`.
+A triangle without area takes the plane of the whole sheet, and so does a push below `MIN_PUSH_M`.
 """
 
 from __future__ import annotations
@@ -28,10 +28,11 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 GRAZING_SINE = 0.05
-"""Sine of the least angle (2.9 degrees) between a ray and the sheet; a pixel smears twentyfold."""
+"""Sine of the minimum angle (2.9 degrees) between a ray and the sheet. At that angle a pixel covers
+twenty times its width."""
 
 NEAR_M = 0.02
-"""Object points nearer to the eye's own depth than this are not drawn."""
+"""Object points closer to the eye's own depth than this are not drawn."""
 
 MIN_PUSH_M = 1e-4
 """Below this depth the four triangles are the plane."""
@@ -47,12 +48,11 @@ class ScreenPlane:
 
 @dataclass(frozen=True, slots=True)
 class ProjectionScreen:
-    """The actual screen: four planes through one point, told apart by where the corners are.
+    """The actual screen: four planes through one point, distinguished by the corners.
 
-    point: r_s (3,), common to all four.
-    normals: n_si (4, 3), towards the user.
-    corners: (4, 3) counter-clockwise as the user sees them; triangle i lies between corner i and
-        the next.  None when all four normals are one plane's.
+    point: r_s (3,), common to all four. normals: n_si (4, 3), towards the user. corners: (4, 3)
+    counter-clockwise as the user sees them. Triangle i lies between corner i and the next. None
+    when all four normals are one plane's.
     """
 
     point: Floats
@@ -62,7 +62,10 @@ class ProjectionScreen:
 
 @dataclass(frozen=True, slots=True)
 class CorrectedPoints:
-    """points: A' (n, 3); on_screen: C' (n, 3); valid: (n,).  Points that are not valid hold A."""
+    """The corrected points A' (n, 3), their points C' on the screen (n, 3), and validity (n,).
+
+    Points that are not valid hold A.
+    """
 
     points: Floats
     on_screen: Floats
@@ -74,18 +77,18 @@ IMAGINARY_SCREEN = ScreenPlane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
 
 
 def make_flat_screen(plane: ScreenPlane) -> ProjectionScreen:
-    """The screen that is one plane."""
+    """Return the screen that is one plane."""
     return ProjectionScreen(plane.point, np.tile(plane.normal, (4, 1)), None)
 
 
 def make_pushed_screen(
     pushed_point: Floats, corners: Floats, plane: ScreenPlane
 ) -> ProjectionScreen:
-    """The four triangles between the pushed point and the sheet's corners (section III-C 3).
+    """Return the four triangles between the pushed point and the sheet's corners (section III-C 3).
 
-    pushed_point: (3,).  corners: (4, 3), left bottom, right bottom, right top, left top.
-    plane: of the sheet at rest; stands in for triangles without area, and for all four when the
-    push is less than `LEAST_PUSH_M`.
+    pushed_point: (3,). corners: (4, 3), left bottom, right bottom, right top, left top. plane: of
+    the sheet at rest. It replaces triangles without area, and all four when the push is less than
+    `MIN_PUSH_M`.
     """
     if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
         return make_flat_screen(plane)
@@ -98,10 +101,10 @@ def make_pushed_screen(
 
 
 def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
-    """(4, 3) unit normals of the planes through the eye, the pushed point and each corner.
+    """Return (4, 3) unit normals of the planes through the eye, the pushed point and each corner.
 
-    Seen from the eye the four spokes divide the picture into sectors; a direction d lies in the
-    sector after spoke i when d . normal_i >= 0 > d . normal_(i+1).  Zeros for one plane, and for a
+    Seen from the eye the four spokes divide the image into sectors. A direction d lies in the
+    sector after spoke i when d . normal_i >= 0 > d . normal_(i+1). Zeros for one plane, and for a
     spoke that the eye sees end-on.
     """
     if screen.corners is None:
@@ -112,11 +115,11 @@ def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
 
 
 def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> NDArray[np.intp]:
-    """Which triangle (n,) each point belongs to: the one that the line V-A crosses.
+    """Return the triangle (n,) of each point: the one that the line V-A crosses.
 
-    It is the sector in which the line lies deepest.  Inside the sheet's outline that is the
-    triangle which is hit; outside, the sectors go on, so that every point has exactly one; where
-    the dent folds over itself as seen from the eye it is decided, though not by which is nearer.
+    It is the sector in which the line lies deepest. Inside the sheet's outline that is the triangle
+    which is hit. Outside, the sectors continue, so that every point has exactly one. Where the
+    indentation folds over itself as seen from the eye, the choice is unique but ignores depth.
     """
     sides = (points - eye) @ sector_normals(screen, eye).T
     depths = np.minimum(sides, -np.roll(sides, -1, axis=1))
@@ -125,9 +128,10 @@ def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> N
 
 
 def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple[Floats, Bools]:
-    """C (n, 3) by equations (1) and (2), and where it exists, before the eye and not grazing.
+    """Return C (n, 3) by equations (1) and (2), and where it exists, before the eye and not
+    grazing.
 
-    r_s: (3,).  n_s: (n, 3), a normal per point.
+    r_s: (3,). n_s: (n, 3), a normal per point.
     """
     denominator = np.sum((eye - points) * n_s, axis=1)
     length = np.linalg.norm(eye - points, axis=1)
@@ -140,7 +144,8 @@ def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple
 def imaginary_point(
     on_actual: Floats, projector: Floats, n_s: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """C' (n, 3) by equations (3) and (4), and where the projector lights the screen's back."""
+    """Return C' (n, 3) by equations (3) and (4), and where the projector lights the screen's
+    back."""
     light = on_actual - projector
     denominator = light @ imaginary.normal
     length = np.linalg.norm(light, axis=1)
@@ -154,7 +159,7 @@ def imaginary_point(
 def shifted_point(
     points: Floats, on_imaginary: Floats, eye: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """A' (n, 3) by equations (5) and (6), and where A is in front of the eye."""
+    """Return A' (n, 3) by equations (5) and (6), and where A is in front of the eye."""
     normal = imaginary.normal
     valid = (eye - points) @ normal > NEAR_M
     denominator = (eye - on_imaginary) @ normal
@@ -170,9 +175,10 @@ def correct(
     screen: ProjectionScreen,
     imaginary: ScreenPlane = IMAGINARY_SCREEN,
 ) -> CorrectedPoints:
-    """A' of every point A (n, 3) by equations (1)-(6); the shader `object.vert.glsl` does the same.
+    """Return A' of every point A (n, 3) by equations (1)-(6); `object.vert.glsl` does the same.
 
-    The eye must stand before the imaginary screen and the projector behind it (ValueError).
+    Raises ValueError unless the eye is in front of the imaginary screen and the projector behind
+    it.
     """
     if (eye - imaginary.point) @ imaginary.normal <= NEAR_M:
         raise ValueError(f"the eye {eye} is not in front of the imaginary screen")
@@ -190,7 +196,8 @@ def correct(
 
 
 def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
-    """Whether the eye sees the front and the projector lights the back at the plane's point."""
+    """Return whether the eye sees the front and the projector lights the back at the plane's
+    point."""
     to_eye, light = eye - plane.point, plane.point - projector
     return bool(
         to_eye @ plane.normal > GRAZING_SINE * np.linalg.norm(to_eye)
@@ -199,7 +206,7 @@ def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
 
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
-    """Where (n, 2) lines from the eye to points (n, 3) cross z = 0, the imaginary screen."""
+    """Return where (n, 2) lines from the eye to points (n, 3) cross z = 0, the imaginary screen."""
     share = eye[2] / (eye[2] - points[:, 2])
     crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * share[:, None]
     return crossings
@@ -213,9 +220,10 @@ def pixel_from_screen(
     cy_px: float,
     world_from_projector: Floats,
 ) -> Floats:
-    """Homography (3, 3): (x, y, 1) on the imaginary screen, metres, to projector pixels.
+    """Return the homography (3, 3) from (x, y, 1) on the imaginary screen, metres, to projector
+    pixels.
 
-    Of a pinhole; a lens bends the pixels afterwards (`lens.py`).
+    It is that of a pinhole; a lens distorts the pixels afterwards (`lens.py`).
     """
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]
@@ -225,7 +233,7 @@ def pixel_from_screen(
 
 
 def clip_from_screen(pixel_from_screen: Floats, width_px: int, height_px: int) -> Floats:
-    """(3, 3): homogeneous (x, y, w) on the imaginary screen to OpenGL's clip (x, y, w).
+    """Return (3, 3): homogeneous (x, y, w) on the imaginary screen to OpenGL's clip (x, y, w).
 
     Pixel (0, 0) is the centre of the top left pixel.
     """

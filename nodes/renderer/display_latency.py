@@ -1,4 +1,4 @@
-"""When the light of a picture begun now will leave, foretold from the pictures before it."""
+"""Predict the display time of a frame from the latencies of recent frames."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ from collections import deque
 from statistics import median
 
 HISTORY = 31
-"""Pictures that the delays are taken from: half a second at 60 Hz, and one slow one is outvoted."""
+"""Frames from which latencies are taken: half a second at 60 Hz, enough to outvote a slow one."""
 
 VSYNC_MARGIN_S = 0.0005
-"""A picture drawn this shortly before a swap is due still makes it."""
+"""A frame drawn this shortly before a swap still makes it."""
 
 ON_TIME_FRACTION = 0.85
-"""Share of the pictures that are to make the swap that is foretold for them."""
+"""Fraction of the frames that must make their predicted swap."""
 
 
 class DisplayLatencyEstimator:
-    """Foretells the middle of the light of a picture from how long drawing and showing took.
+    """Predict the middle of a frame's light from how long drawing and showing took.
 
-    All times are of one clock, ns.  Without a window the light is said to begin when the picture is
-    drawn; with one, when it was swapped to the front.  Where swaps wait for the projector's refresh
-    the next one that the picture will make is counted on from the last.
+    All times are of one clock, ns. Without a window the light begins when the frame is drawn; with
+    one, when it was swapped to the front. Where swaps wait for the projector's refresh, the
+    prediction is the next swap that the frame makes, counted from the last.
     """
 
     def __init__(self, *, first_s: float, display_latency_s: float, period_s: float = 0.0) -> None:
-        """first_s: from the begin to the middle of the light, until a picture has been measured.
+        """first_s: from the begin to the middle of the light, until a frame has been measured.
 
-        light_s: from a swap (or the end of drawing) to the middle of its light.  period_s: of the
-        projector's refresh; 0 when nothing waits for it.
+        display_latency_s: from a swap (or the end of drawing) to the middle of its light. period_s:
+        of the projector's refresh; 0 when nothing waits for it.
         """
         self._first_ns, self._light_ns = round(first_s * 1e9), round(display_latency_s * 1e9)
         self._period_ns = round(period_s * 1e9)
@@ -36,7 +36,7 @@ class DisplayLatencyEstimator:
         self._last_swap_ns = 0
 
     def predict_light_ns(self, begun_ns: int) -> int:
-        """The middle of the light of a picture that is begun at `begun_ns`."""
+        """Return the middle of the light of a frame that is begun at `begun_ns`."""
         if not self._shows_ns:
             return begun_ns + self._first_ns
         usual_ns = begun_ns + round(median(self._shows_ns)) + self._light_ns
@@ -49,18 +49,18 @@ class DisplayLatencyEstimator:
         return self._last_swap_ns + max(swaps, 1) * self._period_ns + self._light_ns
 
     def record_drawn(self, begun_ns: int, drawn_ns: int) -> int:
-        """Take in a picture that no window shows; returns the middle of its light."""
+        """Record a frame that no window shows, and return the middle of its light."""
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(drawn_ns - begun_ns)
         return drawn_ns + self._light_ns
 
     def record_shown(self, begun_ns: int, drawn_ns: int, swapped_ns: int) -> int:
-        """Take in a picture that was swapped to the front; returns the middle of its light."""
+        """Record a frame that was swapped to the front, and return the middle of its light."""
         self._draws_ns.append(drawn_ns - begun_ns)
         self._shows_ns.append(swapped_ns - begun_ns)
         self._last_swap_ns = swapped_ns
         return swapped_ns + self._light_ns
 
     def is_late(self, light_ns: int, predicted_ns: int) -> bool:
-        """Whether light was later than foretold by more than half a frame."""
+        """Return whether light was later than predicted by more than half a frame."""
         return light_ns - predicted_ns > max(self._period_ns // 2, self._light_ns)

@@ -1,4 +1,4 @@
-"""One frame from the newest messages: what is believed, drawn, and said about it."""
+"""Draw one frame from the newest messages, and describe it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ FLANGE_TO_SHEET_M = 0.15
 
 @dataclass(frozen=True, slots=True)
 class RendererInputs:
-    """What a frame is drawn from."""
+    """The inputs that a frame is drawn from."""
 
     skin: Input[Skin]
     soft_body: Input[SoftBody]
@@ -47,7 +47,7 @@ class RendererInputs:
 
 
 class FrameRenderer:
-    """Draws a scene's frames on a screen; counts them, and those whose light was late."""
+    """Draw a scene's frames on an output; count them, and those whose light was late."""
 
     def __init__(
         self,
@@ -73,7 +73,7 @@ class FrameRenderer:
             self.on_soft_body(ports.soft_body.message, ports.soft_body.header)
 
     def is_unchanged(self, shown: Display) -> bool:
-        """Whether a frame would show what the last one did: nobody touches, nothing moves."""
+        """Return whether a frame would equal the last one: nothing touches, nothing moves."""
         ports = self._ports
         arms = (ports.arm_left.message, ports.arm_right.message)
         others = (ports.skin.message, ports.eye.message, shown)
@@ -85,9 +85,9 @@ class FrameRenderer:
         )
 
     def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
-        """Draw a frame and hand it to the screen; also the exposure (ns) that it goes back to.
+        """Draw a frame and hand it to the output; also return its exposure (ns).
 
-        What the frame says of its light is as if no window showed it; see `was_shown`.
+        The frame's light times assume that no window shows it; see `on_shown`.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         self._drawn_of = (ports.skin.message, ports.eye.message, shown)
@@ -160,13 +160,14 @@ class FrameRenderer:
         )
 
     def on_soft_body(self, body: SoftBody, header: Header) -> None:
-        """Take in an answer of the solver."""
+        """Add a response of the solver."""
         self._extrapolator.add(body, header)
 
     def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
-        """Deform the drawn object as the soft body will be; a silent one's is held, however old.
+        """Deform the drawn object as predicted; the last response of a silent solver stays, at any
+        age.
 
-        Returns the exposure (ns) that the picture goes back to, and the instant of the dent.
+        Returns the exposure (ns) of the frame, and the instant of the indentation.
         """
         ports, scene_renderer = self._ports, self.scene_renderer
         skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age_s

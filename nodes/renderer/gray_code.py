@@ -1,9 +1,9 @@
-"""Structured light: Gray code patterns, and what two cameras make of pictures of them.
+"""Generate and decode structured light: Gray code patterns, and camera images of them.
 
-A camera's pixel is wider than a projector's, so the finest stripes are not told apart: each picture
-is decoded to cells of a few projector pixels.  Where a projector pixel is in a picture to a small
-part of a camera's pixel follows from the cells around it, by a smooth map fitted to them (after
-Moreno and Taubin 2012, who fit local homographies).
+A camera's pixel is wider than a projector's, so that the finest stripes are not resolved: each
+image is decoded to cells of a few projector pixels. A smooth map fitted to the cells around a
+projector pixel gives its position in the image to a fraction of a camera pixel (after Moreno and
+Taubin 2012, who fit local homographies).
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
 MIN_CONTRAST = 24
-"""Levels between white and black below which a camera's pixel is not lit by the projector."""
+"""Minimum difference between white and black, in levels, of a camera pixel that the projector
+lights."""
 
 MIN_STRIPE_PX = 4
 """Width of the finest stripes that are used, projector pixels."""
 
 WINDOW_HALF_PX = 22.0
-"""Half the side of the window that a projector pixel's place is fitted in, projector pixels."""
+"""Half the side of the window for the fit at a projector pixel, projector pixels."""
 
 MIN_CELLS = 60
 MAX_FIT_RMS_PX = 0.6
@@ -34,11 +35,12 @@ MAX_FIT_RMS_PX = 0.6
 
 
 class DecodeError(ValueError):
-    """Pictures that are not of the patterns; the message says what is wrong."""
+    """The images do not show the patterns; the message gives the reason."""
 
 
 def patterns(width_px: int, height_px: int) -> list[Image]:
-    """What the projector shows in turn: each stripe and its inverse, then white, then black."""
+    """Return the projector's images in their order: each stripe and its inverse, then white, then
+    black."""
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:
@@ -49,24 +51,28 @@ def patterns(width_px: int, height_px: int) -> list[Image]:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Of one camera: pixels (n, 2) that are lit, and the projector's pixels (n, 2) that light them,
-    each the middle of its cell."""
+    """The lit pixels of one camera: pixels (n, 2), and the projector's pixels (n, 2) that light
+    them.
+
+    The latter are the middles of their cells.
+    """
 
     pixels: Floats
     lit_by: Floats
 
 
 def decode_patterns(pictures: Sequence[Image], width_px: int, height_px: int) -> Decoded:
-    """One camera's pictures (height, width) of `patterns(width_px, height_px)`, in their order.
+    """Decode one camera's images (height, width) of `patterns(width_px, height_px)`, in their
+    order.
 
-    DecodeError for another number of pictures, sizes that differ, or nothing lit.
+    Raises DecodeError for another number of images, sizes that differ, or nothing lit.
     """
     bits = [_bits(width_px), _bits(height_px)]
     wanted = 2 * sum(bits) + 2
     if len(pictures) != wanted:
-        raise DecodeError(f"{len(pictures)} pictures; the patterns are {wanted}")
+        raise DecodeError(f"{len(pictures)} images; the patterns are {wanted}")
     if len({picture.shape for picture in pictures}) != 1:
-        raise DecodeError("the pictures are not of one size")
+        raise DecodeError("the images have different sizes")
     white, black = (picture.astype(np.int16) for picture in pictures[-2:])
     row, column = np.nonzero(white - black >= MIN_CONTRAST)
     if len(row) < MIN_CELLS:
@@ -93,7 +99,7 @@ def _bits(size_px: int) -> int:
 
 
 def find_pixels(view: Decoded, wanted: Floats) -> tuple[Floats, Bools]:
-    """Where (n, 2) a camera sees the projector's pixels (n, 2), and which it sees at all."""
+    """Return the camera's pixels (n, 2) of the projector's pixels (n, 2), and which are found."""
     found, seen = np.zeros((len(wanted), 2)), np.zeros(len(wanted), np.bool_)
     order = np.argsort(view.lit_by[:, 0], kind="stable")
     lit_by, pixels = view.lit_by[order], view.pixels[order]
@@ -111,9 +117,10 @@ def find_pixels(view: Decoded, wanted: Floats) -> tuple[Floats, Bools]:
 
 
 def _fit_pixel(offsets: Floats, pixels: Floats) -> Floats | None:
-    """The camera's pixel (2,) at offset 0 of a quadratic map fitted to offsets (n, 2) in -1..1."""
+    """Return the camera's pixel (2,) at offset 0 of a quadratic map fitted to offsets (n, 2) in
+    -1..1."""
     for _ in range(2):
-        # Cells on all sides, or it would be a guess beyond the sheet's edge.
+        # Cells on all sides are required: beyond the sheet's edge the fit would extrapolate.
         quadrants = (offsets > 0.0) @ np.array([1, 2])
         if len(pixels) < MIN_CELLS or len(np.unique(quadrants)) < 4:
             return None

@@ -1,4 +1,4 @@
-"""Draws the virtual object for the projector, corrected for where the sheet is."""
+"""Draw the virtual object for the projector, corrected for where the sheet is."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ from nodes.renderer.scene_renderer import SceneRenderer
 
 
 class Renderer(Node):
-    """Draws as soon as the soft body has answered to a new fingertip, at most at `rate_hz`.
+    """Draw as soon as the soft body has responded to a new fingertip, at most at `rate_hz`.
 
-    Without a solver the fingertip itself gives the beat, without a finger the timer.  A frame is
+    Without a solver the fingertip triggers a frame, and without a finger the timer does. A frame is
     published when it was drawn, or with a window when that showed it.
     """
 
@@ -99,9 +99,9 @@ class Renderer(Node):
 
     @periodic("rate_hz")
     def refresh(self) -> None:
-        """See to the window, and keep the picture alive when nothing new comes."""
+        """Poll the window, and redraw when no message comes."""
         if not self._output.poll():
-            self._open_anew()
+            self._reopen()
         if self.clock.now_ns() > self._due_ns + self._period_ns:
             self._draw_if_due()
 
@@ -112,8 +112,8 @@ class Renderer(Node):
         """Called by the window's thread, too."""
         self._loop.call_soon_threadsafe(self._publish, *tag, swapped_ns)
 
-    def _open_anew(self) -> None:
-        """A lost context takes all that was drawn with along: begin again from the scene."""
+    def _reopen(self) -> None:
+        """Start again from the scene: a lost context loses all that was drawn with it."""
         self.log.warning("window", problem=self._output.note)
         self._frame_renderer = None
         self._output.close()
@@ -122,7 +122,7 @@ class Renderer(Node):
             self.on_scene(self.scene.message, self.scene.header)
 
     def _draw_if_due(self) -> None:
-        # A quarter of a period early is in time: else a 60 Hz camera beats against 30 Hz.
+        # A quarter of a period early is in time: else a 60 Hz camera interferes with 30 Hz.
         now_ns = self.clock.now_ns()
         if self._frame_renderer is None or now_ns < self._due_ns - self._period_ns // 4:
             return
@@ -131,7 +131,7 @@ class Renderer(Node):
             return
         self._drawn_ns = now_ns
         self._draw(self._frame_renderer, now_ns)
-        # Where drawing is slower than the rate, what has come meanwhile is read before the next.
+        # Where drawing is slower than the rate, messages are read before the next frame.
         rest_until_ns = self.clock.now_ns() + self._period_ns // 2
         self._due_ns = max(self._due_ns + self._period_ns, rest_until_ns)
 
@@ -148,7 +148,7 @@ class Renderer(Node):
             self.frame.publish(frame, source_ns=source_ns)
 
     def _publish(self, frame: Frame, source_ns: int, swapped_ns: int) -> None:
-        """A frame that the window showed, or passed over for a newer one."""
+        """Publish a frame that the window showed, or skipped for a newer one."""
         if self._frame_renderer is not None:
             frame = self._frame_renderer.on_shown(frame, swapped_ns)
         self.frame.publish(frame, source_ns=source_ns)

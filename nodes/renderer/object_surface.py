@@ -1,8 +1,8 @@
-"""The drawn surface: a fine mesh of the scene's object that follows the solver's skin.
+"""Build the drawn surface: a fine mesh of the scene's object that follows the solver's skin.
 
-The equations correct at vertices only, and a silhouette is as round as its facets, so the drawn
-mesh is finer than the solver's and lies on the true shape; between the skin's vertices the
-displacement, and how the normal turns, are interpolated.
+The equations correct at vertices only, and facets are visible in a silhouette. So the drawn mesh is
+finer than the solver's and lies on the true shape. Between the skin's vertices the displacement and
+the rotation of the normal are interpolated.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Real = TypeVar("Real", np.float32, np.float64)
 Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
 
 MIN_AROUND = 128
-"""Vertices around a cylinder, sphere or ellipsoid: its outline must not show corners."""
+"""Minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
 CANDIDATES = 16
 """Sample points of a skin, next to a drawn vertex, whose triangles may hold the nearest point."""
 
@@ -36,8 +36,8 @@ CANDIDATES = 16
 class ObjectSurface:
     """The object at rest, world frame.
 
-    rest_world_m, normals_world: (vertices, 3); along a sharp edge vertices are doubled.
-    triangles: (triangles, 3), outward.
+    rest_world_m, normals_world: (vertices, 3); along a sharp edge vertices are doubled. triangles:
+    (triangles, 3), outward.
     """
 
     rest_world_m: Floats
@@ -48,7 +48,7 @@ class ObjectSurface:
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
     ) -> ObjectSurface:
-        """A surface given in the object's frame."""
+        """Return a surface given in the object's frame."""
         return ObjectSurface(
             apply(world_from_object, points),
             normals @ world_from_object[:3, :3].T,
@@ -59,10 +59,10 @@ class ObjectSurface:
 def make_surface(
     geometry: Geometry, shape: Shape, *, world_from_object: Floats, spacing_m: float
 ) -> ObjectSurface:
-    """The surface of a scene's geometry, whose shape is `shape`; vertices about `spacing_m` apart.
+    """Return the surface of a scene's geometry with this shape; vertices about `spacing_m` apart.
 
-    Of a plane only the touchable rectangle is drawn, of a mesh the smooth surface that it stands
-    for.  ValueError for a spacing that would take too many triangles.
+    Only the touchable rectangle of a plane is drawn, and the smooth surface of a mesh. Raises
+    ValueError for a spacing that needs too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -93,7 +93,7 @@ def make_surface(
 def cylinder_surface(
     *, radius_m: float, length_m: float, world_from_object: Floats, spacing_m: float
 ) -> ObjectSurface:
-    """A closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
+    """Return a closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
 
     Its side comes first, ring by ring; then each end cap, with a rim of its own and a centre.
     """
@@ -130,7 +130,7 @@ def _cells(length_m: float, spacing_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Points (n, 2) of a grid over -0.5..0.5, and its triangles, counter-clockwise."""
+    """Return points (n, 2) of a grid over -0.5..0.5, and its triangles, counter-clockwise."""
     u, v = np.meshgrid(
         np.linspace(-0.5, 0.5, columns + 1), np.linspace(-0.5, 0.5, rows + 1), indexing="xy"
     )
@@ -148,10 +148,10 @@ def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
 def _inflate_cuboid(
     geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape, spacing_m: float
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """A cuboid's surface grid drawn onto a rounder solid: points (n, 3), triangles (t, 3).
+    """Return a cuboid's surface grid mapped onto a rounder solid: points (n, 3), triangles (t, 3).
 
     Onto a box by the nearest points; onto an ellipsoid by the map of a cube to the sphere that
-    nearly keeps areas, (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and in turn).
+    nearly keeps areas, (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically).
     """
     if isinstance(geometry, RoundedBox):
         half = 0.5 * np.array(geometry.size_m)
@@ -181,13 +181,8 @@ def _inflate_cuboid(
     return onto, joined.ravel()[np.concatenate(triangles)]
 
 
-def normals_of(surface: ObjectSurface, positions: Floats) -> Floats:
-    """Smooth unit normals (vertices, 3) of the surface moved to `positions` (vertices, 3)."""
-    return VertexNormals(surface.triangles, len(positions))(positions)
-
-
 class VertexNormals:
-    """Unit normals at the vertices of moving triangles: their triangles' mean, by area."""
+    """Compute unit normals at the vertices of moving triangles: their triangles' mean, by area."""
 
     def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
         columns = np.repeat(np.arange(len(triangles)), 3)
@@ -198,9 +193,9 @@ class VertexNormals:
         self._corners = [np.ascontiguousarray(triangles[:, i]) for i in range(3)]
 
     def __call__(self, positions: NDArray[Real]) -> NDArray[Real]:
-        """(vertices, 3) for positions (vertices, 3)."""
-        # By rows of one coordinate: gathering and multiplying run over whole memory then.  np.cross
-        # is several times slower than its own six products.
+        """Return (vertices, 3) for positions (vertices, 3)."""
+        # By rows of one coordinate: gathering and multiplying then access contiguous memory.
+        # np.cross is several times slower than its own six products.
         places = np.ascontiguousarray(positions.T)
         a, b, c = (places.take(corner, axis=1) for corner in self._corners)
         b -= a
@@ -215,10 +210,10 @@ class VertexNormals:
 
 
 class DeformationTransfer:
-    """A drawn surface that moves as a skin does.
+    """Transfer a skin's displacement to a drawn surface.
 
-    A drawn vertex moves as the nearest point of the skin; its normal, exact at rest, turns as the
-    skin's own smooth normals there turn on the mean.
+    A drawn vertex moves as the nearest point of the skin. Its normal, exact at rest, rotates as the
+    skin's own smooth normals there rotate on average.
     """
 
     def __init__(
@@ -226,7 +221,7 @@ class DeformationTransfer:
     ) -> None:
         """skin_vertices: (s, 3) at rest, world; skin_triangles: (t, 3), outward.
 
-        ValueError for a skin without triangles, or with places that are not finite.
+        Raises ValueError for a skin without triangles, or with coordinates that are not finite.
         """
         self.vertices = len(skin_vertices)
         self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
@@ -239,15 +234,15 @@ class DeformationTransfer:
         self._moves = np.empty((self.vertices, 6), np.float32)
 
     def apply(self, displacement: Singles | None) -> Singles:
-        """Positions and normals, not of unit length, side by side (vertices, 6).
+        """Return positions and normals, not of unit length, side by side (vertices, 6).
 
-        displacement: (s, 3) of the skin; None for the rest.  ValueError for one of another skin, or
-        that is not finite.
+        displacement: (s, 3) of the skin; None: at rest. Raises ValueError for one of another skin,
+        or one that is not finite.
         """
         if displacement is None:
             return self._rest
         if displacement.shape != self._skin.shape:
-            raise ValueError(f"displacement of {len(displacement)} vertices fits no skin")
+            raise ValueError(f"displacement of {len(displacement)} vertices does not fit the skin")
         moves = self._moves
         moves[:, :3] = displacement
         # A sum is NaN or infinite as soon as one of its terms is.
@@ -260,10 +255,11 @@ class DeformationTransfer:
 
 
 def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
-    """(points, skin vertices), float32: interpolates what the skin's vertices carry at the points.
+    """Return (points, skin vertices), float32: interpolates values of the skin's vertices at
+    points.
 
     Each point takes the barycentric weights of the nearest point of the skin; triangles without
-    area are passed over.  ValueError for a skin that has no others, or with NaN.
+    area are ignored. Raises ValueError for a skin that has no others, or with NaN.
     """
     if not np.isfinite(skin_vertices).all():
         raise ValueError("the skin has vertices that are not finite")
@@ -294,10 +290,10 @@ def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indic
 
 
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Points (n, 3) spread over triangles (t, 3, 3), and whose they are (n,).
+    """Return points (n, 3) spread over triangles (t, 3, 3), and their triangle (n,).
 
-    Large triangles get more, so that of a skin finer in front the nearest samples tell the nearest
-    triangle everywhere.
+    Large triangles get more. So the nearest samples find the nearest triangle also on a skin that
+    is finer in front.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
     parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)

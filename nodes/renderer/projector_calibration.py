@@ -1,7 +1,7 @@
-"""The projector's optics and where it stands, from the points that its pixels light.
+"""Calibrate the projector's optics and pose from the points that its pixels light.
 
-A projector is a camera run backwards: each of its pixels lights a point, and two cameras measure
-that point.  So points are measured, not assumed, and the sheet may be held anywhere.
+A projector is an inverse camera: each of its pixels lights a point, and two cameras measure that
+point. So points are measured, not assumed, and the sheet may be held anywhere.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
-"""Between the projector pixels that are looked for."""
+"""Distance between the projector pixels that are searched."""
 
 MIN_POSES, MIN_POINTS = 3, 200
 MIN_DEPTH_RANGE_M = 0.03
@@ -40,19 +40,19 @@ MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
 OUTLIER_RATIO = 4.0
 TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""How far a projector is from a scene's by tape measure: turn (rad), place (m), focal length (as a
-share), principal point (px).  Only the ratios count."""
+"""Typical errors of a scene's projector from a tape measure: rotation (rad), position (m), focal
+length (relative), principal point (px). Only the ratios count."""
 
 
 class ProjectorError(ValueError):
-    """Pictures or points that make no calibration; the message says what to change."""
+    """Images or points that give no calibration; the message gives the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProjectorPoints:
     """World points (n, 3), the projector's pixels (n, 2) that light them, the pose (n,) of each.
 
-    skew_m: (n,) how far the two cameras' rays pass one another.
+    skew_m: (n,) the distance between the two cameras' rays.
     """
 
     world: Floats
@@ -63,10 +63,10 @@ class ProjectorPoints:
 
 @dataclass(frozen=True, slots=True)
 class ProjectorFit:
-    """A calibrated projector and what it leaves, in projector pixels and, on the sheet, metres.
+    """A calibrated projector and its residuals, in projector pixels and, on the sheet, metres.
 
-    held_out_rms_px: of poses that it was fitted without.  before_rms_px: of the projector that it
-    began with.  coverage_ratio: share of the picture's cells with points.
+    held_out_rms_px: of poses that it was fitted without. before_rms_px: of the initial projector.
+    coverage_ratio: fraction of the image's cells with points.
     """
 
     projector: Projector
@@ -86,10 +86,10 @@ def measure_points(
     camera: StereoCamera,
     projector: Projector,
 ) -> ProjectorPoints:
-    """Triangulate what the projector's pixels light: left and right pictures of each pose.
+    """Triangulate what the projector's pixels light, from left and right images of each pose.
 
-    camera: its optics as calibrated, `world_from_left` from the scene.  ProjectorError names the
-    pose whose pictures are not of the patterns.
+    camera: its optics as calibrated, `world_from_left` from the scene. Raises ProjectorError, which
+    names the pose whose images do not show the patterns.
     """
     size = projector.width_px, projector.height_px
     columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
@@ -110,7 +110,8 @@ def measure_points(
 
 
 def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
-    """World points (n, 3) midway between the rays of pixels (n, 2), and the rays' distance (n,)."""
+    """Return world points (n, 3) midway between the rays of pixels (n, 2), and the rays' distance
+    (n,)."""
     from_right = inverse(camera.right_from_left)
     slopes = [
         normalize(
@@ -134,7 +135,7 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tup
 
 
 def project_points(projector: Projector, world: Floats) -> Floats:
-    """The projector's pixels (n, 2) that light world points (n, 3)."""
+    """Return the projector's pixels (n, 2) that light world points (n, 3)."""
     lens, pose = projector.lens, projector.world_from_projector
     local = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), world)
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
@@ -142,10 +143,10 @@ def project_points(projector: Projector, world: Floats) -> Floats:
 
 
 def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
-    """The projector that lights the points, fitted from a rough one.
+    """Fit the projector that lights the points, from an initial one.
 
-    ProjectorError where the points are too few, too alike in depth, cover too little of the
-    picture, or are not of one projector.
+    Raises ProjectorError where the points are too few, too similar in depth, cover too little of
+    the image, or are not of one projector.
     """
     kept = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _depth_range(points, guess)
@@ -162,8 +163,8 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
         )
     if coverage < MIN_COVERAGE:
         raise ProjectorError(
-            f"the points cover {100 * coverage:.0f} % of the projector's picture, "
-            f"{100 * MIN_COVERAGE:.0f} % are needed: the lens is not told elsewhere"
+            f"the points cover {100 * coverage:.0f} % of the projector's image, "
+            f"{100 * MIN_COVERAGE:.0f} % are needed: the lens is not determined elsewhere"
         )
     for _ in range(3):
         projector = _fitted(points, kept, guess)
@@ -175,8 +176,8 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     rms = _rms(off[kept])
     if rms > MAX_RMS_PX or kept.mean() < 0.8:
         raise ProjectorError(
-            f"{rms:.2f} px rms and {int((~kept).sum())} strays of {len(kept)} points: not one "
-            "projector, or the sheet moved between its pictures; hold it still, check the cameras "
+            f"{rms:.2f} px rms and {int((~kept).sum())} outliers of {len(kept)} points: not one "
+            "projector, or the sheet moved between its images; hold it still, check the cameras "
             "(flexsheet calibrate check)"
         )
     held_out = [
@@ -282,12 +283,13 @@ def _projector(
 def keystone(
     corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector
 ) -> ProjectorFit:
-    """The projector whose pixels (4, 2) light the corners of a rectangle on the imaginary screen.
+    """Fit the projector whose pixels (4, 2) light the corners of a rectangle on the imaginary
+    screen.
 
-    corners_px: left bottom, right bottom, right top, left top, as the user sees them.  The picture
-    on the screen, a homography, is met exactly; eight numbers (pose, focal length, one of the
-    principal point's) take it up, nearest to the guess's, whose distortion stays.  ProjectorError
-    where the corners are no convex quadrangle.
+    corners_px: left bottom, right bottom, right top, left top, as the user sees them. The image on
+    the screen, a homography, is matched exactly. Eight numbers (pose, focal length, one of the
+    principal point's) realize it, nearest to the guess's, whose distortion stays. Raises
+    ProjectorError where the corners are no convex quadrangle.
     """
     x, y = half_width_m, half_height_m
     world = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], dtype=np.float64)
@@ -296,8 +298,8 @@ def keystone(
     turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
     if not ((turns > 1.0).all() or (turns < -1.0).all()):
         raise ProjectorError(
-            f"corners {corners_px.tolist()} are no convex quadrangle: give them left bottom, right "
-            "bottom, right top, left top, as the user sees them"
+            f"corners {corners_px.tolist()} are no convex quadrangle: give them as left bottom, "
+            "right bottom, right top, left top, as the user sees them"
         )
     lens, pose = guess.lens, guess.world_from_projector
     start = transform_from_rpy(pose.position_m, pose.rpy_rad)

@@ -1,4 +1,4 @@
-"""What is drawn for one scene: the object, the projector, and the sheet as it is believed to be."""
+"""Draw one scene: the object, the projector, and the predicted sheet."""
 
 from __future__ import annotations
 
@@ -43,16 +43,18 @@ from nodes.renderer.sheet_mesh import (
 Floats = NDArray[np.float64]
 
 OVERSAMPLING = 1.5
-"""Pixels of the eye's picture to one of the projector's."""
+"""Pixels of the eye's image per pixel of the projector's."""
 
 WINDOW_MARGIN_M, WINDOW_STEP_M = 0.001, 0.004
-"""The window goes by steps, lest an outline's pixels swim as the object moves."""
+"""Margin of the rectangle around the object, and steps of its edges. Steps keep an outline's pixels
+steady as the object moves."""
 MAX_WINDOW_M = 0.3
-"""The window's reach from the screen's middle: farther out no sheet is."""
+"""Maximum extent of the rectangle from the screen's middle: the sheet ends before."""
 MIN_REPORTED_FRACTION = 0.005
-"""A smaller share that folds take is not told."""
+"""A smaller occluded fraction is not reported."""
 NO_SHAPES_NOTE = (
-    "no dent shapes at hand: a pushed sheet is taken for four triangles (flexsheet prepare)"
+    "no deflection shapes in the cache: a pushed sheet is drawn as four triangles "
+    "(flexsheet prepare)"
 )
 
 GRID_WINDOW = ScreenRectangle(-0.151, -0.151, 0.302, 0.302)
@@ -63,7 +65,8 @@ def pose_matrix(pose: Pose) -> Floats:
 
 
 def projector_homography(scene: Scene) -> Floats:
-    """(3, 3): the imaginary screen, metres, to projector pixels before the lens bends them."""
+    """Return (3, 3): the imaginary screen, metres, to projector pixels before the lens distorts
+    them."""
     lens = scene.projector.lens
     return pixel_from_screen(
         fx_px=lens.fx_px,
@@ -75,7 +78,7 @@ def projector_homography(scene: Scene) -> Floats:
 
 
 class SceneRenderer:
-    """A scene ready to be drawn."""
+    """Draw frames of one scene."""
 
     def __init__(
         self,
@@ -87,9 +90,8 @@ class SceneRenderer:
         dents: DentShapes | None = None,
         sheet_shape: SheetShapeMethod = "reduced_order",
     ) -> None:
-        """dents: of the scene's sheet, for the two-pass projection; without them a pushed sheet is
-        taken for four triangles.  ValueError for a lens that folds the projector's picture.
-        """
+        """dents: of the scene's sheet, for the two-pass projection. Without them a pushed sheet is
+        drawn as four triangles. Raises ValueError for a lens that folds the projector's image."""
         projector, geometry = scene.projector, scene.object.geometry
         self.scene = scene
         self._world_from_projector = pose_matrix(projector.world_from_projector)
@@ -105,7 +107,7 @@ class SceneRenderer:
             spacing_m=spacing_m,
         )
         self._object_from_world = inverse(self._world_from_object)
-        # From the nearest vertex on, the nearest point of a mesh is found ten times as fast.
+        # Starting from the nearest vertex makes the closest point of a mesh ten times as fast.
         meshed = isinstance(geometry, Mesh)
         self._near = cKDTree(self._surface.rest_world_m) if meshed else None
         self.canvas = Canvas(context, projector.width_px, projector.height_px, samples=samples)
@@ -129,7 +131,7 @@ class SceneRenderer:
         self.mesh_id: str | None = None
 
     def _material(self) -> Material:
-        """The scene's appearance; an image is fitted to the object's front."""
+        """Return the scene's appearance; an image is fitted to the object's front."""
         appearance, object_from_world = (
             self.scene.object.appearance,
             inverse(self._world_from_object),
@@ -148,15 +150,16 @@ class SceneRenderer:
         )
 
     def set_skin(self, skin: Skin) -> None:
-        """From now on the drawn surface follows displacements of this skin."""
+        """Let the drawn surface follow displacements of this skin from now on."""
         vertices = skin.vertices_world_m.astype(np.float64)
         self._follower = DeformationTransfer(self._surface, vertices, skin.triangles)
         self.mesh_id = skin.mesh_id
 
     def deform(self, body: SoftBody | None) -> None:
-        """Deform the surface as a soft body of the followed skin says; None puts it to rest.
+        """Deform the surface by a soft body's response to the present skin; None: at rest.
 
-        ValueError when the displacement is not of that skin, or not finite: the surface stays.
+        Raises ValueError when the displacement is not of that skin, or not finite: the surface
+        stays.
         """
         if body is self._shaped_by:
             return
@@ -164,7 +167,7 @@ class SceneRenderer:
             self.canvas.set_shape(self._surface.rest_world_m, self._surface.normals_world)
             self._box_world = _box_around(self._surface.rest_world_m)
         elif self._follower is None:
-            raise ValueError("a soft body came before its skin")
+            raise ValueError("a soft_body message came before its skin")
         else:
             moved = self._follower.apply(body.displacement_world_m)
             self.canvas.set_moved(moved)
@@ -174,7 +177,8 @@ class SceneRenderer:
     def draw_style(
         self, shown: Display, finger_tip: Floats | None, target: SheetTarget | None
     ) -> DrawStyle:
-        """How to paint what is shown: marks where the finger is and where the sheet is tangent.
+        """Return how to draw what is shown, with marks at the finger and where the sheet is
+        tangent.
 
         finger_tip: (3,) when the light leaves, or None when it is not known.
         """
@@ -189,7 +193,8 @@ class SceneRenderer:
         )
 
     def surface_point(self, world_point: Floats) -> Floats:
-        """The point (3,) of the undeformed object nearest to a world point, for the marks."""
+        """Return the point (3,) of the undeformed object nearest to a world point, for the
+        marks."""
         start = None
         if self._near is not None:
             _, vertex = self._near.query(world_point)
@@ -198,19 +203,21 @@ class SceneRenderer:
         return apply(self._world_from_object, nearest.point)
 
     def sheet_at_rest(self) -> SheetPose:
-        """The slack sheet on the imaginary screen: assumed while no arm has said otherwise."""
+        """Return the slack sheet on the imaginary screen: assumed before any arm reports a pose."""
         half = 0.5 * self.scene.sheet.width_m * np.array([1.0, 0.0, 0.0])
         left, right = transform(np.eye(3), -half), transform(np.eye(3), half)
         return SheetPose(np.eye(4), corners(left, right, self.scene.sheet.height_m), None)
 
     def usable(self, sheet: SheetPose, centre: Floats | None = None) -> bool:
-        """Whether the eyes, about `centre` (3,) or the scene's, see the sheet's front and the
-        projector lights its back."""
+        """Return whether the eyes see the sheet's front and the projector lights its back.
+
+        centre: (3,) between the eyes; None: the scene's.
+        """
         eye = self.scene.eyes.centre_world_m if centre is None else centre
         return is_plane_usable(sheet.plane, eye, self._world_from_projector[:3, 3])
 
     def eyes(self, display: Display) -> Floats:
-        """(2, 3): the scene's left and right eye; twice the point of view when mono."""
+        """Return (2, 3): the scene's left and right eye; twice the point of view when mono."""
         return both_eyes(self.scene.eyes, display.stereo)
 
     def draw(
@@ -223,11 +230,11 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """Draw what the projector shall show; the picture (height, width, 3) if `read`.
+        """Draw the projector's image; return it (height, width, 3) if `read`.
 
-        eyes: (1 or 2, 3), one picture each; None: the scene's, one when mono.  `drawn(number)` is
-        called when an eye's picture is in `canvas.resolved`, which the next one takes.
-        ValueError for a sheet that is nowhere (NaN).
+        eyes: (1 or 2, 3), one image each; None: the scene's, one when mono. `drawn(number)` is
+        called when an eye's image is in `canvas.resolved`, which the next one overwrites. Raises
+        ValueError for a sheet with NaN.
         """
         if not np.isfinite(sheet.world_from_sheet.sum() + sheet.corners.sum()):
             raise ValueError("the sheet's pose is not finite")
@@ -252,7 +259,7 @@ class SceneRenderer:
         eyes: Floats | None = None,
         drawn: Callable[[int], None] = lambda number: None,
     ) -> Image | None:
-        """As `draw`, in two passes onto a sheet of that shape."""
+        """Draw as `draw`, in two passes onto a sheet of that shape."""
 
         def draw_eye(eye: Floats) -> None:
             window = GRID_WINDOW if look.pattern in SCREEN_PATTERNS else self._window(eye)
@@ -261,7 +268,7 @@ class SceneRenderer:
         return self._draw_eyes(display, draw_eye, read=read, eyes=eyes, drawn=drawn)
 
     def view(self, eye: Floats, screen: ProjectionScreen | None = None) -> EyeView:
-        """What an eye's picture is drawn with; corrected for a screen, or not."""
+        """Return the view of an eye's image, corrected for a screen, or not."""
         projector = self._world_from_projector[:3, 3]
         return EyeView(eye, projector, screen, self._clip_from_screen, self._lens)
 
@@ -289,10 +296,10 @@ class SceneRenderer:
         return pack(pictures[0], pictures[-1], display.stereo, swap_eyes=display.swap_eyes)
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
-        """The sheet as `sheet_shape` has it; of dents, four triangles as long as no dent shapes are
-        at hand.
+        """Return the sheet's mesh by `sheet_shape`; four triangles while reduced_order has no
+        shapes.
 
-        `note` says where it is not quite so.
+        `note` reports where it is not exact.
         """
         if self.sheet_shape != "reduced_order" or self.dents is None:
             wants_shapes = self.sheet_shape == "reduced_order"
@@ -316,7 +323,7 @@ class SceneRenderer:
         )
 
     def _report_folds(self, mesh: SheetMesh, eye: Floats) -> None:
-        """Measure and note what of the sheet gets no light because it is folded."""
+        """Measure the fraction of the sheet without light because of folds, and note it."""
         self.occluded_fraction = occluded_fraction(mesh, eye, self._world_from_projector[:3, 3])
         if self.occluded_fraction > MIN_REPORTED_FRACTION:
             folds = (
@@ -325,9 +332,9 @@ class SceneRenderer:
             self.note = "; ".join(filter(None, (self.note, folds)))
 
     def _window(self, eye: Floats) -> ScreenRectangle:
-        """What of the imaginary screen the object covers, as the eye sees it.
+        """Return the part of the imaginary screen that the object covers, as the eye sees it.
 
-        What is level with the eye or behind it is not drawn; the window ends at `WIDEST_M`.
+        Points level with the eye or behind it are not drawn; the rectangle ends at `MAX_WINDOW_M`.
         """
         box = np.minimum(self._box_world, [np.inf, np.inf, eye[2] - NEAR_M])
         crossings = on_imaginary_screen(box, eye)
@@ -346,6 +353,6 @@ class SceneRenderer:
 
 
 def _box_around(points: NDArray[np.floating]) -> Floats:
-    """Corners (8, 3) of the box around points."""
+    """Return the corners (8, 3) of the box around points."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return np.array(list(product(*zip(low, high, strict=True))))

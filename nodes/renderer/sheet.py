@@ -1,4 +1,4 @@
-"""Where the sheet is believed to be, and the screen that the paper's equations take it for."""
+"""Estimate the sheet's pose, and the screen that the paper's equations assume for it."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from nodes.renderer.correction import (
 Floats = NDArray[np.float64]
 
 MIN_EDGE_DISTANCE_M = 0.05
-"""Flanges nearer to one another than this hold no sheet: the poses are not believed."""
+"""Minimum distance of the flanges; closer poses are implausible for a sheet."""
 
 
 @dataclass(frozen=True, slots=True)
 class SheetPose:
-    """The sheet as it is believed to be when the light leaves.
+    """The predicted sheet when the light leaves.
 
-    world_from_sheet: (4, 4).  corners: (4, 3).  pushed_point: (3,) in the world, or None.
+    world_from_sheet: (4, 4). corners: (4, 3). pushed_point: (3,) in the world, or None.
     """
 
     world_from_sheet: Floats
@@ -40,7 +40,7 @@ class SheetPose:
 
     @property
     def edge_distance_m(self) -> float:
-        """Between the middles of both clamped edges."""
+        """Distance between the middles of both clamped edges."""
         left_bottom, right_bottom, right_top, left_top = self.corners
         return float(np.linalg.norm(right_bottom + right_top - left_bottom - left_top)) / 2.0
 
@@ -59,11 +59,11 @@ def estimate_sheet(
     ahead_s: float,
     finger_tip: Floats | None,
 ) -> SheetPose | None:
-    """The sheet between two edges, moved on by `twist_world` (6,) for `ahead_s`.
+    """Return the sheet between two edges, moved by `twist_world` (6,) for `ahead_s`.
 
-    finger_tip: (3,) at that instant, or None.  It pushes the sheet when it is below the plane and
-    over the sheet.  None when the edges are too near to one another to hold a sheet, or a pose or
-    the twist is not finite.
+    finger_tip: (3,) at that instant, or None. It pushes the sheet when it is below the plane and
+    over the sheet. Returns None when the edges are too close for a sheet, or a pose or the twist is
+    not finite.
     """
     left, right = world_from_left_edge, world_from_right_edge
     if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
@@ -84,7 +84,7 @@ def estimate_sheet(
 
 
 def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
-    """The screen that the equations assume; None for no correction, or one without equations."""
+    """Return the screen that the equations assume; None for a method without equations."""
     if method in ("none", "two_pass"):
         return None
     if method == "four_triangles" and sheet.pushed_point is not None:

@@ -1,4 +1,4 @@
-"""Where the renderer believes the sheet and the fingertip to be when the light leaves."""
+"""Predict the sheet and the fingertip at the instant when the light leaves."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ Floats = NDArray[np.float64]
 
 
 class SheetPosePredictor:
-    """The sheet from the measured flange poses; the last good one while those are no good.
+    """Predict the sheet from the measured flange poses; keep the last valid sheet without them.
 
-    Poses older than `stale_s` are not used.  `note` says why the last plane is held; empty
-    otherwise.
+    Poses older than `max_age_s` are not used. `note` gives the reason why the last plane is kept;
+    empty otherwise.
     """
 
     def __init__(self, *, max_age_s: float) -> None:
@@ -37,9 +37,9 @@ class SheetPosePredictor:
         horizon_s: float,
         eye: Floats,
     ) -> SheetPose:
-        """The sheet at `horizon_s` from now; before any pose was measured, the one at rest.
+        """Return the sheet `horizon_s` from now; before the first measured pose, the one at rest.
 
-        finger_tip: (3,) at that instant, or None.  eye: (3,) the point of view.
+        finger_tip: (3,) at that instant, or None. eye: (3,) the point of view.
         """
         sheet, age_s = None, max(left.age_s(), right.age_s())
         if left.message is not None and right.message is not None and age_s <= self._max_age_s:
@@ -58,11 +58,11 @@ class SheetPosePredictor:
         if sheet is not None and scene_renderer.usable(sheet, eye):
             self._sheet, self.note = sheet, ""
             return sheet
-        why = "sheet edge-on or turned away"
+        why = "sheet edge-on or facing away"
         if sheet is None:
             fresh = age_s <= self._max_age_s
-            why = "the flanges hold no sheet" if fresh else f"arm poses {age_s:.2f} s old"
-        self.note = f"{why}: holding the last good sheet plane"
+            why = "flange poses fit no sheet" if fresh else f"arm poses {age_s:.2f} s old"
+        self.note = f"{why}: keeping the last valid sheet plane"
         if self._sheet is None:
             self._sheet = scene_renderer.sheet_at_rest()
         return self._sheet
@@ -71,7 +71,7 @@ class SheetPosePredictor:
 def predict_fingertip(
     finger: Input[Fingertip], horizon_s: float, *, max_age_s: float
 ) -> Floats | None:
-    """The fingertip (3,) at `horizon_s` from now, or None when it is not known."""
+    """Return the fingertip (3,) `horizon_s` from now, or None when it is not known."""
     age_s = finger.age_s()
     if finger.message is None or not finger.message.valid or age_s > max_age_s:
         return None

@@ -1,7 +1,7 @@
-"""The sheet-shape method family: how long the sheet's shape takes, how far it is from the sheet.
+"""Measure the sheet-shape methods: the time of a shape, and its distance from the true sheet.
 
-What is judged is the height of each method's mesh over the flat sheet against the true sheet's, at
-the true sheet's own points; the true sheet is brought along by whoever asks for the family.
+The error is the height of each method's mesh over the flat sheet against the true sheet's, at the
+true sheet's own points. The caller provides the true sheet.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ from nodes.renderer.sheet_mesh import (
 Floats = NDArray[np.float64]
 
 ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
-"""Points (n, 3) of the true sheet in the world, between two edges and under a fingertip (3,)."""
+"""Returns points (n, 3) of the true sheet in the world, between two edges and under a fingertip
+(3,)."""
 
 WITHOUT_SHAPES = ("four_triangles",)
 METHODS = (*WITHOUT_SHAPES, "reduced_order", "membrane")
@@ -46,8 +47,10 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
 
 
 def sheet_shape_family(judge: ReferenceFactory, *, solved: bool = True) -> Family:
-    """Every shape at the scene's stretches, over depths and places; without `solved`, those alone
-    that nothing need be solved for."""
+    """Return every shape at the scene's stretches, over depths and points.
+
+    Without `solved`, only shapes that need no solution beforehand.
+    """
     return Family(
         name="sheet-shape",
         unit="mm",
@@ -118,9 +121,9 @@ def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Tri
 
 
 def height_error_mm(mesh: SheetMesh, *, truth: Floats) -> float:
-    """Root mean square of the mesh's height less the truth's, at the truth's points (n, 3), mm.
+    """Return the root mean square height difference at the reference's points (n, 3), mm.
 
-    Heights are along the world's z, as the sheets of the family lie.
+    Heights are along the world's z, because the sheets of the family are horizontal.
     """
     heights = LinearNDInterpolator(mesh.vertices[:, :2], mesh.vertices[:, 2])(truth[:, :2])
     off = (heights - truth[:, 2])[np.isfinite(heights)]

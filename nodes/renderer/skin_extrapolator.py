@@ -1,8 +1,8 @@
-"""The dented object when the light leaves: the solver's answers, carried on as they have moved.
+"""Extrapolate the solver's responses to the instant when the light leaves.
 
-The solver answers to where the finger was at the exposure (or its own `lead_s` later); the light
-leaves some tens of milliseconds after that.  A straight line through an older and the newest answer
-carries the skin on, vertex by vertex.
+The solver responds to the finger at the exposure, or `prediction_horizon_s` later. The light leaves
+some tens of milliseconds after that. A straight line through an older and the newest response
+extrapolates the skin, vertex by vertex.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from messages.types import SoftBody
 
 HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06
-"""Between the two answers: with less, noise is carried on enlarged; with more, the past counts."""
+"""Time between the two responses. A shorter one amplifies noise, a longer one lags."""
 
 MAX_EXTRAPOLATION_S = 0.06
-"""The skin is carried on no farther: a finger may turn by then."""
+"""Maximum extrapolation of the skin: a finger may reverse by then."""
 
 
 class SkinExtrapolator:
-    """Keeps the solver's last answers."""
+    """Store the solver's last responses, and extrapolate them."""
 
     def __init__(self) -> None:
         self._kept: deque[tuple[int, SoftBody]] = deque(maxlen=HISTORY)
         self._clock_id = ""
 
     def add(self, body: SoftBody, header: Header) -> None:
-        """A new answer; those of another skin, method or clock are forgotten."""
+        """Add a response; another skin, method or clock clears the earlier ones."""
         last = self._kept[-1][1] if self._kept else None
         other = last is not None and (last.mesh_id, last.method) != (body.mesh_id, body.method)
         at_ns = header.source_ns + round(body.prediction_horizon_s * 1e9)
@@ -38,10 +38,11 @@ class SkinExtrapolator:
         self._kept.append((at_ns, body))
 
     def extrapolate(self, at_ns: int, clock_id: str) -> tuple[SoftBody | None, int]:
-        """The skin at `at_ns` of that clock, and the instant (ns) that it was carried on to.
+        """Return the skin at `at_ns` of that clock, and the instant (ns) that it was extrapolated
+        to.
 
-        The newest answer as it is where that is of another clock, later than `at_ns`, or alone;
-        None and 0 before the first.
+        Returns the newest response unchanged where that has another clock, is later than `at_ns`,
+        or is alone. Returns None and 0 before the first.
         """
         if not self._kept:
             return None, 0
