@@ -85,12 +85,12 @@ def rename(type_name: str, fields: Fields) -> Fields:
 def _rename_value(fields: Fields, path: Sequence[str], values: Mapping[str, str]) -> Fields:
     if not isinstance(fields, dict) or path[0] not in fields:
         return fields
-    value = fields[path[0]]
+    value: Any = fields[path[0]]
     if len(path) > 1:
-        renamed = _rename_value(value, path[1:], values)
-    else:
-        renamed = values.get(value, value) if isinstance(value, str) else value
-    return fields | {path[0]: renamed}
+        value = _rename_value(value, path[1:], values)
+    elif isinstance(value, str):
+        value = values.get(value, value)
+    return fields | {path[0]: value}
 
 
 def _rename_in_schema(type_name: str, schema: Schema) -> Schema:

@@ -34,7 +34,7 @@ def test_a_skin_coarser_than_the_fingertip_is_refused() -> None:
 
 
 def test_an_incompressible_body_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"poisson_ratio: 0.49995 .* take 0.499"):
+    with pytest.raises(ValueError, match=r"poisson_ratio: 0.49995 .* use 0.499"):
         body_of(cylinder(nu=0.49995))
 
 

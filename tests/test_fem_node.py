@@ -314,7 +314,7 @@ async def test_another_scene_ends_the_making_of_a_table(few_pushes: None, tmp_pa
     bench = Bench(cache_dir=tmp_path, method="nonlinear_table", workers=1)
     await bench.node.setup()
     await bench.node.step("scene", scene(), header())
-    while "deep pushes" not in bench.node.note:  # noqa: ASYNC110  # notes come without an event
+    while "snapshots for" not in bench.node.note:  # noqa: ASYNC110  # notes come without an event
         await asyncio.sleep(0.01)
     await bench.node.step("scene", scene(support_angle_rad=1.2), header())
     await bench.node.close()

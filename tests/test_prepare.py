@@ -66,7 +66,7 @@ def test_the_table_is_made_where_the_node_looks_for_it_and_once(
     arguments = ("prepare", scene_file, "--cache", tmp_path / "cache", "--skin-spacing", SPACING_M)
     code, said = flexsheet(*arguments)
     assert code == 0
-    assert ": 0 % (" in said.split("deep pushes for")[0]  # what it will take, before it is begun
+    assert ": 0 % (" in said.split("snapshots for")[0]  # what it will take, before it is begun
     assert "100 % (" in said
     scene = load_scene(scene_file)
     spec = body.make_table_spec(scene, body.make_soft_body_spec(scene, SPACING_M))

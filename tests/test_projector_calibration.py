@@ -160,7 +160,7 @@ def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Proje
     near = np.linalg.norm(points.pixels - points.pixels.mean(axis=0), axis=1) < 60
     corner = ProjectorPoints(*(np.repeat(part[near], 6, axis=0) for part in (
         points.world, points.pixels, points.pose, points.skew_m)))  # fmt: skip
-    with pytest.raises(ProjectorError, match="% of the projector's picture"):
+    with pytest.raises(ProjectorError, match="% of the projector's image"):
         calibrate_projector(corner, scene.projector)
     moved = points.world + np.where(points.pose == 1, 0.01, 0.0)[:, None]
     with pytest.raises(ProjectorError, match="not one projector"):
@@ -173,7 +173,7 @@ def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Proje
 
 def test_pictures_that_are_not_of_the_patterns_are_refused(scene: Scene) -> None:
     dark = [np.full((60, 80), 10, np.uint8)] * 38
-    with pytest.raises(DecodeError, match="5 pictures; the patterns are 38"):
+    with pytest.raises(DecodeError, match="5 images; the patterns are 38"):
         decode_patterns(dark[:5], 400, 300)
     with pytest.raises(ProjectorError, match="pose 1, left camera: 0 of the camera's pixels"):
         measure_points([(dark, dark)], scene.camera, scene.projector)

@@ -456,11 +456,11 @@ async def test_stale_arms_hold_the_last_plane_and_say_so(bench: Bench) -> None:
     pose = transform(rotation_from_vector([0.5, 0.0, 0.0]), [0.0, 0.0, 0.0])
     await bench.arms(pose)
     await bench.finger(0.0, 0.0, 0.1)
-    assert "holding" not in bench.node.note
+    assert "keeping" not in bench.node.note
     bench.forward(500)
     await bench.finger(0.0, 0.0, 0.1)
     assert np.allclose(bench.sent[-1][0].world_from_sheet, pose, atol=1e-9)
-    assert "arm poses 0.50 s old: holding" in bench.node.note
+    assert "arm poses 0.50 s old: keeping" in bench.node.note
 
 
 async def test_sheet_turned_away_holds_the_last_plane(bench: Bench) -> None:

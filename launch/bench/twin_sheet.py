@@ -97,7 +97,10 @@ def twin_errors(
     eye = scene.eyes.centre_world_m
 
     def errors(coordinate_ramp_x: Image, coordinate_ramp_y: Image) -> Floats:
-        x, y = (seen(picture, sheet, scene, eye=eye) for picture in (coordinate_ramp_x, coordinate_ramp_y))
+        x, y = (
+            seen(picture, sheet, scene, eye=eye)
+            for picture in (coordinate_ramp_x, coordinate_ramp_y)
+        )
         return error_map(x, y, METRES_PER_PX).sizes_m
 
     return errors

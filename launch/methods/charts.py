@@ -19,6 +19,7 @@ from launch.methods.machine import machine_name
 from launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
 from launch.running.supervisor import git_state
 from messages.scene import Scene
+from nodes.cache import EtaEstimator
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 
 if TYPE_CHECKING:
@@ -101,21 +102,18 @@ def measure_family(
 
 
 def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Says (done, total) in words, not more often than `TOLD_EVERY_S`, with the time left."""
-    begun_s, last_s = time.monotonic(), -math.inf
+    """Return a function that reports (done, total) with the time left, every `TOLD_EVERY_S`."""
+    eta, last_s = EtaEstimator(), -math.inf
 
-    def told(done: int, total: int) -> None:
+    def report(done: int, total: int) -> None:
         nonlocal last_s
         now_s = time.monotonic()
-        if now_s - last_s < TOLD_EVERY_S:
-            return
-        last_s, left = now_s, ""
-        if 0 < done < total:
-            left_s = (now_s - begun_s) / done * (total - done)
-            left = f", about {left_s:.0f} s left"
-        progress(f"{what} {done} of {total}{left}")
+        left = f": {eta.text(done, total, now_s)}" if total else ""
+        if now_s - last_s >= TOLD_EVERY_S:
+            last_s = now_s
+            progress(f"{what} {done} of {total}{left}")
 
-    return told
+    return report
 
 
 def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:

@@ -199,7 +199,7 @@ PARTICULAR = {
     "ms are allowed": "quieten the network, set up chrony, or allow more (docs/clocks.md).",
     "no way: <error>": "bring the arms nearer to the sheet by hand, or the sheet to another place "
     "(docs/arms.md).",
-    ": holding the last good sheet plane": "arms that say nothing, or a sheet turned away; it goes "
+    ": keeping the last valid sheet plane": "arms that say nothing, or a sheet turned away; it goes "
     "on by itself.",
     ", kept until it is reset": "when the danger is over: `flexsheet arms reset`.",
     "watchdog: no command": "its bridge was silent for 100 ms: is it running, and the cable in?",
