@@ -121,7 +121,7 @@ class SoftBodyMethod(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Contact:
+class NormalContact:
     """The solution of a normal contact.
 
     Inward forces (k,) in N on the contact nodes `nodes` (k,); their sum (3,) on the finger. weights
@@ -159,9 +159,9 @@ def saturate_depth(depth_m: float, linear_m: float, largest_m: float) -> float:
 def curve_depths(linear_m: float, largest_m: float, push_m: float | None) -> Floats:
     """Return the depths of a force curve: dense where the contact grows, then up to the deepest
     push."""
-    deepest = largest_m if push_m is None else max(push_m, largest_m)
+    max_push_m = largest_m if push_m is None else max(push_m, largest_m)
     deeper = np.geomspace(
-        linear_m, deepest, max(2, round(4 * np.log2(deepest / linear_m)) // 2 + 1)
+        linear_m, max_push_m, max(2, round(4 * np.log2(max_push_m / linear_m)) // 2 + 1)
     )
     return np.concatenate([[0.0], linear_m * np.array(CURVE_FRACTIONS), deeper[1:]])
 
@@ -195,8 +195,8 @@ class SphereContact:
         self._radius = finger_radius_m
         self._compliance = response.compliance / young_modulus_pa
         corners = response.rest[response.contact_nodes][response.faces]
-        longest = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).max())
-        divisions = max(2, int(np.ceil(longest / (POINT_SPACING_RATIO * finger_radius_m))))
+        max_edge_m = float(np.linalg.norm(corners[:, 0] - corners[:, 1], axis=1).max())
+        divisions = max(2, int(np.ceil(max_edge_m / (POINT_SPACING_RATIO * finger_radius_m))))
         self._shape, _ = sample_triangle(divisions)
         # The finger is tracked above the smooth surface: contact is with that, not with the faces.
         found = shape.closest((self._shape @ corners).reshape(-1, 3))
@@ -231,7 +231,7 @@ class SphereContact:
         result: Floats = depths * facing * facing * (3.0 - 2.0 * facing)
         return result
 
-    def solve(self, query: ContactQuery, depth_m: float) -> Contact | None:
+    def solve(self, query: ContactQuery, depth_m: float) -> NormalContact | None:
         """Return the contact at `depth_m` below `query.surface`; None where the finger does not
         touch."""
         centre = query.surface + (self._radius - depth_m) * query.normal
@@ -259,15 +259,15 @@ class SphereContact:
         weights[np.arange(len(reached))[:, None], local.reshape(-1, 6)] = self._shape[point]
         compliance, penalty = self._compliance[np.ix_(nodes, nodes)], self._penalty[face]
         forces = solve_penalty_contact(weights, compliance, penalty, depths[reached])
-        left = depths[reached] - weights @ (compliance @ forces)
-        pressed = left > 0.0
-        return Contact(
+        remaining = depths[reached] - weights @ (compliance @ forces)
+        pressed = remaining > 0.0
+        return NormalContact(
             nodes=nodes,
             forces=forces,
             force_n=forces @ self._response.normals[nodes],
             weights=weights[pressed],
             normals=self._normals[face[pressed], point[pressed]],
-            pressed_n=penalty[pressed] * left[pressed],
+            pressed_n=penalty[pressed] * remaining[pressed],
         )
 
 
@@ -286,7 +286,7 @@ class DragContact:
         self._compliance = response.compliance / young_modulus_pa
         self._give = TANGENTIAL_COMPLIANCE_RATIO * finger_radius_m
 
-    def solve(self, contact: Contact, drag: Floats) -> Drag:
+    def solve(self, contact: NormalContact, drag: Floats) -> Drag:
         """Return the load of a finger that moved along the skin by `drag` (3,), m, since it
         stuck."""
         nodes, count = contact.nodes, len(contact.nodes)
@@ -297,10 +297,10 @@ class DragContact:
         moved = np.einsum("qk,kai,qij->qjka", contact.weights, across, along, optimize=True)
         moved = moved.reshape(-1, 2 * count)
         ties = np.repeat(contact.pressed_n / self._give, 3)
-        wanted = (along @ drag).ravel()
+        target_drag = (along @ drag).ravel()
         pulled = moved.T * ties
         system = np.eye(2 * count) + pulled @ moved @ self._compliance[np.ix_(rows, rows)]
-        forces = np.linalg.solve(system, pulled @ wanted).reshape(-1, 2)
+        forces = np.linalg.solve(system, pulled @ target_drag).reshape(-1, 2)
         return Drag(nodes, forces, -np.einsum("ka,kai->i", forces, across))
 
 
@@ -343,8 +343,8 @@ def _search_step(
     compliance, compliance_at_points, penalty, depths = problem
 
     def energy(trial: Floats) -> float:
-        left = np.maximum(depths - compliance_at_points @ trial, 0.0)
-        return 0.5 * float(trial @ compliance @ trial + penalty @ (left * left))
+        remaining = np.maximum(depths - compliance_at_points @ trial, 0.0)
+        return 0.5 * float(trial @ compliance @ trial + penalty @ (remaining * remaining))
 
     start, fraction = energy(forces), 1.0
     while fraction > 1e-3 and energy(forces + fraction * (target - forces)) > start * (1.0 + 1e-12):
@@ -400,18 +400,18 @@ class LinearSoftBody:
         self._bounds, self._pad2 = bounds, (PAD_RATIO * finger_radius_m) ** 2
         self.at_rest: Floats32 = np.zeros(response.rest.shape, dtype=np.float32)
         corners = np.unique(response.faces[:, :3])
-        self._places = response.rest[response.contact_nodes[corners]]
+        self._points = response.rest[response.contact_nodes[corners]]
         normals = response.normals[corners]
         self._depths = curve_depths(linear_depth_m, max_depth_m, push_depth_m)
         self._place_forces = np.array(
             [
                 self._forces(point, normal)
-                for point, normal in zip(self._places, normals, strict=True)
+                for point, normal in zip(self._points, normals, strict=True)
             ]
         )
         sides = response.rest[response.contact_nodes[response.faces[:, :2]]]
-        longest = np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1).max()
-        self._smoothing2 = max(float(longest), finger_radius_m) ** 2
+        max_edge_m = np.linalg.norm(sides[:, 0] - sides[:, 1], axis=1).max()
+        self._smoothing2 = max(float(max_edge_m), finger_radius_m) ** 2
 
     def respond(self, query: ContactQuery) -> Response:
         """Return the response; every finite contact has one."""
@@ -466,7 +466,7 @@ class LinearSoftBody:
     def _weights(self, surface: Floats) -> Floats:
         """Return Gaussian weights of the mesh's corners around a point: a mean with them is
         smooth."""
-        squared = np.square(self._places - surface).sum(axis=1)
+        squared = np.square(self._points - surface).sum(axis=1)
         weights = np.exp((squared.min() - squared) / (0.5 * self._smoothing2))
         result: Floats = weights / weights.sum()
         return result

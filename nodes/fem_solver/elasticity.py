@@ -84,11 +84,11 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
     inverted or flat, or a node's coordinates are not finite.
     """
     corners = nodes[elements]
-    lost = ~np.isfinite(corners).all(axis=(1, 2))
-    if lost.any():
+    invalid = ~np.isfinite(corners).all(axis=(1, 2))
+    if invalid.any():
         raise SolidMeshError(
-            f"nodes of {int(lost.sum())} of {len(elements)} elements are not finite, the first is "
-            f"element number {int(np.argmax(lost))}"
+            f"nodes of {int(invalid.sum())} of {len(elements)} elements are not finite, the first "
+            f"is element number {int(np.argmax(invalid))}"
         )
     jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
     determinant: Floats = np.linalg.det(jacobian)
@@ -146,15 +146,18 @@ def stiffness_matrix(
 
 def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
     """Raise SolidMeshError unless at least three fixed nodes, not on one line, hold the body."""
-    held = nodes[fixed]
+    fixed_nodes = nodes[fixed]
     extent = np.ptp(nodes, axis=0).max()
     if (
-        len(held) < 3
-        or np.linalg.matrix_rank(held - held.mean(axis=0), tol=1e-6 * extent * len(held) ** 0.5) < 2
+        len(fixed_nodes) < 3
+        or np.linalg.matrix_rank(
+            fixed_nodes - fixed_nodes.mean(axis=0), tol=1e-6 * extent * len(fixed_nodes) ** 0.5
+        )
+        < 2
     ):
         raise SolidMeshError(
-            f"the body is free to move: {len(held)} fixed nodes, at least three not on one line "
-            "are needed (object.support_angle_rad too small for skin_spacing_m?)"
+            f"the body is free to move: {len(fixed_nodes)} fixed nodes, at least three not on one "
+            "line are needed (object.support_angle_rad too small for skin_spacing_m?)"
         )
 
 
@@ -163,23 +166,23 @@ def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
     return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.arange(3)).ravel()
 
 
-def scatter_add(places: Ints, values: Floats, size: int) -> Floats:
+def scatter_add(indices: Ints, values: Floats, size: int) -> Floats:
     """Return an array (size,) with values (k,) added at their indices (k,)."""
-    result: Floats = np.bincount(places, values, size).astype(np.float64, copy=False)
+    result: Floats = np.bincount(indices, values, size).astype(np.float64, copy=False)
     return result
 
 
-def solve(stiffness: csc_matrix, held: Ints, values: Floats, loads: Floats) -> Floats:
-    """Return displacements (3n,) with the degrees of freedom `fixed` at `values`, `loads`
-    elsewhere.
+def solve(stiffness: csc_matrix, fixed_dofs: Ints, values: Floats, loads: Floats) -> Floats:
+    """Return displacements (3n,) with the degrees of freedom `fixed_dofs` at `values`, and `loads`
+    (3n,) elsewhere.
 
     It takes one sparse factorisation. Raises SolidMeshError if the body can still move freely.
     """
     from scipy.sparse.linalg import splu
 
-    free = np.setdiff1d(np.arange(stiffness.shape[0]), held)
+    free = np.setdiff1d(np.arange(stiffness.shape[0]), fixed_dofs)
     result = np.zeros(stiffness.shape[0])
-    result[held] = values
+    result[fixed_dofs] = values
     inner = stiffness[free][:, free].tocsc()
     try:
         # The matrix is positive definite: the diagonal serves as pivots, which keeps the factor
@@ -195,5 +198,5 @@ def solve(stiffness: csc_matrix, held: Ints, values: Floats, loads: Floats) -> F
     pivots = np.abs(factor.U.diagonal())
     if pivots.min() < 1e-12 * pivots.max():
         raise SolidMeshError("the body is free to move: the stiffness is singular to rounding")
-    result[free] = factor.solve(loads[free] - stiffness[free][:, held] @ values)
+    result[free] = factor.solve(loads[free] - stiffness[free][:, fixed_dofs] @ values)
     return result

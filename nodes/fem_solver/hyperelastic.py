@@ -115,11 +115,11 @@ class NeoHookeanSolid:
             blocks[:, :, axis, :, axis] += self._laplacian
         return first
 
-    def stiffen(self, matrices: Floats, share: float) -> None:
+    def stiffen(self, matrices: Floats, weight: float) -> None:
         """Add `weight` times mu times the Laplacian, which is positive definite, to tangents."""
         blocks = matrices.reshape(-1, 10, 3, 10, 3)
         for axis in range(3):
-            blocks[:, :, axis, :, axis] += share * self._laplacian
+            blocks[:, :, axis, :, axis] += weight * self._laplacian
 
     def min_volume_ratio(self, displacement: Floats) -> float:
         """Return the minimum J at all quadrature points and nodes: 1 at rest, 0 or less where
@@ -130,8 +130,8 @@ class NeoHookeanSolid:
         """
         local = shape_gradients(NODE_COORDINATES)
         rest, moved = (
-            np.linalg.det(places[self.elements].transpose(0, 2, 1)[:, None] @ local)
-            for places in (self.nodes, self.nodes + displacement)
+            np.linalg.det(coordinates[self.elements].transpose(0, 2, 1)[:, None] @ local)
+            for coordinates in (self.nodes, self.nodes + displacement)
         )
         return float(min(self.deformation(displacement)[1].min(), (moved / rest).min()))
 

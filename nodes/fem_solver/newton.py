@@ -188,8 +188,8 @@ class SphereObstacle:
         """
         inner, _, normals, _ = self.inside(positions, centre)
         offsets = self.points(positions)[inner] - centre
-        kept = np.isin(inner, stick.points)
-        offsets[kept] = stick.offsets[np.searchsorted(stick.points, inner[kept])]
+        still_held = np.isin(inner, stick.points)
+        offsets[still_held] = stick.offsets[np.searchsorted(stick.points, inner[still_held])]
         return _StickState(inner, offsets, normals)
 
     def _pressure(self, depth: Floats) -> Floats:
@@ -412,7 +412,7 @@ def _find_parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:
     keys = np.sort(sides[..., :3], axis=2).reshape(-1, 3)
     base = int(elements.max()) + 1
     weights = np.array([base * base, base, 1])
-    known, wanted = keys @ weights, np.sort(faces[:, :3], axis=1) @ weights
-    order = np.argsort(known)
-    parents = order[np.searchsorted(known, wanted, sorter=order)] // len(FACES)
+    face_keys, wanted_keys = keys @ weights, np.sort(faces[:, :3], axis=1) @ weights
+    order = np.argsort(face_keys)
+    parents = order[np.searchsorted(face_keys, wanted_keys, sorter=order)] // len(FACES)
     return parents, (elements[parents][:, None, :] == faces[:, :, None]).argmax(axis=2)

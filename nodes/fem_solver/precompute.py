@@ -190,8 +190,8 @@ def compute(
     skin = mesh.nodes[mesh.skin]
     found = make_shape(dict(spec.mesh.geometry)).closest(skin)
     # Nodes off the smooth surface lie on its ends: caps, the sides of a slab.
-    off = np.linalg.norm(found.point - skin, axis=1) > 0.5 * spec.mesh.skin_spacing_m
-    bounds = ~(off | found.on_edge)
+    off_surface = np.linalg.norm(found.point - skin, axis=1) > 0.5 * spec.mesh.skin_spacing_m
+    bounds = ~(off_surface | found.on_edge)
     bounds[touched] = False
     response = SkinResponse(
         rest=skin,
@@ -245,8 +245,8 @@ def _unit_loads(
 
 def make_tangents(normals: Floats) -> Floats:
     """Return two directions (m, 2, 3) at right angles to unit normals (m, 3) and to one another."""
-    least = np.eye(3)[np.abs(normals).argmin(axis=1)]
-    first = np.cross(normals, least)
+    smallest_axis = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    first = np.cross(normals, smallest_axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(normals, first)], axis=1)
 
@@ -256,11 +256,11 @@ def require_memory(need: ResponseBudget, spec: SoftBodySpec) -> None:
     import psutil
 
     free = psutil.virtual_memory().available
-    wanted = need.working_bytes + need.table_bytes
-    if wanted > free:
+    required_bytes = need.working_bytes + need.table_bytes
+    if required_bytes > free:
         raise MemoryError(
             f"precomputing {need.loads} loads on {need.skin_nodes} skin nodes takes "
-            f"{wanted / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; raise "
+            f"{required_bytes / 2**30:.1f} GiB, {free / 2**30:.1f} GiB are free; raise "
             f"skin_spacing_m above {spec.mesh.skin_spacing_m:g}"
         )
 

@@ -57,8 +57,8 @@ class SurfaceLocator:
         local = np.einsum("qkij,qkj->qki", self._inverse[near], offset)
         local = np.maximum(local, 0.0)
         local /= np.maximum(local.sum(axis=2, keepdims=True), 1.0)
-        left = offset - np.einsum("qki,qkij->qkj", local, self._sides[near])
-        best = np.square(left).sum(axis=2).argmin(axis=1)
+        residual = offset - np.einsum("qki,qkij->qkj", local, self._sides[near])
+        best = np.square(residual).sum(axis=2).argmin(axis=1)
         rows = np.arange(len(points))
         triangle, local = near[rows, best], local[rows, best]
         part = CORNERS[SUBTRIANGLES[triangle % len(SUBTRIANGLES)]]
@@ -92,7 +92,7 @@ class SnapshotInterpolator:
         """solved: all at the same depths. towards_user (3,): a direction less than 180 degrees from
         all normals. radius_m: the finger's."""
         self._solved, self._user, self._radius = solved, towards_user, radius_m
-        self._places = np.array([one.sample.point for one in solved])
+        self._points = np.array([one.sample.point for one in solved])
         self.depths_m = solved[0].snapshot.depths_m
 
     def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Floats32, Floats, float]:
@@ -106,11 +106,11 @@ class SnapshotInterpolator:
         force = np.zeros(self._solved[0].snapshot.force_n.shape)
         reached = 0.0
         for number, weight in weights:
-            part, push = self._transport(self._solved[number], sample, rest)
+            part, force_part = self._transport(self._solved[number], sample, rest)
             moved = (
                 np.float32(weight) * part if moved is None else moved + np.float32(weight) * part
             )
-            force += weight * push
+            force += weight * force_part
             reached += weight * self._solved[number].snapshot.reached
         assert moved is not None
         return moved, force, reached
@@ -121,18 +121,18 @@ class SnapshotInterpolator:
         The weights are those of a local fit, linear over the surface: moving least squares
         (Lancaster & Salkauskas 1981).
         """
-        offset = self._places - sample.point
-        away = np.linalg.norm(offset, axis=1)
-        order = np.argsort(away, kind="stable")[: NEIGHBOURS + 1]
-        if away[order[0]] < 1e-9:
+        offset = self._points - sample.point
+        distances = np.linalg.norm(offset, axis=1)
+        order = np.argsort(distances, kind="stable")[: NEIGHBOURS + 1]
+        if distances[order[0]] < 1e-9:
             return [(int(order[0]), 1.0)]
-        reach = 1.001 * away[order[-1]]
-        near = np.flatnonzero(away < reach)
+        reach = 1.001 * distances[order[-1]]
+        near = np.flatnonzero(distances < reach)
         frame = minimal_rotation(self._user, sample.normal)
         across = (offset[near] @ frame)[:, _tangents(self._user)]
         length = np.linalg.norm(across, axis=1, keepdims=True)
-        across *= away[near, None] / np.maximum(length, 1e-12) / reach
-        weight = away[near] / reach
+        across *= distances[near, None] / np.maximum(length, 1e-12) / reach
+        weight = distances[near] / reach
         kernel = (1.0 - weight) ** 4 * (4.0 * weight + 1.0) / np.maximum(weight, 1e-6)
         basis = np.column_stack([np.ones(len(near)), across])
         normal = (basis * kernel[:, None]).T @ basis
@@ -147,8 +147,8 @@ class SnapshotInterpolator:
             minimal_rotation(self._user, solved.sample.normal)
             @ minimal_rotation(self._user, sample.normal).T
         )
-        away = np.linalg.norm(rest - sample.point, axis=1) / self._radius
-        weight = np.clip((FIXED_RATIO - away) / (FIXED_RATIO - TRANSPORTED_RATIO), 0.0, 1.0)
+        distances = np.linalg.norm(rest - sample.point, axis=1) / self._radius
+        weight = np.clip((FIXED_RATIO - distances) / (FIXED_RATIO - TRANSPORTED_RATIO), 0.0, 1.0)
         weight = (weight * weight * (3.0 - 2.0 * weight))[:, None]
         there = solved.sample.point + (rest - sample.point) @ rotation.T
         nodes, weights = solved.locator.weights(weight * there + (1.0 - weight) * rest)

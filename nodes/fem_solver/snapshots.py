@@ -104,20 +104,20 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
         min_step_fraction=MIN_STEP_FRACTION,
         factor_dtype=np.float32,
     )
-    hull = boundary_faces(job.elements)
-    skin = np.unique(hull)
-    way = [
+    skin_faces = boundary_faces(job.elements)
+    skin = np.unique(skin_faces)
+    path = [
         job.sample.point + (job.finger_radius_m - d) * job.sample.normal for d in (0, *job.depths_m)
     ]
     states = []
-    for state in body.solve_load_steps(way):
+    for state in body.solve_load_steps(path):
         if stopped():
             raise SnapshotCancelledError
         states.append(state)
     states = states[1:]
     return Snapshot(
         rest=job.nodes[skin],
-        faces=np.searchsorted(skin, hull),
+        faces=np.searchsorted(skin, skin_faces),
         depths_m=np.array(job.depths_m),
         moved=np.array([state.displacement[skin] for state in states], dtype=np.float32),
         force_n=np.array([state.force_n for state in states]),
@@ -134,14 +134,14 @@ def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
 
     # Other nodes need not be symmetric: they do not determine whether the body is.
     some = np.union1d(mesh.contact_nodes, np.flatnonzero(mesh.fixed))
-    points, held = mesh.nodes[some], mesh.fixed[some]
+    points, is_fixed = mesh.nodes[some], mesh.fixed[some]
     tree, same = cKDTree(points), SAME_RATIO * float(np.ptp(points, axis=0).max())
     free = [np.ones(3)]
     for axis in (0, 1):
         signs = np.ones(3)
         signs[axis] = -1.0
-        away, partner = tree.query(points * signs)
-        if away.max() < same and np.array_equal(held[partner], held):
+        distances, partner = tree.query(points * signs)
+        if distances.max() < same and np.array_equal(is_fixed[partner], is_fixed):
             free += [one * signs for one in free]
     return free
 
@@ -171,10 +171,10 @@ def choose_sample_points(
     points, normals = points[chosen], normals[chosen]
     # Farthest first: each next point is the farthest from all before.
     numbers = [int((points @ np.array(spec.towards_user)).argmax())]
-    away = np.linalg.norm(points - points[numbers[0]], axis=1)
-    while away.max() > APART_RATIO * radius_m:
-        numbers.append(int(away.argmax()))
-        away = np.minimum(away, np.linalg.norm(points - points[numbers[-1]], axis=1))
+    distances = np.linalg.norm(points - points[numbers[0]], axis=1)
+    while distances.max() > APART_RATIO * radius_m:
+        numbers.append(int(distances.argmax()))
+        distances = np.minimum(distances, np.linalg.norm(points - points[numbers[-1]], axis=1))
     return [SamplePoint(points[number], normals[number]) for number in numbers]
 
 

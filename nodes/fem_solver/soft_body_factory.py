@@ -95,8 +95,10 @@ class SoftBodyFactory:
         With friction there is no table to wait for.
         """
         choice = scene.methods.soft_body
-        wanted = choice is not None and choice.method == "nonlinear_table" and method == "auto"
-        if not wanted or self.friction_ratio > 0.0 or len(made) > 1:
+        waits_for_table = (
+            choice is not None and choice.method == "nonlinear_table" and method == "auto"
+        )
+        if not waits_for_table or self.friction_ratio > 0.0 or len(made) > 1:
             return ""
         return (
             "; the scene's nonlinear table is not computed yet (flexsheet prepare SCENE "

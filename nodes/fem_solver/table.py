@@ -85,13 +85,13 @@ def fill_table(
     on_progress: called with (done, total) nodes; may raise to stop.
     """
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *interpolator.depths_m])
-    places, normals = response.rest[response.contact_nodes], response.normals
-    count = len(places)
+    points, normals = response.rest[response.contact_nodes], response.normals
+    count = len(points)
 
     fields = np.empty((count, len(depths) - 1, response.rest.size), dtype=np.float32)
     force, reach = np.empty((count, len(depths), 3)), np.empty(count)
     for number in range(count):
-        sample = SamplePoint(places[number], normals[number])
+        sample = SamplePoint(points[number], normals[number])
         moved, force[number], reach[number] = _fill_levels(
             sample, response, linear, interpolator, depths
         )
@@ -172,8 +172,8 @@ def count_valid_levels(rest: Floats, moved: Floats32, triangles: NDArray[np.int3
 
     before = normals(rest)
     before /= np.linalg.norm(before, axis=1, keepdims=True)
-    for level, way in enumerate(moved):
-        after = normals(rest + way)
+    for level, displacement in enumerate(moved):
+        after = normals(rest + displacement)
         cosines = (before * after).sum(axis=1) / np.linalg.norm(after, axis=1)
         if not cosines.min() > MIN_COSINE:
             return level
@@ -186,12 +186,16 @@ def project_to_edges(point: Floats, corners: Floats) -> tuple[float, Floats]:
 
     The nearest point is given in local coordinates (2,).
     """
-    starts, ways = corners, np.roll(corners, -1, axis=0) - corners
-    along = np.clip(((point - starts) * ways).sum(axis=1) / np.square(ways).sum(axis=1), 0.0, 1.0)
-    away = np.linalg.norm(point - starts - along[:, None] * ways, axis=1)
-    edge = int(away.argmin())
+    starts, edge_vectors = corners, np.roll(corners, -1, axis=0) - corners
+    along = np.clip(
+        ((point - starts) * edge_vectors).sum(axis=1) / np.square(edge_vectors).sum(axis=1),
+        0.0,
+        1.0,
+    )
+    distances = np.linalg.norm(point - starts - along[:, None] * edge_vectors, axis=1)
+    edge = int(distances.argmin())
     ends = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
-    return float(away[edge]), ends[edge] + along[edge] * (ends[edge + 1] - ends[edge])
+    return float(distances[edge]), ends[edge] + along[edge] * (ends[edge + 1] - ends[edge])
 
 
 class TableSoftBody:
@@ -219,7 +223,7 @@ class TableSoftBody:
         self.at_rest: Floats32 = np.zeros(response.rest.shape, dtype=np.float32)
         self._radius = finger_radius_m
         self._fields = table.fields
-        deepest = float(table.depths_m[-1])
+        max_depth_m = float(table.depths_m[-1])
         self._cubics = CubicInterpolator(table.depths_m)
         self._force = young_modulus_pa * table.force_n
         self.reach_m = np.maximum(table.reach_m, 2.0 * END_SPAN_M)
@@ -234,7 +238,7 @@ class TableSoftBody:
         # Local coordinates of a point on each flat face: one product for all.
         self._across = self._inverse.reshape(-1, 3)
         self._offset = (self._inverse @ self._corners[:, 0, :, None]).reshape(-1, 2)
-        self._depths = curve_depths(linear_depth_m, deepest - END_SPAN_M, push_depth_m)
+        self._depths = curve_depths(linear_depth_m, max_depth_m - END_SPAN_M, push_depth_m)
         self._linear = linear_depth_m
         self._curves = np.array(
             [self._curve(number, normal) for number, normal in enumerate(response.normals)]
@@ -244,16 +248,16 @@ class TableSoftBody:
             room, _ = cKDTree(bounds).query(response.rest[response.contact_nodes])
         self._reach_and_room = np.column_stack([self.reach_m, np.minimum(room, 1.0)])
 
-    def respond(self, push: ContactQuery) -> Response:
+    def respond(self, query: ContactQuery) -> Response:
         """Return the response; every finite contact has one."""
-        nodes, weights, off = self.project_to_surface(push.surface)
+        nodes, weights, off = self.project_to_surface(query.surface)
         curve = self._curve_at(nodes, weights)
         stiffness = float(curve[len(CURVE_FRACTIONS), 1]) / self._linear
-        if push.depth_m <= 0.0:
+        if query.depth_m <= 0.0:
             return Response(self.at_rest, np.zeros(3), stiffness, curve, 0.0, True)
         reach, room = (weights @ self._reach_and_room[nodes]).tolist()
-        depth = saturate_depth(push.depth_m, reach - END_SPAN_M, reach)
-        past = min(max(off, push.beyond_m) / (FADE_RATIO * self._radius), 1.0)
+        depth = saturate_depth(query.depth_m, reach - END_SPAN_M, reach)
+        past = min(max(off, query.beyond_m) / (FADE_RATIO * self._radius), 1.0)
         fade = 1.0 - past * past * (3.0 - 2.0 * past)
         first, over = self._cubics.weights_at(depth)
         # At depth 0 nothing moves: it has no row.
@@ -268,11 +272,11 @@ class TableSoftBody:
             displacement=total.reshape(-1, 3),
             force_n=weights
             @ (over @ self._force[nodes, first : first + 4])
-            * (fade * push.depth_m / depth),
+            * (fade * query.depth_m / depth),
             stiffness_n_per_m=stiffness,
             force_curve=curve,
-            push_depth_m=max(0.0, push.depth_m - push.beyond_m),
-            in_range=push.depth_m <= reach - END_SPAN_M and past == 0.0 and room >= self._radius,
+            push_depth_m=max(0.0, query.depth_m - query.beyond_m),
+            in_range=query.depth_m <= reach - END_SPAN_M and past == 0.0 and room >= self._radius,
         )
 
     def project_to_surface(self, surface: Floats) -> tuple[Ints, Floats, float]:
@@ -290,7 +294,7 @@ class TableSoftBody:
         if min(a, b, 1.0 - a - b) < 0.0:
             # The point is off the skin, or over an edge that two flat faces leave between them.
             nearest = [project_to_edges(surface, self._corners[face, :3]) for face in tried]
-            number = int(np.argmin([away for away, _ in nearest]))
+            number = int(np.argmin([distances for distances, _ in nearest]))
             off, inner = nearest[number]
             return (
                 self._faces[tried[number]],

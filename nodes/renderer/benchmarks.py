@@ -58,7 +58,7 @@ STRETCH = 1.05
 SPACING_M = 0.0025
 
 
-def correction_family(judge: ReferenceFactory, *, solved: bool = True) -> Family:
+def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
     """Return every correction over the tilts and pushes of the paper's figures 11 and 13.
 
     The ends of the scene's working range are included. Without `solved`, only methods that need no
@@ -69,7 +69,7 @@ def correction_family(judge: ReferenceFactory, *, solved: bool = True) -> Family
         unit="mm",
         reference="rms error at the points the eye sees on the twin's sheet",
         methods=METHODS if solved else WITHOUT_SHAPES,
-        trials=partial(_trials, judge, solved),
+        trials=partial(_trials, reference, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
@@ -148,7 +148,7 @@ def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
     return scene.model_copy(update={"projector": projector.model_copy(update=size)})
 
 
-def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
+def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
     dents = deflection_cache.load_or_compute(scene, None) if solved else None
     context = headless_context()
     largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
@@ -165,7 +165,7 @@ def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Tri
                 "width_px": size[0],
                 "height_px": size[1],
             }
-            sheet, judgement = _situation(shown, judge, tilt_deg=tilt_deg, push_mm=push_mm)
+            sheet, judgement = _situation(shown, reference, tilt_deg=tilt_deg, push_mm=push_mm)
             in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
             for method in METHODS if solved else WITHOUT_SHAPES:
                 yield Trial(
@@ -181,7 +181,7 @@ def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Tri
 
 
 def _situation(
-    scene: Scene, judge: ReferenceFactory, *, tilt_deg: float, push_mm: float
+    scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
 ) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
     """Return the predicted sheet, and a function that computes its error measure at the first
     call."""
@@ -196,7 +196,7 @@ def _situation(
         finger_tip=tip,
     )
     assert predicted is not None
-    return predicted, cache(lambda: judge(scene, *edges, tip))
+    return predicted, cache(lambda: reference(scene, *edges, tip))
 
 
 def draw_stereo(stage: SceneRenderer, method: str, sheet: SheetPose) -> None:
@@ -216,17 +216,17 @@ def draw_coordinate_ramps(
     stage: SceneRenderer, method: str, sheet: SheetPose
 ) -> tuple[Image, Image]:
     """Return the projector's images of both coordinate ramps, for the scene's point of view."""
-    pictures = []
+    images = []
     for pattern in COORDINATE_RAMPS:
         display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)
         look = DrawStyle(flat=True, pattern=pattern)
         if method in SHAPES:
-            picture = stage.draw_onto(display, SHAPES[method](sheet), look, read=True)
+            image = stage.draw_onto(display, SHAPES[method](sheet), look, read=True)
         else:
-            picture = stage.draw(display, sheet, look, read=True)
-        assert picture is not None
-        pictures.append(picture)
-    return pictures[0], pictures[1]
+            image = stage.draw(display, sheet, look, read=True)
+        assert image is not None
+        images.append(image)
+    return images[0], images[1]
 
 
 COORDINATE_RAMPS: tuple[Pattern, Pattern] = ("coordinate_ramp_x", "coordinate_ramp_y")

@@ -207,8 +207,8 @@ def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
     """Return where (n, 2) lines from the eye to points (n, 3) cross z = 0, the imaginary screen."""
-    share = eye[2] / (eye[2] - points[:, 2])
-    crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * share[:, None]
+    fraction = eye[2] / (eye[2] - points[:, 2])
+    crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * fraction[:, None]
     return crossings
 
 

@@ -148,7 +148,8 @@ class FrameRenderer:
         return frame, source_ns
 
     def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
-        """The frame with what the window measured; `swapped_ns` 0: a newer one took its place."""
+        """Return the frame with the window's measured times; `swapped_ns` 0: a newer frame replaced
+        it."""
         if not swapped_ns:
             self.superseded += 1
             return frame

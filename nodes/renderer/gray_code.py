@@ -61,7 +61,7 @@ class Decoded:
     lit_by: Floats
 
 
-def decode_patterns(pictures: Sequence[Image], width_px: int, height_px: int) -> Decoded:
+def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> Decoded:
     """Decode one camera's images (height, width) of `patterns(width_px, height_px)`, in their
     order.
 
@@ -69,11 +69,11 @@ def decode_patterns(pictures: Sequence[Image], width_px: int, height_px: int) ->
     """
     bits = [_bits(width_px), _bits(height_px)]
     wanted = 2 * sum(bits) + 2
-    if len(pictures) != wanted:
-        raise DecodeError(f"{len(pictures)} images; the patterns are {wanted}")
-    if len({picture.shape for picture in pictures}) != 1:
+    if len(images) != wanted:
+        raise DecodeError(f"{len(images)} images; the patterns are {wanted}")
+    if len({image.shape for image in images}) != 1:
         raise DecodeError("the images have different sizes")
-    white, black = (picture.astype(np.int16) for picture in pictures[-2:])
+    white, black = (image.astype(np.int16) for image in images[-2:])
     row, column = np.nonzero(white - black >= MIN_CONTRAST)
     if len(row) < MIN_CELLS:
         raise DecodeError(
@@ -86,7 +86,7 @@ def decode_patterns(pictures: Sequence[Image], width_px: int, height_px: int) ->
         before = np.zeros(len(row), np.int64)
         unused = min(int(np.log2(MIN_STRIPE_PX)), count - 1)
         for number in range(count - unused):
-            shown, inverse = pictures[begin + 2 * number], pictures[begin + 2 * number + 1]
+            shown, inverse = images[begin + 2 * number], images[begin + 2 * number + 1]
             before ^= shown[row, column] > inverse[row, column]
             value = 2 * value + before
         axes.append(value * 2.0**unused + 0.5 * (2.0**unused - 1.0))

@@ -40,8 +40,8 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
         for y in (-0.5, height_px - 0.5)
     ]
     # Radii r at which the radial polynomial r (1 + k1 r^2 + ...) stops growing.
-    turns = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
-    real = turns[(np.abs(turns.imag) < 1e-9) & (turns.real > 0.0)].real
+    stationary = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    real = stationary[(np.abs(stationary.imag) < 1e-9) & (stationary.real > 0.0)].real
     fold = float(np.sqrt(real.min())) if len(real) else np.inf
     largest = fold * (1.0 + k1 * fold**2 + k2 * fold**4 + k3 * fold**6) if len(real) else np.inf
     needed = REACH_MARGIN * max(float(np.hypot(*corner)) for corner in corners)

@@ -196,8 +196,8 @@ class VertexNormals:
         """Return (vertices, 3) for positions (vertices, 3)."""
         # By rows of one coordinate: gathering and multiplying then access contiguous memory.
         # np.cross is several times slower than its own six products.
-        places = np.ascontiguousarray(positions.T)
-        a, b, c = (places.take(corner, axis=1) for corner in self._corners)
+        coordinates = np.ascontiguousarray(positions.T)
+        a, b, c = (coordinates.take(corner, axis=1) for corner in self._corners)
         b -= a
         c -= a
         area = np.empty((len(self._corners[0]), 3), positions.dtype)
@@ -272,12 +272,12 @@ def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indic
     _, near = cKDTree(samples).query(points, k=candidates)
     near = owners[near.reshape(len(points), candidates)]
     weights = np.empty((len(points), candidates, 3))
-    away = np.empty((len(points), candidates))
+    distances = np.empty((len(points), candidates))
     for i in range(candidates):
         weights[:, i] = nearest_in_triangles(points, corners[near[:, i]])
         foot = np.einsum("pc,pcx->px", weights[:, i], corners[near[:, i]])
-        away[:, i] = np.linalg.norm(foot - points, axis=1)
-    rows, best = np.arange(len(points)), np.argmin(away, axis=1)
+        distances[:, i] = np.linalg.norm(foot - points, axis=1)
+    rows, best = np.arange(len(points)), np.argmin(distances, axis=1)
     columns = skin_triangles[near[rows, best]]
     return csr_array(
         (

@@ -36,7 +36,7 @@ class OutputWindow(Protocol):
     note: str
 
     def open(self, size: tuple[int, int]) -> None: ...
-    def take(self, number: int, picture: moderngl.Framebuffer) -> None: ...
+    def take(self, number: int, image: moderngl.Framebuffer) -> None: ...
     def show(self, tag: Any, display: Display) -> None: ...
     def poll(self) -> bool: ...
     def close(self) -> None: ...
@@ -55,7 +55,7 @@ class OffscreenOutput:
     def open(self, size: tuple[int, int]) -> None:
         """Do nothing: there is no window."""
 
-    def take(self, number: int, picture: moderngl.Framebuffer) -> None:
+    def take(self, number: int, image: moderngl.Framebuffer) -> None:
         """Do nothing: no image is stored."""
 
     def show(self, tag: Any, display: Display) -> None:
@@ -141,13 +141,13 @@ class ProjectorWindow:
         self.is_seen, self.note = True, ""
         self._note_size(size, self._presenter.framebuffer_px)
 
-    def take(self, number: int, picture: moderngl.Framebuffer) -> None:
+    def take(self, number: int, image: moderngl.Framebuffer) -> None:
         """Store an eye's image, 0 the first, for the next `show`."""
         if self._presenter is None:
             return
         if self._filling is None:
             self._filling = self._presenter.free_slot()
-        self.context.copy_framebuffer(self._filling.frames[number], picture)
+        self.context.copy_framebuffer(self._filling.frames[number], image)
 
     def show(self, tag: Any, display: Display) -> None:
         """Show the stored images at the next refresh; `shown(tag, when)` reports it."""
@@ -190,7 +190,7 @@ class ProjectorWindow:
         self.note = (
             ""
             if fits
-            else f"window of {width}x{height} for pictures of {size[0]}x{size[1]}: shown unscaled, "
+            else f"window of {width}x{height} for images of {size[0]}x{size[1]}: shown unscaled, "
             "in the middle"
         )
 

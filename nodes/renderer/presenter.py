@@ -76,7 +76,7 @@ class Presenter:
         self._now_ns, self._shown = now_ns, shown
         self._changed = threading.Condition()
         self._ready: Slot | None = None
-        self._held: Slot | None = None
+        self._shown_slot: Slot | None = None
         self._stop, self._again = False, 0
         self._right_is_next = False
         self.framebuffer_px = glfw.get_framebuffer_size(window)
@@ -88,7 +88,9 @@ class Presenter:
         """Return a slot to draw into: neither shown nor ready."""
         with self._changed:
             return next(
-                slot for slot in self._slots if slot is not self._ready and slot is not self._held
+                slot
+                for slot in self._slots
+                if slot is not self._ready and slot is not self._shown_slot
             )
 
     def put(self, slot: Slot) -> None:
@@ -130,11 +132,13 @@ class Presenter:
         with self._changed:
             while not self._stop:
                 if self._ready is not None:
-                    self._held, self._ready = self._ready, None
-                    return self._held, True
-                if self._held is not None and (self._again or self._alternates(self._held)):
+                    self._shown_slot, self._ready = self._ready, None
+                    return self._shown_slot, True
+                if self._shown_slot is not None and (
+                    self._again or self._alternates(self._shown_slot)
+                ):
                     self._again = max(0, self._again - 1)
-                    return self._held, False
+                    return self._shown_slot, False
                 self._changed.wait(IDLE_S)
         return None
 

@@ -58,9 +58,9 @@ class TwoPassProjector:
             context.renderbuffer(size, 4, samples=samples),
             context.depth_renderbuffer(size, samples=samples),
         )
-        self._picture = context.texture(size, 4)
-        self._picture.repeat_x = self._picture.repeat_y = False
-        self._resolved = context.framebuffer([self._picture])
+        self._image = context.texture(size, 4)
+        self._image.repeat_x = self._image.repeat_y = False
+        self._resolved = context.framebuffer([self._image])
         self._program = context.program(
             vertex_shader=shader_text("sheet.vert.glsl"),
             fragment_shader=shader_text("sheet.frag.glsl"),
@@ -86,7 +86,7 @@ class TwoPassProjector:
         array = self._sheet_array(sheet)
         set_view(self._uniforms, view)
         self._uniforms.set(window=(window.left, window.bottom, window.width, window.height))
-        self._picture.use()
+        self._image.use()
         canvas.begin()
         # The projector is behind the sheet and sees its back.
         self._context.disable(moderngl.CULL_FACE)
@@ -102,9 +102,9 @@ class TwoPassProjector:
         """Return the sheet's vertices in a buffer, with its triangles; new when those change."""
         if self._array is not None and sheet is self._drawn:
             return self._array
-        vertices, known = np.ascontiguousarray(sheet.vertices, np.float32), self._triangles
-        same = known is sheet.triangles or (
-            known is not None and np.array_equal(known, sheet.triangles)
+        vertices, previous = np.ascontiguousarray(sheet.vertices, np.float32), self._triangles
+        same = previous is sheet.triangles or (
+            previous is not None and np.array_equal(previous, sheet.triangles)
         )
         if self._array is None or self._vertices is None or not same:
             self._release_sheet()

@@ -93,18 +93,18 @@ def measure_points(
     """
     size = projector.width_px, projector.height_px
     columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
-    wanted = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    grid_pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     parts: list[tuple[Floats, Floats, Indices, Floats]] = []
     for number, views in enumerate(poses):
         found = []
-        for side, pictures in zip(("left", "right"), views, strict=True):
+        for side, images in zip(("left", "right"), views, strict=True):
             try:
-                found.append(find_pixels(decode_patterns(pictures, *size), wanted))
+                found.append(find_pixels(decode_patterns(images, *size), grid_pixels))
             except DecodeError as error:
                 raise ProjectorError(f"pose {number + 1}, {side} camera: {error}") from error
         both = found[0][1] & found[1][1]
         world, skew_m = triangulate_points(found[0][0][both], found[1][0][both], camera)
-        parts.append((world, wanted[both], np.full(int(both.sum()), number), skew_m))
+        parts.append((world, grid_pixels[both], np.full(int(both.sum()), number), skew_m))
     world, pixels, pose, skew = (np.concatenate(columns) for columns in zip(*parts, strict=True))
     return ProjectorPoints(world, pixels, pose, skew)
 
@@ -126,9 +126,9 @@ def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tup
     base = from_right[:3, 3]
     aa, ab, bb = ((p * q).sum(axis=1) for p, q in ((a, a), (a, b), (b, b)))
     da, db = a @ base, b @ base
-    share = aa * bb - ab * ab
-    on_a = ((bb * da - ab * db) / share)[:, None] * a
-    on_b = base + ((ab * da - aa * db) / share)[:, None] * b
+    denominator = aa * bb - ab * ab
+    on_a = ((bb * da - ab * db) / denominator)[:, None] * a
+    on_b = base + ((ab * da - aa * db) / denominator)[:, None] * b
     pose = camera.world_from_left
     world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
     return apply(world_from_left, 0.5 * (on_a + on_b)), np.linalg.norm(on_a - on_b, axis=1)
@@ -148,7 +148,7 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     Raises ProjectorError where the points are too few, too similar in depth, cover too little of
     the image, or are not of one projector.
     """
-    kept = np.ones(len(points.world), np.bool_)
+    inliers = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _depth_range(points, guess)
     coverage = _coverage(points.pixels, guess)
     if poses < MIN_POSES or len(points.world) < MIN_POINTS:
@@ -167,27 +167,31 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
             f"{100 * MIN_COVERAGE:.0f} % are needed: the lens is not determined elsewhere"
         )
     for _ in range(3):
-        projector = _fitted(points, kept, guess)
-        off = np.linalg.norm(project_points(projector, points.world) - points.pixels, axis=1)
-        now = off <= OUTLIER_RATIO * np.median(off)
-        if (now == kept).all():
+        projector = _fitted(points, inliers, guess)
+        residual_px = np.linalg.norm(
+            project_points(projector, points.world) - points.pixels, axis=1
+        )
+        now = residual_px <= OUTLIER_RATIO * np.median(residual_px)
+        if (now == inliers).all():
             break
-        kept = now
-    rms = _rms(off[kept])
-    if rms > MAX_RMS_PX or kept.mean() < 0.8:
+        inliers = now
+    rms = _rms(residual_px[inliers])
+    if rms > MAX_RMS_PX or inliers.mean() < 0.8:
         raise ProjectorError(
-            f"{rms:.2f} px rms and {int((~kept).sum())} outliers of {len(kept)} points: not one "
-            "projector, or the sheet moved between its images; hold it still, check the cameras "
+            f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points: not "
+            "one projector, or the sheet moved between its images; hold it still, check the cameras "
             "(flexsheet calibrate check)"
         )
     held_out = [
         np.linalg.norm(
-            project_points(_fitted(points, kept & (points.pose != pose), guess), points.world[here])
+            project_points(
+                _fitted(points, inliers & (points.pose != pose), guess), points.world[here]
+            )
             - points.pixels[here],
             axis=1,
         )
         for pose in np.unique(points.pose)
-        if (here := kept & (points.pose == pose)).any()
+        if (here := inliers & (points.pose == pose)).any()
     ]
     position = projector.world_from_projector.position_m
     distance_m = float(np.median(np.linalg.norm(points.world - position, axis=1)))
@@ -196,13 +200,13 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
         projector=projector,
         rms_px=rms,
         held_out_rms_px=_rms(np.concatenate(held_out)),
-        before_rms_px=_rms(before[kept]),
+        before_rms_px=_rms(before[inliers]),
         rms_m=rms * distance_m / projector.lens.fx_px,
         coverage_ratio=coverage,
         depth_range_m=depth_m,
         poses=poses,
-        points=int(kept.sum()),
-        outliers=int((~kept).sum()),
+        points=int(inliers.sum()),
+        outliers=int((~inliers).sum()),
     )
 
 
@@ -223,13 +227,13 @@ def _coverage(pixels: Floats, projector: Projector) -> float:
     return len(np.unique(cells, axis=0)) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
 
 
-def _fitted(points: ProjectorPoints, kept: NDArray[np.bool_], guess: Projector) -> Projector:
+def _fitted(points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projector) -> Projector:
     """The projector of least squared pixels: square pixels, k1, k2, p1, p2; k3 as guessed.
 
     OpenCV's own fit refuses a principal point outside the picture, where lens shift puts it; its
     projection and that one's derivatives serve here.
     """
-    world, pixels = points.world[kept], points.pixels[kept]
+    world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
     from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
     aspect, k3 = lens.fy_px / lens.fx_px, lens.distortion[4]
@@ -295,8 +299,8 @@ def keystone(
     world = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], dtype=np.float64)
     edges = np.roll(corners_px, -1, axis=0) - corners_px
     after = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
-    if not ((turns > 1.0).all() or (turns < -1.0).all()):
+    cross_products = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+    if not ((cross_products > 1.0).all() or (cross_products < -1.0).all()):
         raise ProjectorError(
             f"corners {corners_px.tolist()} are no convex quadrangle: give them as left bottom, "
             "right bottom, right top, left top, as the user sees them"
@@ -306,33 +310,33 @@ def keystone(
 
     def projector(numbers: Floats) -> Projector:
         x = numbers * TYPICAL_ERRORS
-        turned = transform(rotation_from_vector(x[:3]), x[3:6])
+        correction = transform(rotation_from_vector(x[:3]), x[3:6])
         focal = np.exp(x[6])
         matrix = camera_matrix(
             lens.fx_px * focal, lens.fy_px * focal, lens.cx_px + x[7], lens.cy_px + x[8]
         )
-        return _projector(guess, matrix, np.array(lens.distortion), start @ turned)
+        return _projector(guess, matrix, np.array(lens.distortion), start @ correction)
 
     def residuals(numbers: Floats) -> Floats:
-        off = project_points(projector(numbers), world) - corners_px
-        return np.concatenate([off.ravel(), 1e-2 * numbers])
+        residual_px = project_points(projector(numbers), world) - corners_px
+        return np.concatenate([residual_px.ravel(), 1e-2 * numbers])
 
     solved = least_squares(residuals, np.zeros(9), x_scale="jac", max_nfev=60)
     found = projector(solved.x)
-    off = np.linalg.norm(project_points(found, world) - corners_px, axis=1)
+    residual_px = np.linalg.norm(project_points(found, world) - corners_px, axis=1)
     before = np.linalg.norm(project_points(guess, world) - corners_px, axis=1)
-    if _rms(off) > MAX_RMS_PX:
+    if _rms(residual_px) > MAX_RMS_PX:
         raise ProjectorError(
-            f"no projector near the scene's lights these corners ({_rms(off):.1f} px left): "
-            "check their order, and the pose in the scene"
+            f"no projector near the scene's lights these corners "
+            f"({_rms(residual_px):.1f} px left): check their order, and the pose in the scene"
         )
     distance_m = float(np.linalg.norm(found.world_from_projector.position_m))
     return ProjectorFit(
         projector=found,
-        rms_px=_rms(off),
+        rms_px=_rms(residual_px),
         held_out_rms_px=float("nan"),
         before_rms_px=_rms(before),
-        rms_m=_rms(off) * distance_m / found.lens.fx_px,
+        rms_m=_rms(residual_px) * distance_m / found.lens.fx_px,
         coverage_ratio=_coverage(corners_px, guess),
         depth_range_m=0.0,
         poses=1,

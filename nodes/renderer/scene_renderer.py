@@ -283,17 +283,17 @@ class SceneRenderer:
     ) -> Image | None:
         if eyes is None:
             eyes = self.eyes(display)[: 1 if display.stereo == "mono" else 2]
-        pictures = []
+        images = []
         for number, eye in enumerate(eyes):
             draw_eye(eye)
             drawn(number)
             if read:
-                pictures.append(self.canvas.read())
+                images.append(self.canvas.read())
         if not read:
             return None
-        if len(pictures) == 1:
-            return pictures[0]
-        return pack(pictures[0], pictures[-1], display.stereo, swap_eyes=display.swap_eyes)
+        if len(images) == 1:
+            return images[0]
+        return pack(images[0], images[-1], display.stereo, swap_eyes=display.swap_eyes)
 
     def sheet_mesh(self, sheet: SheetPose) -> SheetMesh:
         """Return the sheet's mesh by `sheet_shape`; four triangles while reduced_order has no

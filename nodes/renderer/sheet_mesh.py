@@ -79,23 +79,23 @@ def deflected_mesh(sheet: SheetPose, dents: DentShapes) -> SheetMesh:
     if sheet.pushed_point is not None:
         x, y, z = apply(inverse(sheet.world_from_sheet), sheet.pushed_point).tolist()
         depth_m = max(0.0, -z)
-    place = (x, y)
-    flat = dents.grid(stretch, place)
-    offsets = dents.offsets(stretch, place, depth_m if depth_m >= MIN_PUSH_M else 0.0)
+    position = (x, y)
+    flat = dents.grid(stretch, position)
+    offsets = dents.offsets(stretch, position, depth_m if depth_m >= MIN_PUSH_M else 0.0)
     rows, columns = flat.shape[:2]
     across = (flat[..., 0] / sheet.edge_distance_m + 0.5).ravel()
     up = (flat[..., 1] / dents.rubber.height_m + 0.5).ravel()
     left_bottom, right_bottom, right_top, left_top = sheet.corners
     # Ruled between the edges: each point is bilinear in its position across and up.
-    ways = np.stack([right_bottom - left_bottom, left_top - left_bottom])
-    turn = right_top - right_bottom - left_top + left_bottom
+    edge_vectors = np.stack([right_bottom - left_bottom, left_top - left_bottom])
+    twist = right_top - right_bottom - left_top + left_bottom
     vertices = offsets.reshape(-1, 3) @ sheet.world_from_sheet[:3, :3].T
-    vertices += np.stack([across, up, across * up], axis=1) @ np.vstack([ways, turn])
+    vertices += np.stack([across, up, across * up], axis=1) @ np.vstack([edge_vectors, twist])
     vertices += left_bottom
     return SheetMesh(
         vertices,
         _grid_triangles(rows, columns),
-        dents.outside(stretch, place, depth_m),
+        dents.outside(stretch, position, depth_m),
     )
 
 
@@ -106,16 +106,16 @@ def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
     area again is counted for its shadow. 0 for a sheet without folds, 1 at most.
     """
     # By rows of one coordinate, which is several times faster than by points.
-    places = np.ascontiguousarray(mesh.vertices.T)
-    a, b, c = (places.take(mesh.triangles[:, i], axis=1) for i in range(3))
+    coordinates = np.ascontiguousarray(mesh.vertices.T)
+    a, b, c = (coordinates.take(mesh.triangles[:, i], axis=1) for i in range(3))
     b -= a
     c -= a
     x = b[1] * c[2] - b[2] * c[1]
     y = b[2] * c[0] - b[0] * c[2]
     z = b[0] * c[1] - b[1] * c[0]
     light = (a[0] - projector[0]) * x + (a[1] - projector[1]) * y + (a[2] - projector[2]) * z
-    way = a - projector[:, None]
-    lengths = np.sqrt((x * x + y * y + z * z) * (way * way).sum(axis=0))
+    rays = a - projector[:, None]
+    lengths = np.sqrt((x * x + y * y + z * z) * (rays * rays).sum(axis=0))
     unlit = light <= GRAZING_SINE * lengths
     if not unlit.any():
         return 0.0

@@ -46,7 +46,7 @@ SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
 """Names, and x over the width, y over the height."""
 
 
-def sheet_shape_family(judge: ReferenceFactory, *, solved: bool = True) -> Family:
+def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
     """Return every shape at the scene's stretches, over depths and points.
 
     Without `solved`, only shapes that need no solution beforehand.
@@ -56,12 +56,12 @@ def sheet_shape_family(judge: ReferenceFactory, *, solved: bool = True) -> Famil
         unit="mm",
         reference="the twin's membrane, rms height",
         methods=METHODS if solved else WITHOUT_SHAPES,
-        trials=partial(_trials, judge, solved),
+        trials=partial(_trials, reference, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
 
-def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
+def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
     dents = deflection_cache.load_or_compute(scene, None) if solved else None
     rubber, _ = deflection_cache.required_shapes(scene)
     spec = scene.sheet
@@ -81,7 +81,7 @@ def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Tri
             finger_tip=tip,
         )
         assert sheet is not None
-        place = (float(tip[0]), float(tip[1]))
+        position = (float(tip[0]), float(tip[1]))
 
         def elements(sheet: SheetPose, stretch: float = stretch, depth: float = depth) -> SheetMesh:
             assert sheet.pushed_point is not None
@@ -104,10 +104,10 @@ def _trials(judge: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Tri
         if dents is not None:
             shapes |= {"reduced_order": partial(deflected_mesh, dents=dents), "membrane": elements}
             in_range |= {
-                "reduced_order": not dents.outside(stretch, place, depth),
+                "reduced_order": not dents.outside(stretch, position, depth),
                 "membrane": True,
             }
-        truth = judge(scene, *edges, tip)
+        truth = reference(scene, *edges, tip)
         case: Case = {"stretch": stretch, "depth_mm": 1e3 * depth, "place": where}
         for method, shape in shapes.items():
             yield Trial(

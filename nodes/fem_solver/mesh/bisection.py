@@ -66,34 +66,34 @@ def bisect(
             )
         ends = vertices[tetrahedra[:, EDGES]]
         square = np.square(ends[:, :, 0] - ends[:, :, 1]).sum(axis=2)
-        longest = square.argmax(axis=1)
+        longest_edges = square.argmax(axis=1)
         middles = ends.sum(axis=2)
-        known = np.sort(_keys(2 * vertices))
+        known_keys = np.sort(_keys(2 * vertices))
         wanted_keys = _keys(middles.reshape(-1, 3))
-        positions = np.minimum(np.searchsorted(known, wanted_keys), len(known) - 1)
-        hanging = (known[positions] == wanted_keys).reshape(-1, 6).any(axis=1)
+        positions = np.minimum(np.searchsorted(known_keys, wanted_keys), len(known_keys) - 1)
+        hanging = (known_keys[positions] == wanted_keys).reshape(-1, 6).any(axis=1)
         split = np.flatnonzero(hanging | too_large(vertices, tetrahedra))
         if not len(split):
             return vertices, tetrahedra
-        doubled = middles[split, longest[split]]
+        doubled = middles[split, longest_edges[split]]
         if (doubled % 2).any():
             raise UnfitMeshError("skin_spacing_m: far too small for the object; raise it")
         count = len(vertices)
-        fresh, index = np.unique(doubled // 2, axis=0, return_inverse=True)
+        new_points, index = np.unique(doubled // 2, axis=0, return_inverse=True)
         # A midpoint that another element created before is among the vertices already.
-        where = _find(vertices, fresh)
+        where = _find(vertices, new_points)
         new = np.flatnonzero(where < 0)
         where[new] = count + np.arange(len(new))
-        vertices = np.concatenate([vertices, fresh[new]])
+        vertices = np.concatenate([vertices, new_points[new]])
         middle = where[index.reshape(-1)]
-        edge = EDGES[longest[split]]
+        edge = EDGES[longest_edges[split]]
         first, second = tetrahedra[split].copy(), tetrahedra[split].copy()
         rows = np.arange(len(split))
         first[rows, edge[:, 1]] = middle
         second[rows, edge[:, 0]] = middle
-        kept = np.ones(len(tetrahedra), dtype=bool)
-        kept[split] = False
-        tetrahedra = np.concatenate([tetrahedra[kept], first, second])
+        unchanged = np.ones(len(tetrahedra), dtype=bool)
+        unchanged[split] = False
+        tetrahedra = np.concatenate([tetrahedra[unchanged], first, second])
 
 
 def _keys(points: Ints) -> Ints:

@@ -114,14 +114,14 @@ class _Sizes:
             result: Floats = self.element_m * (1.0 + (BACK_COARSENING - 1.0) * behind)
             return result
         apart = (wrapped - self.focus.angle_rad + np.pi) % (2 * np.pi) - np.pi
-        return self._away(self.radius_m * np.abs(apart), self.focus)
+        return self._sizes_at_distance(self.radius_m * np.abs(apart), self.focus)
 
     def along(self, x: Floats) -> Floats:
         if self.focus is None:
             return np.full(len(x), self.element_m)
-        return self._away(np.abs(x - self.focus.x_m), self.focus)
+        return self._sizes_at_distance(np.abs(x - self.focus.x_m), self.focus)
 
-    def _away(self, distance_m: Floats, focus: Focus) -> Floats:
+    def _sizes_at_distance(self, distance_m: Floats, focus: Focus) -> Floats:
         grown = self.element_m + FOCUS_GROWTH * np.maximum(distance_m - focus.near_m, 0.0)
         result: Floats = np.minimum(grown, max(MAX_SIZE_RATIO * self.radius_m, self.element_m))
         return result

@@ -52,7 +52,7 @@ class _Field:
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m
-        self._known: dict[bytes, int] = {}
+        self._row_numbers: dict[bytes, int] = {}
         self._rows = np.empty((0, 5))
 
     def positions(self, vertices: Ints) -> Floats:
@@ -61,15 +61,15 @@ class _Field:
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
         """Return signed distance (n,), normal of the nearest surface (n, 3), its curvature (n,)."""
         keys = [vertex.tobytes() for vertex in vertices]
-        new = [i for i, key in enumerate(keys) if key not in self._known]
+        new = [i for i, key in enumerate(keys) if key not in self._row_numbers]
         if new:
             found = self.shape.closest(self.positions(vertices[new]))
             bend = np.sqrt(np.square(found.shape_operator).sum(axis=(1, 2)))
             rows = np.column_stack([found.height_m, found.normal, bend])
             for number, i in enumerate(new, len(self._rows)):
-                self._known[keys[i]] = number
+                self._row_numbers[keys[i]] = number
             self._rows = np.concatenate([self._rows, rows])
-        rows = self._rows[[self._known[key] for key in keys]]
+        rows = self._rows[[self._row_numbers[key] for key in keys]]
         return rows[:, 0], rows[:, 1:4], rows[:, 4]
 
 
@@ -90,11 +90,16 @@ def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> t
     for _ in range(ATTEMPTS):
         chosen = _remove_pinches(tetrahedra, core, distance)
         used, index = np.unique(chosen, return_inverse=True)
-        begun = points[used]
-        cells = orient_tetrahedra(begun, index.reshape(-1, 4))
+        start_points = points[used]
+        cells = orient_tetrahedra(start_points, index.reshape(-1, 4))
         hull = np.unique(hull_faces(cells))
         corners = smooth_mesh(
-            begun, cells, hull, make_surface_query(shape), springs=SPRINGS_OFF_SURFACE, anchor=0.0
+            start_points,
+            cells,
+            hull,
+            make_surface_query(shape),
+            springs=SPRINGS_OFF_SURFACE,
+            anchor=0.0,
         )
         ratios = radius_ratios(corners, cells)
         if ratios.min() > best_ratio:

@@ -143,8 +143,8 @@ def world_from_mesh(scene: Scene) -> Floats:
     world_from_object = _world_from_object(scene)
     if not isinstance(scene.object.geometry, Cylinder):
         return world_from_object
-    turned = rigid.transform_from_rpy(np.zeros(3), [_cylinder_rotation_rad(scene), 0.0, 0.0])
-    return np.asarray(world_from_object @ turned)
+    rotation = rigid.transform_from_rpy(np.zeros(3), [_cylinder_rotation_rad(scene), 0.0, 0.0])
+    return np.asarray(world_from_object @ rotation)
 
 
 def _world_from_object(scene: Scene) -> Floats:
@@ -334,10 +334,10 @@ def _slab_normals(nodes: Floats) -> Floats:
 def _require_volume(mesh: Mesh, nodes: Floats, elements: Ints, spec: MeshSpec) -> None:
     """Raise UnfitMeshError where too much of the object is missing: parts too thin for the
     elements."""
-    wanted = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
-    lost = 1.0 - float(signed_volumes(nodes, elements).sum()) / wanted
-    if lost > MAX_LOST_FRACTION:
+    required_m3 = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
+    lost_fraction = 1.0 - float(signed_volumes(nodes, elements).sum()) / required_m3
+    if lost_fraction > MAX_LOST_FRACTION:
         raise UnfitMeshError(
-            f"skin_spacing_m: {100 * lost:.0f} % of the object is too thin for elements of "
-            f"{2.0 * spec.skin_spacing_m:g} m; lower it"
+            f"skin_spacing_m: {100 * lost_fraction:.0f} % of the object is too thin for elements "
+            f"of {2.0 * spec.skin_spacing_m:g} m; lower it"
         )

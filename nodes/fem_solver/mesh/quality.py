@@ -73,8 +73,8 @@ def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
     derivative = slopes[:, :, 1:] - slopes[:, :, :1]
     crossed = np.cross(derivative[:, :, None, 0], derivative[:, None, :, 1])
     triple = np.einsum("eijx,ekx->eijk", crossed, derivative[:, :, 2])
-    least = np.full(len(elements), np.inf)
+    minimum = np.full(len(elements), np.inf)
     for corners in itertools.combinations_with_replacement(range(4), 3):
         orders = list(itertools.permutations(corners))
-        least = np.minimum(least, sum(triple[:, i, j, k] for i, j, k in orders) / len(orders))
-    return least / (6.0 * signed_volumes(nodes, elements))
+        minimum = np.minimum(minimum, sum(triple[:, i, j, k] for i, j, k in orders) / len(orders))
+    return minimum / (6.0 * signed_volumes(nodes, elements))

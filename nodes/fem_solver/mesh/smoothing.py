@@ -71,8 +71,8 @@ def smooth_mesh(
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
-    begun = corners / unit
-    points = begun
+    start_points = corners / unit
+    points = start_points
     for spring in springs:
         feet, normals = surface(points[hull] * unit)
         feet = feet / unit
@@ -82,23 +82,23 @@ def smooth_mesh(
         ) -> tuple[float, Floats]:
             value, gradient = _distortion(x, tetrahedra)
             feet, normals, spring = pull
-            away = ((x[hull] - feet) * normals).sum(axis=1)
-            gradient[hull] += 2.0 * spring * away[:, None] * normals
-            gradient += 2.0 * anchor * (x - begun)
-            value += spring * float(np.square(away).sum())
-            return value + anchor * float(np.square(x - begun).sum()), gradient
+            distance = ((x[hull] - feet) * normals).sum(axis=1)
+            gradient[hull] += 2.0 * spring * distance[:, None] * normals
+            gradient += 2.0 * anchor * (x - start_points)
+            value += spring * float(np.square(distance).sum())
+            return value + anchor * float(np.square(x - start_points).sum()), gradient
 
         points = _minimize(points, energy)
     points = points * unit
-    wanted = points.copy()
-    wanted[hull] = surface(points[hull])[0]
+    targets = points.copy()
+    targets[hull] = surface(points[hull])[0]
     while True:
-        flat = radius_ratios(wanted, tetrahedra) < MIN_FINAL_RADIUS_RATIO
+        flat = radius_ratios(targets, tetrahedra) < MIN_FINAL_RADIUS_RATIO
         moved = np.unique(tetrahedra[flat])
-        moved = moved[(wanted[moved] != points[moved]).any(axis=1)]
+        moved = moved[(targets[moved] != points[moved]).any(axis=1)]
         if not len(moved):
-            return wanted
-        wanted[moved] = points[moved]
+            return targets
+        targets[moved] = points[moved]
 
 
 def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
@@ -136,8 +136,8 @@ def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) 
             steps, direction = [], -gradient
             slope = -float(np.square(gradient).sum())
         # Limit the step to a fifth of an edge.
-        longest = float(np.sqrt(np.square(direction).sum(axis=1).max()))
-        step = min(1.0, 0.2 / max(longest, 1e-300))
+        max_step = float(np.sqrt(np.square(direction).sum(axis=1).max()))
+        step = min(1.0, 0.2 / max(max_step, 1e-300))
         while step > 1e-6:
             new_value, new_gradient = energy(points + step * direction)
             if new_value <= value + 1e-4 * step * slope:
@@ -145,10 +145,10 @@ def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) 
             step *= 0.5
         else:
             return points
-        moved, turned = step * direction, new_gradient - gradient
-        curvature = float((moved * turned).sum())
+        moved, gradient_change = step * direction, new_gradient - gradient
+        curvature = float((moved * gradient_change).sum())
         if curvature > 0.0:
-            steps = [*steps[1 - MEMORY :], (moved, turned, 1.0 / curvature)]
+            steps = [*steps[1 - MEMORY :], (moved, gradient_change, 1.0 / curvature)]
         points, value, gradient = points + moved, new_value, new_gradient
     return points
 
@@ -157,13 +157,13 @@ def _times_inverse_hessian(gradient: Floats, steps: list[tuple[Floats, Floats, f
     """Apply the two loops of L-BFGS."""
     result = gradient.copy()
     weights = []
-    for moved, turned, inverse in reversed(steps):
+    for moved, gradient_change, inverse in reversed(steps):
         weight = inverse * float((moved * result).sum())
         weights.append(weight)
-        result -= weight * turned
+        result -= weight * gradient_change
     if steps:
-        moved, turned, inverse = steps[-1]
-        result /= inverse * float((turned * turned).sum())
-    for (moved, turned, inverse), weight in zip(steps, reversed(weights), strict=True):
-        result += (weight - inverse * float((turned * result).sum())) * moved
+        moved, gradient_change, inverse = steps[-1]
+        result /= inverse * float((gradient_change * gradient_change).sum())
+    for (moved, gradient_change, inverse), weight in zip(steps, reversed(weights), strict=True):
+        result += (weight - inverse * float((gradient_change * result).sum())) * moved
     return result

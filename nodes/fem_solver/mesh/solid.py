@@ -93,11 +93,11 @@ def add_midside_nodes(corners: Floats, tetrahedra: Ints) -> tuple[Floats, Ints]:
 def orient_tetrahedra(corners: Floats, tetrahedra: Ints) -> Ints:
     """Return the tetrahedra (e, 4), with those reversed whose volume was negative."""
     sides = corners[tetrahedra[:, 1:]] - corners[tetrahedra[:, :1]]
-    turned = tetrahedra.copy()
-    turned[:, 1:3] = np.where(
+    oriented = tetrahedra.copy()
+    oriented[:, 1:3] = np.where(
         (np.linalg.det(sides) < 0.0)[:, None], tetrahedra[:, [2, 1]], tetrahedra[:, [1, 2]]
     )
-    return turned
+    return oriented
 
 
 def number_slabs(nodes: Floats, elements: Ints) -> Ints:
@@ -115,8 +115,8 @@ def number_slabs(nodes: Floats, elements: Ints) -> Ints:
         if not reached.any():
             raise UnfitMeshError("the mesh has several components; lower skin_spacing_m")
         number += 1
-        fresh = np.unique(waiting[reached])
-        level[fresh[level[fresh] < 0]] = number
+        new_nodes = np.unique(waiting[reached])
+        level[new_nodes[level[new_nodes] < 0]] = number
         waiting = waiting[~reached]
     return level
 
@@ -166,10 +166,10 @@ def restrict_touchable(mesh: SolidMesh, touchable: Bools) -> SolidMesh:
             "no part of the skin can be touched: object.support fixes it, or it faces away from "
             "the user by more than working_range.tilt_rad; reduce the support, or rotate the object"
         )
-    kept = np.unique(faces)
+    used = np.unique(faces)
     return replace(
         mesh,
-        contact_nodes=mesh.contact_nodes[kept],
-        contact_normals=mesh.contact_normals[kept],
-        contact_faces=np.searchsorted(kept, faces),
+        contact_nodes=mesh.contact_nodes[used],
+        contact_normals=mesh.contact_normals[used],
+        contact_faces=np.searchsorted(used, faces),
     )
