@@ -1,14 +1,13 @@
-"""What a frame costs the processor, beside OpenGL: where the time between a soft body and the
-picture goes.
+"""Measure the processor time of a frame beside OpenGL, from the soft body to the image.
 
     python -m benchmarks.frame_cpu [--scene FILE] [--triangles 20000] [--frames 300]
 
-Draws a stereo frame of a pushed sheet again and again, each with a new soft body, by the renderer's
-own steps.  Calls into OpenGL are timed apart from the rest: `GL calls` are their own time (they
-return early on a graphics card, on a software driver they may not), `GL finish` is the wait for the
-picture; both by the clock.  All else is the CPU side, in processor time of the drawing thread, so
-that what else runs on the machine counts little.  For it the picture is drawn small: a software
-driver that fills many pixels leaves nothing else in the caches, which a graphics card does not do.
+Draws a stereo frame of a pushed sheet repeatedly, each with a new soft body, by the renderer's own
+steps. Calls into OpenGL are timed apart from the rest. `GL calls` are their own time: they return
+early on a graphics card, perhaps not on a software driver. `GL finish` is the wait for the image.
+Both are wall time. All else is the CPU side, in processor time of the drawing thread, so that other
+load on the machine counts little. For that measurement the image is small: a software driver that
+fills many pixels evicts the caches, which a graphics card does not do.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SKIN_SPACING_M = 0.0045
 STRETCH = 1.05
 SMALL = 0.1
-"""Of the projector's width and height, while the CPU side is measured."""
+"""Fraction of the projector's width and height while the CPU side is measured."""
 GL_TYPES: tuple[type, ...] = (
     moderngl.Buffer,
     moderngl.Context,
@@ -55,7 +54,7 @@ GL_TYPES: tuple[type, ...] = (
 
 
 class Clock:
-    """Seconds of one frame by name; inside a call set `apart` the span around it stands still."""
+    """Seconds of one frame by name; a call set `apart` pauses the span around it."""
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = defaultdict(float)
@@ -72,7 +71,7 @@ class Clock:
     def apart(
         self, call: Callable[..., Any], name: str, now: Callable[[], float]
     ) -> Callable[..., Any]:
-        """The call, its time put under `name` and taken from the span that it happens in."""
+        """Record the time of the call under `name` and subtract it from the enclosing span."""
 
         def timed(*args: Any, **rest: Any) -> Any:
             if self._inside:
@@ -89,7 +88,7 @@ class Clock:
 
 @contextmanager
 def gl_apart(clock: Clock) -> Iterator[None]:
-    """Every method of moderngl's objects timed by `clock` while this lasts."""
+    """Time every method of moderngl's objects with `clock` inside the context."""
     kept: list[tuple[type, str, Any]] = []
     for kind in GL_TYPES:
         for name, method in list(vars(kind).items()):
@@ -107,7 +106,7 @@ def gl_apart(clock: Clock) -> Iterator[None]:
 
 
 def shrunk(scene: Scene, share: float) -> Scene:
-    """The scene with a projector of fewer pixels."""
+    """Return the scene with a projector of fewer pixels."""
     projector, lens = scene.projector, scene.projector.lens
     sizes = {name: share * getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
     changes = {
@@ -119,7 +118,7 @@ def shrunk(scene: Scene, share: float) -> Scene:
 
 
 def stage_of(scene: Scene, triangles: int) -> SceneRenderer:
-    """A stage whose surface has about so many triangles."""
+    """Return a scene renderer whose surface has about this many triangles."""
     spacing_m = 0.0025
     for _ in range(4):
         stage = SceneRenderer(
@@ -136,7 +135,7 @@ def stage_of(scene: Scene, triangles: int) -> SceneRenderer:
 
 
 def skin_of(scene: Scene) -> Skin:
-    """The solver's skin, as fine as the demo's."""
+    """Return the solver's skin, as fine as the demo's."""
     mesh = mesh_scene(scene, SKIN_SPACING_M)
     points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
     return Skin(
@@ -147,7 +146,7 @@ def skin_of(scene: Scene) -> Skin:
 
 
 def bodies(skin: Skin) -> Iterator[SoftBody]:
-    """Soft bodies that a finger pushes here and there, 15 mm deep."""
+    """Yield soft bodies that a finger pushes at several points, 15 mm deep."""
     points = skin.vertices_world_m.astype(np.float64)
     for number in range(10**6):
         place = 0.02 * np.array([np.sin(0.1 * number), np.cos(0.1 * number)])
@@ -164,8 +163,8 @@ def bodies(skin: Skin) -> Iterator[SoftBody]:
         )
 
 
-def select_eyes(scene: Scene, edges: tuple[Floats, Floats], number: int) -> SheetPose:
-    """The sheet between two edges, pushed here and there."""
+def predict_sheet(scene: Scene, edges: tuple[Floats, Floats], number: int) -> SheetPose:
+    """Return the sheet between two edges, pushed at several points."""
     tip = np.array([0.02 * np.sin(0.1 * number), 0.02 * np.cos(0.1 * number), -0.015])
     sheet = estimate_sheet(
         *edges,
@@ -181,7 +180,7 @@ def select_eyes(scene: Scene, edges: tuple[Floats, Floats], number: int) -> Shee
 def measure(
     scene: Scene, *, triangles: int, frames: int
 ) -> tuple[SceneRenderer, list[dict[str, float]]]:
-    """Seconds of each frame by name."""
+    """Return the seconds of each frame by name."""
     stage, skin = stage_of(scene, triangles), skin_of(scene)
     stage.set_skin(skin)
     shown = Display(correction="two_pass", stereo="side_by_side")
@@ -194,7 +193,7 @@ def measure(
         for number, body in zip(range(frames + 20), bodies(skin), strict=False):
             clock.spent = defaultdict(float)
             with clock.span("sheet believed"):
-                sheet = select_eyes(scene, edges, number)
+                sheet = predict_sheet(scene, edges, number)
             with clock.span("object shaped"):
                 stage.deform(body)
             with clock.span("look and marks"):

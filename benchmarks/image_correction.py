@@ -1,14 +1,14 @@
-"""The renderer's pictures, judged by the twin, without the graph.
+"""Measure the renderer's images against the simulator, without the graph.
 
     python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretches] [frames]
 
 sizes: figures 11 and 13 of the paper, the error of each size as the eye sees it on the true sheet
-(mm).  The tilted sheet either rolls on the cylinder (its plane tangent, the touched line staying
-put on it) or turns about its own centre; positive tilts turn the sheet's front upwards, as a finger
-does that strokes up.  The others give the errors at all points that the eye sees (mean, 95 %,
-maximum, mm) and what share of the object it sees: over tilt to 80 degrees, over depth to 70 mm,
-over the place of the push on upright and tilted sheets, and over the stretch.  frames: the time of
-a stereo frame over the floor's, both taken in turn.  Without a name: all.
+(mm). The tilted sheet either rolls on the cylinder (its plane tangent, the touched line fixed on
+it) or rotates about its own centre. Positive tilts rotate the sheet's front upwards, as a finger
+does that strokes up. The others give the errors at all points that the eye sees (mean, 95 %,
+maximum, mm) and the fraction of the object that it sees. They vary the tilt to 80 degrees, the
+depth to 70 mm, the position of the push on upright and tilted sheets, and the stretch. frames: the
+time of a stereo frame over the floor's, both measured alternately. Without a name: all.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ Image = NDArray[np.uint8]
 ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
-"""Of a flat sheet; four triangles are then one plane."""
+"""Corrections for a flat sheet; four triangles are then one plane."""
 ROUNDS = 40
 
 
 class Bench:
-    """Renderer, true sheet and eye of one scene."""
+    """The renderer, the true sheet and the eye of one scene."""
 
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
@@ -70,7 +70,7 @@ class Bench:
     def situation(
         self, world_from_sheet: Floats, tip: Floats | None, *, stretch: float | None = None
     ) -> tuple[SheetPose, DeformedSheet]:
-        """The sheet as the renderer believes it to be, and as it is."""
+        """Return the predicted sheet and the true sheet."""
         sheet = self.scene.sheet
         edges = edge_poses(world_from_sheet, sheet.width_m * (stretch or self.stretch))
         predicted = estimate_sheet(
@@ -86,7 +86,8 @@ class Bench:
     def pushed(
         self, depth_m: float, *, tilt_deg: float = 0.0, place_m: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Floats, Floats | None]:
-        """world_from_sheet that touches the cylinder with that place, and the fingertip there."""
+        """Return world_from_sheet that touches the cylinder with that point, and the fingertip
+        there."""
         pose = roll_sheet(self.scene, -np.radians(tilt_deg), place_m)
         touched = pose[:3, 3] + pose[:3, :3] @ [*place_m, 0.0]
         return pose, touched - depth_m * pose[:3, 2] if depth_m else None
@@ -98,7 +99,8 @@ class Bench:
         truth: DeformedSheet,
         sizes: Callable[[Image, float], Sequence[float]],
     ) -> Floats:
-        """Of each size (m), against the proper picture; the drawn object is not deformed."""
+        """Return the error of each size (m) against the expected image; the drawn object is not
+        deformed."""
         shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
         projected = self.stage.draw(shown, predicted, DrawStyle(True, "object"), read=True)
         assert projected is not None
@@ -107,13 +109,14 @@ class Bench:
         return np.asarray(np.abs(np.array(sizes(picture, METRES_PER_PX)) - wanted))
 
     def errors(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> ErrorMap:
-        """At all points that the eye sees."""
+        """Return the errors at all points that the eye sees."""
         pictures = draw_coordinate_ramps(self.stage, method, predicted)
         x, y = (seen(each, truth, self.scene, eye=self._eye) for each in pictures)
         return error_map(x, y, METRES_PER_PX)
 
     def cell(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> str:
-        """Mean / 95 % / maximum of the errors, mm, and how much of the object is seen."""
+        """Return mean / 95 % / maximum of the errors, mm, and the visible fraction of the
+        object."""
         sizes = 1e3 * self.errors(method, predicted, truth).sizes_m
         if len(sizes) == 0:
             return "dark"
@@ -219,7 +222,7 @@ def print_stretches(bench: Bench) -> None:
 
 
 def print_frames(scene: Scene) -> None:
-    """Wall time of a stereo frame: the median over rounds in which every method has its turn."""
+    """Print the wall time of a stereo frame: the median over rounds that include every method."""
     dents, context = deflection_cache.load_or_compute(scene, None), headless_context()
     print(f"\n{context.info['GL_RENDERER']}")
     heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")

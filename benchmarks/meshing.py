@@ -1,10 +1,11 @@
-"""What meshing costs and how good it is: every shape at several spacings.
+"""Measure the cost and quality of meshing: every shape at several spacings.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.meshing [FILE METRES_PER_UNIT]
 
-Prints a table row for each: nodes beside those foreseen, tetrahedra, skin and touchable nodes, the
-skin's mean spacing where fingers go, seconds, the worst radius ratio, dihedral angle and Jacobian,
-and the error of the volume.  FILE: an STL or OBJ to mesh as well.  Some minutes, 2 GiB.
+Prints a table row for each: nodes beside the estimate, tetrahedra, skin and touchable nodes, the
+skin's mean spacing where fingers touch, seconds, the worst radius ratio, dihedral angle and
+Jacobian, and the error of the volume. FILE: an STL or OBJ to mesh as well. Takes some minutes and 2
+GiB.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def with_geometry(scene: Scene, geometry: Geometry) -> Scene:
 
 
 def volume_of(geometry: Geometry, slab_depth_m: float) -> float:
-    """Of the solid, m^3; of a slab for a plane, of the facets for a mesh."""
+    """Return the volume of the solid, m^3; of a slab for a plane, of the facets for a mesh."""
     match geometry:
         case Cylinder(radius_m=r, length_m=length):
             return np.pi * r**2 * length
@@ -94,14 +95,14 @@ def volume_of(geometry: Geometry, slab_depth_m: float) -> float:
 
 
 def meshed_volume(mesh: SolidMesh) -> float:
-    """Of the curved elements, m^3."""
+    """Return the volume of the curved elements, m^3."""
     points, weights = quadrature()
     jacobian = np.einsum("qak,eai->eqik", shape_gradients(points), mesh.nodes[mesh.elements])
     return float((np.linalg.det(jacobian) * weights).sum())
 
 
 def spacing_mm(mesh: SolidMesh) -> float:
-    """Root of the touchable skin's area per node."""
+    """Return the root of the touchable skin's area per node."""
     corners = mesh.nodes[mesh.contact_nodes][mesh.contact_faces]
     area = 0.0
     for i, j, k in ((0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)):

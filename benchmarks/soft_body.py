@@ -1,14 +1,15 @@
-"""How smooth and how quick the soft body is: slides a fingertip over meshes of several spacings.
+"""Measure how smooth and how fast the soft body is: slide a fingertip over meshes of several
+spacings.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body [--table]
 
-With --table, the nonlinear table of the demo's mesh instead: how long it takes to make (minutes, if
-the cache does not hold it), how far it and the linear method are, at places that it was not made
-from, from Newton solutions on finer meshes, and the same slides.
+With --table, the nonlinear table of the demo's mesh is measured instead: the time to compute it
+(minutes, if it is not cached), its error and the linear method's against Newton solutions on finer
+meshes at points that it was not computed from, and the same slides.
 
-The fingertip goes 6 mm in each of three directions at constant depth, 0.02 mm a step.  Prints for
+The fingertip moves 6 mm in each of three directions at constant depth, 0.02 mm per step. Prints for
 every mesh and depth the force (beside Hertz's), its ripple, the largest jump of any skin node in a
-step, the stiffness, and the time of a step.  About a minute, 1.5 GiB.
+step, the stiffness, and the time of a step. Takes about a minute and 1.5 GiB.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 DEMO_SPACING_M = 0.0045
 JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
-"""Station along the axis (m) and angle: places that no table is made from."""
+"""Position along the axis (m) and angle: points that no table is computed from."""
 JUDGE_RATIO = 0.3
-"""Of the judge's mesh at the push, in finger radii: finer than the table's."""
+"""Spacing of the reference mesh at the push, in finger radii: finer than the table's."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
 HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
@@ -53,7 +54,7 @@ FINEST_TOUCH_ANGLE_RAD = 0.7
 
 @dataclass(frozen=True, slots=True)
 class Slides:
-    """What came of sliding at one depth: per step, but for the largest jump (m)."""
+    """The results of sliding at one depth: per step, except the largest jump (m)."""
 
     force_n: Floats
     stiffness_n_per_m: Floats
@@ -62,14 +63,14 @@ class Slides:
 
 
 def places(heading_rad: float) -> Iterator[tuple[float, float]]:
-    """Places of the fingertip on the skin: along the axis, and around it (m)."""
+    """Yield positions of the fingertip on the skin: along the axis, and around it (m)."""
     for i in range(STEPS):
         way = STEP_M * i
         yield FROM_M[0] + way * np.cos(heading_rad), FROM_M[1] + way * np.sin(heading_rad)
 
 
 def judge_table(scene: Scene, spacing_m: float) -> None:
-    """Make or load the table, compare it with full Newton, slide over it, print."""
+    """Compute or load the table, compare it with full Newton, slide over it, print."""
     maker = SoftBodyFactory(
         skin_spacing_m=spacing_m,
         linear_depth_m=0.006,
@@ -101,7 +102,7 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
 
 
 def say(done: int, total: int, need: precompute.WorkBudget) -> None:
-    """Progress, on one line."""
+    """Print progress on one line."""
     print(f"\r{100 * done // total:3d} % of {need.text()}", end="", file=sys.stderr, flush=True)
 
 
@@ -112,7 +113,7 @@ def judge_push(
     best: body.SceneBody,
     linear: body.SceneBody,
 ) -> None:
-    """Largest error off the finger and error of the force, depth by depth."""
+    """Print the largest error off the finger and the error of the force, depth by depth."""
     job = snapshots.make_snapshot_job(
         best.spec.mesh,
         mesh,
@@ -164,7 +165,8 @@ def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
 
 
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
-    """Hertz's force of a sphere on a half-space bent like the cylinder, its patch taken round."""
+    """Return Hertz's force of a sphere on a half-space curved like the cylinder, with a circular
+    patch."""
     modulus, nu = scene.object.material.young_modulus_pa, scene.object.material.poisson_ratio
     finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / cylinder_of(scene).radius_m
     radius = 1.0 / np.sqrt(finger * (finger + cylinder))

@@ -1,11 +1,10 @@
-"""Where the soft body's methods break, and what the system then does: the tables of
-docs/limits-soft-body.md.
+"""Measure where the soft body's methods fail, and the system's response: docs/limits-soft-body.md.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_limits [CASE ...]
 
-On small, coarse bodies, so that it takes minutes: depths at which Newton ends depend on the mesh,
-and are told with it.  The nonlinear table is made of such pushes: it ends `END_SPAN_M` before they
-do.
+The bodies are small and coarse, so that it takes minutes. Depths at which Newton ends depend on the
+mesh, and are printed with it. The nonlinear table consists of such pushes: it ends `END_SPAN_M`
+before they do.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A scene's body by the linear method, and the mesh that it is of."""
+    """A scene's body by the linear method, and its mesh."""
 
     scene: Scene
     soft: SceneBody
@@ -64,7 +63,7 @@ def scene_of(
     nu: float = 0.45,
     finger_m: float = 0.007,
 ) -> Scene:
-    """The demo's scene with another object, its front at the world's origin."""
+    """Return the demo's scene with another object, its front at the world's origin."""
     content = load_scene(SCENE_FILE).model_dump()
     content["object"] = {
         "geometry": geometry,
@@ -96,7 +95,7 @@ def site_of(body: Body, x: float = 0.002, y: float = 0.0015) -> SamplePoint:
 
 
 def newton(body: Body, sample: SamplePoint, depths_m: tuple[float, ...] = DEPTHS_M) -> Snapshot:
-    """Full Newton on the body's own mesh."""
+    """Solve full Newton on the body's own mesh."""
     return solve_snapshot(
         SnapshotJob(
             nodes=body.mesh.nodes,
@@ -120,7 +119,7 @@ def table_mm(newton_mm: float) -> float:
 
 
 def overturned(body: Body, moved: NDArray[Any]) -> int:
-    """Triangles of the skin whose normal is turned by more than a right angle."""
+    """Return the number of skin triangles whose normal is rotated by more than a right angle."""
 
     def normals(points: Floats) -> Floats:
         a, b, c = points[body.model.triangles].transpose(1, 0, 2)
@@ -131,7 +130,7 @@ def overturned(body: Body, moved: NDArray[Any]) -> int:
 
 
 def linear_inversion_mm(body: Body, sample: SamplePoint) -> float:
-    """The depth at which the linear field, not held back, first turns a corner of an element."""
+    """Return the depth at which the unlimited linear field first inverts a corner of an element."""
     mesh, nu = body.mesh, body.soft.spec.poisson_ratio
     matrices = element_stiffness(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=nu)
     factors = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices)
@@ -156,7 +155,7 @@ def row(*cells: object) -> None:
 
 
 def incompressible() -> None:
-    """Poisson's ratio towards 0.5."""
+    """Vary Poisson's ratio towards 0.5."""
     row("ν", "linear: force at 3 mm", "Newton: to", "table: to", "refused")
     for nu in (0.3, 0.45, 0.49, 0.499, 0.4999, 0.49995):
         try:
@@ -172,7 +171,7 @@ def incompressible() -> None:
 
 
 def inversion() -> None:
-    """Pushed deeper and deeper."""
+    """Push to increasing depths."""
     row("skin spacing", "linear field inverts at", "Newton: to", "shown at 50 mm", "overturned")
     for spacing in (0.005, 0.004, 0.003):
         body = body_of(cylinder(), spacing)
@@ -191,8 +190,11 @@ def inversion() -> None:
 
 
 def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float, float, int]:
-    """Largest move (mm) of a skin node in a step of 0.02 mm across a body, the share of the steps
-    that is flagged, and the most triangles overturned; the finger keeps its depth."""
+    """Slide a finger across a body at constant depth, in steps of 0.02 mm.
+
+    Returns the largest displacement (mm) of a skin node in a step, the fraction of the steps that
+    is flagged, and the maximum number of inverted triangles.
+    """
     held: ContactAnchor | None = None
     before: NDArray[Any] | None = None
     jump, flagged, most = 0.0, 0, 0
@@ -212,7 +214,7 @@ def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float
 
 
 def rim() -> None:
-    """A finger that slides over the edge of a box, from its front to its side."""
+    """Slide a finger over the edge of a box, from its front to its side."""
     row("edge radius", "depth", "largest jump", "flagged", "overturned", "Newton on the edge: to")
     for edge in (0.010, 0.005, 0.0025):
         box = {"shape": "rounded_box", "size_m": [0.06, 0.05, 0.03], "edge_radius_m": edge}
@@ -233,7 +235,8 @@ def rim() -> None:
 
 
 def two_supports() -> None:
-    """A cylinder held at the middles of its two ends only, against one held along its back."""
+    """Compare a cylinder fixed at the middles of its two ends only with one fixed along its
+    back."""
     row("held", "held nodes", "linear: force at 5 mm", "skin moves at most", "Newton: to")
     ends = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
     point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
@@ -255,7 +258,7 @@ def two_supports() -> None:
 
 
 def slivers() -> None:
-    """Elements flattened: the nodes inside the cylinder drawn towards a plane."""
+    """Flatten elements: move the nodes inside the cylinder towards a plane."""
     row("flattened to", "least height over edge", "Newton: force at 3 mm", "Newton: to")
     base = body_of(cylinder())
     sample = site_of(base)
@@ -273,8 +276,10 @@ def slivers() -> None:
 
 
 def flattened(mesh: SolidMesh, share: float) -> Floats:
-    """Nodes of a mesh one of whose inner corners lies within `share` of its height from the
-    opposite face of an element; its edges stay straight."""
+    """Return the nodes of a mesh with one inner corner close to the opposite face of an element.
+
+    The distance is `share` of the corner's height; edges stay straight.
+    """
     skin = np.zeros(len(mesh.nodes), dtype=bool)
     skin[mesh.skin] = True
     corners = mesh.elements[:, :4]
@@ -301,7 +306,7 @@ EDGES_OF = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 
 def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
-    """The least height of an element over its longest edge."""
+    """Return the minimum height of an element over its longest edge."""
     corners = nodes[mesh.elements[:, :4]]
     edges = corners[:, [1, 2, 3, 2, 3, 3]] - corners[:, [0, 0, 0, 1, 1, 2]]
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
@@ -312,7 +317,8 @@ def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
 
 
 def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
-    """Of the finger 3 mm deep by Newton on these nodes; NaN where it cannot follow."""
+    """Return the force of a finger 3 mm deep by Newton on these nodes; NaN where it does not
+    converge."""
     mesh = replace(body.mesh, nodes=nodes)
     answer = newton(replace(body, mesh=mesh), sample, (0.003,))
     modulus = body.scene.object.material.young_modulus_pa
@@ -320,7 +326,7 @@ def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
 
 
 def teleport() -> None:
-    """A finger that is somewhere else in every frame, against one that came straight there."""
+    """Compare a finger that jumps in every frame with one that moved straight to each point."""
     row("finger", "skin differs from that of a finger fresh from outside by at most")
     body, rng = body_of(cylinder()), np.random.default_rng(4)
     held: ContactAnchor | None = None
@@ -348,7 +354,7 @@ def teleport() -> None:
 
 
 def small_tip() -> None:
-    """A fingertip smaller than the mesh under it."""
+    """Push with a fingertip smaller than the mesh under it."""
     row("tip radius", "over spacing", "depth", "linear: force over Hertz", "Newton: over Hertz")
     for radius in (0.007, 0.003, 0.0015, 0.0007, 0.0003):
         body = body_of(cylinder(finger_m=radius), meshed_for=cylinder())
@@ -372,7 +378,7 @@ def small_tip() -> None:
 
 
 def beyond() -> None:
-    """A finger that leaves the touchable skin: past the cylinder's end, and around to its back."""
+    """Move a finger off the touchable skin: past the cylinder's end, and around to its back."""
     row("way", "flagged from", "force half at", "force none at")
     body = body_of(cylinder())
     for name, ways in (

@@ -1,16 +1,16 @@
-"""What an answer of the soft body costs in time and memory, by skin nodes and by contact nodes.
+"""Measure time and memory of a soft body response, by skin nodes and by contact nodes.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_size [--output docs/charts]
 
-Bodies of 500 to 20,000 skin nodes answer fingers at random places and at slowly moving ones.  Their
-geometry is the demo's cylinder, meshed as finely as that takes, and the steps are those that the
-node runs; but the numbers in the tables are made up, and only some places have rows, as many as fit
-into `TABLE_BYTES`: to solve for 20,000 nodes would take hours, and 10,000 places some 100 GB by the
-nonlinear table.  What a whole table would take is said beside it.  The floor is how long this
-machine takes, there and then, to read as many bytes as the answer needs, by a plain dot product.
+Bodies of 500 to 20,000 skin nodes respond to fingers at random points and to slowly moving ones.
+Their geometry is the demo's cylinder with a suitable mesh, and the steps are those of the node. The
+numbers in the tables are synthetic, and only some nodes have rows, as many as fit into
+`TABLE_BYTES`. Solving for 20,000 nodes would take hours, and 10,000 contact nodes some 100 GB with
+the nonlinear table. The memory of a full table is printed beside it. The floor is the time that
+this machine needs at that moment to read the same number of bytes, by a plain dot product.
 
-Writes soft-body-size.svg and soft-body-size.json.  A minute, 3 GB.  With --redraw nothing is
-measured: the numbers in the folder are drawn anew.
+Writes soft-body-size.svg and soft-body-size.json. Takes a minute and 3 GB. With --redraw nothing is
+measured: the numbers in the folder are drawn again.
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ DEPTH_M = 0.005
 CONTACT_SPACING_M = 0.0022
 CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
 LINEAR_RANGE_M = (0.012, 0.018)
-"""Wider than the method is good for, so that the contact grows with the depth."""
+"""Wider than the method's range, so that the contact grows with the depth."""
 TABLE_BYTES, MOST_PLACES = 400_000_000, 800
 FLOOR_BYTES = 400_000_000
 STEPS = 600
 SLOW_STEP_M = 2e-5
 ROWS_PER_ANSWER = 6 * 4
-"""Of the nonlinear table: six nodes, four depths."""
+"""Rows of the nonlinear table: six nodes, four depths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Synthetic:
-    """A body of the right size: rows of made-up numbers at the touch nodes of a patch."""
+    """A body of the right size: rows of synthetic numbers at the contact nodes of a patch."""
 
     mesh: SolidMesh
     response: SkinResponse
@@ -131,7 +131,8 @@ def synthetic(scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int) 
 
 
 def floor_s(read_bytes: float) -> float:
-    """Median time to read so much in one piece from random places of memory."""
+    """Return the median time to read this many bytes in one piece from random positions of
+    memory."""
     source, rng = np.ones(FLOOR_BYTES // 4, dtype=np.float32), np.random.default_rng(1)
     count = max(16, int(read_bytes / 4))
     durations = []
@@ -144,7 +145,8 @@ def floor_s(read_bytes: float) -> float:
 
 
 def pushes_on(body: Synthetic, depth_m: float, *, slow: bool) -> list[ContactQuery]:
-    """At random places of the patch, or to and fro along a line at 0.02 mm a step."""
+    """Return contacts at random points of the patch, or back and forth along a line at 0.02 mm a
+    step."""
     rng = np.random.default_rng(2)
     ways = rng.uniform(-body.half_m, body.half_m, (STEPS, 2))
     if slow:
@@ -319,7 +321,7 @@ def points_of(kept: Sequence[dict[str, Any]]) -> list[Point]:
 
 
 def measure_all() -> dict[str, Any]:
-    """All sizes, all contacts, as they are kept."""
+    """Measure all sizes and contacts, as they are stored."""
     scene = load_scene(SCENE_FILE)
     shape = make_shape(dict(cylinder_of(scene)))
     by_size, by_contact = [], []

@@ -1,4 +1,4 @@
-"""What the tests of pictures share: dented objects and sheets that are pushed."""
+"""Helpers of the image tests: deformed objects and pushed sheets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 
 
 def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> SheetPose:
-    """The scene's sheet, stretched a little, its middle at a pose (4, 4)."""
+    """Return the scene's sheet, stretched a little, its middle at a pose (4, 4)."""
     sheet = estimate_sheet(
         *edge_poses(pose, 1.05 * scene.sheet.width_m),
         height_m=scene.sheet.height_m,
@@ -28,7 +28,7 @@ def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> SheetPose
 
 
 def follow(stage: SceneRenderer, displacement: Floats | None) -> None:
-    """Deform the stage by a displacement (vertices, 3) of its own surface, or put it to rest."""
+    """Deform the scene renderer by a displacement (vertices, 3) of its own surface, or reset it."""
     if displacement is None:
         stage.deform(None)
         return
@@ -51,7 +51,7 @@ def body_of(displacement: Floats) -> SoftBody:
 
 
 def dent(stage: SceneRenderer, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Displacement (vertices, 3) of the stage's surface, pushed from the front; its back stays."""
+    """Return a displacement (vertices, 3) of the surface, pushed from the front; its back stays."""
     points = stage._surface.rest_world_m
     away = np.linalg.norm(points[:, :2] - np.array(place), axis=1)
     facing = np.clip(1.0 + points[:, 2] / 0.05, 0.0, 1.0)

@@ -1,10 +1,10 @@
-"""Pictures that the renderer must go on drawing as they are.
+"""Images that the renderer must reproduce.
 
     python -m tests.golden_pictures [NAME ...]
 
-draws them anew into tests/golden (all, or those named).  Look at them before they are committed:
-they are what `tests/test_golden.py` holds the renderer to.  The projector has 320x240 pixels here,
-and its pictures are mirrored, as it stands behind the sheet.
+draws them again into tests/golden (all, or those named). Inspect them before a commit:
+`tests/test_golden.py` compares the renderer with them. The projector has 320x240 pixels here, and
+its images are mirrored, because it is behind the sheet.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 SHAPES = ("box", "cylinder", "ellipsoid", "organ", "plane", "sphere")
 MODES: tuple[StereoMode, ...] = ("side_by_side", "top_bottom", "frame_sequential", "anaglyph")
 SHARE = 0.4
-"""Of the scene's projector, in pixels to a side."""
+"""Fraction of the projector's pixels per side."""
 
 TILTED = transform(rotation_from_vector([0.35, -0.25, 0.0]), np.array([0.0, 0.005, 0.0]))
 TIP = (TILTED @ [0.015, -0.01, -0.025, 1.0])[:3]

@@ -1,4 +1,5 @@
-"""The window on the projector's monitor, under a virtual display whose pixels are read back."""
+"""Test the window on the projector's monitor, under a virtual display whose pixels are read
+back."""
 
 from __future__ import annotations
 
@@ -48,7 +49,7 @@ class VirtualDisplay:
         self._file = folder / "Xvfb_screen0"
 
     def pixels(self) -> NDArray[np.uint8]:
-        """What the monitor shows, (600, 800, 3), from the XWD file."""
+        """Return what the monitor shows, (600, 800, 3), from the XWD file."""
         data = self._file.read_bytes()
         header = np.frombuffer(data, ">u4", 25)
         width, height, line, colours = header[4], header[5], header[12], header[19]
@@ -81,7 +82,7 @@ class WindowBench(Bench):
         await self.step("scene", self.scene)
 
     async def draw(self, mode: StereoMode, *, swap_eyes: bool = False) -> Frame:
-        """A frame of the object, once the window has shown it."""
+        """Draw a frame of the object, and return once the window has shown it."""
         await self.step(
             "display",
             Display(correction="two_pass", stereo=mode, swap_eyes=swap_eyes, pixels_every=1),

@@ -22,7 +22,7 @@ def cylinder_spec(
     poisson_ratio: float = 0.45,
     sticking: bool = False,
 ) -> SoftBodySpec:
-    """A cylinder that lies across, held at its back."""
+    """Return a horizontal cylinder that is fixed at its back."""
     mesh = MeshSpec(
         geometry=Cylinder(radius_m=radius_m, length_m=length_m),
         support=StripSupport(angle_rad=support_angle_rad),
@@ -37,7 +37,7 @@ def cylinder_spec(
 
 
 class Here(Executor):
-    """Does what is submitted at once, in this process."""
+    """Run submitted functions at once, in this process."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()

@@ -179,8 +179,8 @@ def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorF
     if rms > MAX_RMS_PX or inliers.mean() < 0.8:
         raise ProjectorError(
             f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points: not "
-            "one projector, or the sheet moved between its images; hold it still, check the cameras "
-            "(flexsheet calibrate check)"
+            "one projector, or the sheet moved between its images; hold it still, check "
+            "the cameras (flexsheet calibrate check)"
         )
     held_out = [
         np.linalg.norm(

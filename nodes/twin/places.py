@@ -1,9 +1,9 @@
 """Where each seen point of the object ought to be: reads the places that it is painted with.
 
 In the patterns `coordinate_ramp_x` and `coordinate_ramp_y` every point of the drawn object has the
-colour of the x or y at which the eye ought to see it on the imaginary screen: red and green the cosine and sine of a
-phase, blue the same over the whole screen, coarsely.  What the eye's picture shows elsewhere is the
-error of the image, at each point and not on its outline only.
+colour of the x or y at which the eye ought to see it on the imaginary screen: red and green the
+cosine and sine of a phase, blue the same over the whole screen, coarsely. What the eye's picture
+shows elsewhere is the error of the image, at each point and not on its outline only.
 """
 
 from __future__ import annotations
