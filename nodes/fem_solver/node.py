@@ -127,7 +127,5 @@ class FemSolver(Node):
                 hold_s=self.parameters.hold_s,
                 relax_s=self.parameters.relax_s,
             )
-        answer = current.message(
-            response, prediction_horizon_s=self.parameters.prediction_horizon_s
-        )
+        answer = current.message(response, horizon_s=self.parameters.prediction_horizon_s)
         self.soft_body.publish(answer, source_ns=header.source_ns)
