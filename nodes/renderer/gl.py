@@ -64,7 +64,7 @@ class DrawStyle:
 
 
 @dataclass(frozen=True, slots=True)
-class Material:
+class SurfaceMaterial:
     """The object's own colour and texture.
 
     colour: red, green, blue, 0 to 1. pitch_m: of the procedural textures. image: (height, width,
@@ -105,7 +105,7 @@ class Canvas:
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         self._object: _MeshBuffers | None = None
         self._image: moderngl.Texture | None = None
-        self.set_material(Material())
+        self.set_material(SurfaceMaterial())
         self._grid = _MeshBuffers(self.context, *_grid_mesh())
 
     def release(self) -> None:
@@ -123,7 +123,7 @@ class Canvas:
             self._image.release()
         self._program.release()
 
-    def set_material(self, paint: Material) -> None:
+    def set_material(self, paint: SurfaceMaterial) -> None:
         """Set the object's colour and texture."""
         if self._image is not None:
             self._image.release()

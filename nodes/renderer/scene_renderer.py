@@ -25,7 +25,7 @@ from nodes.renderer.correction import (
     on_imaginary_screen,
     pixel_from_screen,
 )
-from nodes.renderer.gl import SAMPLES, SCREEN_PATTERNS, Canvas, DrawStyle, EyeView, Material
+from nodes.renderer.gl import SAMPLES, SCREEN_PATTERNS, Canvas, DrawStyle, EyeView, SurfaceMaterial
 from nodes.renderer.lens import clip_lens
 from nodes.renderer.object_surface import DeformationTransfer, make_surface
 from nodes.renderer.output import Image, both_eyes, pack
@@ -130,7 +130,7 @@ class SceneRenderer:
         self._shaped_by: SoftBody | None = None
         self.mesh_id: str | None = None
 
-    def _material(self) -> Material:
+    def _material(self) -> SurfaceMaterial:
         """Return the scene's appearance; an image is fitted to the object's front."""
         appearance, object_from_world = (
             self.scene.object.appearance,
@@ -140,7 +140,7 @@ class SceneRenderer:
         low, extent = front.min(axis=0), np.ptp(front, axis=0)
         image_from_object = np.diag([*(1.0 / extent), 1.0, 1.0])
         image_from_object[:2, 3] = -low / extent
-        return Material(
+        return SurfaceMaterial(
             colour=appearance.colour,
             texture=appearance.texture,
             pitch_m=appearance.texture_pitch_m,
