@@ -123,24 +123,24 @@ class Canvas:
             self._image.release()
         self._program.release()
 
-    def set_material(self, paint: SurfaceMaterial) -> None:
+    def set_material(self, material: SurfaceMaterial) -> None:
         """Set the object's colour and texture."""
         if self._image is not None:
             self._image.release()
             self._image = None
-        if paint.image is not None:
-            height, width = paint.image.shape[:2]
-            rows = np.ascontiguousarray(paint.image[::-1])
+        if material.image is not None:
+            height, width = material.image.shape[:2]
+            rows = np.ascontiguousarray(material.image[::-1])
             self._image = self.context.texture((width, height), 3, rows, alignment=1)
             self._image.build_mipmaps()
             self._image.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
             self._image.repeat_x = self._image.repeat_y = False
         self._uniforms.set(
-            object_colour=paint.colour,
-            texture_kind=TEXTURES[paint.texture],
-            texture_pitch_m=paint.pitch_m,
-            image_from_world=tuple(paint.image_from_world.T.ravel().tolist()),
-            object_from_world=tuple(paint.object_from_world.T.ravel().tolist()),
+            object_colour=material.colour,
+            texture_kind=TEXTURES[material.texture],
+            texture_pitch_m=material.pitch_m,
+            image_from_world=tuple(material.image_from_world.T.ravel().tolist()),
+            object_from_world=tuple(material.object_from_world.T.ravel().tolist()),
         )
 
     def set_mesh(
