@@ -177,7 +177,7 @@ def test_a_miss_is_said_with_how_far_it_misses() -> None:
 def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     there = {
         "launch.methods.families:QUICK_SHAPE": family(
-            "sheet-shape", ["flat", "four_triangles", "dents"]
+            "sheet-shape", ["four_triangles", "reduced_order"]
         ),
         "launch.methods.families:QUICK_CORRECTION": family(
             "correction", ["one_plane", "two_pass_triangles"]
@@ -185,16 +185,16 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
         "launch.methods.families:CORRECTION": family("correction", ["two_pass"]),
     }
     monkeypatch.setattr(tune, "family_at", there.__getitem__)
-    errors = {"flat": 9.0, "four_triangles": 0.2, "dents": 0.1, "one_plane": 9.0}
+    errors = {"four_triangles": 0.2, "reduced_order": 0.1, "one_plane": 9.0}
 
     def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
         return [point(name, errors.get(name, 0.3), took=1e-3) for name in asked.methods]
 
     tunables = tunables_named(["correction", "sheet-shape"])
     shape, correction = tune.tune(SCENE, tunables, measured=measured)
-    assert shape.chosen.setting == "dents"  # as quick as the others, and more exact
+    assert shape.chosen.setting == "reduced_order"  # as quick as the others, and more exact
     assert (correction.chosen.method, correction.chosen.setting) == ("two_pass", "two_pass")
-    errors["dents"] = 9.0
+    errors["reduced_order"] = 9.0
     shape, correction = tune.tune(SCENE, tunables, measured=measured)
     assert shape.chosen.setting == "four_triangles"
     assert correction.chosen.method == "two_pass_triangles"
