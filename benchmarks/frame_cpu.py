@@ -1,14 +1,13 @@
-"""What a frame costs the processor, beside OpenGL: where the time between a soft body and the
-picture goes.
+"""Measure the processor time of a frame beside OpenGL, from the soft body to the image.
 
     python -m benchmarks.frame_cpu [--scene FILE] [--triangles 20000] [--frames 300]
 
-Draws a stereo frame of a pushed sheet again and again, each with a new soft body, by the renderer's
-own steps.  Calls into OpenGL are timed apart from the rest: `GL calls` are their own time (they
-return early on a graphics card, on a software driver they may not), `GL finish` is the wait for the
-picture; both by the clock.  All else is the CPU side, in processor time of the drawing thread, so
-that what else runs on the machine counts little.  For it the picture is drawn small: a software
-driver that fills many pixels leaves nothing else in the caches, which a graphics card does not do.
+Draws a stereo frame of a pushed sheet repeatedly, each with a new soft body, by the renderer's own
+steps. Calls into OpenGL are timed apart from the rest. `GL calls` are their own time: they return
+early on a graphics card, perhaps not on a software driver. `GL finish` is the wait for the image.
+Both are wall time. All else is the CPU side, in processor time of the drawing thread, so that other
+load on the machine counts little. For that measurement the image is small: a software driver that
+fills many pixels evicts the caches, which a graphics card does not do.
 """
 
 from __future__ import annotations
@@ -28,13 +27,13 @@ from numpy.typing import NDArray
 from launch.plans.plan import load_scene
 from messages.scene import Scene
 from messages.types import Display, Skin, SoftBody
-from nodes.fem_solver.mesh.from_scene import mesh_of_scene, world_from_mesh
+from nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
 from nodes.models.rigid import apply
 from nodes.models.sheet import edge_poses
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 from nodes.renderer.gl import headless_context
-from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.stage import Stage
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose, estimate_sheet
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +41,7 @@ ROOT = Path(__file__).resolve().parents[1]
 SKIN_SPACING_M = 0.0045
 STRETCH = 1.05
 SMALL = 0.1
-"""Of the projector's width and height, while the CPU side is measured."""
+"""Fraction of the projector's width and height while the CPU side is measured."""
 GL_TYPES: tuple[type, ...] = (
     moderngl.Buffer,
     moderngl.Context,
@@ -55,7 +54,7 @@ GL_TYPES: tuple[type, ...] = (
 
 
 class Clock:
-    """Seconds of one frame by name; inside a call set `apart` the span around it stands still."""
+    """Seconds of one frame by name; a call set `apart` pauses the span around it."""
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = defaultdict(float)
@@ -72,7 +71,7 @@ class Clock:
     def apart(
         self, call: Callable[..., Any], name: str, now: Callable[[], float]
     ) -> Callable[..., Any]:
-        """The call, its time put under `name` and taken from the span that it happens in."""
+        """Record the time of the call under `name` and subtract it from the enclosing span."""
 
         def timed(*args: Any, **rest: Any) -> Any:
             if self._inside:
@@ -89,7 +88,7 @@ class Clock:
 
 @contextmanager
 def gl_apart(clock: Clock) -> Iterator[None]:
-    """Every method of moderngl's objects timed by `clock` while this lasts."""
+    """Time every method of moderngl's objects with `clock` inside the context."""
     kept: list[tuple[type, str, Any]] = []
     for kind in GL_TYPES:
         for name, method in list(vars(kind).items()):
@@ -107,7 +106,7 @@ def gl_apart(clock: Clock) -> Iterator[None]:
 
 
 def shrunk(scene: Scene, share: float) -> Scene:
-    """The scene with a projector of fewer pixels."""
+    """Return the scene with a projector of fewer pixels."""
     projector, lens = scene.projector, scene.projector.lens
     sizes = {name: share * getattr(lens, name) for name in ("fx_px", "fy_px", "cx_px", "cy_px")}
     changes = {
@@ -118,15 +117,15 @@ def shrunk(scene: Scene, share: float) -> Scene:
     return scene.model_copy(update={"projector": projector.model_copy(update=changes)})
 
 
-def stage_of(scene: Scene, triangles: int) -> Stage:
-    """A stage whose surface has about so many triangles."""
+def stage_of(scene: Scene, triangles: int) -> SceneRenderer:
+    """Return a scene renderer whose surface has about this many triangles."""
     spacing_m = 0.0025
     for _ in range(4):
-        stage = Stage(
+        stage = SceneRenderer(
             scene,
             headless_context(),
             spacing_m=spacing_m,
-            dents=dent_cache.load_or_solve(scene, None),
+            dents=deflection_cache.load_or_compute(scene, None),
         )
         have = len(stage._surface.triangles)
         if abs(have - triangles) < 0.05 * triangles:
@@ -136,8 +135,8 @@ def stage_of(scene: Scene, triangles: int) -> Stage:
 
 
 def skin_of(scene: Scene) -> Skin:
-    """The solver's skin, as fine as the demo's."""
-    mesh = mesh_of_scene(scene, SKIN_SPACING_M)
+    """Return the solver's skin, as fine as the demo's."""
+    mesh = mesh_scene(scene, SKIN_SPACING_M)
     points = apply(world_from_mesh(scene), mesh.nodes[mesh.skin])
     return Skin(
         mesh_id="bench",
@@ -147,7 +146,7 @@ def skin_of(scene: Scene) -> Skin:
 
 
 def bodies(skin: Skin) -> Iterator[SoftBody]:
-    """Soft bodies that a finger pushes here and there, 15 mm deep."""
+    """Yield soft bodies that a finger pushes at several points, 15 mm deep."""
     points = skin.vertices_world_m.astype(np.float64)
     for number in range(10**6):
         place = 0.02 * np.array([np.sin(0.1 * number), np.cos(0.1 * number)])
@@ -164,10 +163,10 @@ def bodies(skin: Skin) -> Iterator[SoftBody]:
         )
 
 
-def believed(scene: Scene, edges: tuple[Floats, Floats], number: int) -> Sheet:
-    """The sheet between two edges, pushed here and there."""
+def predict_sheet(scene: Scene, edges: tuple[Floats, Floats], number: int) -> SheetPose:
+    """Return the sheet between two edges, pushed at several points."""
     tip = np.array([0.02 * np.sin(0.1 * number), 0.02 * np.cos(0.1 * number), -0.015])
-    sheet = sheet_between(
+    sheet = estimate_sheet(
         *edges,
         height_m=scene.sheet.height_m,
         twist_world=np.zeros(6),
@@ -178,10 +177,12 @@ def believed(scene: Scene, edges: tuple[Floats, Floats], number: int) -> Sheet:
     return sheet
 
 
-def measure(scene: Scene, *, triangles: int, frames: int) -> tuple[Stage, list[dict[str, float]]]:
-    """Seconds of each frame by name."""
+def measure(
+    scene: Scene, *, triangles: int, frames: int
+) -> tuple[SceneRenderer, list[dict[str, float]]]:
+    """Return the seconds of each frame by name."""
     stage, skin = stage_of(scene, triangles), skin_of(scene)
-    stage.follow(skin)
+    stage.set_skin(skin)
     shown = Display(correction="two_pass", stereo="side_by_side")
     edges = edge_poses(np.eye(4), STRETCH * scene.sheet.width_m)
     rows = []
@@ -192,11 +193,11 @@ def measure(scene: Scene, *, triangles: int, frames: int) -> tuple[Stage, list[d
         for number, body in zip(range(frames + 20), bodies(skin), strict=False):
             clock.spent = defaultdict(float)
             with clock.span("sheet believed"):
-                sheet = believed(scene, edges, number)
+                sheet = predict_sheet(scene, edges, number)
             with clock.span("object shaped"):
-                stage.shape(body)
+                stage.deform(body)
             with clock.span("look and marks"):
-                look = stage.look(shown, sheet.pushed_point, None)
+                look = stage.draw_style(shown, sheet.pushed_point, None)
             with clock.span("two eyes drawn"):
                 stage.draw(shown, sheet, look, read=False)
             rows.append(dict(clock.spent))

@@ -1,14 +1,14 @@
-"""The renderer's pictures, judged by the twin, without the graph.
+"""Measure the renderer's images against the simulator, without the graph.
 
     python -m benchmarks.image_correction [sizes] [tilts] [depths] [places] [stretches] [frames]
 
 sizes: figures 11 and 13 of the paper, the error of each size as the eye sees it on the true sheet
-(mm).  The tilted sheet either rolls on the cylinder (its plane tangent, the touched line staying
-put on it) or turns about its own centre; positive tilts turn the sheet's front upwards, as a finger
-does that strokes up.  The others give the errors at all points that the eye sees (mean, 95 %,
-maximum, mm) and what share of the object it sees: over tilt to 80 degrees, over depth to 70 mm,
-over the place of the push on upright and tilted sheets, and over the stretch.  frames: the time of
-a stereo frame over the floor's, both taken in turn.  Without a name: all.
+(mm). The tilted sheet either rolls on the cylinder (its plane tangent, the touched line fixed on
+it) or rotates about its own centre. Positive tilts rotate the sheet's front upwards, as a finger
+does that strokes up. The others give the errors at all points that the eye sees (mean, 95 %,
+maximum, mm) and the fraction of the object that it sees. They vary the tilt to 80 degrees, the
+depth to 70 mm, the position of the push on upright and tilted sheets, and the stretch. frames: the
+time of a stereo frame over the floor's, both measured alternately. Without a name: all.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from messages.scene import Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer import dent_cache
-from nodes.renderer.families import (
+from nodes.renderer import deflection_cache
+from nodes.renderer.benchmarks import (
     METHODS,
     SIZES_PX,
+    draw_coordinate_ramps,
     draw_stereo,
-    places_pictures,
-    rolled_on,
-    with_projector_of,
+    roll_sheet,
+    scale_projector,
 )
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.stage import Stage
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose, estimate_sheet
 from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen, tilt_sizes
 from nodes.twin.membrane import DeformedSheet, NotConvergedError
 from nodes.twin.places import ErrorMap, error_map
@@ -51,17 +51,17 @@ Image = NDArray[np.uint8]
 ROOT = Path(__file__).resolve().parents[1]
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 TILT_CORRECTIONS: tuple[Correction, ...] = ("none", "one_plane", "two_pass")
-"""Of a flat sheet; four triangles are then one plane."""
+"""Corrections for a flat sheet; four triangles are then one plane."""
 ROUNDS = 40
 
 
 class Bench:
-    """Renderer, true sheet and eye of one scene."""
+    """The renderer, the true sheet and the eye of one scene."""
 
     def __init__(self, scene: Scene, *, stretch: float) -> None:
         self.scene, self.stretch = scene, stretch
-        dents = dent_cache.load_or_solve(scene, None)
-        self.stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
+        dents = deflection_cache.load_or_compute(scene, None)
+        self.stage = SceneRenderer(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
         self._proper = proper(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
         unmoved = self.situation(np.eye(4), None)
@@ -69,52 +69,55 @@ class Bench:
 
     def situation(
         self, world_from_sheet: Floats, tip: Floats | None, *, stretch: float | None = None
-    ) -> tuple[Sheet, DeformedSheet]:
-        """The sheet as the renderer believes it to be, and as it is."""
+    ) -> tuple[SheetPose, DeformedSheet]:
+        """Return the predicted sheet and the true sheet."""
         sheet = self.scene.sheet
         edges = edge_poses(world_from_sheet, sheet.width_m * (stretch or self.stretch))
-        believed = sheet_between(
+        predicted = estimate_sheet(
             *edges,
             height_m=sheet.height_m,
             twist_world=np.zeros(6),
             ahead_s=0.0,
             finger_tip=tip,
         )
-        assert believed is not None
-        return believed, true_sheet(self.scene, *edges, tip)
+        assert predicted is not None
+        return predicted, true_sheet(self.scene, *edges, tip)
 
     def pushed(
         self, depth_m: float, *, tilt_deg: float = 0.0, place_m: tuple[float, float] = (0.0, 0.0)
     ) -> tuple[Floats, Floats | None]:
-        """world_from_sheet that touches the cylinder with that place, and the fingertip there."""
-        pose = rolled_on(self.scene, -np.radians(tilt_deg), place_m)
+        """Return world_from_sheet that touches the cylinder with that point, and the fingertip
+        there."""
+        pose = roll_sheet(self.scene, -np.radians(tilt_deg), place_m)
         touched = pose[:3, 3] + pose[:3, :3] @ [*place_m, 0.0]
         return pose, touched - depth_m * pose[:3, 2] if depth_m else None
 
     def size_errors(
         self,
         correction: Correction,
-        believed: Sheet,
+        predicted: SheetPose,
         truth: DeformedSheet,
         sizes: Callable[[Image, float], Sequence[float]],
     ) -> Floats:
-        """Of each size (m), against the proper picture; the drawn object is not deformed."""
+        """Return the error of each size (m) against the expected image; the drawn object is not
+        deformed."""
         shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
-        projected = self.stage.draw(shown, believed, Look(True, "object"), read=True)
+        projected = self.stage.draw(shown, predicted, DrawStyle(True, "object"), read=True)
         assert projected is not None
         picture = seen(projected, truth, self.scene, eye=self._eye)
         wanted = np.array(sizes(self._proper, METRES_PER_PX))
         return np.asarray(np.abs(np.array(sizes(picture, METRES_PER_PX)) - wanted))
 
-    def errors(self, method: str, believed: Sheet, truth: DeformedSheet) -> ErrorMap:
-        """At all points that the eye sees."""
-        pictures = places_pictures(self.stage, method, believed)
+    def errors(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> ErrorMap:
+        """Return the errors at all points that the eye sees."""
+        pictures = draw_coordinate_ramps(self.stage, method, predicted)
         x, y = (seen(each, truth, self.scene, eye=self._eye) for each in pictures)
         return error_map(x, y, METRES_PER_PX)
 
-    def cell(self, method: str, believed: Sheet, truth: DeformedSheet) -> str:
-        """Mean / 95 % / maximum of the errors, mm, and how much of the object is seen."""
-        sizes = 1e3 * self.errors(method, believed, truth).sizes_m
+    def cell(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> str:
+        """Return mean / 95 % / maximum of the errors, mm, and the visible fraction of the
+        object."""
+        sizes = 1e3 * self.errors(method, predicted, truth).sizes_m
         if len(sizes) == 0:
             return "dark"
         figures = f"{sizes.mean():.2f} / {np.quantile(sizes, 0.95):.2f} / {sizes.max():.2f}"
@@ -142,7 +145,7 @@ def print_sizes(bench: Bench) -> None:
         for degrees in (-50, -40, -30, -20, -10, 10, 20, 30, 40, 50):
             tilt = -np.radians(degrees)
             turned = transform(rotation_from_vector([tilt, 0.0, 0.0]), np.zeros(3))
-            pose = rolled_on(bench.scene, tilt) if name == "rolls" else turned
+            pose = roll_sheet(bench.scene, tilt) if name == "rolls" else turned
             situation = bench.situation(pose, None)
             for correction in TILT_CORRECTIONS:
                 errors = 1e3 * bench.size_errors(correction, *situation, tilt_sizes)
@@ -163,7 +166,7 @@ def print_sizes(bench: Bench) -> None:
 def print_tilts(bench: Bench) -> None:
     heading("tilt, °", *TILT_CORRECTIONS)
     for degrees in (*range(-80, -50, 5), *range(-50, 60, 25), *range(55, 85, 5)):
-        situation = bench.situation(rolled_on(bench.scene, -np.radians(degrees)), None)
+        situation = bench.situation(roll_sheet(bench.scene, -np.radians(degrees)), None)
         usable = bench.stage.usable(situation[0])
         row(
             f"{degrees:+d}{'' if usable else ' (held)'}",
@@ -219,16 +222,16 @@ def print_stretches(bench: Bench) -> None:
 
 
 def print_frames(scene: Scene) -> None:
-    """Wall time of a stereo frame: the median over rounds in which every method has its turn."""
-    dents, context = dent_cache.load_or_solve(scene, None), headless_context()
+    """Print the wall time of a stereo frame: the median over rounds that include every method."""
+    dents, context = deflection_cache.load_or_compute(scene, None), headless_context()
     print(f"\n{context.info['GL_RENDERER']}")
     heading("projector", "method", "ms", "over the floor", "processor, ms", "over the floor")
     for size in SIZES_PX:
-        shown = with_projector_of(scene, *size)
-        bench_stage = Stage(shown, context, spacing_m=0.0025, dents=dents)
+        shown = scale_projector(scene, *size)
+        bench_stage = SceneRenderer(shown, context, spacing_m=0.0025, dents=dents)
         edges = edge_poses(np.eye(4), scene.sheet.width_m * 1.05)
         tip = np.array([0.0, 0.0, -0.03])
-        sheet = sheet_between(
+        sheet = estimate_sheet(
             *edges,
             height_m=scene.sheet.height_m,
             twist_world=np.zeros(6),

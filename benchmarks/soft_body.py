@@ -1,14 +1,15 @@
-"""How smooth and how quick the soft body is: slides a fingertip over meshes of several spacings.
+"""Measure how smooth and how fast the soft body is: slide a fingertip over meshes of several
+spacings.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body [--table]
 
-With --table, the nonlinear table of the demo's mesh instead: how long it takes to make (minutes, if
-the cache does not hold it), how far it and the linear method are, at places that it was not made
-from, from Newton solutions on finer meshes, and the same slides.
+With --table, the nonlinear table of the demo's mesh is measured instead: the time to compute it
+(minutes, if it is not cached), its error and the linear method's against Newton solutions on finer
+meshes at points that it was not computed from, and the same slides.
 
-The fingertip goes 6 mm in each of three directions at constant depth, 0.02 mm a step.  Prints for
+The fingertip moves 6 mm in each of three directions at constant depth, 0.02 mm per step. Prints for
 every mesh and depth the force (beside Hertz's), its ripple, the largest jump of any skin node in a
-step, the stiffness, and the time of a step.  About a minute, 1.5 GiB.
+step, the stiffness, and the time of a step. Takes about a minute and 1.5 GiB.
 """
 
 from __future__ import annotations
@@ -27,11 +28,11 @@ from numpy.typing import NDArray
 from launch.plans.plan import load_scene
 from messages.scene import Scene, cylinder_of
 from nodes.cache import default_cache_dir
-from nodes.fem_solver import body, precompute, pushes
-from nodes.fem_solver.carried import Hull
-from nodes.fem_solver.making import Maker
+from nodes.fem_solver import body, precompute, snapshots
+from nodes.fem_solver.closest_contact import ContactQuery, locate
 from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.place import Push, locate
+from nodes.fem_solver.snapshot_interpolator import SurfaceLocator
+from nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from nodes.fem_solver.table import TableSoftBody
 
 Floats = NDArray[np.float64]
@@ -39,9 +40,9 @@ Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 DEMO_SPACING_M = 0.0045
 JUDGED_AT = ((0.004, 0.1), (0.021, 0.55))
-"""Station along the axis (m) and angle: places that no table is made from."""
+"""Position along the axis (m) and angle: points that no table is computed from."""
 JUDGE_RATIO = 0.3
-"""Of the judge's mesh at the push, in finger radii: finer than the table's."""
+"""Spacing of the reference mesh at the push, in finger radii: finer than the table's."""
 SPACINGS_M = (0.006, 0.0045, 0.003, 0.0022)
 DEPTHS_M = (0.0005, 0.001, 0.002, 0.003, 0.006, 0.010, 0.020)
 HEADINGS_RAD = np.radians([0.0, 37.0, 90.0])
@@ -53,7 +54,7 @@ FINEST_TOUCH_ANGLE_RAD = 0.7
 
 @dataclass(frozen=True, slots=True)
 class Slides:
-    """What came of sliding at one depth: per step, but for the largest jump (m)."""
+    """The results of sliding at one depth: per step, except the largest jump (m)."""
 
     force_n: Floats
     stiffness_n_per_m: Floats
@@ -62,18 +63,18 @@ class Slides:
 
 
 def places(heading_rad: float) -> Iterator[tuple[float, float]]:
-    """Places of the fingertip on the skin: along the axis, and around it (m)."""
+    """Yield positions of the fingertip on the skin: along the axis, and around it (m)."""
     for i in range(STEPS):
         way = STEP_M * i
         yield FROM_M[0] + way * np.cos(heading_rad), FROM_M[1] + way * np.sin(heading_rad)
 
 
 def judge_table(scene: Scene, spacing_m: float) -> None:
-    """Make or load the table, compare it with full Newton, slide over it, print."""
-    maker = Maker(
+    """Compute or load the table, compare it with full Newton, slide over it, print."""
+    maker = SoftBodyFactory(
         skin_spacing_m=spacing_m,
         linear_depth_m=0.006,
-        largest_depth_m=0.010,
+        max_depth_m=0.010,
         friction_ratio=0.0,
         cache_dir=default_cache_dir(),
         workers=0,
@@ -81,7 +82,7 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
     start = time.perf_counter()
     bodies = maker.bodies(scene, "auto", lambda *_: None)
     if len(bodies) == 1:
-        bodies.insert(0, maker.tabulated(scene, bodies[0], say))
+        bodies.insert(0, maker.build_table(scene, bodies[0], say))
     best, linear = bodies
     print(f"ready after {time.perf_counter() - start:.1f} s, {len(best.rest)} skin nodes")
     if isinstance(best.method, TableSoftBody):
@@ -94,56 +95,56 @@ def judge_table(scene: Scene, spacing_m: float) -> None:
     mesh, radius_m = build_mesh(best.spec.mesh), cylinder_of(scene).radius_m
     for along, angle in JUDGED_AT:
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])
-        site = pushes.Site(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
-        judge_push(scene, mesh, site, best, linear)
+        sample = snapshots.SamplePoint(radius_m * normal + np.array([along, 0.0, 0.0]), normal)
+        judge_push(scene, mesh, sample, best, linear)
     for depth_m in DEPTHS_M:
         say_slides(scene, slide(best, radius_m, depth_m), depth_m)
 
 
-def say(done: int, total: int, need: precompute.Need) -> None:
-    """Progress, on one line."""
+def say(done: int, total: int, need: precompute.WorkBudget) -> None:
+    """Print progress on one line."""
     print(f"\r{100 * done // total:3d} % of {need.text()}", end="", file=sys.stderr, flush=True)
 
 
 def judge_push(
     scene: Scene,
     mesh: SolidMesh,
-    site: pushes.Site,
+    sample: snapshots.SamplePoint,
     best: body.SceneBody,
     linear: body.SceneBody,
 ) -> None:
-    """Largest error off the finger and error of the force, depth by depth."""
-    job = pushes.job_of(
+    """Print the largest error off the finger and the error of the force, depth by depth."""
+    job = snapshots.make_snapshot_job(
         best.spec.mesh,
         mesh,
-        site,
+        sample,
         poisson_ratio=best.spec.poisson_ratio,
         finger_radius_m=scene.finger.radius_m,
         spacing_m=JUDGE_RATIO * scene.finger.radius_m,
     )
-    solved = pushes.solve_push(job)
-    nodes, weights = Hull(solved.rest, solved.faces).weights(best.rest)
-    away = np.linalg.norm(best.rest - site.place, axis=1) > 1.5 * scene.finger.radius_m
-    print(f"\nagainst Newton at {1e3 * site.place[0]:.0f} mm, normal {site.normal.round(2)}:")
+    solved = snapshots.solve_snapshot(job)
+    nodes, weights = SurfaceLocator(solved.rest, solved.faces).weights(best.rest)
+    away = np.linalg.norm(best.rest - sample.point, axis=1) > 1.5 * scene.finger.radius_m
+    print(f"\nagainst Newton at {1e3 * sample.point[0]:.0f} mm, normal {sample.normal.round(2)}:")
     for level in range(solved.reached):
         depth_m = float(solved.depths_m[level])
         wanted = np.einsum("qa,qai->qi", weights, solved.moved[level][nodes])
         modulus = scene.object.material.young_modulus_pa
-        force_n = modulus * float(solved.force_n[level] @ site.normal)
+        force_n = modulus * float(solved.force_n[level] @ sample.normal)
         texts = []
         for one in (best, linear):
-            answer = one.method.respond(Push(site.place, site.normal, depth_m))
+            answer = one.method.respond(ContactQuery(sample.point, sample.normal, depth_m))
             error = np.linalg.norm(answer.displacement - wanted, axis=1)
             texts.append(
                 f"{one.method.name} {1e3 * error[away].max():.3f} mm,"
-                f" force {100 * (answer.force_n @ site.normal / force_n - 1):+.1f} %"
+                f" force {100 * (answer.force_n @ sample.normal / force_n - 1):+.1f} %"
             )
         print(f"{1e3 * depth_m:5.1f} mm: {'; '.join(texts)}")
 
 
 def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
     """Slide in every direction at one depth."""
-    forces, stiffness, took, jump = [], [], [], 0.0
+    forces, stiffness, durations, jump = [], [], [], 0.0
     for heading in HEADINGS_RAD:
         before: NDArray[np.float32] | None = None
         for along, around in places(float(heading)):
@@ -153,18 +154,19 @@ def slide(built: body.SceneBody, radius_m: float, depth_m: float) -> Slides:
             start = time.perf_counter()
             push, _ = locate(built.shape, point, None)
             answer = built.method.respond(push)
-            took.append(time.perf_counter() - start)
+            durations.append(time.perf_counter() - start)
             forces.append(answer.force_n @ normal)
             stiffness.append(answer.stiffness_n_per_m)
             if before is not None:
                 moved = np.linalg.norm(answer.displacement - before, axis=1).max()
                 jump = max(jump, float(moved))
             before = answer.displacement
-    return Slides(np.array(forces), np.array(stiffness), np.array(took), jump)
+    return Slides(np.array(forces), np.array(stiffness), np.array(durations), jump)
 
 
 def hertz_force_n(scene: Scene, depth_m: float) -> float:
-    """Hertz's force of a sphere on a half-space bent like the cylinder, its patch taken round."""
+    """Return Hertz's force of a sphere on a half-space curved like the cylinder, with a circular
+    patch."""
     modulus, nu = scene.object.material.young_modulus_pa, scene.object.material.poisson_ratio
     finger, cylinder = 1.0 / scene.finger.radius_m, 1.0 / cylinder_of(scene).radius_m
     radius = 1.0 / np.sqrt(finger * (finger + cylinder))
@@ -173,7 +175,7 @@ def hertz_force_n(scene: Scene, depth_m: float) -> float:
 
 def measure(scene: Scene, spacing_m: float) -> None:
     """Precompute one mesh, cold and warm, slide over it, print."""
-    spec = body.spec_of(scene, spacing_m)
+    spec = body.make_soft_body_spec(scene, spacing_m)
     if spacing_m == min(SPACINGS_M):
         mesh = replace(spec.mesh, touch_angle_rad=FINEST_TOUCH_ANGLE_RAD)
         spec = replace(spec, mesh=mesh)
@@ -183,11 +185,11 @@ def measure(scene: Scene, spacing_m: float) -> None:
             model = precompute.load_or_compute(spec, Path(folder), lambda *_: None)
             times.append(time.perf_counter())
     cold_s, warm_s = np.diff(times)
-    built = body.scene_body(scene, spec, model, linear_depth_m=0.006, largest_depth_m=0.010)
+    built = body.build_scene_body(scene, spec, model, linear_depth_m=0.006, max_depth_m=0.010)
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
     print(
         f"\n{1e3 * spacing_m:g} mm: {len(model.response.rest)} skin nodes,"
-        f" {len(model.response.touch)} loads, cold {cold_s:.1f} s, warm {warm_s:.2f} s,"
+        f" {len(model.response.contact_nodes)} loads, cold {cold_s:.1f} s, warm {warm_s:.2f} s,"
         f" peak {peak_mib:.0f} MiB",
         flush=True,
     )

@@ -1,11 +1,10 @@
-"""Where the soft body's methods break, and what the system then does: the tables of
-docs/limits-soft-body.md.
+"""Measure where the soft body's methods fail, and the system's response: docs/limits-soft-body.md.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_limits [CASE ...]
 
-On small, coarse bodies, so that it takes minutes: depths at which Newton ends depend on the mesh,
-and are told with it.  The nonlinear table is made of such pushes: it ends `END_SPAN_M` before they
-do.
+The bodies are small and coarse, so that it takes minutes. Depths at which Newton ends depend on the
+mesh, and are printed with it. The nonlinear table consists of such pushes: it ends `END_SPAN_M`
+before they do.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from numpy.typing import NDArray
 
 from launch.plans.plan import load_scene
 from messages.scene import Scene
-from nodes.fem_solver.body import SceneBody, scene_body, spec_of
+from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
 from nodes.fem_solver.contact import LinearSoftBody
 from nodes.fem_solver.elasticity import element_stiffness
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.mesh.quality import least_jacobians
-from nodes.fem_solver.multifrontal import Dissection
-from nodes.fem_solver.place import Entry, Push
+from nodes.fem_solver.mesh.quality import min_jacobian_ratios
+from nodes.fem_solver.multifrontal import NestedDissection
 from nodes.fem_solver.precompute import SoftBodyModel, compute
-from nodes.fem_solver.pushes import PushAnswer, PushJob, Site, solve_push
+from nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob, solve_snapshot
 from nodes.fem_solver.table import END_SPAN_M
 from nodes.models import rigid
 
@@ -43,12 +42,12 @@ CYLINDER = {"shape": "cylinder", "radius_m": RADIUS_M, "length_m": 0.05}
 STRIP = {"kind": "strip", "angle_rad": 1.57}
 DEPTHS_M = tuple(1e-3 * d for d in range(1, 36))
 STEP_M = 2e-5
-LINEAR_DEPTH_M, LARGEST_DEPTH_M = 0.006, 0.010
+LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """A scene's body by the linear method, and the mesh that it is of."""
+    """A scene's body by the linear method, and its mesh."""
 
     scene: Scene
     soft: SceneBody
@@ -64,7 +63,7 @@ def scene_of(
     nu: float = 0.45,
     finger_m: float = 0.007,
 ) -> Scene:
-    """The demo's scene with another object, its front at the world's origin."""
+    """Return the demo's scene with another object, its front at the world's origin."""
     content = load_scene(SCENE_FILE).model_dump()
     content["object"] = {
         "geometry": geometry,
@@ -82,28 +81,28 @@ def cylinder(**changes: float) -> Scene:
 
 def body_of(scene: Scene, spacing_m: float = SPACING_M, *, meshed_for: Scene | None = None) -> Body:
     """meshed_for: the scene whose finger's size decides whether the mesh is fine enough."""
-    spec = spec_of(meshed_for or scene, spacing_m)
+    spec = make_soft_body_spec(meshed_for or scene, spacing_m)
     model = compute(spec, lambda *_: None)
-    soft = scene_body(
-        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, largest_depth_m=LARGEST_DEPTH_M
+    soft = build_scene_body(
+        scene, spec, model, linear_depth_m=LINEAR_DEPTH_M, max_depth_m=MAX_DEPTH_M
     )
     return Body(scene, soft, model, build_mesh(spec.mesh))
 
 
-def site_of(body: Body, x: float = 0.002, y: float = 0.0015) -> Site:
+def site_of(body: Body, x: float = 0.002, y: float = 0.0015) -> SamplePoint:
     found = body.soft.shape.closest(body.soft.front + np.array([x, y, 0.0]))
-    return Site(found.point, found.normal)
+    return SamplePoint(found.point, found.normal)
 
 
-def newton(body: Body, site: Site, depths_m: tuple[float, ...] = DEPTHS_M) -> PushAnswer:
-    """Full Newton on the body's own mesh."""
-    return solve_push(
-        PushJob(
+def newton(body: Body, sample: SamplePoint, depths_m: tuple[float, ...] = DEPTHS_M) -> Snapshot:
+    """Solve full Newton on the body's own mesh."""
+    return solve_snapshot(
+        SnapshotJob(
             nodes=body.mesh.nodes,
             elements=body.mesh.elements,
             fixed=body.mesh.fixed,
-            faces=body.mesh.touch[body.mesh.touch_faces],
-            site=site,
+            faces=body.mesh.contact_nodes[body.mesh.contact_faces],
+            sample=sample,
             poisson_ratio=body.soft.spec.poisson_ratio,
             finger_radius_m=body.scene.finger.radius_m,
             depths_m=depths_m,
@@ -111,7 +110,7 @@ def newton(body: Body, site: Site, depths_m: tuple[float, ...] = DEPTHS_M) -> Pu
     )
 
 
-def deepest_mm(answer: PushAnswer) -> float:
+def deepest_mm(answer: Snapshot) -> float:
     return 1e3 * float(answer.depths_m[answer.reached - 1]) if answer.reached else 0.0
 
 
@@ -120,7 +119,7 @@ def table_mm(newton_mm: float) -> float:
 
 
 def overturned(body: Body, moved: NDArray[Any]) -> int:
-    """Triangles of the skin whose normal is turned by more than a right angle."""
+    """Return the number of skin triangles whose normal is rotated by more than a right angle."""
 
     def normals(points: Floats) -> Floats:
         a, b, c = points[body.model.triangles].transpose(1, 0, 2)
@@ -130,21 +129,23 @@ def overturned(body: Body, moved: NDArray[Any]) -> int:
     return int(((normals(rest) * normals(rest + moved)).sum(axis=1) <= 0.0).sum())
 
 
-def linear_inversion_mm(body: Body, site: Site) -> float:
-    """The depth at which the linear field, not held back, first turns a corner of an element."""
+def linear_inversion_mm(body: Body, sample: SamplePoint) -> float:
+    """Return the depth at which the unlimited linear field first inverts a corner of an element."""
     mesh, nu = body.mesh, body.soft.spec.poisson_ratio
     matrices = element_stiffness(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=nu)
-    factors = Dissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices)
+    factors = NestedDissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices)
     method = body.soft.method
     assert isinstance(method, LinearSoftBody)
     for depth in DEPTHS_M:
-        contact = method.contact.solve(Push(site.place, site.normal, depth), depth)
+        contact = method.contact.solve(ContactQuery(sample.point, sample.normal, depth), depth)
         assert contact is not None
         loads = np.zeros_like(mesh.nodes)
         forces = contact.forces / body.scene.object.material.young_modulus_pa
-        loads[mesh.touch[contact.nodes]] = -forces[:, None] * mesh.touch_normals[contact.nodes]
+        loads[mesh.contact_nodes[contact.nodes]] = (
+            -forces[:, None] * mesh.contact_normals[contact.nodes]
+        )
         moved = factors.solve(loads.ravel()).reshape(-1, 3)
-        if least_jacobians(mesh.nodes + moved, mesh.elements).min() <= 0.0:
+        if min_jacobian_ratios(mesh.nodes + moved, mesh.elements).min() <= 0.0:
             return 1e3 * depth
     return np.inf
 
@@ -154,7 +155,7 @@ def row(*cells: object) -> None:
 
 
 def incompressible() -> None:
-    """Poisson's ratio towards 0.5."""
+    """Vary Poisson's ratio towards 0.5."""
     row("ν", "linear: force at 3 mm", "Newton: to", "table: to", "refused")
     for nu in (0.3, 0.45, 0.49, 0.499, 0.4999, 0.49995):
         try:
@@ -162,26 +163,26 @@ def incompressible() -> None:
         except ValueError as error:
             row(nu, "-", "-", "-", error)
             continue
-        site = site_of(body)
-        force = body.soft.method.respond(Push(site.place, site.normal, 0.003)).force_n
-        end = deepest_mm(newton(body, site))
-        newtons = f"{1e3 * float(force @ site.normal):.1f} mN"
+        sample = site_of(body)
+        force = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.003)).force_n
+        end = deepest_mm(newton(body, sample))
+        newtons = f"{1e3 * float(force @ sample.normal):.1f} mN"
         row(nu, newtons, f"{end:g} mm", f"{table_mm(end):g} mm", "")
 
 
 def inversion() -> None:
-    """Pushed deeper and deeper."""
+    """Push to increasing depths."""
     row("skin spacing", "linear field inverts at", "Newton: to", "shown at 50 mm", "overturned")
     for spacing in (0.005, 0.004, 0.003):
         body = body_of(cylinder(), spacing)
-        site = site_of(body)
-        end = "not run" if spacing <= 0.003 else f"{deepest_mm(newton(body, site)):g} mm"
-        answer = body.soft.method.respond(Push(site.place, site.normal, 0.050))
+        sample = site_of(body)
+        end = "not run" if spacing <= 0.003 else f"{deepest_mm(newton(body, sample)):g} mm"
+        answer = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.050))
         largest = 1e3 * float(np.linalg.norm(answer.displacement, axis=1).max())
         flag = "in range" if answer.in_range else "flagged"
         row(
             f"{1e3 * spacing:g} mm",
-            f"{linear_inversion_mm(body, site):g} mm",
+            f"{linear_inversion_mm(body, sample):g} mm",
             end,
             f"skin moves {largest:.1f} mm, {flag}",
             overturned(body, answer.displacement),
@@ -189,9 +190,12 @@ def inversion() -> None:
 
 
 def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float, float, int]:
-    """Largest move (mm) of a skin node in a step of 0.02 mm across a body, the share of the steps
-    that is flagged, and the most triangles overturned; the finger keeps its depth."""
-    held: Entry | None = None
+    """Slide a finger across a body at constant depth, in steps of 0.02 mm.
+
+    Returns the largest displacement (mm) of a skin node in a step, the fraction of the steps that
+    is flagged, and the maximum number of inverted triangles.
+    """
+    held: ContactAnchor | None = None
     before: NDArray[Any] | None = None
     jump, flagged, most = 0.0, 0, 0
     steps = 1000
@@ -210,14 +214,14 @@ def slide(body: Body, depth_m: float, way: Floats, start: Floats) -> tuple[float
 
 
 def rim() -> None:
-    """A finger that slides over the edge of a box, from its front to its side."""
+    """Slide a finger over the edge of a box, from its front to its side."""
     row("edge radius", "depth", "largest jump", "flagged", "overturned", "Newton on the edge: to")
     for edge in (0.010, 0.005, 0.0025):
         box = {"shape": "rounded_box", "size_m": [0.06, 0.05, 0.03], "edge_radius_m": edge}
         body = body_of(scene_of(box, STRIP, height_m=0.015))
         start = np.array([0.018, 0.001, 0.03])
         found = body.soft.shape.closest(np.array([0.030, 0.001, 0.015]))
-        end = deepest_mm(newton(body, Site(found.point, found.normal), DEPTHS_M[:15]))
+        end = deepest_mm(newton(body, SamplePoint(found.point, found.normal), DEPTHS_M[:15]))
         for depth in (0.002, 0.006):
             jump, flagged, most = slide(body, depth, np.array([1.0, 0.0, -0.6]), start)
             row(
@@ -231,7 +235,8 @@ def rim() -> None:
 
 
 def two_supports() -> None:
-    """A cylinder held at the middles of its two ends only, against one held along its back."""
+    """Compare a cylinder fixed at the middles of its two ends only with one fixed along its
+    back."""
     row("held", "held nodes", "linear: force at 5 mm", "skin moves at most", "Newton: to")
     ends = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
     point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
@@ -241,38 +246,40 @@ def two_supports() -> None:
         except ValueError as error:
             row(name, "-", f"refused: {error}", "-", "-")
             continue
-        site = site_of(body)
-        answer = body.soft.method.respond(Push(site.place, site.normal, 0.005))
+        sample = site_of(body)
+        answer = body.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.005))
         row(
             name,
             int(body.mesh.fixed.sum()),
-            f"{1e3 * float(answer.force_n @ site.normal):.0f} mN",
+            f"{1e3 * float(answer.force_n @ sample.normal):.0f} mN",
             f"{1e3 * float(np.linalg.norm(answer.displacement, axis=1).max()):.1f} mm",
-            f"{deepest_mm(newton(body, site)):g} mm",
+            f"{deepest_mm(newton(body, sample)):g} mm",
         )
 
 
 def slivers() -> None:
-    """Elements flattened: the nodes inside the cylinder drawn towards a plane."""
+    """Flatten elements: move the nodes inside the cylinder towards a plane."""
     row("flattened to", "least height over edge", "Newton: force at 3 mm", "Newton: to")
     base = body_of(cylinder())
-    site = site_of(base)
+    sample = site_of(base)
     for share in (1.0, 0.3, 0.1, 0.03, 0.01, 0.001, 0.0):
         nodes = flattened(base.mesh, share)
         try:
             NeoHookeanSolid(nodes, base.mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
-            force = force_n(base, nodes, site)
+            force = force_n(base, nodes, sample)
         except ValueError as error:
             row(share, "-", f"refused: {error}", "-")
             continue
         mesh = replace(base.mesh, nodes=nodes)
-        end = deepest_mm(newton(replace(base, mesh=mesh), site))
+        end = deepest_mm(newton(replace(base, mesh=mesh), sample))
         row(share, f"{thinnest(nodes, base.mesh):.2g}", f"{1e3 * force:.1f} mN", f"{end:g} mm")
 
 
 def flattened(mesh: SolidMesh, share: float) -> Floats:
-    """Nodes of a mesh one of whose inner corners lies within `share` of its height from the
-    opposite face of an element; its edges stay straight."""
+    """Return the nodes of a mesh with one inner corner close to the opposite face of an element.
+
+    The distance is `share` of the corner's height; edges stay straight.
+    """
     skin = np.zeros(len(mesh.nodes), dtype=bool)
     skin[mesh.skin] = True
     corners = mesh.elements[:, :4]
@@ -299,7 +306,7 @@ EDGES_OF = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 
 def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
-    """The least height of an element over its longest edge."""
+    """Return the minimum height of an element over its longest edge."""
     corners = nodes[mesh.elements[:, :4]]
     edges = corners[:, [1, 2, 3, 2, 3, 3]] - corners[:, [0, 0, 0, 1, 1, 2]]
     volume = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
@@ -309,19 +316,20 @@ def thinnest(nodes: Floats, mesh: SolidMesh) -> float:
     return float((volume / largest / np.linalg.norm(edges, axis=2).max(axis=1)).min())
 
 
-def force_n(body: Body, nodes: Floats, site: Site) -> float:
-    """Of the finger 3 mm deep by Newton on these nodes; NaN where it cannot follow."""
+def force_n(body: Body, nodes: Floats, sample: SamplePoint) -> float:
+    """Return the force of a finger 3 mm deep by Newton on these nodes; NaN where it does not
+    converge."""
     mesh = replace(body.mesh, nodes=nodes)
-    answer = newton(replace(body, mesh=mesh), site, (0.003,))
+    answer = newton(replace(body, mesh=mesh), sample, (0.003,))
     modulus = body.scene.object.material.young_modulus_pa
-    return modulus * float(answer.force_n[0] @ site.normal) if answer.reached else np.nan
+    return modulus * float(answer.force_n[0] @ sample.normal) if answer.reached else np.nan
 
 
 def teleport() -> None:
-    """A finger that is somewhere else in every frame, against one that came straight there."""
+    """Compare a finger that jumps in every frame with one that moved straight to each point."""
     row("finger", "skin differs from that of a finger fresh from outside by at most")
     body, rng = body_of(cylinder()), np.random.default_rng(4)
-    held: Entry | None = None
+    held: ContactAnchor | None = None
     worst, kept = {"near": 0.0, "across": 0.0}, 0
     for _ in range(600):
         x, angle, depth = rng.uniform([-0.02, -1.0, -0.005], [0.02, 1.0, 0.012])
@@ -338,27 +346,28 @@ def teleport() -> None:
     row(
         f"by more ({kept} of 600 jumps): the place it entered by stays", f"{worst['across']:.0f} mm"
     )
-    site, forces = site_of(body), []
+    sample, forces = site_of(body), []
     for steps in (1, 40):
         depths = tuple(float(d) for d in np.linspace(0.0, 0.006, steps + 1)[1:])
-        forces.append(float(newton(body, site, depths).force_n[-1] @ site.normal))
+        forces.append(float(newton(body, sample, depths).force_n[-1] @ sample.normal))
     row("Newton, 6 mm in one step or 40", f"force {100 * abs(forces[1] / forces[0] - 1):.1g} %")
 
 
 def small_tip() -> None:
-    """A fingertip smaller than the mesh under it."""
+    """Push with a fingertip smaller than the mesh under it."""
     row("tip radius", "over spacing", "depth", "linear: force over Hertz", "Newton: over Hertz")
     for radius in (0.007, 0.003, 0.0015, 0.0007, 0.0003):
         body = body_of(cylinder(finger_m=radius), meshed_for=cylinder())
-        site, depth = site_of(body), 0.5 * radius
+        sample, depth = site_of(body), 0.5 * radius
         modulus = body.scene.object.material.young_modulus_pa
         bend = np.sqrt(1.0 / radius * (1.0 / radius + 1.0 / RADIUS_M))
         hertz = 4.0 / 3.0 * modulus / (1.0 - 0.45**2) * np.sqrt(1.0 / bend) * depth**1.5
         force = float(
-            body.soft.method.respond(Push(site.place, site.normal, depth)).force_n @ site.normal
+            body.soft.method.respond(ContactQuery(sample.point, sample.normal, depth)).force_n
+            @ sample.normal
         )
-        answer = newton(body, site, (depth,))
-        pushed = modulus * float(answer.force_n[0] @ site.normal)
+        answer = newton(body, sample, (depth,))
+        pushed = modulus * float(answer.force_n[0] @ sample.normal)
         row(
             f"{1e3 * radius:g} mm",
             f"{radius / SPACING_M:.2g}",
@@ -369,7 +378,7 @@ def small_tip() -> None:
 
 
 def beyond() -> None:
-    """A finger that leaves the touchable skin: past the cylinder's end, and around to its back."""
+    """Move a finger off the touchable skin: past the cylinder's end, and around to its back."""
     row("way", "flagged from", "force half at", "force none at")
     body = body_of(cylinder())
     for name, ways in (

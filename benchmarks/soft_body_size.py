@@ -1,16 +1,16 @@
-"""What an answer of the soft body costs in time and memory, by skin nodes and by contact nodes.
+"""Measure time and memory of a soft body response, by skin nodes and by contact nodes.
 
     OPENBLAS_NUM_THREADS=1 python -m benchmarks.soft_body_size [--output docs/charts]
 
-Bodies of 500 to 20,000 skin nodes answer fingers at random places and at slowly moving ones.  Their
-geometry is the demo's cylinder, meshed as finely as that takes, and the steps are those that the
-node runs; but the numbers in the tables are made up, and only some places have rows, as many as fit
-into `TABLE_BYTES`: to solve for 20,000 nodes would take hours, and 10,000 places some 100 GB by the
-nonlinear table.  What a whole table would take is said beside it.  The floor is how long this
-machine takes, there and then, to read as many bytes as the answer needs, by a plain dot product.
+Bodies of 500 to 20,000 skin nodes respond to fingers at random points and to slowly moving ones.
+Their geometry is the demo's cylinder with a suitable mesh, and the steps are those of the node. The
+numbers in the tables are synthetic, and only some nodes have rows, as many as fit into
+`TABLE_BYTES`. Solving for 20,000 nodes would take hours, and 10,000 contact nodes some 100 GB with
+the nonlinear table. The memory of a full table is printed beside it. The floor is the time that
+this machine needs at that moment to read the same number of bytes, by a plain dot product.
 
-Writes soft-body-size.svg and soft-body-size.json.  A minute, 3 GB.  With --redraw nothing is
-measured: the numbers in the folder are drawn anew.
+Writes soft-body-size.svg and soft-body-size.json. Takes a minute and 3 GB. With --redraw nothing is
+measured: the numbers in the folder are drawn again.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from launch.methods.svg import COLOURS, drawn_for_pages, save_svg
 from launch.plans.plan import load_scene
 from launch.running.code_state import git_state
 from messages.scene import Scene, cylinder_of
-from nodes.fem_solver.body import spec_of
+from nodes.fem_solver.body import make_soft_body_spec
+from nodes.fem_solver.closest_contact import ContactQuery
 from nodes.fem_solver.contact import LinearSoftBody, SkinResponse
 from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.place import Push
-from nodes.fem_solver.pushes import DEPTHS_M
+from nodes.fem_solver.snapshots import DEPTHS_M
 from nodes.fem_solver.table import LINEAR_DEPTHS_M, Table, TableSoftBody, table_bytes
 from nodes.models.shapes import Shape, make_shape
 
@@ -54,13 +54,13 @@ DEPTH_M = 0.005
 CONTACT_SPACING_M = 0.0022
 CONTACT_DEPTHS_M = (0.0005, 0.001, 0.002, 0.004, 0.008, 0.012)
 LINEAR_RANGE_M = (0.012, 0.018)
-"""Wider than the method is good for, so that the contact grows with the depth."""
+"""Wider than the method's range, so that the contact grows with the depth."""
 TABLE_BYTES, MOST_PLACES = 400_000_000, 800
 FLOOR_BYTES = 400_000_000
 STEPS = 600
 SLOW_STEP_M = 2e-5
 ROWS_PER_ANSWER = 6 * 4
-"""Of the nonlinear table: six nodes, four depths."""
+"""Rows of the nonlinear table: six nodes, four depths."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Synthetic:
-    """A body of the right size: rows of made-up numbers at the touch nodes of a patch."""
+    """A body of the right size: rows of synthetic numbers at the contact nodes of a patch."""
 
     mesh: SolidMesh
     response: SkinResponse
@@ -95,12 +95,12 @@ class Synthetic:
 def patch_of(mesh: SolidMesh, row_bytes: int) -> tuple[Ints, Ints]:
     """The touch nodes (numbers among them) around the front whose rows fit into `TABLE_BYTES`, and
     their faces."""
-    touched = mesh.nodes[mesh.touch]
+    touched = mesh.nodes[mesh.contact_nodes]
     front = touched[int(touched[:, 2].argmax())]
     order = np.argsort(np.abs(touched - front).max(axis=1), kind="stable")
     kept = np.zeros(len(touched), dtype=bool)
     kept[order[: min(MOST_PLACES, TABLE_BYTES // row_bytes)]] = True
-    faces = mesh.touch_faces[kept[mesh.touch_faces].all(axis=1)]
+    faces = mesh.contact_faces[kept[mesh.contact_faces].all(axis=1)]
     return np.unique(faces), faces
 
 
@@ -108,22 +108,22 @@ def synthetic(scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int) 
     """rows_per_place: 1 of the linear table, more of the nonlinear."""
     numbers, faces = patch_of(mesh, rows_per_place * 12 * len(mesh.skin))
     rest = mesh.nodes[mesh.skin]
-    touch = np.searchsorted(mesh.skin, mesh.touch[numbers])
-    places = rest[touch]
+    contact_nodes = np.searchsorted(mesh.skin, mesh.contact_nodes[numbers])
+    places = rest[contact_nodes]
     # the half-space under a load, blunt below the spacing: positive definite, right in size
     apart = np.linalg.norm(places[:, None] - places[None], axis=2)
     blunt = 0.5 * float(np.median(np.partition(apart, 1, axis=1)[:, 1]))
     nu = scene.object.material.poisson_ratio
     compliance = (1.0 - nu**2) / (np.pi * np.sqrt(apart**2 + blunt**2))
     made_up = np.random.default_rng(0).random(3 * len(rest), dtype=np.float32)
-    linear_rows = len(touch) if rows_per_place == 1 else 1
+    linear_rows = len(contact_nodes) if rows_per_place == 1 else 1
     response = SkinResponse(
         rest=rest,
-        touch=touch,
-        normals=mesh.touch_normals[numbers],
+        contact_nodes=contact_nodes,
+        normals=mesh.contact_normals[numbers],
         faces=np.searchsorted(numbers, faces),
         compliance=compliance,
-        table=np.tile(made_up, (linear_rows, 1)),
+        influence=np.tile(made_up, (linear_rows, 1)),
     )
     centre = places.mean(axis=0)
     half = 0.7 * float(np.abs(places - centre)[:, :2].max(axis=0).min())
@@ -131,20 +131,22 @@ def synthetic(scene: Scene, mesh: SolidMesh, shape: Shape, rows_per_place: int) 
 
 
 def floor_s(read_bytes: float) -> float:
-    """Median time to read so much in one piece from random places of memory."""
+    """Return the median time to read this many bytes in one piece from random positions of
+    memory."""
     source, rng = np.ones(FLOOR_BYTES // 4, dtype=np.float32), np.random.default_rng(1)
     count = max(16, int(read_bytes / 4))
-    took = []
+    durations = []
     for start in rng.integers(0, len(source) - count, 60):
         piece = source[start : start + count]
         begun = time.perf_counter()
         piece.dot(piece)
-        took.append(time.perf_counter() - begun)
-    return float(np.median(took))
+        durations.append(time.perf_counter() - begun)
+    return float(np.median(durations))
 
 
-def pushes_on(body: Synthetic, depth_m: float, *, slow: bool) -> list[Push]:
-    """At random places of the patch, or to and fro along a line at 0.02 mm a step."""
+def pushes_on(body: Synthetic, depth_m: float, *, slow: bool) -> list[ContactQuery]:
+    """Return contacts at random points of the patch, or back and forth along a line at 0.02 mm a
+    step."""
     rng = np.random.default_rng(2)
     ways = rng.uniform(-body.half_m, body.half_m, (STEPS, 2))
     if slow:
@@ -152,16 +154,18 @@ def pushes_on(body: Synthetic, depth_m: float, *, slow: bool) -> list[Push]:
         to_and_fro = np.abs((gone + body.half_m) % (4.0 * body.half_m) - 2.0 * body.half_m)
         ways = np.outer(to_and_fro - body.half_m, [1.0, 0.7])
     found = body.shape.closest(body.centre + np.column_stack([ways, np.zeros(STEPS)]))
-    return [Push(at, way, depth_m) for at, way in zip(found.point, found.normal, strict=True)]
+    return [
+        ContactQuery(at, way, depth_m) for at, way in zip(found.point, found.normal, strict=True)
+    ]
 
 
-def timed(respond: Callable[[Push], Any], pushes: Sequence[Push]) -> Floats:
-    took = np.empty(len(pushes))
-    for number, push in enumerate(pushes):
+def timed(respond: Callable[[ContactQuery], Any], queries: Sequence[ContactQuery]) -> Floats:
+    durations = np.empty(len(queries))
+    for number, push in enumerate(queries):
         begun = time.perf_counter()
         respond(push)
-        took[number] = time.perf_counter() - begun
-    return took
+        durations[number] = time.perf_counter() - begun
+    return durations
 
 
 def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> Point:
@@ -173,16 +177,16 @@ def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) ->
         young_modulus_pa=scene.object.material.young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         linear_depth_m=LINEAR_RANGE_M[0],
-        largest_depth_m=LINEAR_RANGE_M[1],
+        max_depth_m=LINEAR_RANGE_M[1],
     )
-    pushes = pushes_on(body, depth_m, slow=False)
-    contacts = [method.contact.solve(push, depth_m) for push in pushes]
+    queries = pushes_on(body, depth_m, slow=False)
+    contacts = [method.contact.solve(push, depth_m) for push in queries]
     count = float(np.median([0 if one is None else len(one.nodes) for one in contacts]))
-    whole = len(mesh.touch) * (12 * len(mesh.skin) + 8 * len(mesh.touch))
+    whole = len(mesh.contact_nodes) * (12 * len(mesh.skin) + 8 * len(mesh.contact_nodes))
     return measured(
         method,
         body,
-        pushes,
+        queries,
         depth_m=depth_m,
         contact_nodes=count,
         rows=count,
@@ -193,8 +197,8 @@ def linear_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) ->
 def table_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> Point:
     levels = len(DEPTHS_M) + len(LINEAR_DEPTHS_M)
     body = synthetic(scene, mesh, shape, rows_per_place=levels)
-    places = len(body.response.touch)
-    row = np.tile(body.response.table[0], levels).reshape(1, levels, -1)
+    places = len(body.response.contact_nodes)
+    row = np.tile(body.response.influence[0], levels).reshape(1, levels, -1)
     depths = np.array([0.0, *LINEAR_DEPTHS_M, *DEPTHS_M])
     table = Table(
         depths_m=depths,
@@ -211,12 +215,12 @@ def table_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> 
         push_depth_m=LINEAR_RANGE_M[1],
         linear_depth_m=0.006,
     )
-    whole = table_bytes(len(mesh.touch), len(mesh.skin), len(DEPTHS_M))
-    pushes = pushes_on(body, depth_m, slow=False)
+    whole = table_bytes(len(mesh.contact_nodes), len(mesh.skin), len(DEPTHS_M))
+    queries = pushes_on(body, depth_m, slow=False)
     return measured(
         method,
         body,
-        pushes,
+        queries,
         depth_m=depth_m,
         contact_nodes=6.0,
         rows=ROWS_PER_ANSWER,
@@ -227,7 +231,7 @@ def table_point(scene: Scene, mesh: SolidMesh, shape: Shape, depth_m: float) -> 
 def measured(
     method: LinearSoftBody | TableSoftBody,
     body: Synthetic,
-    pushes: Sequence[Push],
+    queries: Sequence[ContactQuery],
     *,
     depth_m: float,
     contact_nodes: float,
@@ -236,8 +240,8 @@ def measured(
 ) -> Point:
     read = rows * 12.0 * len(body.response.rest)
     slow = pushes_on(body, depth_m, slow=True)
-    timed(method.respond, pushes[:20])
-    at_random, slowly = timed(method.respond, pushes), timed(method.respond, slow)
+    timed(method.respond, queries[:20])
+    at_random, slowly = timed(method.respond, queries), timed(method.respond, slow)
     return Point(
         method=method.name,
         skin_nodes=len(body.response.rest),
@@ -302,10 +306,10 @@ def main() -> None:
     )
     parser.add_argument("--output", type=Path, default=Path("runs/charts"))
     parser.add_argument("--redraw", action="store_true")
-    asked = parser.parse_args()
-    numbers, picture = asked.output / f"{NAME}.json", asked.output / f"{NAME}.svg"
-    if not asked.redraw:
-        asked.output.mkdir(parents=True, exist_ok=True)
+    arguments = parser.parse_args()
+    numbers, picture = arguments.output / f"{NAME}.json", arguments.output / f"{NAME}.svg"
+    if not arguments.redraw:
+        arguments.output.mkdir(parents=True, exist_ok=True)
         numbers.write_text(json.dumps(measure_all(), indent=1) + "\n")
     kept = json.loads(numbers.read_text())
     with drawn_for_pages():
@@ -317,13 +321,13 @@ def points_of(kept: Sequence[dict[str, Any]]) -> list[Point]:
 
 
 def measure_all() -> dict[str, Any]:
-    """All sizes, all contacts, as they are kept."""
+    """Measure all sizes and contacts, as they are stored."""
     scene = load_scene(SCENE_FILE)
     shape = make_shape(dict(cylinder_of(scene)))
     by_size, by_contact = [], []
     print(HEAD)
     for spacing in SPACINGS_M:
-        mesh = build_mesh(spec_of(scene, spacing).mesh)
+        mesh = build_mesh(make_soft_body_spec(scene, spacing).mesh)
         for measure in (linear_point, table_point):
             by_size.append(measure(scene, mesh, shape, DEPTH_M))
             say(by_size[-1])

@@ -9,7 +9,9 @@ function from the recorded fields to those of the type that came after.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from functools import partial
 from typing import Any
 
 from messages.base import Message, schema_fingerprint
@@ -31,6 +33,18 @@ MIGRATIONS: dict[tuple[str, str], Migration] = {
     ("Scene", "d7307561a5180666"): _one_way_of_stepping,
 }
 
+RENAMED_FIELDS: dict[str, Mapping[str, str]] = {
+    "Frame": {"lost_share": "occluded_fraction"},
+    "SoftBody": {"lead_s": "prediction_horizon_s"},
+}
+"""Old to new names of fields, by message type."""
+
+RENAMED_VALUES: dict[tuple[str, ...], Mapping[str, str]] = {
+    ("Display", "pattern"): {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
+    ("Scene", "methods", "sheet_shape"): {"dents": "reduced_order", "flat": "four_triangles"},
+}
+"""Old to new values of a literal field, by message type and the path to the field."""
+
 _IGNORED = frozenset({"title", "description", "default", "discriminator", "$defs"})
 _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf", "oneOf",
                        "items", "prefixItems"})  # fmt: skip
@@ -45,9 +59,56 @@ def migration_for(
     """
     if fingerprint == schema_fingerprint(message_type).hex():
         return _as_it_is
-    if (message_type.__name__, fingerprint) in MIGRATIONS:
-        return MIGRATIONS[message_type.__name__, fingerprint]
-    return _as_it_is if fits(recorded_schema, message_type.model_json_schema()) else None
+    name = message_type.__name__
+    if (name, fingerprint) in MIGRATIONS:
+        migration = MIGRATIONS[name, fingerprint]
+        return lambda fields: rename(name, migration(fields))
+    if fits(recorded_schema, message_type.model_json_schema()):
+        return _as_it_is
+    try:
+        renamed_schema = _rename_in_schema(name, recorded_schema)
+    except (KeyError, TypeError, AttributeError):
+        return None
+    return partial(rename, name) if fits(renamed_schema, message_type.model_json_schema()) else None
+
+
+def rename(type_name: str, fields: Fields) -> Fields:
+    """Return recorded fields with the names and values of today."""
+    names = RENAMED_FIELDS.get(type_name, {})
+    result = {names.get(name, name): value for name, value in fields.items()}
+    for (holder, *path), values in RENAMED_VALUES.items():
+        if holder == type_name:
+            result = _rename_value(result, path, values)
+    return result
+
+
+def _rename_value(fields: Fields, path: Sequence[str], values: Mapping[str, str]) -> Fields:
+    if not isinstance(fields, dict) or path[0] not in fields:
+        return fields
+    value: Any = fields[path[0]]
+    if len(path) > 1:
+        value = _rename_value(value, path[1:], values)
+    elif isinstance(value, str):
+        value = values.get(value, value)
+    return fields | {path[0]: value}
+
+
+def _rename_in_schema(type_name: str, schema: Schema) -> Schema:
+    """Return a recorded schema with the names and values of today."""
+    result = deepcopy(dict(schema))
+    names = RENAMED_FIELDS.get(type_name, {})
+    properties = result["properties"]
+    result["properties"] = {names.get(name, name): one for name, one in properties.items()}
+    result["required"] = [names.get(name, name) for name in result.get("required", [])]
+    for (holder, *path), values in RENAMED_VALUES.items():
+        if holder == type_name:
+            part: Any = result
+            for name in path:
+                part = _resolved(part, result.get("$defs", {}))["properties"][name]
+            for option in (part, *_options(part)):
+                if "enum" in option:
+                    option["enum"] = [values.get(one, one) for one in option["enum"]]
+    return result
 
 
 def fits(recorded: Schema, today: Schema) -> bool:

@@ -31,7 +31,9 @@ from messages.scene import Finite, NonNegative, Positive
 
 Correction = methods.Correction
 Side = Literal["left", "right"]
-Pattern = Literal["object", "grid", "checker", "white", "black", "places_x", "places_y"]
+Pattern = Literal[
+    "object", "grid", "checker", "white", "black", "coordinate_ramp_x", "coordinate_ramp_y"
+]
 Shading = Literal["soft", "flat"]
 StereoMode = Literal["mono", "side_by_side", "top_bottom", "frame_sequential", "anaglyph"]
 
@@ -176,11 +178,11 @@ ForceCurve = Annotated[NDArray[np.float64], ArraySpec("<f8", ("depths", 2))]
 
 
 class SoftBody(Message):
-    """The skin's answer to the finger."""
+    """The response of the skin to the finger."""
 
     mesh_id: str
     method: str
-    in_range: bool = Field(description="false: the push exceeds what the method is good for")
+    in_range: bool = Field(description="false: the push is outside the method's range")
     push_depth_m: NonNegative
     force_world_n: Vector3 = Field(description="of the object on the finger")
     stiffness_n_per_m: NonNegative = Field(description="of the object where the finger is")
@@ -189,8 +191,8 @@ class SoftBody(Message):
         description="of the object where the finger is, whether it touches or not: rows of depth "
         "(m) and force (N), both from 0 and never falling; empty: not known",
     )
-    lead_s: NonNegative = Field(
-        default=0.0, description="how long after the exposure the finger is that it answers to"
+    prediction_horizon_s: NonNegative = Field(
+        default=0.0, description="from the exposure to the predicted finger of this response"
     )
     displacement_world_m: Points3
 
@@ -216,7 +218,8 @@ class Display(Message):
     pattern: Pattern = Field(
         default="object",
         description="grid, checker, white: 300 mm square on the imaginary screen, every 20 mm a "
-        "line or a change; places_x, places_y: the object, painted with where it should be seen",
+        "line or a change; coordinate_ramp_x, coordinate_ramp_y: the object, coloured by the "
+        "position at which the eye should see it",
     )
     marks: bool = Field(default=True, description="draw the target mark and the fingertip mark")
     pixels_every: int = Field(
@@ -255,8 +258,8 @@ class Frame(Message):
         default_factory=lambda: np.zeros((0, 3)),
         description="where the finger was taken to be at `predicted_to_ns`; none: not known",
     )
-    lost_share: NonNegative = Field(
-        default=0.0, description="of the sheet, folded so that it gets no light"
+    occluded_fraction: NonNegative = Field(
+        default=0.0, description="fraction of the sheet's visible area without light, in folds"
     )
     pixels: tuple[ColorImage, ...] = Field(
         description="projector images, top row first: none, one (mono or packed)"

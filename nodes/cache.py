@@ -1,58 +1,135 @@
-"""Arrays kept on disk: a file is whole or absent, and is read only if every checksum in it holds.
+"""Cache results on disk: one file of arrays per result, whole or absent, checked when it is read.
 
-What takes long is kept part by part while it is computed, in a folder beside the final file, so
-that an interrupted computation goes on where it stopped.
+A long computation stores checkpoints in a folder beside the final file. An interrupted computation
+continues from them.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import shutil
 import zipfile
 import zlib
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import structlog
 from numpy.typing import NDArray
 
 Arrays = Mapping[str, NDArray[Any]]
+T = TypeVar("T")
 
 DAMAGE = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
-"""What reading a file that is cut, changed or of another kind may raise."""
+"""Exceptions that reading a truncated, changed or foreign file may raise."""
+
+CACHED_S = 1.0
+"""Steps that finish this soon after the start were cached and do not count for the time left."""
+MINUTE_S = 60.0
 
 
 def default_cache_dir() -> Path:
-    """$XDG_CACHE_HOME/flexsheet, or ~/.cache/flexsheet."""
+    """Return $XDG_CACHE_HOME/flexsheet, or ~/.cache/flexsheet."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "flexsheet"
 
 
-def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
-    """The arrays of a file; None if there is none, or (logged) it is damaged."""
+def make_digest(value: object) -> str:
+    """Return a digest of a JSON value; equal values have equal digests."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:24]
+
+
+@dataclass(frozen=True, slots=True)
+class Specification(Generic[T]):
+    """All that a cached result depends on, and how the result becomes arrays and back.
+
+    kind: of result, the first part of the file name. depends_on: a JSON value, with the version of
+    the code that computes the result. decode raises one of `DAMAGE` for arrays that it cannot use.
+    """
+
+    kind: str
+    depends_on: object
+    encode: Callable[[T], Arrays]
+    decode: Callable[[dict[str, NDArray[Any]]], T]
+
+    def path(self, cache_dir: Path | None) -> Path:
+        """Return the file of the result. cache_dir: None: the user's cache."""
+        return (
+            cache_dir or default_cache_dir()
+        ) / f"{self.kind}-{make_digest(self.depends_on)}.npz"
+
+    def checkpoints(self, cache_dir: Path | None) -> CheckpointStore:
+        """Return the store of what an interrupted computation has finished."""
+        return CheckpointStore(self.path(cache_dir).with_suffix(".parts"))
+
+
+def cached(specification: Specification[T], cache_dir: Path | None, compute: Callable[[], T]) -> T:
+    """Return the cached result, or compute and store it, and then delete its checkpoints.
+
+    Raises OSError if the result cannot be written, and what `compute` raises.
+    """
+    result = load_cached(specification, cache_dir)
+    if result is None:
+        result = compute()
+        save_cached(specification, cache_dir, result)
+        specification.checkpoints(cache_dir).remove()
+    return result
+
+
+def load_cached(specification: Specification[T], cache_dir: Path | None) -> T | None:
+    """Return the cached result; None if there is none, or if its file is damaged (logged)."""
+    path = specification.path(cache_dir)
+    content = load_arrays(path)
+    if content is None:
+        return None
     try:
-        # reading a member of the archive to its end verifies its CRC-32
+        return specification.decode(content)
+    except DAMAGE as error:
+        warn_damaged(path, error)
+        return None
+
+
+def save_cached(specification: Specification[T], cache_dir: Path | None, result: T) -> Path:
+    """Store a result and return its file. Raises OSError if the file cannot be written."""
+    path = specification.path(cache_dir)
+    save_arrays(path, specification.encode(result))
+    return path
+
+
+def encode_fields(result: Any) -> dict[str, NDArray[Any]]:
+    """Return the fields of a dataclass that holds arrays only, by name."""
+    return {one.name: np.asarray(getattr(result, one.name)) for one in fields(result)}
+
+
+def load_arrays(path: Path) -> dict[str, NDArray[Any]] | None:
+    """Return the arrays of a file; None if there is none, or if it is damaged (logged)."""
+    try:
+        # Reading a member of the archive to its end verifies its CRC-32.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: archive[name] for name in archive.files}
     except FileNotFoundError:
         return None
     except DAMAGE as error:
-        say_damaged(path, error)
+        warn_damaged(path, error)
         return None
 
 
-def say_damaged(path: Path, error: Exception) -> None:
-    """Log that a file is of no use; what it held is computed anew."""
+def warn_damaged(path: Path, error: Exception) -> None:
+    """Log that a file cannot be used and that its content is computed again."""
     structlog.get_logger().warning(
-        "damaged cache file is computed anew", path=str(path), error=repr(error)
+        "damaged cache file, computing it again", path=str(path), error=repr(error)
     )
 
 
 def save_arrays(path: Path, arrays: Arrays) -> None:
-    """Keep arrays; a reader sees the whole file or none.  OSError if it cannot be written."""
+    """Write arrays so that a reader sees the whole file or none.
+
+    Raises OSError if the file cannot be written.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp")
@@ -67,7 +144,7 @@ def save_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Delete temporary files of processes that are gone (killed while they wrote)."""
+    """Delete the temporary files of processes that were killed while they wrote."""
     import psutil
 
     for leftover in path.parent.glob(f".{path.stem}.*.tmp"):
@@ -77,22 +154,58 @@ def _remove_leftovers(path: Path) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
-    """The parts of an unfinished computation, in a folder of their own."""
+class CheckpointStore:
+    """The finished parts of a computation, in a folder of their own."""
 
     folder: Path
 
     def load(self, name: str) -> dict[str, NDArray[Any]] | None:
-        """A part kept before; None as `load_arrays`."""
+        """Return a stored part; None as `load_arrays`."""
         return load_arrays(self._path(name))
 
     def save(self, name: str, arrays: Arrays) -> None:
-        """Keep a part.  OSError as `save_arrays`."""
+        """Store a part. Raises OSError as `save_arrays`."""
         save_arrays(self._path(name), arrays)
 
+    def get(
+        self, name: str, compute: Callable[[], dict[str, NDArray[Any]]]
+    ) -> dict[str, NDArray[Any]]:
+        """Return a stored part, or compute and store it."""
+        part = self.load(name)
+        if part is None:
+            part = compute()
+            self.save(name, part)
+        return part
+
     def remove(self) -> None:
-        """Delete all parts, once the whole is kept."""
+        """Delete all parts."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _path(self, name: str) -> Path:
         return self.folder / f"{name}.npz"
+
+
+class EtaEstimator:
+    """Estimate the time left of a long computation from the duration of its finished steps."""
+
+    def __init__(self) -> None:
+        self._total = self._last = self._cached = 0
+        self._start_s = 0.0
+
+    def text(self, done: int, total: int, now_s: float) -> str:
+        """Return a text such as "40 %, about 3 min left" for the finished steps at time now_s.
+
+        Another total, or fewer finished steps than before, starts a new estimate.
+        """
+        if total != self._total or done < self._last:
+            self._total, self._start_s = total, now_s
+        if now_s - self._start_s < CACHED_S:
+            self._cached = done
+        self._last = done
+        percent = f"{100 * done // total} %"
+        if done in (self._cached, total):
+            return percent
+        left_s = (now_s - self._start_s) / (done - self._cached) * (total - done)
+        if left_s < MINUTE_S:
+            return f"{percent}, about {max(1, round(left_s))} s left"
+        return f"{percent}, about {round(left_s / MINUTE_S)} min left"

@@ -1,4 +1,4 @@
-"""What the tests of pictures share: dented objects and sheets that are pushed."""
+"""Helpers of the image tests: deformed objects and pushed sheets."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from numpy.typing import NDArray
 from messages.scene import Scene
 from messages.types import Skin, SoftBody
 from nodes.models.sheet import edge_poses
-from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.stage import Stage
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose, estimate_sheet
 
 Floats = NDArray[np.float64]
 
 
-def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> Sheet:
-    """The scene's sheet, stretched a little, its middle at a pose (4, 4)."""
-    sheet = sheet_between(
+def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> SheetPose:
+    """Return the scene's sheet, stretched a little, its middle at a pose (4, 4)."""
+    sheet = estimate_sheet(
         *edge_poses(pose, 1.05 * scene.sheet.width_m),
         height_m=scene.sheet.height_m,
         twist_world=np.zeros(6),
@@ -27,15 +27,15 @@ def sheet_at(scene: Scene, pose: Floats, tip: Floats | None = None) -> Sheet:
     return sheet
 
 
-def follow(stage: Stage, displacement: Floats | None) -> None:
-    """Deform the stage by a displacement (vertices, 3) of its own surface, or put it to rest."""
+def follow(stage: SceneRenderer, displacement: Floats | None) -> None:
+    """Deform the scene renderer by a displacement (vertices, 3) of its own surface, or reset it."""
     if displacement is None:
-        stage.shape(None)
+        stage.deform(None)
         return
     surface = stage._surface
     vertices = surface.rest_world_m.astype(np.float32)
-    stage.follow(Skin(mesh_id="own", vertices_world_m=vertices, triangles=surface.triangles))
-    stage.shape(body_of(displacement))
+    stage.set_skin(Skin(mesh_id="own", vertices_world_m=vertices, triangles=surface.triangles))
+    stage.deform(body_of(displacement))
 
 
 def body_of(displacement: Floats) -> SoftBody:
@@ -50,8 +50,8 @@ def body_of(displacement: Floats) -> SoftBody:
     )
 
 
-def dent(stage: Stage, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
-    """Displacement (vertices, 3) of the stage's surface, pushed from the front; its back stays."""
+def dent(stage: SceneRenderer, depth_m: float, place: tuple[float, float] = (0.0, 0.0)) -> Floats:
+    """Return a displacement (vertices, 3) of the surface, pushed from the front; its back stays."""
     points = stage._surface.rest_world_m
     away = np.linalg.norm(points[:, :2] - np.array(place), axis=1)
     facing = np.clip(1.0 + points[:, 2] / 0.05, 0.0, 1.0)

@@ -1,7 +1,7 @@
-"""Loads, norms and equilibrium on meshes of 10-node tetrahedra, for tests.
+"""Provide loads, norms and equilibrium on meshes of 10-node tetrahedra, for tests.
 
-Shape functions and quadrature are written here again, apart from the solver's own: what is judged
-is not judged by itself.
+Shape functions and quadrature are independent of the solver's own, so that the solver is not
+compared with itself.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def lame(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
 
 
 def dofs_of(nodes: Ints) -> Ints:
-    """The degrees of freedom (3k,) of nodes (k,)."""
+    """Return the degrees of freedom (3k,) of nodes (k,)."""
     return (3 * np.asarray(nodes)[:, None] + np.arange(3)).ravel()
 
 
@@ -168,12 +168,13 @@ def relative_errors(
 
 
 def rate(sizes: list[float], errors: list[float]) -> float:
-    """The power with which errors fall with the elements' size: a line's slope through all."""
+    """Return the power with which errors fall with the elements' size: a line's slope through
+    all."""
     return float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
 
 
 def tangent_matrix(solid: NeoHookeanSolid, displacement: Floats) -> csc_matrix:
-    """The assembled tangent stiffness (3n, 3n)."""
+    """Return the assembled tangent stiffness (3n, 3n)."""
     dofs = (3 * solid.elements[:, :, None] + np.arange(3)).reshape(-1, 30)
     rows, columns = np.repeat(dofs, 30, axis=1).ravel(), np.tile(dofs, (1, 30)).ravel()
     size = 3 * len(solid.nodes)
@@ -184,10 +185,11 @@ def tangent_matrix(solid: NeoHookeanSolid, displacement: Floats) -> csc_matrix:
 def equilibrium(
     solid: NeoHookeanSolid, held: Ints, values: Floats, loads: Floats, *, steps: int
 ) -> Floats:
-    """Displacements (n, 3) under dead loads (3n,), with the degrees of freedom `held` at `values`:
-    Newton's method in equal steps of both, its own steps shortened where elements turn over.
+    """Return displacements (n, 3) under dead loads (3n,), with the degrees of freedom `held` at
+    `values`.
 
-    ArithmeticError if it does not settle.
+    Newton's method in equal steps of both, with shorter steps where elements invert. Raises
+    ArithmeticError if it does not converge.
     """
     free = np.setdiff1d(np.arange(3 * len(solid.nodes)), held)
     moved = np.zeros(3 * len(solid.nodes))

@@ -1,11 +1,11 @@
-"""What the soft body was verified against: findings of the tests, and the table of them.
+"""Record what the soft body was verified against, and print the table of the findings.
 
     OPENBLAS_NUM_THREADS=1 python -m tests.fem_verification
 
-runs tests/test_fem_verify_*.py and prints a Markdown table, a row for each finding: docs/
-soft-body-verification.md holds it.  A test notes what it measures by `at_most`, `between` or
-`near`, which assert at once what they note, and names its source in the last paragraph of its
-docstring, after "Source:".
+runs tests/test_fem_verify_*.py and prints a Markdown table, a row for each finding;
+docs/soft-body-verification.md holds it. A test records its measurements with `at_most`, `between`
+or `near`, which also assert them. It names its source in the last paragraph of its docstring, after
+"Source:".
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ KEY = "verified"
 
 
 def at_most(record: Record, what: str, measured: float, limit: float) -> None:
-    """Note an error; AssertionError unless it is within the limit."""
+    """Record an error. Raises AssertionError unless it is within the limit."""
     record(KEY, (what, f"{measured:.2g}", f"at most {limit:g}"))
     assert measured <= limit, f"{what}: {measured:.3g}, at most {limit:g}"
 
 
 def between(record: Record, what: str, measured: float, low: float, high: float) -> None:
-    """Note a value; AssertionError unless it lies in the band."""
+    """Record a value. Raises AssertionError unless it lies in the band."""
     record(KEY, (what, f"{measured:.4g}", f"{low:g} to {high:g}"))
     assert low <= measured <= high, f"{what}: {measured:.6g}, not in {low:g} to {high:g}"
 
 
 def near(record: Record, what: str, measured: float, wanted: float, relative: float) -> None:
-    """Note a value beside the one that it should have."""
+    """Record a value beside the expected one."""
     record(KEY, (what, f"{measured:.5g}", f"{wanted:.5g} ± {100 * relative:.2g} %"))
     error = abs(measured / wanted - 1.0)
     assert error <= relative, f"{what}: {measured:.6g}, wanted {wanted:.6g}, off by {error:.3g}"

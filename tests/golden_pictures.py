@@ -1,10 +1,10 @@
-"""Pictures that the renderer must go on drawing as they are.
+"""Images that the renderer must reproduce.
 
     python -m tests.golden_pictures [NAME ...]
 
-draws them anew into tests/golden (all, or those named).  Look at them before they are committed:
-they are what `tests/test_golden.py` holds the renderer to.  The projector has 320x240 pixels here,
-and its pictures are mirrored, as it stands behind the sheet.
+draws them again into tests/golden (all, or those named). Inspect them before a commit:
+`tests/test_golden.py` compares the renderer with them. The projector has 320x240 pixels here, and
+its images are mirrored, because it is behind the sheet.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from launch.plans.plan import load_scene
 from messages.scene import Appearance, Scene
 from messages.types import Display, StereoMode
 from nodes.models.rigid import rotation_from_vector, transform
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.sheet import Sheet
-from nodes.renderer.stage import Stage
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose
 from tests.dent_shapes import few_dents
 from tests.drawing import dent, follow, sheet_at
 
@@ -35,7 +35,7 @@ SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 SHAPES = ("box", "cylinder", "ellipsoid", "organ", "plane", "sphere")
 MODES: tuple[StereoMode, ...] = ("side_by_side", "top_bottom", "frame_sequential", "anaglyph")
 SHARE = 0.4
-"""Of the scene's projector, in pixels to a side."""
+"""Fraction of the projector's pixels per side."""
 
 TILTED = transform(rotation_from_vector([0.35, -0.25, 0.0]), np.array([0.0, 0.005, 0.0]))
 TIP = (TILTED @ [0.015, -0.01, -0.025, 1.0])[:3]
@@ -63,15 +63,15 @@ def small_scene(name: str, **appearance: object) -> Scene:
 
 
 def draw(
-    context: moderngl.Context, scene: Scene, display: Display, sheet: Sheet | None = None
+    context: moderngl.Context, scene: Scene, display: Display, sheet: SheetPose | None = None
 ) -> Image:
     """A dented object with both its marks."""
     sheet = sheet_at(scene, np.eye(4)) if sheet is None else sheet
     dented = display.correction == "two_pass" and sheet.pushed_point is not None
-    stage = Stage(scene, context, spacing_m=0.004, dents=few_dents() if dented else None)
+    stage = SceneRenderer(scene, context, spacing_m=0.004, dents=few_dents() if dented else None)
     follow(stage, dent(stage, 0.014, (0.008, -0.006)))
     marked = display.marks and display.pattern == "object"
-    look = Look(
+    look = DrawStyle(
         flat=False,
         pattern=display.pattern,
         fingertip_mark=stage.surface_point(np.array([0.008, -0.006, 0.01])) if marked else None,
@@ -129,7 +129,7 @@ CASES: dict[str, Case] = {
     "stereo-anaglyph-swapped": _stereo("anaglyph", swap_eyes=True),
     **{
         f"pattern-{name}": _pattern(name)
-        for name in ("grid", "checker", "white", "black", "places_x", "places_y")
+        for name in ("grid", "checker", "white", "black", "coordinate_ramp_x", "coordinate_ramp_y")
     },
     **{
         f"pushed-{correction}-{pattern}": _pushed(correction, pattern)

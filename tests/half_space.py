@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.bisection import CELL, bisected, lattice
+from nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
 from nodes.fem_solver.mesh.grading import longest_edges
-from nodes.fem_solver.mesh.solid import oriented, with_middles
+from nodes.fem_solver.mesh.solid import add_midside_nodes, orient_tetrahedra
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -22,7 +22,7 @@ def half_space(
     growth: longest edge over the distance from the origin.  whole: all four quarters about the z
     axis, or the one with x, y >= 0 only.
     """
-    vertices, tetrahedra = lattice((1, 1, 1))
+    vertices, tetrahedra = make_lattice((1, 1, 1))
     inside = vertices[:, 2] <= 0
     if not whole:
         inside &= (vertices[:, :2] >= 0).all(axis=1)
@@ -40,6 +40,6 @@ def half_space(
         wanted = np.where(away < fine_radius, smallest, np.maximum(smallest, growth * away))
         return np.asarray(longest_edges(points, tetrahedra) > 1.5 * wanted)
 
-    vertices, tetrahedra = bisected(vertices, index.reshape(-1, 4), too_large)
+    vertices, tetrahedra = bisect(vertices, index.reshape(-1, 4), too_large)
     corners = place(vertices)
-    return with_middles(corners, oriented(corners, tetrahedra))
+    return add_midside_nodes(corners, orient_tetrahedra(corners, tetrahedra))

@@ -1,4 +1,5 @@
-"""The window on the projector's monitor, under a virtual display whose pixels are read back."""
+"""Test the window on the projector's monitor, under a virtual display whose pixels are read
+back."""
 
 from __future__ import annotations
 
@@ -16,9 +17,9 @@ from numpy.typing import NDArray
 
 from messages.base import Header
 from messages.types import Display, Frame, StereoMode
-from nodes.renderer.monitors import WindowError, chosen_monitor, start_glfw
+from nodes.renderer.monitors import WindowError, find_monitor, start_glfw
 from nodes.renderer.output import pack
-from nodes.renderer.window import CLOSED, ProjectorWindow
+from nodes.renderer.output_window import CLOSED, ProjectorWindow
 from tests.test_renderer import Bench
 from tests.waiting import until
 
@@ -48,7 +49,7 @@ class VirtualDisplay:
         self._file = folder / "Xvfb_screen0"
 
     def pixels(self) -> NDArray[np.uint8]:
-        """What the monitor shows, (600, 800, 3), from the XWD file."""
+        """Return what the monitor shows, (600, 800, 3), from the XWD file."""
         data = self._file.read_bytes()
         header = np.frombuffer(data, ">u4", 25)
         width, height, line, colours = header[4], header[5], header[12], header[19]
@@ -81,7 +82,7 @@ class WindowBench(Bench):
         await self.step("scene", self.scene)
 
     async def draw(self, mode: StereoMode, *, swap_eyes: bool = False) -> Frame:
-        """A frame of the object, once the window has shown it."""
+        """Draw a frame of the object, and return once the window has shown it."""
         await self.step(
             "display",
             Display(correction="two_pass", stereo=mode, swap_eyes=swap_eyes, pixels_every=1),
@@ -206,14 +207,14 @@ async def test_a_monitor_that_is_not_there_is_named_with_those_that_are(
 ) -> None:
     start_glfw()
     with pytest.raises(WindowError, match=r"'beamer': there is none; monitors: 0: \"screen\" 800x"):
-        chosen_monitor("beamer")
-    assert chosen_monitor("screen") is not None
-    assert chosen_monitor("0") is not None
+        find_monitor("beamer")
+    assert find_monitor("screen") is not None
+    assert find_monitor("0") is not None
     bench = WindowBench(output="window", monitor=0)
     await bench.node.setup()
     small = bench.scene.projector.model_copy(update={"width_px": 801})
     header = Header(1, 0, 0, "virtual", "test", 1)
-    with pytest.raises(WindowError, match=r"scene\.projector is 801x600.*knows 800x600"):
+    with pytest.raises(WindowError, match=r"scene\.projector is 801x600.*supports 800x600"):
         bench.node.on_scene(bench.scene.model_copy(update={"projector": small}), header)
     await bench.node.close()
 

@@ -11,7 +11,7 @@ import trimesh
 from ruamel.yaml import YAML
 
 from messages.scene import Scene
-from nodes.fem_solver.mesh import SolidMesh, mesh_of_scene
+from nodes.fem_solver.mesh import SolidMesh, mesh_scene
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SPACINGS_M = {"plane": 0.0075}
@@ -50,4 +50,4 @@ def scene_solid(shape: str) -> SolidMesh:
     body.pop("support_angle_rad", None)
     body["geometry"] = geometry(shape)
     body["support"] = {"kind": "strip", "angle_rad": 1.5}
-    return mesh_of_scene(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006))
+    return mesh_scene(Scene.model_validate(content), SPACINGS_M.get(shape, 0.006))

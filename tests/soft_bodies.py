@@ -22,7 +22,7 @@ def cylinder_spec(
     poisson_ratio: float = 0.45,
     sticking: bool = False,
 ) -> SoftBodySpec:
-    """A cylinder that lies across, held at its back."""
+    """Return a horizontal cylinder that is fixed at its back."""
     mesh = MeshSpec(
         geometry=Cylinder(radius_m=radius_m, length_m=length_m),
         support=StripSupport(angle_rad=support_angle_rad),
@@ -30,14 +30,14 @@ def cylinder_spec(
         skin_spacing_m=skin_spacing_m,
         towards_user=(0.0, 0.0, 1.0),
         down=(0.0, 0.0, 0.0),
-        turn_rad=0.0,
+        rotation_rad=0.0,
         slab_depth_m=0.0,
     )
     return SoftBodySpec(mesh, poisson_ratio, sticking)
 
 
 class Here(Executor):
-    """Does what is submitted at once, in this process."""
+    """Run submitted functions at once, in this process."""
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from messages.scene import Scene
-from nodes.fem_solver.body import SceneBody, scene_body, spec_of
-from nodes.fem_solver.contact import CURVE_SHARES, curve_depths
-from nodes.fem_solver.place import Push
+from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from nodes.fem_solver.closest_contact import ContactQuery
+from nodes.fem_solver.contact import CURVE_FRACTIONS, curve_depths
 from nodes.fem_solver.precompute import compute
 
 Floats = NDArray[np.float64]
@@ -23,15 +23,15 @@ LINEAR = 0.006
 
 @pytest.fixture(scope="module")
 def soft() -> SceneBody:
-    spec = spec_of(SCENE, 0.0045)
+    spec = make_soft_body_spec(SCENE, 0.0045)
     model = compute(spec, lambda done, total, need: None)
-    return scene_body(SCENE, spec, model, linear_depth_m=LINEAR, largest_depth_m=0.010)
+    return build_scene_body(SCENE, spec, model, linear_depth_m=LINEAR, max_depth_m=0.010)
 
 
 def test_the_depths_reach_from_the_touch_to_the_deepest_push() -> None:
     depths = curve_depths(0.006, 0.010, 0.05)
     assert depths[0] == 0.0
-    assert depths[len(CURVE_SHARES)] == pytest.approx(0.006)
+    assert depths[len(CURVE_FRACTIONS)] == pytest.approx(0.006)
     assert depths[-1] == pytest.approx(0.05)
     assert (np.diff(depths) > 0.0).all()
     assert curve_depths(0.006, 0.010, None)[-1] == pytest.approx(0.010)
@@ -46,7 +46,7 @@ def test_the_curve_is_what_pushes_then_give(soft: SceneBody) -> None:
     assert (curve[0] == 0.0).all()
     assert (np.diff(curve[:, 1]) >= 0.0).all()
     for depth in (0.003, 0.006, 0.02, 0.05):
-        answer = soft.method.respond(Push(surface, normal, depth))
+        answer = soft.method.respond(ContactQuery(surface, normal, depth))
         wanted = float(np.interp(depth, *curve.T))
         assert answer.force_n @ normal == pytest.approx(wanted, rel=0.1)
         assert np.array_equal(answer.force_curve, curve)
@@ -66,5 +66,5 @@ def test_the_curve_is_said_in_the_air_and_changes_smoothly_along_the_skin(soft: 
 def test_the_stiffness_is_the_curves_secant(soft: SceneBody) -> None:
     place = np.array([0.004, 0.0, soft.front[2]])
     curve = soft.method.force_curve(place)
-    secant = curve[len(CURVE_SHARES), 1] / LINEAR
+    secant = curve[len(CURVE_FRACTIONS), 1] / LINEAR
     assert soft.method.stiffness_n_per_m(place) == pytest.approx(secant)

@@ -251,9 +251,11 @@ def test_charts_are_gathered_on_a_page_and_drawn_anew(
     points = [measure(trial, repeats=3) for trial in family.trials(SCENE)]
     result = chart_result(family, SCENE, points)
     result["family"] = "made-up"
-    older = {name: value for name, value in result.items() if name not in ("along", "code")}
-    older["points"] = [{k: v for k, v in point.items() if k not in ("also", "doubts")}
-                       for point in result["points"]]  # fmt: skip
+    older = {name: value for name, value in result.items() if name not in ("sweep_key", "code")}
+    newer = ("extra_metrics", "reference_uncertainty")
+    older["points"] = [
+        {k: v for k, v in point.items() if k not in newer} for point in result["points"]
+    ]
     (tmp_path / "made-up.json").write_text(json.dumps(older))
     outcome = CliRunner().invoke(app, ["chart", "--redraw", "--output", str(tmp_path)])
     assert outcome.exit_code == 0, outcome.output

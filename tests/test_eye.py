@@ -17,8 +17,8 @@ from messages.topics import Topic
 from messages.types import Correction, Display, Frame, TwinArms, TwinEye
 from nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
 from nodes.models.sheet import edge_poses, flange_pose
-from nodes.renderer.families import rolled_on
-from nodes.renderer.sheet import Sheet
+from nodes.renderer.benchmarks import roll_sheet
+from nodes.renderer.sheet import SheetPose
 from nodes.twin.eye import (
     METRES_PER_PX,
     Image,
@@ -198,7 +198,7 @@ def test_what_cannot_be_measured_is_said(what: str) -> None:
         tilt_sizes(picture, 1.0)
 
 
-Situation = tuple[Sheet, DeformedSheet]
+Situation = tuple[SheetPose, DeformedSheet]
 Sizes = Callable[[Image, float], Sequence[float]]
 
 
@@ -208,7 +208,7 @@ def mean_mm(bench: Bench, correction: Correction, situation: Situation, sizes: S
 
 def test_row_of_figure_11(bench: Bench) -> None:
     """At 50 degrees the uncorrected error is the paper's tens of mm; corrected, a tenth."""
-    rolled = bench.situation(rolled_on(bench.scene, np.radians(50.0)), None)
+    rolled = bench.situation(roll_sheet(bench.scene, np.radians(50.0)), None)
     assert 27.0 < mean_mm(bench, "none", rolled, tilt_sizes) < 34.0
     assert 1e3 * bench.size_errors("one_plane", *rolled, tilt_sizes).max() < 0.15
     turn = transform(rotation_from_vector([np.radians(50.0), 0.0, 0.0]), np.zeros(3))

@@ -11,15 +11,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery, locate
 from nodes.fem_solver.contact import (
     LinearSoftBody,
     Response,
     SphereContact,
-    saturated,
-    solve_bed,
-    triangle_points,
+    sample_triangle,
+    saturate_depth,
+    solve_penalty_contact,
 )
-from nodes.fem_solver.place import Entry, Push, locate
 from nodes.fem_solver.precompute import SoftBodyModel, compute
 from nodes.models.shapes import CylinderShape
 from tests.soft_bodies import cylinder_spec
@@ -44,7 +44,7 @@ def soft_body(model: SoftBodyModel, modulus: float = 4000.0) -> LinearSoftBody:
         young_modulus_pa=modulus,
         finger_radius_m=FINGER,
         linear_depth_m=0.006,
-        largest_depth_m=0.010,
+        max_depth_m=0.010,
     )
 
 
@@ -53,11 +53,11 @@ def body(model: SoftBodyModel) -> LinearSoftBody:
     return soft_body(model)
 
 
-def push(x: float, angle: float, depth: float) -> Push:
+def push(x: float, angle: float, depth: float) -> ContactQuery:
     normal = np.array([0.0, np.sin(angle), np.cos(angle)])
     point = (RADIUS - depth) * normal + np.array([x, 0.0, 0.0])
     beyond = max(0.0, abs(x) - 0.5 * LENGTH)
-    return Push(point + depth * normal, normal, depth, beyond)
+    return ContactQuery(point + depth * normal, normal, depth, beyond)
 
 
 def largest_move(a: Response, b: Response) -> float:
@@ -160,8 +160,8 @@ def test_deep_pushes_are_flagged_bounded_and_never_inverted(
         answer = body.respond(there)
         assert np.isfinite(answer.displacement).all()
         assert np.linalg.norm(answer.displacement, axis=1).max() < 0.0101
-        turned = np.einsum("ij,ij->i", normals(rest), normals(rest + answer.displacement))
-        assert turned.min() > 0.0
+        alignments = np.einsum("ij,ij->i", normals(rest), normals(rest + answer.displacement))
+        assert alignments.min() > 0.0
         assert answer.in_range == (answer.push_depth_m <= 0.006)
         force = float(np.linalg.norm(answer.force_n))
         assert last <= force < 10.0
@@ -171,7 +171,7 @@ def test_deep_pushes_are_flagged_bounded_and_never_inverted(
 
 def test_saturation_has_no_kink() -> None:
     depths = np.linspace(-0.01, 0.1, 20001)
-    bent = np.array([saturated(d, 0.006, 0.010) for d in depths])
+    bent = np.array([saturate_depth(d, 0.006, 0.010) for d in depths])
     slope = np.diff(bent) / np.diff(depths)
     assert (slope > 0).all()
     assert np.abs(np.diff(slope)).max() < 2e-3
@@ -237,7 +237,7 @@ def test_to_twenty_millimetres_the_place_follows_from_the_finger_alone(
     point = (RADIUS - depth) * normal + np.array([x, 0.0, 0.0])
     fresh, _ = locate(SHAPE, point, None)
     aside = np.array([0.0, np.sin(angle + 0.5), np.cos(angle + 0.5)])
-    after, _ = locate(SHAPE, point, Entry(RADIUS * aside, aside))
+    after, _ = locate(SHAPE, point, ContactAnchor(RADIUS * aside, aside))
     assert after.depth_m == pytest.approx(depth, abs=1e-12)
     assert np.array_equal(after.surface, fresh.surface)
 
@@ -251,20 +251,20 @@ def test_bed_forces_are_the_minimum_of_the_energy(seed: int, stiff: float) -> No
     compliance = root @ root.T + 0.1 * np.eye(size)
     weights = rng.uniform(0, 1, (count, size))
     weights /= weights.sum(axis=1, keepdims=True)
-    below, bed = rng.uniform(0.0, 1.0, count), np.full(count, 10.0**stiff)
+    below, penalty = rng.uniform(0.0, 1.0, count), np.full(count, 10.0**stiff)
 
     def energy(forces: Floats) -> tuple[float, Floats]:
         left = np.maximum(below - weights @ (compliance @ forces), 0.0)
-        value = 0.5 * float(forces @ compliance @ forces + bed @ left**2)
-        return value, compliance @ (forces - weights.T @ (bed * left))
+        value = 0.5 * float(forces @ compliance @ forces + penalty @ left**2)
+        return value, compliance @ (forces - weights.T @ (penalty * left))
 
-    forces = solve_bed(weights, compliance, bed, below)
+    forces = solve_penalty_contact(weights, compliance, penalty, below)
     best = minimize(energy, np.zeros(size), jac=True, method="BFGS", options={"gtol": 1e-9}).fun
     assert energy(forces)[0] <= best * (1 + 1e-9) + 1e-12
 
 
 def test_shape_functions_at_the_points_reproduce_a_parabola() -> None:
-    shape, local = triangle_points(4)
+    shape, local = sample_triangle(4)
     assert len(local) == 16
     nodes = np.array([[0, 0], [1, 0], [0, 1], [0.5, 0], [0.5, 0.5], [0, 0.5]])
 
@@ -276,7 +276,7 @@ def test_shape_functions_at_the_points_reproduce_a_parabola() -> None:
 
 
 def test_depths_in_the_wrong_order_are_refused(model: SoftBodyModel) -> None:
-    with pytest.raises(ValueError, match="largest_depth_m"):
+    with pytest.raises(ValueError, match="max_depth_m"):
         LinearSoftBody(
             model.response,
             SHAPE,
@@ -284,7 +284,7 @@ def test_depths_in_the_wrong_order_are_refused(model: SoftBodyModel) -> None:
             young_modulus_pa=4000.0,
             finger_radius_m=FINGER,
             linear_depth_m=0.01,
-            largest_depth_m=0.006,
+            max_depth_m=0.006,
         )
 
 

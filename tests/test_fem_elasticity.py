@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from nodes.fem_solver.elasticity import (
-    MeshError,
+    SolidMeshError,
     degrees_of_freedom,
     quadrature,
     require_support,
@@ -29,13 +29,17 @@ RADIUS, LENGTH = 0.0353553, 0.12
 
 
 def cylinder(
-    spacing: float, *, support: float = np.pi / 2, touch: float = 1.5, length: float = LENGTH
+    spacing: float,
+    *,
+    support: float = np.pi / 2,
+    contact_nodes: float = 1.5,
+    length: float = LENGTH,
 ) -> SolidMesh:
     return cylinder_mesh(
         radius_m=RADIUS,
         length_m=length,
         support_angle_rad=support,
-        touch_angle_rad=touch,
+        touch_angle_rad=contact_nodes,
         skin_spacing_m=spacing,
     )
 
@@ -101,19 +105,19 @@ def test_the_mesh_is_a_sound_solid(spacing: float) -> None:
 
 def test_the_side_lies_on_the_cylinder_and_is_fine_in_front() -> None:
     mesh = cylinder(0.0045)
-    touch = mesh.nodes[mesh.touch]
-    assert np.hypot(touch[:, 1], touch[:, 2]) == pytest.approx(RADIUS, rel=1e-12)
-    assert np.abs(np.linalg.norm(mesh.touch_normals, axis=1) - 1).max() < 1e-12
-    distance, _ = cKDTree(touch).query(touch, k=2)
+    contact_nodes = mesh.nodes[mesh.contact_nodes]
+    assert np.hypot(contact_nodes[:, 1], contact_nodes[:, 2]) == pytest.approx(RADIUS, rel=1e-12)
+    assert np.abs(np.linalg.norm(mesh.contact_normals, axis=1) - 1).max() < 1e-12
+    distance, _ = cKDTree(contact_nodes).query(contact_nodes, k=2)
     assert 0.003 < distance[:, 1].mean() < 0.005
-    assert np.isin(mesh.touch, mesh.skin).all()
-    assert not mesh.fixed[mesh.touch].any()
+    assert np.isin(mesh.contact_nodes, mesh.skin).all()
+    assert not mesh.fixed[mesh.contact_nodes].any()
 
 
 @given(support=st.floats(0.3, 3.0), spacing=st.floats(0.004, 0.008))
 @settings(max_examples=15, deadline=None)
 def test_exactly_the_strip_at_the_back_is_fixed(support: float, spacing: float) -> None:
-    mesh = cylinder(spacing, support=support, touch=1.2)
+    mesh = cylinder(spacing, support=support, contact_nodes=1.2)
     held = mesh.nodes[mesh.fixed]
     angle = np.arctan2(np.abs(held[:, 1]), -held[:, 2])
     # the strip's edges are nodes of the mesh, so that its width does not depend on the spacing
@@ -257,7 +261,7 @@ def test_bad_elements_are_named(how: str) -> None:
     else:
         corner = elements[7, 0]
         nodes[corner] = nodes[elements[7, 1:4]].mean(axis=0)
-    with pytest.raises(MeshError, match="inverted or flat"):
+    with pytest.raises(SolidMeshError, match="inverted or flat"):
         stiffness_matrix(nodes, elements, young_modulus_pa=1.0, poisson_ratio=0.3)
 
 
@@ -267,10 +271,10 @@ def test_a_free_body_is_an_error_not_a_number() -> None:
     loads = np.zeros(matrix.shape[0])
     loads[2] = 1.0
     nothing = np.empty(0, dtype=np.int64)
-    with pytest.raises(MeshError, match="free to move"):
+    with pytest.raises(SolidMeshError, match="free to move"):
         solve(matrix, nothing, np.empty(0), loads)
     line = np.isclose(nodes[:, 0], 0) & np.isclose(nodes[:, 1], 0)
-    with pytest.raises(MeshError, match="free to move"):
+    with pytest.raises(SolidMeshError, match="free to move"):
         require_support(nodes, line)
-    with pytest.raises(MeshError, match="0 fixed nodes"):
+    with pytest.raises(SolidMeshError, match="0 fixed nodes"):
         require_support(nodes, np.zeros(len(nodes), dtype=bool))

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from nodes.cache import load_cached, save_cached
+from nodes.fem_solver.closest_contact import (
+    ContactAnchor,
+    ContactQuery,
+    locate_sticking,
+    slide_anchor,
+)
 from nodes.fem_solver.contact import LinearSoftBody
 from nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
 from nodes.fem_solver.mesh import build_mesh
-from nodes.fem_solver.place import Entry, Push, locate_stuck, slipped
-from nodes.fem_solver.precompute import SoftBodyModel, compute, load, save, tangents_of
+from nodes.fem_solver.precompute import SoftBodyModel, compute, make_tangents, response_cache
 from nodes.models.shapes import CylinderShape
 from tests.soft_bodies import cylinder_spec
 
@@ -38,13 +44,15 @@ def body(model: SoftBodyModel) -> LinearSoftBody:
         young_modulus_pa=MODULUS,
         finger_radius_m=FINGER,
         linear_depth_m=0.006,
-        largest_depth_m=0.010,
+        max_depth_m=0.010,
         drag=model.drag,
     )
 
 
-def push(depth: float, drag: tuple[float, float, float] = (0.0, 0.0, 0.0), x: float = 0.0) -> Push:
-    return Push(RADIUS * UP + [x, 0.0, 0.0], UP, depth, 0.0, np.array(drag))
+def push(
+    depth: float, drag: tuple[float, float, float] = (0.0, 0.0, 0.0), x: float = 0.0
+) -> ContactQuery:
+    return ContactQuery(RADIUS * UP + [x, 0.0, 0.0], UP, depth, 0.0, np.array(drag))
 
 
 def test_each_column_is_the_solution_under_its_load(model: SoftBodyModel) -> None:
@@ -52,20 +60,20 @@ def test_each_column_is_the_solution_under_its_load(model: SoftBodyModel) -> Non
     assert model.drag is not None
     matrix = stiffness_matrix(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
     held = degrees_of_freedom(np.flatnonzero(mesh.fixed))
-    for node, which in ((0, 0), (len(mesh.touch) // 2, 1)):
+    for node, which in ((0, 0), (len(mesh.contact_nodes) // 2, 1)):
         loads = np.zeros(matrix.shape[0])
-        loads[degrees_of_freedom(mesh.touch[[node]])] = model.drag.tangents[node, which]
+        loads[degrees_of_freedom(mesh.contact_nodes[[node]])] = model.drag.tangents[node, which]
         wanted = solve(matrix, held, np.zeros(len(held)), loads).reshape(-1, 3)
-        got = model.drag.table[2 * node + which].reshape(-1, 3)
+        got = model.drag.influence[2 * node + which].reshape(-1, 3)
         assert np.abs(got - wanted[mesh.skin]).max() < 1e-6 * np.abs(wanted).max()
-        along = np.einsum("mi,mpi->mp", wanted[mesh.touch], model.drag.tangents).ravel()
+        along = np.einsum("mi,mpi->mp", wanted[mesh.contact_nodes], model.drag.tangents).ravel()
         assert model.drag.compliance[2 * node + which] == pytest.approx(along, rel=1e-7)
 
 
 def test_tangents_are_at_right_angles() -> None:
     normals = np.random.default_rng(2).normal(size=(50, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    frames = np.concatenate([normals[:, None], tangents_of(normals)], axis=1)
+    frames = np.concatenate([normals[:, None], make_tangents(normals)], axis=1)
     assert frames @ frames.transpose(0, 2, 1) == pytest.approx(np.tile(np.eye(3), (50, 1, 1)))
 
 
@@ -103,24 +111,24 @@ def test_sticking_is_smooth_in_depth_and_drag(body: LinearSoftBody) -> None:
 
 
 def test_the_place_of_first_touch_stays_until_the_finger_lifts() -> None:
-    touch, held = locate_stuck(SHAPE, np.array([0.001, 0.0, RADIUS - 1e-4]), None)
-    assert touch.drag_m is None
-    there, held = locate_stuck(SHAPE, np.array([0.003, 0.001, RADIUS - 0.004]), held)
+    contact_nodes, held = locate_sticking(SHAPE, np.array([0.001, 0.0, RADIUS - 1e-4]), None)
+    assert contact_nodes.drag_m is None
+    there, held = locate_sticking(SHAPE, np.array([0.003, 0.001, RADIUS - 0.004]), held)
     assert there.surface == pytest.approx([0.001, 0.0, RADIUS])
     assert there.drag_m == pytest.approx([0.002, 0.001, 0.0])
     assert there.depth_m == pytest.approx(0.004)
-    away, held = locate_stuck(SHAPE, np.array([0.003, 0.001, RADIUS + 0.01]), held)
+    away, held = locate_sticking(SHAPE, np.array([0.003, 0.001, RADIUS + 0.01]), held)
     assert held is None
     assert away.depth_m < 0.0
-    anew, held = locate_stuck(SHAPE, np.array([0.005, 0.0, RADIUS - 0.001]), held)
+    anew, held = locate_sticking(SHAPE, np.array([0.005, 0.0, RADIUS - 0.001]), held)
     assert anew.surface[0] == pytest.approx(0.005)
 
 
 def test_slipping_leaves_the_drag_that_friction_holds() -> None:
-    held = Entry(RADIUS * UP, UP)
-    after = slipped(SHAPE, held, np.array([0.004, 0.0, 0.0]), 0.25)
+    held = ContactAnchor(RADIUS * UP, UP)
+    after = slide_anchor(SHAPE, held, np.array([0.004, 0.0, 0.0]), 0.25)
     assert after.point == pytest.approx([0.003, 0.0, RADIUS])
-    around = slipped(SHAPE, held, np.array([0.0, 0.004, 0.0]), 0.25)
+    around = slide_anchor(SHAPE, held, np.array([0.0, 0.004, 0.0]), 0.25)
     assert np.linalg.norm(around.point[1:]) == pytest.approx(RADIUS)
 
 
@@ -128,10 +136,10 @@ def test_what_drags_is_kept_with_the_model(
     model: SoftBodyModel, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("drag")
-    save(model, SPEC, folder)
-    kept = load(SPEC, folder)
+    save_cached(response_cache(SPEC), folder, model)
+    kept = load_cached(response_cache(SPEC), folder)
     assert kept is not None
     assert kept.drag is not None
     assert model.drag is not None
-    assert np.array_equal(kept.drag.table, model.drag.table)
+    assert np.array_equal(kept.drag.influence, model.drag.influence)
     assert np.array_equal(kept.drag.tangents, model.drag.tangents)

@@ -16,7 +16,7 @@ from benchmarks.soft_body_limits import (
     scene_of,
     site_of,
 )
-from nodes.fem_solver.place import Entry, Push
+from nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
 from nodes.models import rigid
 
 ENDS = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
@@ -34,19 +34,20 @@ def test_a_skin_coarser_than_the_fingertip_is_refused() -> None:
 
 
 def test_an_incompressible_body_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"poisson_ratio: 0.49995 .* take 0.499"):
+    with pytest.raises(ValueError, match=r"poisson_ratio: 0.49995 .* use 0.499"):
         body_of(cylinder(nu=0.49995))
 
 
 def test_two_supports_hold_and_one_point_is_refused(body: Body) -> None:
     hanging = body_of(scene_of(CYLINDER, ENDS, height_m=0.02))
-    site = site_of(hanging)
+    sample = site_of(hanging)
     answers = [
-        one.soft.method.respond(Push(site.place, site.normal, 0.005)) for one in (hanging, body)
+        one.soft.method.respond(ContactQuery(sample.point, sample.normal, 0.005))
+        for one in (hanging, body)
     ]
-    forces = [float(answer.force_n @ site.normal) for answer in answers]
+    forces = [float(answer.force_n @ sample.normal) for answer in answers]
     assert 0.3 * forces[1] < forces[0] < forces[1]
-    assert deepest_mm(newton(hanging, site, (0.002, 0.004))) == 4.0
+    assert deepest_mm(newton(hanging, sample, (0.002, 0.004))) == 4.0
     point = {"kind": "sphere_patch", "centre_m": [0.025, 0.0, 0.0], "radius_m": 0.0005}
     with pytest.raises(ValueError, match=r"object.support: .* at least three"):
         body_of(scene_of(CYLINDER, point, height_m=0.02))
@@ -55,7 +56,7 @@ def test_two_supports_hold_and_one_point_is_refused(body: Body) -> None:
 def test_a_finger_that_jumps_is_answered_where_it_is(body: Body) -> None:
     """Anywhere within a right angle of where it was; nothing is turned over anywhere."""
     rng = np.random.default_rng(7)
-    jumped: Entry | None = None
+    jumped: ContactAnchor | None = None
     for _ in range(40):
         x, angle, depth = rng.uniform([-0.02, -0.7, -0.002], [0.02, 0.7, 0.012])
         normal = np.array([0.0, np.sin(angle), np.cos(angle)])

@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from nodes.fem_solver.mesh import boundary_faces
 from nodes.fem_solver.newton import (
-    NOTHING_HELD,
+    NO_STICK,
+    EquilibriumState,
     Friction,
     NeoHookeanBody,
-    Solved,
+    NewtonNotConvergedError,
     SphereObstacle,
-    StuckError,
 )
-from nodes.fem_solver.pushes import PushJob, Site, solve_push
+from nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.solids import box
 
 Floats = NDArray[np.float64]
@@ -30,7 +30,7 @@ SIDE, HEIGHT = 0.03, 0.012
 def pad(
     friction: Friction = "none",
     divisions: tuple[int, int, int] = (5, 5, 2),
-    factored_in: type[np.float32 | np.float64] = np.float64,
+    factor_dtype: type[np.float32 | np.float64] = np.float64,
 ) -> NeoHookeanBody:
     """A block of 30 x 30 x 12 mm, glued to the ground, its top at z = 0."""
     nodes, elements = box(divisions, (SIDE, SIDE, HEIGHT))
@@ -45,7 +45,7 @@ def pad(
         poisson_ratio=NU,
         finger_radius_m=FINGER,
         friction=friction,
-        factored_in=factored_in,
+        factor_dtype=factor_dtype,
     )
 
 
@@ -53,8 +53,8 @@ def centre(depth: float, x: float = 0.0012, y: float = 0.0007) -> Floats:
     return np.array([x, y, FINGER - depth])
 
 
-def press(body: NeoHookeanBody, *centres: Floats) -> list[Solved]:
-    return list(body.follow(centres))
+def press(body: NeoHookeanBody, *centres: Floats) -> list[EquilibriumState]:
+    return list(body.solve_load_steps(centres))
 
 
 @pytest.fixture(scope="module")
@@ -63,26 +63,28 @@ def body() -> NeoHookeanBody:
 
 
 @pytest.fixture(scope="module")
-def pressed(body: NeoHookeanBody) -> Solved:
+def pressed(body: NeoHookeanBody) -> EquilibriumState:
     return press(body, centre(0.0), centre(0.004))[-1]
 
 
-def test_the_body_is_in_balance_with_the_finger(body: NeoHookeanBody, pressed: Solved) -> None:
+def test_the_body_is_in_balance_with_the_finger(
+    body: NeoHookeanBody, pressed: EquilibriumState
+) -> None:
     assert pressed.reached
     inner = body.solid.forces(pressed.displacement)
-    outer = body.obstacle.forces(
-        body.solid.nodes + pressed.displacement, pressed.centre, NOTHING_HELD
-    )
+    outer = body.obstacle.forces(body.solid.nodes + pressed.displacement, pressed.centre, NO_STICK)
     free = ~body.fixed
     assert np.abs((inner + outer)[free]).max() < 1e-7 * np.abs(outer).max()
     # what the finger pushes, the ground takes
     assert inner[body.fixed].sum(axis=0) == pytest.approx(pressed.force_n * [1, 1, 1], rel=1e-5)
     assert not pressed.displacement[body.fixed].any()
     assert pressed.force_n[2] > 0.0
-    assert 0.3 < pressed.least_volume_ratio < 1.0
+    assert 0.3 < pressed.min_volume_ratio < 1.0
 
 
-def test_no_point_of_the_skin_is_inside_the_finger(body: NeoHookeanBody, pressed: Solved) -> None:
+def test_no_point_of_the_skin_is_inside_the_finger(
+    body: NeoHookeanBody, pressed: EquilibriumState
+) -> None:
     _, depth, _, _ = body.obstacle.inside(body.solid.nodes + pressed.displacement, pressed.centre)
     assert len(depth) > 10
     assert 0.0 < depth.max() < 0.02 * FINGER
@@ -94,10 +96,10 @@ def test_the_force_is_the_energys_derivative_along_the_finger(body: NeoHookeanBo
     step = 1e-5
     states = press(body, centre(0.0), centre(0.003 - step), centre(0.003), centre(0.003 + step))
 
-    def energy(state: Solved) -> float:
+    def energy(state: EquilibriumState) -> float:
         positions = body.solid.nodes + state.displacement
         return body.solid.energy(state.displacement) + body.obstacle.energy(
-            positions, state.centre, NOTHING_HELD
+            positions, state.centre, NO_STICK
         )
 
     slope = (energy(states[3]) - energy(states[1])) / (2 * step)
@@ -105,7 +107,7 @@ def test_the_force_is_the_energys_derivative_along_the_finger(body: NeoHookeanBo
 
 
 def test_without_friction_every_way_there_gives_the_same(
-    body: NeoHookeanBody, pressed: Solved
+    body: NeoHookeanBody, pressed: EquilibriumState
 ) -> None:
     aside = press(body, centre(0.0, x=-0.004), centre(0.003, x=-0.004, y=0.003), centre(0.004))[-1]
     deeper = press(body, centre(0.0), centre(0.006), centre(0.004))[-1]
@@ -127,10 +129,10 @@ def test_the_answer_is_smooth_in_the_fingers_place(body: NeoHookeanBody) -> None
 
 
 def test_factors_of_single_precision_lead_to_the_same_balance(
-    body: NeoHookeanBody, pressed: Solved
+    body: NeoHookeanBody, pressed: EquilibriumState
 ) -> None:
     """They only say where to look next: the balance is that of forces in double precision."""
-    coarse = pad(factored_in=np.float32)
+    coarse = pad(factor_dtype=np.float32)
     quick = press(coarse, centre(0.0), pressed.centre)[-1]
     assert quick.reached
     largest = np.abs(pressed.displacement).max()
@@ -138,7 +140,7 @@ def test_factors_of_single_precision_lead_to_the_same_balance(
     assert np.allclose(quick.force_n, pressed.force_n, rtol=1e-6, atol=1e-9)
     stiffness = body.solid.tangents(pressed.displacement)
     factors = body._order.factor(stiffness.astype(np.float32))
-    assert {pivot.dtype for pivot in factors.pivots} == {np.dtype(np.float32)}
+    assert {pivot.dtype for pivot in factors.diagonal} == {np.dtype(np.float32)}
 
 
 def test_a_sticking_finger_drags_the_skin_and_a_smooth_one_does_not() -> None:
@@ -162,7 +164,7 @@ def test_a_push_deeper_than_the_body_is_bounded_flagged_and_not_inside_out() -> 
     assert not states[-1].reached
     last = states[-1]
     assert np.isfinite(last.displacement).all()
-    assert last.least_volume_ratio > 0.0
+    assert last.min_volume_ratio > 0.0
     assert np.linalg.norm(last.displacement, axis=1).max() < 2 * HEIGHT
     assert last.centre[2] > FINGER - 0.03
     forces = [state.force_n[2] for state in states]
@@ -173,29 +175,29 @@ def test_where_newton_does_not_settle_the_push_ends(monkeypatch: pytest.MonkeyPa
     """Though no element is turned over: the last answer stays, flagged, and a table takes the push
     to be as deep as that."""
     body = pad(divisions=(4, 4, 2))
-    job = PushJob(
+    job = SnapshotJob(
         nodes=body.solid.nodes,
         elements=body.solid.elements,
         fixed=body.fixed,
         faces=body.obstacle._faces,
-        site=Site(centre(FINGER), np.array([0.0, 0.0, 1.0])),
+        sample=SamplePoint(centre(FINGER), np.array([0.0, 0.0, 1.0])),
         poisson_ratio=NU,
         finger_radius_m=FINGER,
         depths_m=(0.001, 0.002, 0.003, 0.004),
     )
-    settle = NeoHookeanBody.settle
+    solve_equilibrium = NeoHookeanBody.solve_equilibrium
 
     def never_deeper(
         body: NeoHookeanBody, displacement: Floats, to: Floats, *rest: Any, **also: Any
     ) -> Any:
         if to[2] < FINGER - 0.0022:
-            raise StuckError("not settled")
-        return settle(body, displacement, to, *rest, **also)
+            raise NewtonNotConvergedError("not settled")
+        return solve_equilibrium(body, displacement, to, *rest, **also)
 
     monkeypatch.setattr(NeoHookeanBody, "settle", never_deeper)
-    answer = solve_push(job)
+    answer = solve_snapshot(job)
     assert answer.reached == 2
-    assert answer.force_n[1] @ job.site.normal > 0.0
+    assert answer.force_n[1] @ job.sample.normal > 0.0
     for held in (2, 3):
         assert np.array_equal(answer.moved[held], answer.moved[2])
     # it went as far as a quarter of a step leads, and no farther
@@ -214,15 +216,15 @@ def test_obstacle_tangent_is_the_derivative_of_its_forces() -> None:
     obstacle = SphereObstacle(nodes, elements, faces, modulus_pa=MODULUS, radius_m=FINGER)
     there = np.array([0.003, 0.006, 0.0166])
     way = np.random.default_rng(5).normal(size=nodes.shape)
-    held = obstacle.hold(nodes, there + 1e-4, NOTHING_HELD)
+    held = obstacle.update_stick(nodes, there + 1e-4, NO_STICK)
     matrices = np.zeros((len(elements), 30, 30))
-    obstacle.add_tangents(matrices, nodes, there, held, turned=1.0)
+    obstacle.add_tangents(matrices, nodes, there, held, geometric_stiffness_weight=1.0)
     dofs = (3 * elements[:, :, None] + np.arange(3)).reshape(-1, 30)
-    turned = np.zeros(nodes.size)
-    np.add.at(turned, dofs, np.einsum("eij,ej->ei", matrices, way.ravel()[dofs]))
+    forces_change = np.zeros(nodes.size)
+    np.add.at(forces_change, dofs, np.einsum("eij,ej->ei", matrices, way.ravel()[dofs]))
     step = 1e-9
     ahead = obstacle.forces(nodes + step * way, there, held)
     behind = obstacle.forces(nodes - step * way, there, held)
     change = (ahead - behind).ravel() / (2 * step)
     assert len(held.points) > 3
-    assert np.abs(turned - change).max() < 1e-5 * np.abs(change).max()
+    assert np.abs(forces_change - change).max() < 1e-5 * np.abs(change).max()

@@ -20,9 +20,10 @@ from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
 from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver import precompute, pushes
+from nodes.fem_solver import precompute, snapshots
 from nodes.fem_solver.body import SceneBody
-from nodes.fem_solver.node import FemSolver, FemSolverParameters
+from nodes.fem_solver.node import FemSolver
+from nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
 
 SCENES = Path(__file__).parents[1] / "launch" / "scenes"
@@ -172,7 +173,7 @@ async def test_a_lost_finger_is_held_and_then_the_body_springs_back(bench: Bench
 
 
 async def test_lead_moves_the_finger_along_its_velocity(cache: str, bench: Bench) -> None:
-    ahead = Bench(cache_dir=cache, lead_s=0.1)
+    ahead = Bench(cache_dir=cache, prediction_horizon_s=0.1)
     await ahead.node.setup()
     await ahead.node.step("scene", scene(), header())
     moving = await ahead.push(fingertip((0.0, 0.0, -0.002), velocity=(0.0, 0.0, -0.02)))
@@ -316,10 +317,10 @@ async def test_the_same_messages_give_the_same_bytes(cache: str) -> None:
 
 @pytest.fixture
 def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pushes, "DEPTHS_M", (0.0015, 0.003, 0.006))
-    monkeypatch.setattr(pushes, "SPACING_RATIO", 1.0)
-    monkeypatch.setattr(pushes, "STATIONS", (0.0,))
-    monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
+    monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.003, 0.006))
+    monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
+    monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
+    monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
 
 
 async def test_the_table_is_made_while_the_linear_method_answers(
@@ -354,7 +355,7 @@ async def test_another_scene_ends_the_making_of_a_table(few_pushes: None, tmp_pa
     bench = Bench(cache_dir=tmp_path, method="nonlinear_table", workers=1)
     await bench.node.setup()
     await bench.node.step("scene", scene(), header())
-    while "deep pushes" not in bench.node.note:  # noqa: ASYNC110  # notes come without an event
+    while "snapshots for" not in bench.node.note:  # noqa: ASYNC110  # notes come without an event
         await asyncio.sleep(0.01)
     await bench.node.step("scene", scene(support_angle_rad=1.2), header())
     await bench.node.close()

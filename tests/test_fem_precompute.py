@@ -12,29 +12,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.cache import Parts, default_cache_dir
+from nodes.cache import CheckpointStore, default_cache_dir, load_cached, save_cached
 from nodes.fem_solver import precompute
 from nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
 from nodes.fem_solver.mesh import build_mesh
-from nodes.fem_solver.multifrontal import Dissection
+from nodes.fem_solver.multifrontal import NestedDissection
 from nodes.fem_solver.precompute import (
-    Budget,
     Interrupted,
+    ResponseBudget,
     SoftBodyModel,
-    budget,
-    cache_path,
     compute,
-    load,
+    compute_budget,
     load_or_compute,
-    parts_of,
-    save,
+    response_cache,
 )
 from tests.soft_bodies import cylinder_spec
 
 SPEC = cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.005)
 
 
-def quiet(done: int, total: int, need: Budget) -> None:
+def quiet(done: int, total: int, need: ResponseBudget) -> None:
     pass
 
 
@@ -53,13 +50,13 @@ def test_each_column_is_the_solution_under_its_load(model: SoftBodyModel) -> Non
     mesh = build_mesh(SPEC.mesh)
     matrix = stiffness_matrix(mesh.nodes, mesh.elements, young_modulus_pa=1.0, poisson_ratio=0.45)
     held = degrees_of_freedom(np.flatnonzero(mesh.fixed))
-    for number in (0, len(mesh.touch) // 2, len(mesh.touch) - 1):
+    for number in (0, len(mesh.contact_nodes) // 2, len(mesh.contact_nodes) - 1):
         loads = np.zeros(matrix.shape[0])
-        loads[degrees_of_freedom(mesh.touch[[number]])] = -mesh.touch_normals[number]
+        loads[degrees_of_freedom(mesh.contact_nodes[[number]])] = -mesh.contact_normals[number]
         wanted = solve(matrix, held, np.zeros(len(held)), loads).reshape(-1, 3)
-        got = model.response.table[number].reshape(-1, 3)
+        got = model.response.influence[number].reshape(-1, 3)
         assert np.abs(got - wanted[mesh.skin]).max() < 1e-6 * np.abs(wanted).max()
-        inward = -np.einsum("ij,ij->i", wanted[mesh.touch], mesh.touch_normals)
+        inward = -np.einsum("ij,ij->i", wanted[mesh.contact_nodes], mesh.contact_normals)
         assert model.response.compliance[number] == pytest.approx(inward, rel=1e-8)
 
 
@@ -70,18 +67,18 @@ def test_compliance_is_symmetric_and_positive(model: SoftBodyModel) -> None:
 
 
 def test_a_kept_model_comes_back_the_same(model: SoftBodyModel, tmp_path: Path) -> None:
-    assert load(SPEC, tmp_path) is None
-    path = save(model, SPEC, tmp_path / "new" / "folder")
-    kept = load(SPEC, path.parent)
+    assert load_cached(response_cache(SPEC), tmp_path) is None
+    path = save_cached(response_cache(SPEC), tmp_path / "new" / "folder", model)
+    kept = load_cached(response_cache(SPEC), path.parent)
     assert kept is not None
     assert same(kept, model)
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 
 
 def test_the_second_start_computes_nothing(model: SoftBodyModel, tmp_path: Path) -> None:
-    save(model, SPEC, tmp_path)
+    save_cached(response_cache(SPEC), tmp_path, model)
 
-    def refuse(done: int, total: int, need: Budget) -> None:
+    def refuse(done: int, total: int, need: ResponseBudget) -> None:
         raise AssertionError("computed although it was kept")
 
     assert same(load_or_compute(SPEC, tmp_path, refuse), model)
@@ -107,11 +104,11 @@ def test_another_version_of_the_code_has_its_own_file(monkeypatch: pytest.Monkey
 
 @pytest.mark.parametrize("where", [0.0, 0.1, 0.3, 0.5, 0.7, 0.9, 0.999])
 def test_a_flipped_byte_is_found(model: SoftBodyModel, tmp_path: Path, where: float) -> None:
-    path = save(model, SPEC, tmp_path)
+    path = save_cached(response_cache(SPEC), tmp_path, model)
     content = bytearray(path.read_bytes())
     content[int(where * len(content))] ^= 0x40
     path.write_bytes(content)
-    kept = load(SPEC, tmp_path)
+    kept = load_cached(response_cache(SPEC), tmp_path)
     # a byte of the archive's own directory may be one that nothing depends on
     assert kept is None or same(kept, model)
     assert kept is None or where > 0.99
@@ -121,21 +118,21 @@ def test_a_flipped_byte_is_found(model: SoftBodyModel, tmp_path: Path, where: fl
 def test_a_half_written_file_is_never_used_and_is_replaced(
     model: SoftBodyModel, tmp_path: Path, part: float
 ) -> None:
-    path = save(model, SPEC, tmp_path)
+    path = save_cached(response_cache(SPEC), tmp_path, model)
     content = path.read_bytes()
     path.write_bytes(content[: int(part * len(content))])
-    assert load(SPEC, tmp_path) is None
+    assert load_cached(response_cache(SPEC), tmp_path) is None
     again = load_or_compute(SPEC, tmp_path, quiet)
     assert np.allclose(again.response.compliance, model.response.compliance, rtol=1e-9)
-    kept = load(SPEC, tmp_path)
+    kept = load_cached(response_cache(SPEC), tmp_path)
     assert kept is not None
     assert same(kept, again)
 
 
 def test_an_archive_with_other_content_is_not_used(tmp_path: Path) -> None:
-    with cache_path(SPEC, tmp_path).open("wb") as file:
+    with response_cache(SPEC).path(tmp_path).open("wb") as file:
         np.savez(file, triangles=np.zeros((1, 3), dtype=np.int32), something=np.zeros(3))
-    assert load(SPEC, tmp_path) is None
+    assert load_cached(response_cache(SPEC), tmp_path) is None
 
 
 def test_progress_runs_from_nothing_to_all() -> None:
@@ -152,38 +149,38 @@ def test_an_interrupted_computation_goes_on_where_it_stopped(
 ) -> None:
     monkeypatch.setattr(precompute, "CHUNK_LOADS", 20)
 
-    def stop(done: int, total: int, need: Budget) -> None:
+    def stop(done: int, total: int, need: ResponseBudget) -> None:
         if done >= stop_at * total:
             raise Interrupted
 
     with pytest.raises(Interrupted):
         load_or_compute(SPEC, tmp_path, stop)
-    assert load(SPEC, tmp_path) is None
-    parts = sorted(parts_of(SPEC, tmp_path).folder.glob("*"))
+    assert load_cached(response_cache(SPEC), tmp_path) is None
+    parts = sorted(response_cache(SPEC).checkpoints(tmp_path).folder.glob("*"))
     assert len(parts) > 2 or stop_at < 0.5
     assert all(part.suffix == ".npz" for part in parts)
     stamps = [part.stat().st_mtime_ns for part in parts]
     kept: list[str] = []
-    monkeypatch.setattr(Parts, "save", lambda self, name, arrays: kept.append(name))
+    monkeypatch.setattr(CheckpointStore, "save", lambda self, name, arrays: kept.append(name))
     whole = load_or_compute(SPEC, tmp_path, quiet)
     assert np.allclose(whole.response.compliance, model.response.compliance, rtol=1e-9)
-    assert len(kept) == -(-len(model.response.touch) // 20) - len(stamps)
-    assert [path.name for path in tmp_path.iterdir()] == [cache_path(SPEC, tmp_path).name]
+    assert len(kept) == -(-len(model.response.contact_nodes) // 20) - len(stamps)
+    assert [path.name for path in tmp_path.iterdir()] == [response_cache(SPEC).path(tmp_path).name]
 
 
 def test_a_damaged_part_is_computed_anew(model: SoftBodyModel, tmp_path: Path) -> None:
-    def stop(done: int, total: int, need: Budget) -> None:
+    def stop(done: int, total: int, need: ResponseBudget) -> None:
         if done == total:
             raise Interrupted
 
     with pytest.raises(Interrupted):
         load_or_compute(SPEC, tmp_path, stop)
-    (part,) = parts_of(SPEC, tmp_path).folder.iterdir()
+    (part,) = response_cache(SPEC).checkpoints(tmp_path).folder.iterdir()
     content = bytearray(part.read_bytes())
     content[len(content) // 2] ^= 1
     part.write_bytes(content)
     whole = load_or_compute(SPEC, tmp_path, quiet)
-    assert np.allclose(whole.response.table, model.response.table, rtol=1e-5, atol=1e-9)
+    assert np.allclose(whole.response.influence, model.response.influence, rtol=1e-5, atol=1e-9)
 
 
 def test_a_write_that_fails_leaves_no_file(
@@ -194,19 +191,19 @@ def test_a_write_that_fails_leaves_no_file(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        save(model, SPEC, tmp_path)
+        save_cached(response_cache(SPEC), tmp_path, model)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_what_a_killed_process_left_is_swept(model: SoftBodyModel, tmp_path: Path) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
-    stem = cache_path(SPEC, tmp_path).stem
+    stem = response_cache(SPEC).path(tmp_path).stem
     leftover = tmp_path / f".{stem}.{gone.pid}.tmp"
     alive = tmp_path / f".{stem}.{os.getppid()}.tmp"
     leftover.write_bytes(b"half")
     alive.write_bytes(b"half")
-    save(model, SPEC, tmp_path)
+    save_cached(response_cache(SPEC), tmp_path, model)
     assert not leftover.exists()
     assert alive.exists()
 
@@ -214,7 +211,7 @@ def test_what_a_killed_process_left_is_swept(model: SoftBodyModel, tmp_path: Pat
 def test_too_little_memory_is_said_before_it_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     fine = cylinder_spec(0.02, 0.06, touch_angle_rad=1.2, skin_spacing_m=0.003)
     mesh = build_mesh(fine.mesh)
-    need = budget(mesh, Dissection(mesh.nodes, mesh.elements, mesh.fixed))
+    need = compute_budget(mesh, NestedDissection(mesh.nodes, mesh.elements, mesh.fixed))
     assert need.table_bytes > need.loads * need.skin_nodes * 12
     assert str(need.loads) in need.text()
 
@@ -222,7 +219,7 @@ def test_too_little_memory_is_said_before_it_is_taken(monkeypatch: pytest.Monkey
         available = need.working_bytes
 
     monkeypatch.setattr("psutil.virtual_memory", Little)
-    monkeypatch.setattr(Dissection, "factor", None)  # not reached
+    monkeypatch.setattr(NestedDissection, "factor", None)  # not reached
     with pytest.raises(MemoryError, match="skin_spacing_m"):
         compute(fine, quiet)
 

@@ -17,10 +17,11 @@ from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
 from messages.types import Skin, SoftBody
-from nodes.fem_solver.body import SceneBody, scene_body, spec_of
+from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
 from nodes.fem_solver.contact import Response
-from nodes.fem_solver.node import FemSolver, FemSolverParameters
-from nodes.fem_solver.precompute import compute, foreseen
+from nodes.fem_solver.node import FemSolver
+from nodes.fem_solver.parameters import FemSolverParameters
+from nodes.fem_solver.precompute import compute, estimate_budget
 from nodes.models import rigid
 from tests.fingertips import fingertip
 
@@ -69,12 +70,12 @@ SCENES = {
 @pytest.fixture(scope="module", params=SCENES)
 def soft(request: pytest.FixtureRequest) -> SceneBody:
     chosen = SCENES[request.param]
-    spec = spec_of(chosen, 0.006)
+    spec = make_soft_body_spec(chosen, 0.006)
     model = compute(spec, lambda done, total, need: None)
-    expected, table = foreseen(spec), model.response.table
+    expected, table = estimate_budget(spec), model.response.influence
     # said beforehand, and not far off
     assert 0.5 * len(table) < expected.loads < 4.0 * len(table)
-    return scene_body(chosen, spec, model, linear_depth_m=0.006, largest_depth_m=0.010)
+    return build_scene_body(chosen, spec, model, linear_depth_m=0.006, max_depth_m=0.010)
 
 
 def pushed(soft: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Floats]:

@@ -14,24 +14,28 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.fem_solver import precompute_table, pushes
-from nodes.fem_solver.carried import Hull, turn
-from nodes.fem_solver.contact import CURVE_SHARES, Response, SkinResponse
+from nodes.cache import load_cached, save_cached
+from nodes.fem_solver import precompute_table, snapshots
+from nodes.fem_solver.closest_contact import ContactQuery
+from nodes.fem_solver.contact import CURVE_FRACTIONS, Response, SkinResponse
 from nodes.fem_solver.mesh import build_mesh, cylinder
-from nodes.fem_solver.place import Push
 from nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
 from nodes.fem_solver.precompute_table import (
     TableSpec,
     compute_table,
-    load_table,
     local_processes,
-    parts_of,
-    save_table,
     solve_all,
-    table_path,
+    table_cache,
 )
-from nodes.fem_solver.pushes import PushAnswer, Site, solve_push
-from nodes.fem_solver.table import END_SPAN_M, Cubics, Table, TableSoftBody, sound_levels
+from nodes.fem_solver.snapshot_interpolator import SurfaceLocator, minimal_rotation
+from nodes.fem_solver.snapshots import SamplePoint, Snapshot, solve_snapshot
+from nodes.fem_solver.table import (
+    END_SPAN_M,
+    CubicInterpolator,
+    Table,
+    TableSoftBody,
+    count_valid_levels,
+)
 from tests.soft_bodies import Here, cylinder_spec
 
 Floats = NDArray[np.float64]
@@ -46,10 +50,10 @@ MODULUS = 4000.0
 def coarse() -> Iterator[None]:
     """Few sites, few depths, a coarse mesh: what is tested does not depend on them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pushes, "DEPTHS_M", DEPTHS)
-        patch.setattr(pushes, "SPACING_RATIO", 1.0)
-        patch.setattr(pushes, "STATIONS", (0.0, 0.6))
-        patch.setattr(pushes, "ANGLE_STEP_RAD", 0.5)
+        patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
+        patch.setattr(snapshots, "SPACING_RATIO", 1.0)
+        patch.setattr(snapshots, "STATIONS", (0.0, 0.6))
+        patch.setattr(snapshots, "ANGLE_STEP_RAD", 0.5)
         patch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
         yield
 
@@ -63,7 +67,7 @@ def model() -> SoftBodyModel:
 def table(model: SoftBodyModel, tmp_path_factory: pytest.TempPathFactory) -> Table:
     folder = tmp_path_factory.mktemp("table")
     made = compute_table(SPEC, model, folder, Here(), lambda done, total, need: None)
-    assert [path.name for path in folder.iterdir()] == [table_path(SPEC, folder).name]
+    assert [path.name for path in folder.iterdir()] == [table_cache(SPEC).path(folder).name]
     return made
 
 
@@ -84,10 +88,10 @@ def body(model: SoftBodyModel, table: Table) -> TableSoftBody:
     return soft_body(model.response, model.response.rest[model.bounds], table)
 
 
-def push(x: float, angle: float, depth: float) -> Push:
+def push(x: float, angle: float, depth: float) -> ContactQuery:
     normal = np.array([0.0, np.sin(angle), np.cos(angle)])
     beyond = max(0.0, abs(x) - 0.5 * LENGTH)
-    return Push(RADIUS * normal + np.array([x, 0.0, 0.0]), normal, depth, beyond)
+    return ContactQuery(RADIUS * normal + np.array([x, 0.0, 0.0]), normal, depth, beyond)
 
 
 def largest_move(a: Response, b: Response) -> float:
@@ -100,10 +104,12 @@ def test_away_from_the_finger_it_is_what_newton_finds(
     """At a place that no push was solved at."""
     there = push(0.005, 0.2, 0.003)
     mesh = build_mesh(SPEC.body.mesh)
-    site = Site(there.surface, there.normal)
-    job = pushes.job_of(SPEC.body.mesh, mesh, site, poisson_ratio=0.45, finger_radius_m=FINGER)
-    wanted = solve_push(job)
-    nodes, weights = Hull(wanted.rest, wanted.faces).weights(model.response.rest)
+    sample = SamplePoint(there.surface, there.normal)
+    job = snapshots.make_snapshot_job(
+        SPEC.body.mesh, mesh, sample, poisson_ratio=0.45, finger_radius_m=FINGER
+    )
+    wanted = solve_snapshot(job)
+    nodes, weights = SurfaceLocator(wanted.rest, wanted.faces).weights(model.response.rest)
     moved = np.einsum("qa,qai->qi", weights, wanted.moved[DEPTHS.index(0.003)][nodes])
     answer = body.respond(there)
     away = np.linalg.norm(model.response.rest - there.surface, axis=1) > 1.5 * FINGER
@@ -148,8 +154,8 @@ def test_deeper_than_solved_is_flagged_bounded_and_never_inverted(
         answer = body.respond(push(0.004, 0.1, depth))
         assert answer.in_range == (depth <= DEPTHS[-1] - END_SPAN_M)
         assert np.linalg.norm(answer.displacement, axis=1).max() < 1.2 * DEPTHS[-1]
-        turned = np.einsum("ij,ij->i", normals(rest), normals(rest + answer.displacement))
-        assert turned.min() > 0.0
+        alignments = np.einsum("ij,ij->i", normals(rest), normals(rest + answer.displacement))
+        assert alignments.min() > 0.0
 
 
 def test_past_the_end_the_dent_fades_and_is_flagged(body: TableSoftBody) -> None:
@@ -169,7 +175,7 @@ def test_the_curve_is_what_pushes_then_give(body: TableSoftBody) -> None:
         answer = body.respond(push(0.004, 0.1, depth))
         wanted = np.interp(depth, *curve.T)
         assert answer.force_n @ there.normal == pytest.approx(wanted, rel=0.12)
-    secant = curve[len(CURVE_SHARES), 1] / 0.003
+    secant = curve[len(CURVE_FRACTIONS), 1] / 0.003
     assert body.stiffness_n_per_m(there.surface) == pytest.approx(secant)
 
 
@@ -187,19 +193,19 @@ def test_the_body_answers_its_mirror_image_alike(body: TableSoftBody) -> None:
 
 def test_pushes_cover_what_can_be_touched_but_for_reflections() -> None:
     mesh = build_mesh(SPEC.body.mesh)
-    mirrors = pushes.mirrors_of(mesh)
+    mirrors = snapshots.find_mirror_planes(mesh)
     assert len(mirrors) == 4
-    sites = pushes.sites_of(SPEC.body.mesh, mesh, mirrors, FINGER)
-    assert all(site.place[0] >= 0.0 and site.place[1] >= 0.0 for site in sites)
-    one_sided = pushes.sites_of(SPEC.body.mesh, mesh, mirrors[:1], FINGER)
-    assert len(one_sided) == (2 * 2 - 1) * (2 * len(sites) // 2 - 1)
+    samples = snapshots.choose_sample_points(SPEC.body.mesh, mesh, mirrors, FINGER)
+    assert all(sample.point[0] >= 0.0 and sample.point[1] >= 0.0 for sample in samples)
+    one_sided = snapshots.choose_sample_points(SPEC.body.mesh, mesh, mirrors[:1], FINGER)
+    assert len(one_sided) == (2 * 2 - 1) * (2 * len(samples) // 2 - 1)
 
 
 def test_a_point_is_found_on_the_hull() -> None:
     mesh = build_mesh(SPEC.body.mesh)
-    answer = PushAnswer(mesh.nodes, mesh.touch[mesh.touch_faces], *[np.zeros(1)] * 3, 0)
-    points = mesh.nodes[mesh.touch]
-    nodes, weights = Hull(answer.rest, answer.faces).weights(points)
+    answer = Snapshot(mesh.nodes, mesh.contact_nodes[mesh.contact_faces], *[np.zeros(1)] * 3, 0)
+    points = mesh.nodes[mesh.contact_nodes]
+    nodes, weights = SurfaceLocator(answer.rest, answer.faces).weights(points)
     found = np.einsum("qa,qai->qi", weights, mesh.nodes[nodes])
     assert found == pytest.approx(points, abs=1e-12)
     assert weights.sum(axis=1) == pytest.approx(1.0)
@@ -210,17 +216,17 @@ def test_the_least_turn_takes_one_direction_into_another() -> None:
     for _ in range(20):
         start, end = rng.normal(size=(2, 3))
         start, end = start / np.linalg.norm(start), end / np.linalg.norm(end)
-        rotation = turn(start, end)
+        rotation = minimal_rotation(start, end)
         assert rotation @ start == pytest.approx(end)
         assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
 
 
 def test_cubics_go_through_their_points_and_reproduce_parabolas() -> None:
     depths = np.array([0.0, 0.7, 1.5, 3.0, 5.0, 7.5])
-    cubics = Cubics(depths)
+    cubics = CubicInterpolator(depths)
 
     def through(values: Floats, at: float) -> float:
-        first, weights = cubics.at(at)
+        first, weights = cubics.weights_at(at)
         return float(weights @ values[first : first + 4])
 
     any_values = np.random.default_rng(1).normal(size=6)
@@ -238,37 +244,37 @@ def test_levels_that_turn_triangles_over_are_left_out() -> None:
     moved = np.zeros((4, 3, 3), dtype=np.float32)
     moved[1, 1] = [-0.5, 0.0, 0.0]
     moved[2, 1] = [-1.5, 0.0, 0.0]
-    assert sound_levels(rest, moved, triangles) == 2
-    assert sound_levels(rest, moved[:2], triangles) == 2
+    assert count_valid_levels(rest, moved, triangles) == 2
+    assert count_valid_levels(rest, moved[:2], triangles) == 2
 
 
 def test_a_table_is_kept_whole_or_not_at_all(table: Table, tmp_path: Path) -> None:
-    assert load_table(SPEC, tmp_path) is None
-    save_table(table, SPEC, tmp_path)
-    kept = load_table(SPEC, tmp_path)
+    assert load_cached(table_cache(SPEC), tmp_path) is None
+    save_cached(table_cache(SPEC), tmp_path, table)
+    kept = load_cached(table_cache(SPEC), tmp_path)
     assert kept is not None
     assert np.array_equal(kept.fields, table.fields)
-    path = table_path(SPEC, tmp_path)
+    path = table_cache(SPEC).path(tmp_path)
     path.write_bytes(path.read_bytes()[:-1000])
-    assert load_table(SPEC, tmp_path) is None
+    assert load_cached(table_cache(SPEC), tmp_path) is None
 
 
 def test_an_interrupted_table_goes_on_where_it_stopped(
     model: SoftBodyModel, table: Table, tmp_path: Path
 ) -> None:
     def stop(done: int, total: int, need: object) -> None:
-        if done >= precompute_table.PUSH_STEPS * 2:
+        if done >= precompute_table.SNAPSHOT_STEPS * 2:
             raise Interrupted
 
     with pytest.raises(Interrupted):
         compute_table(SPEC, model, tmp_path, Here(), stop)
-    assert load_table(SPEC, tmp_path) is None
-    kept = len(list(parts_of(SPEC, tmp_path).folder.iterdir()))
+    assert load_cached(table_cache(SPEC), tmp_path) is None
+    kept = len(list(table_cache(SPEC).checkpoints(tmp_path).folder.iterdir()))
     assert kept >= 2
     seen: list[int] = []
     compute_table(SPEC, model, tmp_path, Here(), lambda done, *_: seen.append(done))
-    assert seen[1] == precompute_table.PUSH_STEPS * kept
-    again = load_table(SPEC, tmp_path)
+    assert seen[1] == precompute_table.SNAPSHOT_STEPS * kept
+    again = load_cached(table_cache(SPEC), tmp_path)
     assert again is not None
     assert np.allclose(again.fields, table.fields, atol=1e-9)
 
@@ -286,25 +292,33 @@ def test_too_little_memory_is_said_before_it_is_taken(
 
 def test_pushes_are_solved_in_other_processes(tmp_path: Path) -> None:
     mesh = build_mesh(SPEC.body.mesh)
-    site = pushes.sites_of(SPEC.body.mesh, mesh, pushes.mirrors_of(mesh), FINGER)[0]
-    job = pushes.job_of(SPEC.body.mesh, mesh, site, poisson_ratio=0.45, finger_radius_m=FINGER)
-    parts = precompute_table.Parts(tmp_path / "parts")
+    sample = snapshots.choose_sample_points(
+        SPEC.body.mesh, mesh, snapshots.find_mirror_planes(mesh), FINGER
+    )[0]
+    job = snapshots.make_snapshot_job(
+        SPEC.body.mesh, mesh, sample, poisson_ratio=0.45, finger_radius_m=FINGER
+    )
+    parts = precompute_table.CheckpointStore(tmp_path / "parts")
     with local_processes(1) as executor:
         (there,) = solve_all([job], executor, parts, lambda count: None)
-    here = solve_push(job)
+    here = solve_snapshot(job)
     assert np.array_equal(there.moved, here.moved)
     assert there.reached == here.reached == len(DEPTHS)
 
 
 def test_a_push_that_is_asked_to_stop_does() -> None:
     mesh = build_mesh(SPEC.body.mesh)
-    site = pushes.sites_of(SPEC.body.mesh, mesh, pushes.mirrors_of(mesh), FINGER)[0]
-    job = pushes.job_of(SPEC.body.mesh, mesh, site, poisson_ratio=0.45, finger_radius_m=FINGER)
-    with pytest.raises(pushes.StoppedError):
-        solve_push(job, lambda: True)
+    sample = snapshots.choose_sample_points(
+        SPEC.body.mesh, mesh, snapshots.find_mirror_planes(mesh), FINGER
+    )[0]
+    job = snapshots.make_snapshot_job(
+        SPEC.body.mesh, mesh, sample, poisson_ratio=0.45, finger_radius_m=FINGER
+    )
+    with pytest.raises(snapshots.SnapshotCancelledError):
+        solve_snapshot(job, lambda: True)
 
 
-def test_an_interrupted_computation_ends_its_workers_in_mid_push() -> None:
+def test_an_interrupted_computation_stops_its_workers_at_once() -> None:
     with suppress(Interrupted), local_processes(1) as executor:
         assert executor.submit(os.getpid).result() != os.getpid()
         busy = executor.submit(time.sleep, 60)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from benchmarks.soft_body_limits import Body, body_of, overturned, scene_of
-from nodes.fem_solver import pushes
-from nodes.fem_solver.body import SceneBody, table_spec_of, with_table
+from nodes.fem_solver import snapshots
+from nodes.fem_solver.body import SceneBody, attach_table, make_table_spec
+from nodes.fem_solver.closest_contact import ContactQuery
 from nodes.fem_solver.contact import Response
-from nodes.fem_solver.place import Push
 from nodes.fem_solver.precompute_table import compute_table
 from nodes.fem_solver.table import END_SPAN_M
 from tests.soft_bodies import Here
@@ -37,17 +37,17 @@ def both(
     scene = SCENES[request.param]
     linear = body_of(scene, 0.0065)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pushes, "DEPTHS_M", DEPTHS)
-        patch.setattr(pushes, "APART_RATIO", 6.0)
-        spec = table_spec_of(scene, linear.soft.spec)
+        patch.setattr(snapshots, "DEPTHS_M", DEPTHS)
+        patch.setattr(snapshots, "APART_RATIO", 6.0)
+        spec = make_table_spec(scene, linear.soft.spec)
         folder: Path = tmp_path_factory.mktemp("table")
         table = compute_table(spec, linear.model, folder, Here(), lambda *_: None)
-    return linear, with_table(linear.soft, scene, linear.model, table)
+    return linear, attach_table(linear.soft, scene, linear.model, table)
 
 
-def pushed(body: SceneBody, x: float, y: float, depth: float) -> tuple[Response, Push]:
+def pushed(body: SceneBody, x: float, y: float, depth: float) -> tuple[Response, ContactQuery]:
     found = body.shape.closest(body.front + np.array([x, y, 0.0]))
-    push = Push(found.point, found.normal, depth)
+    push = ContactQuery(found.point, found.normal, depth)
     return body.method.respond(push), push
 
 

@@ -73,8 +73,8 @@ def test_point_load_on_a_half_space(record_property: Record, nu: float) -> None:
 RADIUS, NU = 10.0, 0.3
 HALF_WIDTH = 12.0
 DEPTHS = (0.2, 0.4)
-SHIPPED = (newton.BED_RATIO, newton.ROUNDING_RATIO)
-HARD = (10 * newton.BED_RATIO, newton.ROUNDING_RATIO / 10)
+SHIPPED = (newton.PENALTY_RATIO, newton.ROUNDING_RATIO)
+HARD = (10 * newton.PENALTY_RATIO, newton.ROUNDING_RATIO / 10)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class Touch:
 
 
 @cache
-def touches(bed: tuple[float, float]) -> list[Touch]:
+def touches(penalty: tuple[float, float]) -> list[Touch]:
     """A sphere pressed lightly into a block by the full Newton, its contact's bed as hard as this:
     the solver's ratios `BED_RATIO` and `ROUNDING_RATIO`."""
     nodes, elements = half_space(
@@ -100,8 +100,8 @@ def touches(bed: tuple[float, float]) -> list[Touch]:
     faces = boundary_faces(elements)
     top = faces[(nodes[faces, 2] == 0.0).all(axis=1)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(newton, "BED_RATIO", bed[0])
-        patch.setattr(newton, "ROUNDING_RATIO", bed[1])
+        patch.setattr(newton, "BED_RATIO", penalty[0])
+        patch.setattr(newton, "ROUNDING_RATIO", penalty[1])
         body = newton.NeoHookeanBody(
             nodes,
             elements,
@@ -117,10 +117,10 @@ def touches(bed: tuple[float, float]) -> list[Touch]:
     ring = (r > 4.0) & (r < 6.0)
     found = []
     centres = [np.array([0.0, 0.0, RADIUS - depth]) for depth in (0.0, *DEPTHS)]
-    for depth, state in zip(DEPTHS, list(body.follow(centres))[1:], strict=True):
+    for depth, state in zip(DEPTHS, list(body.solve_load_steps(centres))[1:], strict=True):
         assert state.reached
         positions = nodes + state.displacement
-        push = body.obstacle.forces(positions, state.centre, newton.NOTHING_HELD)[surface, 2]
+        push = body.obstacle.forces(positions, state.centre, newton.NO_STICK)[surface, 2]
         down = -state.displacement[surface, 2]
         found.append(
             Touch(
@@ -145,7 +145,7 @@ def sunk_at(r: float, patch: float, force: float) -> float:
 
 @pytest.mark.parametrize(("bed", "name", "off"), [(HARD, "hard", 0.04), (SHIPPED, "own", 0.1)])
 def test_light_pushes_follow_hertz(
-    record_property: Record, bed: tuple[float, float], name: str, off: float
+    record_property: Record, penalty: tuple[float, float], name: str, off: float
 ) -> None:
     """From the force: the patch's radius, and how far the skin sinks; and the power 3/2.  Sinking
     is taken against the skin some patches away, which the block's far ends do not shift.  With a
@@ -155,16 +155,30 @@ def test_light_pushes_follow_hertz(
     Source: Hertz 1882; Johnson, Contact Mechanics, 1985, eqs. 3.42, 4.22-4.24
     """
     modulus = E / (1 - NU**2)
-    found = touches(bed)
-    for touch in found:
-        what = f"Hertz, depth {touch.depth / RADIUS:g} R, {name} bed"
-        patch = (0.75 * touch.force * RADIUS / modulus) ** (1 / 3)
+    found = touches(penalty)
+    for contact_nodes in found:
+        what = f"Hertz, depth {contact_nodes.depth / RADIUS:g} R, {name} bed"
+        patch = (0.75 * contact_nodes.force * RADIUS / modulus) ** (1 / 3)
         near(
-            record_property, f"{what}, patch radius / R", touch.patch / RADIUS, patch / RADIUS, off
+            record_property,
+            f"{what}, patch radius / R",
+            contact_nodes.patch / RADIUS,
+            patch / RADIUS,
+            off,
         )
-        wanted = patch**2 / RADIUS - sunk_at(touch.away, patch, touch.force)
-        near(record_property, f"{what}, sinking / R", touch.relative / RADIUS, wanted / RADIUS, off)
-    sunk = [touch.relative + sunk_at(touch.away, touch.patch, touch.force) for touch in found]
+        wanted = patch**2 / RADIUS - sunk_at(contact_nodes.away, patch, contact_nodes.force)
+        near(
+            record_property,
+            f"{what}, sinking / R",
+            contact_nodes.relative / RADIUS,
+            wanted / RADIUS,
+            off,
+        )
+    sunk = [
+        contact_nodes.relative
+        + sunk_at(contact_nodes.away, contact_nodes.patch, contact_nodes.force)
+        for contact_nodes in found
+    ]
     power = np.log(found[1].force / found[0].force) / np.log(sunk[1] / sunk[0])
     between(record_property, f"Hertz, power of force, {name} bed", float(power), 1.45, 1.55)
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.mesh.quality import least_jacobians
-from nodes.fem_solver.newton import Friction, NeoHookeanBody, Solved, winding_number
+from nodes.fem_solver.mesh.quality import min_jacobian_ratios
+from nodes.fem_solver.newton import EquilibriumState, Friction, NeoHookeanBody, winding_number
 from tests.fem_verification import Record, at_most, between
 from tests.solids import box
 
@@ -42,19 +42,21 @@ def pad(
     )
 
 
-def pressed(body: NeoHookeanBody, *places: tuple[float, float, float]) -> list[Solved]:
-    return list(body.follow([np.array(place) for place in places]))
+def pressed(body: NeoHookeanBody, *places: tuple[float, float, float]) -> list[EquilibriumState]:
+    return list(body.solve_load_steps([np.array(place) for place in places]))
 
 
-def require_sound(body: NeoHookeanBody, states: list[Solved]) -> None:
+def require_sound(body: NeoHookeanBody, states: list[EquilibriumState]) -> None:
     """No answer is turned over or endless, all Newton's claims hold, and after the first that was
     not reached none is."""
     for state in states:
         assert np.isfinite(state.displacement).all()
         assert np.isfinite(state.force_n).all()
-        bound = least_jacobians(body.solid.nodes + state.displacement, body.solid.elements).min()
+        bound = min_jacobian_ratios(
+            body.solid.nodes + state.displacement, body.solid.elements
+        ).min()
         assert bound > 0.0
-        assert state.least_volume_ratio > 0.0
+        assert state.min_volume_ratio > 0.0
     assert all(a.reached or not b.reached for a, b in itertools.pairwise(states))
 
 
@@ -155,8 +157,8 @@ def test_a_turned_corner_is_seen_though_quadrature_sees_nothing() -> None:
     moved[middle] = 0.3 * (nodes[first] - nodes[second])
     assert np.isfinite(solid.energy(moved))
     assert solid.deformation(moved)[1].min() > 0.0
-    assert least_jacobians(nodes + moved, elements).min() < 0.0
-    assert solid.smallest_volume_ratio(moved) < 0.0
+    assert min_jacobian_ratios(nodes + moved, elements).min() < 0.0
+    assert solid.min_volume_ratio(moved) < 0.0
 
 
 @pytest.mark.parametrize(("place", "times"), [((0.4, 0.5, 0.6), 1.0), ((1.2, 0.5, 0.5), 0.0)])

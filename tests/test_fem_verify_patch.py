@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.fem_solver.elasticity import MeshError, solve, stiffness_matrix
+from nodes.fem_solver.elasticity import SolidMeshError, solve, stiffness_matrix
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces
 from nodes.fem_solver.mesh.quality import radius_ratios
@@ -203,9 +203,9 @@ def test_large_deformation_with_a_sliver(record_property: Record) -> None:
 def test_flat_and_inverted_elements_are_refused(flatness: float) -> None:
     """Both laws refuse what has no volume to rounding, by the same measure."""
     nodes, elements = with_sliver(flatness)
-    with pytest.raises(MeshError, match="inverted or flat"):
+    with pytest.raises(SolidMeshError, match="inverted or flat"):
         stiffness_matrix(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=NU)
-    with pytest.raises(MeshError, match="inverted or flat"):
+    with pytest.raises(SolidMeshError, match="inverted or flat"):
         NeoHookeanSolid(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=NU)
 
 
@@ -214,7 +214,7 @@ def test_nodes_that_are_not_finite_are_refused(value: float) -> None:
     """Not a number is not a place."""
     nodes, elements = box((1, 1, 1), (1.0, 1.0, 1.0))
     nodes[3, 1] = value
-    with pytest.raises(MeshError, match="not finite"):
+    with pytest.raises(SolidMeshError, match="not finite"):
         stiffness_matrix(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=NU)
-    with pytest.raises(MeshError, match="not finite"):
+    with pytest.raises(SolidMeshError, match="not finite"):
         NeoHookeanSolid(nodes, elements, young_modulus_pa=MODULUS, poisson_ratio=NU)

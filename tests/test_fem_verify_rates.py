@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from nodes.fem_solver.elasticity import element_stiffness
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.multifrontal import Dissection
+from nodes.fem_solver.multifrontal import NestedDissection
 from tests.fem_fields import body_loads, lame, rate, relative_errors
 from tests.fem_verification import Record, at_most, between
 from tests.solids import box, distorted
@@ -44,8 +44,8 @@ def neo_hooke(gradient: Complexes) -> Complexes:
     lam, mu = lame(E, NU)
     deformation = gradient + np.eye(3)
     log = np.log(np.linalg.det(deformation))[:, None, None]
-    turned = np.linalg.inv(deformation).transpose(0, 2, 1)
-    return np.asarray(mu * deformation + (lam * log - mu) * turned)
+    product = np.linalg.inv(deformation).transpose(0, 2, 1)
+    return np.asarray(mu * deformation + (lam * log - mu) * product)
 
 
 def body_force(size: float, law: object, points: Floats) -> Floats:
@@ -80,7 +80,9 @@ def test_linear_rates(record_property: Record) -> None:
             elements,
             (matrices @ held[elements].reshape(-1, 30, 1)).reshape(-1, 10, 3),
         )
-        got = held + Dissection(nodes, elements, fixed).factor(matrices).solve(loads).reshape(-1, 3)
+        got = held + NestedDissection(nodes, elements, fixed).factor(matrices).solve(loads).reshape(
+            -1, 3
+        )
         sizes.append(1.0 / divisions)
         errors.append(
             relative_errors(
@@ -109,7 +111,7 @@ def test_neo_hookean_rates(record_property: Record) -> None:
         solid = NeoHookeanSolid(nodes, elements, young_modulus_pa=E, poisson_ratio=NU)
         fixed = np.zeros(len(nodes), dtype=bool)
         fixed[np.unique(boundary_faces(elements))] = True
-        order = Dissection(nodes, elements, fixed)
+        order = NestedDissection(nodes, elements, fixed)
         loads = body_loads(nodes, elements, lambda p: body_force(size, neo_hooke, p))
         got = field(size, nodes)
         got[~fixed] += 0.001 * np.sin(50.0 * nodes[~fixed])

@@ -14,7 +14,7 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from nodes.fem_solver.elasticity import element_stiffness, quadrature, solve, stiffness_matrix
 from nodes.fem_solver.mesh import EDGES, boundary_faces
-from nodes.fem_solver.multifrontal import Dissection
+from nodes.fem_solver.multifrontal import NestedDissection
 from tests.fem_fields import dofs_of, pressure_loads
 from tests.fem_verification import Record, at_most
 from tests.scene_solids import SHAPES, scene_solid
@@ -84,7 +84,7 @@ def test_solution_equals_that_of_scikit_fem(record_property: Record, shape: str)
     mesh = scene_solid(shape)
     _, order = their_basis(shape)
     faces = boundary_faces(mesh.elements)
-    pressed = faces[np.isin(faces, mesh.touch).all(axis=1)]
+    pressed = faces[np.isin(faces, mesh.contact_nodes).all(axis=1)]
     loads = pressure_loads(mesh.nodes, pressed, PRESSURE)
     held = np.flatnonzero(np.isin(order, dofs_of(np.flatnonzero(mesh.fixed))))
     solver = skfem.solver_direct_scipy(permc_spec="MMD_AT_PLUS_A")
@@ -96,7 +96,9 @@ def test_solution_equals_that_of_scikit_fem(record_property: Record, shape: str)
     fixed = dofs_of(np.flatnonzero(mesh.fixed))
     by_sparse = solve(ours, fixed, np.zeros(len(fixed)), loads)
     matrices = element_stiffness(mesh.nodes, mesh.elements, young_modulus_pa=E, poisson_ratio=NU)
-    by_fronts = Dissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices).solve(loads)
+    by_fronts = (
+        NestedDissection(mesh.nodes, mesh.elements, mesh.fixed).factor(matrices).solve(loads)
+    )
     for name, mine in (("sparse", by_sparse), ("multifrontal", by_fronts)):
         error = float(np.abs(mine[order] - theirs).max() / largest)
         what = f"solution by {name} factor as scikit-fem's, mesh of the {shape}"

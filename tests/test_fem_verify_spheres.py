@@ -39,8 +39,8 @@ class Lame:
     def slope(self, points: Floats) -> Floats:
         radius = np.linalg.norm(points, axis=1)[:, None, None]
         way = points / radius[:, 0]
-        turned = np.eye(3) - 3 * way[:, :, None] * way[:, None, :]
-        return self.uniform * np.eye(3) + self.shear / radius**3 * turned
+        product = np.eye(3) - 3 * way[:, :, None] * way[:, None, :]
+        return self.uniform * np.eye(3) + self.shear / radius**3 * product
 
 
 @cache

@@ -14,11 +14,16 @@ from launch.plans.plan import load_scene
 from messages.types import Display
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer.families import PLACES, draw_stereo, places_pictures, rolled_on
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer.benchmarks import (
+    COORDINATE_RAMPS,
+    draw_coordinate_ramps,
+    draw_stereo,
+    roll_sheet,
+)
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose, estimate_sheet
 from nodes.renderer.sheet_mesh import SheetMesh
-from nodes.renderer.stage import Stage
 from nodes.twin.eye import seen
 from nodes.twin.places import error_map
 from tests.dent_shapes import DEEPEST_M, few_dents
@@ -34,16 +39,16 @@ PROJECTOR = np.array(SCENE.projector.world_from_projector.position_m)
 
 
 @pytest.fixture(scope="module")
-def stage() -> Iterator[Stage]:
+def stage() -> Iterator[SceneRenderer]:
     context = headless_context()
-    made = Stage(SCENE, context, spacing_m=0.005, dents=few_dents())
+    made = SceneRenderer(SCENE, context, spacing_m=0.005, dents=few_dents())
     yield made
     made.release()
     context.release()
 
 
-def sheet_at(pose: Floats, tip: Floats | None = None) -> Sheet:
-    sheet = sheet_between(
+def sheet_at(pose: Floats, tip: Floats | None = None) -> SheetPose:
+    sheet = estimate_sheet(
         *edge_poses(pose, STRETCH * SCENE.sheet.width_m),
         height_m=SCENE.sheet.height_m,
         twist_world=np.zeros(6),
@@ -63,7 +68,7 @@ def plane_through(point: Floats) -> Floats:
 @pytest.mark.parametrize("seer", ["eye", "projector"])
 @pytest.mark.parametrize("turned_deg", [-2.0, 0.0, 2.0])
 def test_a_sheet_with_eye_or_projector_in_its_plane_is_dark(
-    stage: Stage, seer: str, turned_deg: float
+    stage: SceneRenderer, seer: str, turned_deg: float
 ) -> None:
     pose = plane_through(EYE if seer == "eye" else PROJECTOR)
     turn = transform(rotation_from_vector([np.radians(turned_deg), 0.0, 0.0]), np.zeros(3))
@@ -72,14 +77,16 @@ def test_a_sheet_with_eye_or_projector_in_its_plane_is_dark(
     assert abs(sheet.plane.normal @ towards) < 0.04 * np.linalg.norm(towards)
     assert not stage.usable(sheet)
     for method in METHODS:
-        for picture in places_pictures(stage, method, sheet):
+        for picture in draw_coordinate_ramps(stage, method, sheet):
             # Near the plane a few rays to the object's ends are not quite grazing.
             assert (picture.max(axis=2) > 0).mean() < 0.002, method
 
 
 @pytest.mark.parametrize("tilt_deg", [-85, -80, 80, 85, 100, 180])
-def test_beyond_the_steepest_tilts_the_plane_is_not_usable(stage: Stage, tilt_deg: int) -> None:
-    sheet = sheet_at(rolled_on(SCENE, -np.radians(tilt_deg)))
+def test_beyond_the_steepest_tilts_the_plane_is_not_usable(
+    stage: SceneRenderer, tilt_deg: int
+) -> None:
+    sheet = sheet_at(roll_sheet(SCENE, -np.radians(tilt_deg)))
     assert stage.usable(sheet) == (tilt_deg == 80)
     for method in ("none", *METHODS):
         draw_stereo(stage, method, sheet)
@@ -90,7 +97,7 @@ def test_poses_that_are_not_finite_hold_no_sheet(what: str) -> None:
     left, right = edge_poses(np.eye(4), STRETCH * SCENE.sheet.width_m)
     twist = np.zeros(6)
     {"left": left, "right": right, "corner": right[:1]}.get(what, twist[None])[0, 1] = np.nan
-    found = sheet_between(
+    found = estimate_sheet(
         left, right, height_m=0.24, twist_world=twist, ahead_s=0.01, finger_tip=None
     )
     assert found is None
@@ -123,26 +130,28 @@ def test_what_pushes_the_sheet(tip: tuple[float, float, float], pushes: bool) ->
     ],
 )
 def test_a_push_out_of_range_is_drawn_and_said(
-    stage: Stage, tip: tuple[float, float, float], said: str
+    stage: SceneRenderer, tip: tuple[float, float, float], said: str
 ) -> None:
-    picture, _ = places_pictures(stage, "two_pass", sheet_at(np.eye(4), np.array(tip)))
+    picture, _ = draw_coordinate_ramps(stage, "two_pass", sheet_at(np.eye(4), np.array(tip)))
     assert picture.max() > 150
     assert stage.note == "" if not said else said in stage.note
 
 
-def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(stage: Stage) -> None:
+def test_a_fold_that_keeps_the_light_away_is_dark_and_the_rest_is_right(
+    stage: SceneRenderer,
+) -> None:
     """The dent of a sheet that faces down stands in the light's way: what is lit is as it should
     be, the rest is lost."""
     place = np.array([0.0, 0.05, 0.0])
-    pose = rolled_on(SCENE, np.radians(40.0), (0.0, 0.05))
+    pose = roll_sheet(SCENE, np.radians(40.0), (0.0, 0.05))
     tip = pose[:3, 3] + pose[:3, :3] @ (place - [0.0, 0.0, DEEPEST_M])
     edges = edge_poses(pose, STRETCH * SCENE.sheet.width_m)
     truth = true_sheet(SCENE, *edges, tip)
     mesh = SheetMesh(truth.positions.reshape(-1, 3), truth.triangles().astype(np.int32))
     found = []
-    for pattern in PLACES:
+    for pattern in COORDINATE_RAMPS:
         display = Display(correction="two_pass", stereo="mono", pattern=pattern)
-        picture = stage.draw_onto(display, mesh, Look(flat=True, pattern=pattern), read=True)
+        picture = stage.draw_onto(display, mesh, DrawStyle(flat=True, pattern=pattern), read=True)
         assert picture is not None
         found.append(seen(picture, truth, SCENE, eye=EYE, metres_per_px=0.0007))
     sizes = error_map(*found, 0.0007).sizes_m

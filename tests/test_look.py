@@ -16,16 +16,16 @@ from launch.plans.plan import load_scene
 from messages.scene import Appearance, Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import rotation_from_vector, transform
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.sheet import Sheet
-from nodes.renderer.stage import Stage
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose
 from tests.drawing import dent, follow, sheet_at
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 CYLINDER = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(CYLINDER)
-SOFT = Look(flat=False, pattern="object")
+SOFT = DrawStyle(flat=False, pattern="object")
 MIDDLE = (299, 399)
 """Row and column that light the world's origin; two pixels to a millimetre, x to the left."""
 
@@ -36,8 +36,8 @@ def context() -> moderngl.Context:
 
 
 @pytest.fixture(scope="module")
-def plain(context: moderngl.Context) -> Stage:
-    return Stage(SCENE, context, spacing_m=0.004)
+def plain(context: moderngl.Context) -> SceneRenderer:
+    return SceneRenderer(SCENE, context, spacing_m=0.004)
 
 
 def painted(**appearance: object) -> Scene:
@@ -46,11 +46,11 @@ def painted(**appearance: object) -> Scene:
 
 
 def drawn(
-    stage: Stage,
-    look: Look = SOFT,
+    stage: SceneRenderer,
+    look: DrawStyle = SOFT,
     *,
     correction: Correction = "none",
-    sheet: Sheet | None = None,
+    sheet: SheetPose | None = None,
 ) -> Image:
     shown = Display(correction=correction, stereo="mono")
     picture = stage.draw(shown, sheet or stage.sheet_at_rest(), look, read=True)
@@ -58,7 +58,7 @@ def drawn(
     return picture
 
 
-def test_the_dent_is_darker_and_its_walls_face_the_light_or_not(plain: Stage) -> None:
+def test_the_dent_is_darker_and_its_walls_face_the_light_or_not(plain: SceneRenderer) -> None:
     follow(plain, None)
     before = drawn(plain).astype(int)
     follow(plain, dent(plain, 0.015))
@@ -72,7 +72,7 @@ def test_the_dent_is_darker_and_its_walls_face_the_light_or_not(plain: Stage) ->
     assert lower - upper > 20
 
 
-def test_shadows_are_redder_than_light(plain: Stage) -> None:
+def test_shadows_are_redder_than_light(plain: SceneRenderer) -> None:
     picture = drawn(plain).astype(float)[60:540, 399]
     lit = picture[picture[:, 0] > 20]
     share = lit[:, 0] / lit.sum(axis=1)
@@ -85,7 +85,7 @@ def test_an_image_is_laid_over_the_front(context: moderngl.Context) -> None:
     image = np.zeros((4, 8, 3), np.uint8)
     image[:2, :4], image[:2, 4:] = (255, 0, 0), (0, 255, 0)
     image[2:, :4], image[2:, 4:] = (0, 0, 255), (255, 255, 0)
-    stage = Stage(painted(texture="image", image=image), context, spacing_m=0.004)
+    stage = SceneRenderer(painted(texture="image", image=image), context, spacing_m=0.004)
     picture = drawn(stage).astype(int)
     stage.release()
     row, column = MIDDLE
@@ -98,7 +98,7 @@ def test_an_image_is_laid_over_the_front(context: moderngl.Context) -> None:
 
 @pytest.mark.parametrize("texture", ["speckle", "grid"])
 def test_a_texture_moves_with_the_skin(context: moderngl.Context, texture: str) -> None:
-    stage = Stage(painted(texture=texture), context, spacing_m=0.004)
+    stage = SceneRenderer(painted(texture=texture), context, spacing_m=0.004)
     row, column = MIDDLE
     patch = np.s_[row - 30 : row + 30, column - 60 : column + 60]
     before = drawn(stage)[patch]
@@ -111,14 +111,14 @@ def test_a_texture_moves_with_the_skin(context: moderngl.Context, texture: str) 
     assert np.abs(after - before).mean() > 10.0
 
 
-def test_checker_and_white(plain: Stage) -> None:
+def test_checker_and_white(plain: SceneRenderer) -> None:
     row, column = MIDDLE
-    checker = drawn(plain, Look(False, "checker"))
+    checker = drawn(plain, DrawStyle(False, "checker"))
     signs = [int(checker[row + 20 * j, column + 20 * i, 0]) for j in (-1, 1) for i in (-1, 1)]
     assert sorted(signs) == [0, 0, 255, 255]
     assert signs[0] == signs[3]
     assert checker[row + 20, column + 60, 0] == signs[2]
-    assert drawn(plain, Look(False, "white"))[row, column].tolist() == [255] * 3
+    assert drawn(plain, DrawStyle(False, "white"))[row, column].tolist() == [255] * 3
 
 
 POSES = [
@@ -129,11 +129,13 @@ POSES = [
 
 @pytest.mark.parametrize("pose", POSES)
 @pytest.mark.parametrize("correction", ["one_plane", "four_triangles", "two_pass"])
-def test_an_even_patch_has_no_seam(plain: Stage, correction: Correction, pose: Floats) -> None:
+def test_an_even_patch_has_no_seam(
+    plain: SceneRenderer, correction: Correction, pose: Floats
+) -> None:
     """No dark line where triangles meet, of the sheet or of what is drawn."""
     tip = (pose @ [0.02, -0.03, -0.03, 1.0])[:3]
     picture = drawn(
-        plain, Look(False, "white"), correction=correction, sheet=sheet_at(SCENE, pose, tip)
+        plain, DrawStyle(False, "white"), correction=correction, sheet=sheet_at(SCENE, pose, tip)
     )
     lit = picture.min(axis=2)
     outlines, _ = cv2.findContours(
@@ -146,9 +148,9 @@ def test_an_even_patch_has_no_seam(plain: Stage, correction: Correction, pose: F
 
 
 @pytest.mark.parametrize("correction", ["none", "four_triangles", "two_pass"])
-def test_edges_are_soft(plain: Stage, correction: Correction) -> None:
+def test_edges_are_soft(plain: SceneRenderer, correction: Correction) -> None:
     """Outlines have steps between black and white: they are sampled more than once a pixel."""
-    picture = drawn(plain, Look(True, "object"), correction=correction)[..., 0]
+    picture = drawn(plain, DrawStyle(True, "object"), correction=correction)[..., 0]
     between = (picture > 16) & (picture < 240)
     assert between.sum() > 200
     assert len(np.unique(picture[between])) >= 3

@@ -12,8 +12,8 @@ from launch.plans.plan import load_scene
 from messages.types import Display
 from nodes.models.rigid import transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.stage import Stage
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import SceneRenderer
 from nodes.twin.eye import seen
 from nodes.twin.membrane import Rubber, solve
 from nodes.twin.places import PERIOD_M, RANGE_M, RIM_PX, error_map
@@ -62,7 +62,7 @@ def test_blended_colours_are_left_out() -> None:
 
 def test_the_renderer_paints_what_the_twin_reads() -> None:
     """On an unpushed sheet nothing is off; moved to the side unknown to the renderer, all is."""
-    stage = Stage(SCENE, headless_context(), spacing_m=0.005)
+    stage = SceneRenderer(SCENE, headless_context(), spacing_m=0.005)
     sheet = SCENE.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
     eye = SCENE.eyes.centre_world_m
@@ -71,11 +71,11 @@ def test_the_renderer_paints_what_the_twin_reads() -> None:
         pose = transform(np.eye(3), [0.0, 0.0, -back_m])
         truth = solve(rubber, *edge_poses(pose, 1.05 * sheet.width_m), cells=4)
         pictures = []
-        for pattern in ("places_x", "places_y"):
+        for pattern in ("coordinate_ramp_x", "coordinate_ramp_y"):
             shown = Display.model_validate(
                 {"correction": "none", "stereo": "mono", "pattern": pattern}
             )
-            drawn = stage.draw(shown, stage.sheet_at_rest(), Look(True, pattern), read=True)
+            drawn = stage.draw(shown, stage.sheet_at_rest(), DrawStyle(True, pattern), read=True)
             assert drawn is not None
             pictures.append(seen(drawn, truth, SCENE, eye=eye, metres_per_px=SCALE_M))
         found = error_map(*pictures, SCALE_M)

@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from launch import cli
 from launch.plans.plan import load_scene
-from nodes.fem_solver import body, precompute_table, pushes
+from nodes.fem_solver import body, precompute_table, snapshots
 from nodes.fem_solver.mesh import cylinder
 from tests.soft_bodies import Here
 
@@ -24,10 +24,10 @@ SPACING_M = 0.005
 def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A small cylinder, that few shallow pushes on a coarse mesh do for; no dents are worked out:
     they take longer than all else here."""
-    monkeypatch.setattr(pushes, "DEPTHS_M", (0.0015, 0.002, 0.0025, 0.003))
-    monkeypatch.setattr(pushes, "SPACING_RATIO", 1.0)
-    monkeypatch.setattr(pushes, "STATIONS", (0.0,))
-    monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
+    monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.002, 0.0025, 0.003))
+    monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
+    monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
+    monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
     monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
     monkeypatch.setattr(
         "launch.running.prepare.prepare_dents", lambda scene, cache, progress: cache
@@ -63,19 +63,19 @@ def test_the_table_is_made_where_the_node_looks_for_it_and_once(
     monkeypatch: pytest.MonkeyPatch,
     flexsheet: Callable[..., tuple[int, str]],
 ) -> None:
-    asked = ("prepare", scene_file, "--cache", tmp_path / "cache", "--skin-spacing", SPACING_M)
-    code, said = flexsheet(*asked)
+    arguments = ("prepare", scene_file, "--cache", tmp_path / "cache", "--skin-spacing", SPACING_M)
+    code, said = flexsheet(*arguments)
     assert code == 0
-    assert ": 0 % (" in said.split("deep pushes for")[0]  # what it will take, before it is begun
+    assert ": 0 % (" in said.split("snapshots for")[0]  # what it will take, before it is begun
     assert "100 % (" in said
     scene = load_scene(scene_file)
-    spec = body.table_spec_of(scene, body.spec_of(scene, SPACING_M))
-    path = precompute_table.table_path(spec, tmp_path / "cache")
-    assert precompute_table.load_table(spec, tmp_path / "cache") is not None
+    spec = body.make_table_spec(scene, body.make_soft_body_spec(scene, SPACING_M))
+    path = precompute_table.table_cache(spec).path(tmp_path / "cache")
+    assert path.exists()
     assert path.name in said.replace(" ", "")
     made = path.stat().st_mtime_ns
     monkeypatch.setattr(precompute_table, "local_processes", pytest.fail)
-    assert flexsheet(*asked)[0] == 0
+    assert flexsheet(*arguments)[0] == 0
     assert path.stat().st_mtime_ns == made
 
 

@@ -14,14 +14,15 @@ from scipy.interpolate import LinearNDInterpolator
 from launch.bench.twin_sheet import twin_points
 from launch.plans.plan import load_scene
 from messages.types import Correction, Display
+from nodes.cache import load_cached
 from nodes.models.rigid import apply, rotation_from_vector, transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer import dent_cache
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.shape_families import sheet_shape_family
-from nodes.renderer.sheet import Sheet, sheet_between
-from nodes.renderer.sheet_mesh import dented_mesh, flat_mesh, pyramid_mesh
-from nodes.renderer.stage import NO_DENTS, Stage
+from nodes.renderer import deflection_cache
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import NO_SHAPES_NOTE, SceneRenderer
+from nodes.renderer.sheet import SheetPose, estimate_sheet
+from nodes.renderer.sheet_mesh import deflected_mesh, flat_mesh, pyramid_mesh
+from nodes.renderer.sheet_shape_benchmark import sheet_shape_family
 from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen
 from nodes.twin.membrane import DeformedSheet, Rubber, solve
 from nodes.twin.true_object import TrueBody
@@ -31,7 +32,7 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")
 STRETCH = 1.05
-FLAT = Look(flat=True, pattern="object")
+FLAT = DrawStyle(flat=True, pattern="object")
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +41,14 @@ def context() -> moderngl.Context:
 
 
 @pytest.fixture(scope="module")
-def stage(context: moderngl.Context) -> Stage:
-    return Stage(SCENE, context, spacing_m=0.004, dents=few_dents())
+def stage(context: moderngl.Context) -> SceneRenderer:
+    return SceneRenderer(SCENE, context, spacing_m=0.004, dents=few_dents())
 
 
-def sheet_at(pose: Floats, tip: Floats | None = None, *, twist_rad: float = 0.0) -> Sheet:
+def sheet_at(pose: Floats, tip: Floats | None = None, *, twist_rad: float = 0.0) -> SheetPose:
     left, right = edge_poses(pose, STRETCH * SCENE.sheet.width_m)
     turn = transform(rotation_from_vector([twist_rad, 0.0, 0.0]), np.zeros(3))
-    sheet = sheet_between(
+    sheet = estimate_sheet(
         left,
         right @ turn,
         height_m=SCENE.sheet.height_m,
@@ -66,7 +67,9 @@ def true_sheet(tip: Floats) -> DeformedSheet:
     return solve(rubber, *edges, finger_tip=tip, finger_radius_m=SCENE.finger.radius_m)
 
 
-def drawn(stage: Stage, correction: Correction, sheet: Sheet, look: Look = FLAT) -> Image:
+def drawn(
+    stage: SceneRenderer, correction: Correction, sheet: SheetPose, look: DrawStyle = FLAT
+) -> Image:
     shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
     picture = stage.draw(shown, sheet, look, read=True)
     assert picture is not None
@@ -74,7 +77,9 @@ def drawn(stage: Stage, correction: Correction, sheet: Sheet, look: Look = FLAT)
 
 
 @pytest.mark.parametrize("tilt_deg", [-45.0, 0.0, 30.0])
-def test_on_a_flat_sheet_two_passes_are_the_equations(stage: Stage, tilt_deg: float) -> None:
+def test_on_a_flat_sheet_two_passes_are_the_equations(
+    stage: SceneRenderer, tilt_deg: float
+) -> None:
     pose = transform(rotation_from_vector([np.radians(tilt_deg), 0.0, 0.0]), np.zeros(3))
     one_plane = drawn(stage, "one_plane", sheet_at(pose)).astype(float)
     two_pass = drawn(stage, "two_pass", sheet_at(pose)).astype(float)
@@ -86,7 +91,7 @@ def test_on_a_flat_sheet_two_passes_are_the_equations(stage: Stage, tilt_deg: fl
 
 
 @pytest.mark.parametrize("depth_mm", [15, 29])
-def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: Stage, depth_mm: int) -> None:
+def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: SceneRenderer, depth_mm: int) -> None:
     tip = np.array([0.0, 0.0, -1e-3 * depth_mm])
     eye = SCENE.eyes.centre_world_m
     truth, sheet = true_sheet(tip), sheet_at(np.eye(4), tip)
@@ -106,7 +111,7 @@ def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: Stage, depth_mm: i
 @pytest.mark.parametrize(("place", "rms_m"), [((0.0, 0.0), 4e-4), ((0.03, -0.04), 1e-3)])
 def test_the_dented_mesh_is_the_twins_sheet(place: tuple[float, float], rms_m: float) -> None:
     tip = np.array([*place, -0.02])
-    mesh = dented_mesh(sheet_at(np.eye(4), tip), few_dents())
+    mesh = deflected_mesh(sheet_at(np.eye(4), tip), few_dents())
     assert mesh.note == ""
     truth = true_sheet(tip)
     points = truth.positions.reshape(-1, 3)
@@ -121,7 +126,7 @@ def test_meshes_reach_to_the_corners_and_the_fingertip() -> None:
     pose = transform(rotation_from_vector([0.4, 0.1, 0.0]), np.array([0.01, 0.02, -0.01]))
     tip = apply(pose, np.array([0.02, 0.01, -0.015]))
     for sheet in (sheet_at(pose, tip), sheet_at(pose, tip, twist_rad=0.15)):
-        for mesh in (pyramid_mesh(sheet), dented_mesh(sheet, few_dents())):
+        for mesh in (pyramid_mesh(sheet), deflected_mesh(sheet, few_dents())):
             for corner in sheet.corners:
                 assert np.linalg.norm(mesh.vertices - corner, axis=1).min() < 1e-4
             assert np.linalg.norm(mesh.vertices - tip, axis=1).min() < 1e-3
@@ -129,7 +134,7 @@ def test_meshes_reach_to_the_corners_and_the_fingertip() -> None:
     assert pyramid_mesh(unpushed).vertices == pytest.approx(flat_mesh(unpushed).vertices)
 
 
-def test_a_push_out_of_range_is_drawn_and_said(stage: Stage) -> None:
+def test_a_push_out_of_range_is_drawn_and_said(stage: SceneRenderer) -> None:
     picture = drawn(stage, "two_pass", sheet_at(np.eye(4), np.array([0.0, 0.0, -0.06])))
     assert picture.max() == 255
     assert "deeper than 30 mm" in stage.note
@@ -140,27 +145,27 @@ def test_a_push_out_of_range_is_drawn_and_said(stage: Stage) -> None:
 def test_without_dent_shapes_four_triangles_are_taken_and_it_is_said(
     context: moderngl.Context,
 ) -> None:
-    bare = Stage(SCENE, context, spacing_m=0.006)
+    bare = SceneRenderer(SCENE, context, spacing_m=0.006)
     tip = np.array([0.0, 0.0, -0.02])
     picture = drawn(bare, "two_pass", sheet_at(np.eye(4), tip))
     assert picture.max() == 255
-    assert bare.note == NO_DENTS
+    assert bare.note == NO_SHAPES_NOTE
     bare.release()
 
 
 @pytest.mark.parametrize("tilt_deg", [88.5, 91.0])
-def test_a_sheet_edge_on_is_not_lit(stage: Stage, tilt_deg: float) -> None:
+def test_a_sheet_edge_on_is_not_lit(stage: SceneRenderer, tilt_deg: float) -> None:
     pose = transform(rotation_from_vector([0.0, np.radians(tilt_deg), 0.0]), np.zeros(3))
     assert drawn(stage, "two_pass", sheet_at(pose)).max() == 0
 
 
-def test_the_grid_is_projected_too(stage: Stage) -> None:
-    grid = drawn(stage, "two_pass", sheet_at(np.eye(4)), Look(flat=False, pattern="grid"))
+def test_the_grid_is_projected_too(stage: SceneRenderer) -> None:
+    grid = drawn(stage, "two_pass", sheet_at(np.eye(4)), DrawStyle(flat=False, pattern="grid"))
     assert grid[300, 400].max() > 150
     assert grid[290, 410].max() < 60
 
 
-def test_a_new_shape_of_another_grid_is_drawn_anew(stage: Stage) -> None:
+def test_a_new_shape_of_another_grid_is_drawn_anew(stage: SceneRenderer) -> None:
     tip = np.array([0.0, 0.0, -0.02])
     dented = drawn(stage, "two_pass", sheet_at(np.eye(4), tip))
     stage.dents = None
@@ -180,26 +185,26 @@ def test_dent_shapes_are_kept_and_found_again(
         solves.append(rubber)
         return few_dents()
 
-    monkeypatch.setattr(dent_cache, "solve_dents", solve_few)
-    assert dent_cache.load(SCENE, tmp_path) is None
-    dent_cache.load_or_solve(SCENE, tmp_path)
-    kept = dent_cache.load_or_solve(SCENE, tmp_path)
+    monkeypatch.setattr(deflection_cache, "solve_dents", solve_few)
+    assert load_cached(deflection_cache.shapes_cache(SCENE), tmp_path) is None
+    deflection_cache.load_or_compute(SCENE, tmp_path)
+    kept = deflection_cache.load_or_compute(SCENE, tmp_path)
     assert len(solves) == 1
     at = (1.05, (0.01, 0.02), 0.01)
     same = replace(few_dents(), deepest_m=kept.deepest_m)
     assert kept.offsets(*at) == pytest.approx(same.offsets(*at), abs=1e-6)
     assert [path.suffix for path in tmp_path.iterdir()] == [".npz"]
-    path = dent_cache.file_of(SCENE, tmp_path)
+    path = deflection_cache.shapes_cache(SCENE).path(tmp_path)
     path.write_bytes(path.read_bytes()[:1000])
-    assert dent_cache.load(SCENE, tmp_path) is None
-    dent_cache.load_or_solve(SCENE, tmp_path)
+    assert load_cached(deflection_cache.shapes_cache(SCENE), tmp_path) is None
+    deflection_cache.load_or_compute(SCENE, tmp_path)
     assert len(solves) == 2
 
 
 def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(
     tmp_path: Path,
 ) -> None:
-    own = dent_cache.file_of(SCENE, tmp_path)
+    own = deflection_cache.shapes_cache(SCENE).path(tmp_path)
     for part, change, differs in (
         ("sheet", {"width_m": 0.26}, True),
         ("sheet", {"max_stretch_ratio": 1.1}, True),
@@ -207,12 +212,14 @@ def test_another_sheet_or_finger_has_another_file_and_another_modulus_has_not(
         ("sheet", {"young_modulus_pa": 2e6}, False),
     ):
         changed = getattr(SCENE, part).model_copy(update=change)
-        other = dent_cache.file_of(SCENE.model_copy(update={part: changed}), tmp_path)
+        other = deflection_cache.shapes_cache(SCENE.model_copy(update={part: changed})).path(
+            tmp_path
+        )
         assert (other != own) == differs
 
 
 def test_the_family_of_shapes_tells_them_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dent_cache, "load_or_solve", lambda scene, folder: few_dents())
+    monkeypatch.setattr(deflection_cache, "load_or_compute", lambda scene, folder: few_dents())
     shallow = SCENE.working_range.model_copy(update={"push_depth_m": 0.02})
     spec = SCENE.sheet.model_copy(update={"min_stretch_ratio": 1.04, "max_stretch_ratio": 1.06})
     scene = SCENE.model_copy(update={"working_range": shallow, "sheet": spec})
@@ -220,10 +227,9 @@ def test_the_family_of_shapes_tells_them_apart(monkeypatch: pytest.MonkeyPatch) 
     for trial in sheet_shape_family(twin_points).trials(scene):
         if trial.case == {"stretch": 1.04, "depth_mm": 20.0, "place": "centre"}:
             errors[trial.method] = trial.error(trial.run())
-            assert trial.in_range == (trial.method in ("dents", "membrane"))
+            assert trial.in_range == (trial.method in ("reduced_order", "membrane"))
         elif errors:
             break
     assert errors["membrane"] < 0.4
-    assert errors["dents"] < 0.4
-    assert errors["dents"] < 0.2 * errors["four_triangles"]
-    assert errors["four_triangles"] < errors["flat"]
+    assert errors["reduced_order"] < 0.4
+    assert errors["reduced_order"] < 0.2 * errors["four_triangles"]

@@ -13,14 +13,20 @@ from launch.cli import app
 from launch.commands.calibrate_projector import write_scene
 from launch.plans.plan import load_scene
 from messages.scene import Lens, Projector, Scene, StereoCamera
-from nodes.renderer.gray_code import FINEST_PX, DecodeError, decoded, patterns, places
+from nodes.renderer.gray_code import (
+    MIN_STRIPE_PX,
+    DecodeError,
+    decode_patterns,
+    find_pixels,
+    patterns,
+)
 from nodes.renderer.projector_calibration import (
-    Points,
     ProjectorError,
-    calibrated,
+    ProjectorPoints,
+    calibrate_projector,
     keystone,
-    measured,
-    projected,
+    measure_points,
+    project_points,
 )
 from nodes.twin.eye import TrueProjector
 from nodes.twin.projector import (
@@ -79,20 +85,20 @@ def true(scene: Scene) -> Projector:
 
 
 @pytest.fixture(scope="module")
-def points(scene: Scene, true_rig: StereoCamera, true: Projector) -> Points:
+def points(scene: Scene, true_rig: StereoCamera, true: Projector) -> ProjectorPoints:
     """What the rig, its optics known, measures of the true projector's light."""
     lit = LitSheet(scene, true_rig, true, seed=3)
     shown = patterns(scene.projector.width_px, scene.projector.height_px)
     views = [lit.pair(shown, pose) for pose in sheet_poses(4)]
-    return measured(views, true_rig, scene.projector)
+    return measure_points(views, true_rig, scene.projector)
 
 
 def test_the_patterns_are_decoded_to_the_cell_as_opencv_decodes_them() -> None:
     shown = patterns(70, 50)
     assert len(shown) == 2 * (7 + 6) + 2
-    view = decoded(shown, 70, 50)
+    view = decode_patterns(shown, 70, 50)
     assert len(view.pixels) == 70 * 50
-    assert np.abs(view.lit_by - view.pixels).max() <= 0.5 * (FINEST_PX - 1)
+    assert np.abs(view.lit_by - view.pixels).max() <= 0.5 * (MIN_STRIPE_PX - 1)
     coder = cv2.structured_light.GrayCodePattern.create(70, 50)
     for x, y in ((0, 0), (69, 49), (33, 17)):
         failed, pixel = coder.getProjPixel(shown[:-2], x, y)
@@ -113,18 +119,20 @@ def test_a_pixel_is_found_between_the_cameras_pixels() -> None:
         cv2.remap(pattern, source[..., 0], source[..., 1], cv2.INTER_LINEAR) for pattern in shown
     ]
     wanted = np.array([[100.0, 80.0], [150.0, 120.0], [3.0, 3.0]])
-    found, seen = places(decoded(pictures, 256, 192), wanted)
+    found, seen = find_pixels(decode_patterns(pictures, 256, 192), wanted)
     assert seen.tolist() == [True, True, False]
     again = lit_by(found[:2, 0], found[:2, 1])
     assert np.abs(again - wanted[:2]).max() < 0.35
 
 
-def test_the_twins_projector_is_recovered(scene: Scene, true: Projector, points: Points) -> None:
+def test_the_twins_projector_is_recovered(
+    scene: Scene, true: Projector, points: ProjectorPoints
+) -> None:
     lens = true.lens
     assert any(lens.distortion)
     off = np.linalg.norm(pixels_lighting(true, points.world) - points.pixels, axis=1)
     assert np.median(off) < 0.4
-    fit = calibrated(points, scene.projector)
+    fit = calibrate_projector(points, scene.projector)
     assert fit.rms_px < 0.4
     assert fit.held_out_rms_px < 1.2 * fit.rms_px
     assert fit.before_rms_px > 2.0
@@ -136,44 +144,48 @@ def test_the_twins_projector_is_recovered(scene: Scene, true: Projector, points:
     assert after.max() < 0.4e-3
 
 
-def test_points_that_make_no_calibration_are_refused(scene: Scene, points: Points) -> None:
-    def some(keep: np.ndarray) -> Points:
-        return Points(
+def test_points_that_make_no_calibration_are_refused(scene: Scene, points: ProjectorPoints) -> None:
+    def some(keep: np.ndarray) -> ProjectorPoints:
+        return ProjectorPoints(
             points.world[keep], points.pixels[keep], points.pose[keep], points.skew_m[keep]
         )
 
     with pytest.raises(ProjectorError, match="in 2 poses"):
-        calibrated(some(points.pose < 2), scene.projector)
+        calibrate_projector(some(points.pose < 2), scene.projector)
     flat = points.world * [1.0, 1.0, 0.0]
     with pytest.raises(ProjectorError, match="nearer and farther"):
-        calibrated(Points(flat, points.pixels, points.pose, points.skew_m), scene.projector)
+        calibrate_projector(
+            ProjectorPoints(flat, points.pixels, points.pose, points.skew_m), scene.projector
+        )
     near = np.linalg.norm(points.pixels - points.pixels.mean(axis=0), axis=1) < 60
-    corner = Points(*(np.repeat(part[near], 6, axis=0) for part in (
+    corner = ProjectorPoints(*(np.repeat(part[near], 6, axis=0) for part in (
         points.world, points.pixels, points.pose, points.skew_m)))  # fmt: skip
-    with pytest.raises(ProjectorError, match="% of the projector's picture"):
-        calibrated(corner, scene.projector)
+    with pytest.raises(ProjectorError, match="% of the projector's image"):
+        calibrate_projector(corner, scene.projector)
     moved = points.world + np.where(points.pose == 1, 0.01, 0.0)[:, None]
     with pytest.raises(ProjectorError, match="not one projector"):
-        calibrated(Points(moved, points.pixels, points.pose, points.skew_m), scene.projector)
+        calibrate_projector(
+            ProjectorPoints(moved, points.pixels, points.pose, points.skew_m), scene.projector
+        )
     with pytest.raises(ProjectorError, match="0 points"):
-        calibrated(some(points.pose < 0), scene.projector)
+        calibrate_projector(some(points.pose < 0), scene.projector)
 
 
 def test_pictures_that_are_not_of_the_patterns_are_refused(scene: Scene) -> None:
     dark = [np.full((60, 80), 10, np.uint8)] * 38
-    with pytest.raises(DecodeError, match="5 pictures; the patterns are 38"):
-        decoded(dark[:5], 400, 300)
+    with pytest.raises(DecodeError, match="5 images; the patterns are 38"):
+        decode_patterns(dark[:5], 400, 300)
     with pytest.raises(ProjectorError, match="pose 1, left camera: 0 of the camera's pixels"):
-        measured([(dark, dark)], scene.camera, scene.projector)
+        measure_points([(dark, dark)], scene.camera, scene.projector)
 
 
 @pytest.mark.parametrize("off", np.random.default_rng(4).uniform(-12.0, 12.0, (6, 8)))
 def test_four_corners_by_hand_are_met_exactly(off: np.ndarray) -> None:
     guess = load_scene(SCENE_FILE).projector
     world = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0.1, 0.1, 0], [-0.1, 0.1, 0]])
-    wanted = projected(guess, world) + np.reshape(off, (4, 2))
+    wanted = project_points(guess, world) + np.reshape(off, (4, 2))
     fit = keystone(wanted, 0.1, 0.1, guess)
-    assert np.abs(projected(fit.projector, world) - wanted).max() < 0.2
+    assert np.abs(project_points(fit.projector, world) - wanted).max() < 0.2
 
 
 def test_corners_in_no_order_are_refused() -> None:
@@ -200,7 +212,7 @@ def test_the_scene_keeps_its_comments_and_takes_the_projector(tmp_path: Path) ->
     written = load_scene(copy).projector
     assert np.allclose(written.lens.distortion, found.lens.distortion, atol=1e-8)
     world = np.array([[0.05, -0.03, 0.02]])
-    assert np.allclose(projected(written, world), projected(found, world), atol=1e-4)
+    assert np.allclose(project_points(written, world), project_points(found, world), atol=1e-4)
 
 
 def test_the_command_names_what_is_missing(tmp_path: Path) -> None:

@@ -18,13 +18,13 @@ from messages.types import Display, Frame, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import rotation_from_vector, transform
 from nodes.models.sheet import edge_poses, flange_pose
 from nodes.renderer import gl
-from nodes.renderer.correction import Plane, correct, flat_screen, pushed_screen
-from nodes.renderer.gl import Canvas, Look, NoOpenGLError, View, headless_context
+from nodes.renderer.correction import ScreenPlane, correct, make_flat_screen, make_pushed_screen
+from nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
 from nodes.renderer.node import Renderer, RendererParameters
+from nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
 from nodes.renderer.output import pack
-from nodes.renderer.sheet import sheet_between
-from nodes.renderer.stage import Stage, transform_of
-from nodes.renderer.surface import cylinder_surface, follow_matrix, normals_of
+from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 
@@ -48,8 +48,8 @@ def context() -> moderngl.Context:
 
 
 @pytest.fixture(scope="module")
-def stage(scene: Scene, context: moderngl.Context) -> Stage:
-    return Stage(scene, context, spacing_m=0.004)
+def stage(scene: Scene, context: moderngl.Context) -> SceneRenderer:
+    return SceneRenderer(scene, context, spacing_m=0.004)
 
 
 def random_screens(scene: Scene) -> list[object]:
@@ -58,20 +58,20 @@ def random_screens(scene: Scene) -> list[object]:
     screens: list[object] = [None]
     for _ in range(4):
         normal = rotation_from_vector(rng.uniform(-1.2, 1.2, 3) * [1, 1, 0])[:, 2]
-        plane = Plane(rng.uniform(-0.03, 0.03, 3), normal)
+        plane = ScreenPlane(rng.uniform(-0.03, 0.03, 3), normal)
         screens += [
-            flat_screen(plane),
-            pushed_screen(rng.uniform(-0.05, 0, 3), corners, plane),
+            make_flat_screen(plane),
+            make_pushed_screen(rng.uniform(-0.05, 0, 3), corners, plane),
         ]
     return screens
 
 
-def test_shader_moves_points_as_the_numpy_equations(scene: Scene, stage: Stage) -> None:
+def test_shader_moves_points_as_the_numpy_equations(scene: Scene, stage: SceneRenderer) -> None:
     rest = stage._surface.rest_world_m
     projector = scene.projector.world_from_projector.position_m
     for screen in random_screens(scene):
         for eye in stage.eyes(Display(correction="none", stereo="side_by_side")):
-            view = View(eye, projector, screen, stage._clip_from_screen)
+            view = EyeView(eye, projector, screen, stage._clip_from_screen)
             shifted = stage.canvas.shifted_points(view)
             if screen is None:
                 assert np.allclose(shifted[:, :3], rest, atol=1e-7)
@@ -85,12 +85,12 @@ def test_shader_moves_points_as_the_numpy_equations(scene: Scene, stage: Stage) 
 
 
 def test_uncorrected_silhouette_lies_where_the_projector_model_says(
-    scene: Scene, stage: Stage
+    scene: Scene, stage: SceneRenderer
 ) -> None:
-    stage.shape(None)
+    stage.deform(None)
     sheet = stage.sheet_at_rest()
     shown = Display(correction="none", stereo="mono", shading="flat")
-    picture = stage.draw(shown, sheet, Look(flat=True, pattern="object"), read=True)
+    picture = stage.draw(shown, sheet, DrawStyle(flat=True, pattern="object"), read=True)
     assert picture is not None
     rows, columns = np.nonzero(picture[..., 0] > 127)
     # Front of the cylinder, 60 mm to both sides, 2 px a millimetre around (399.5, 299.5).
@@ -103,14 +103,16 @@ def test_uncorrected_silhouette_lies_where_the_projector_model_says(
     assert abs(rows.max() - (299.5 + half)) <= 1
 
 
-def test_nearest_surface_hides_what_is_behind(context: moderngl.Context, stage: Stage) -> None:
+def test_nearest_surface_hides_what_is_behind(
+    context: moderngl.Context, stage: SceneRenderer
+) -> None:
     """Two crossing squares: depth decides, whatever the order of the triangles."""
     canvas = Canvas(context, 80, 60)
     square = np.array([[-0.05, -0.05, 0.0], [0.05, -0.05, 0], [0.05, 0.05, 0], [-0.05, 0.05, 0]])
     far = square + np.array([0.0, 0.0, -0.05])
     near = 0.4 * square + np.array([0.0, 0.0, 0.02])
     triangles = np.array([[0, 1, 2], [0, 2, 3]])
-    view = View(
+    view = EyeView(
         np.array([0.0, 0.0, 0.4]), np.array([0, -0.25, -1.0]), None, np.diag([10.0, 10.0, 1.0])
     )
     lit, dark = np.tile(gl.LIGHT, (4, 1)), np.tile(-gl.LIGHT, (4, 1))
@@ -118,18 +120,18 @@ def test_nearest_surface_hides_what_is_behind(context: moderngl.Context, stage: 
         positions = np.concatenate([far, near][::order])
         canvas.set_mesh(positions, np.concatenate([triangles, triangles + 4]).astype(np.int32))
         canvas.set_shape(positions, np.concatenate([dark, lit][::order]))
-        canvas.draw(view, Look(flat=False, pattern="object"))
+        canvas.draw(view, DrawStyle(flat=False, pattern="object"))
         picture = canvas.read()
         assert picture[30, 40, 0] > 200
         assert 30 < picture[30, 50, 0] < 100
     canvas.release()
 
 
-def test_black_and_grid_patterns(stage: Stage) -> None:
+def test_black_and_grid_patterns(stage: SceneRenderer) -> None:
     sheet = stage.sheet_at_rest()
     shown = Display(correction="one_plane", stereo="mono")
-    black = stage.draw(shown, sheet, Look(flat=False, pattern="black"), read=True)
-    grid = stage.draw(shown, sheet, Look(flat=False, pattern="grid"), read=True)
+    black = stage.draw(shown, sheet, DrawStyle(flat=False, pattern="black"), read=True)
+    grid = stage.draw(shown, sheet, DrawStyle(flat=False, pattern="grid"), read=True)
     assert black is not None
     assert grid is not None
     assert black.max() == 0
@@ -139,10 +141,10 @@ def test_black_and_grid_patterns(stage: Stage) -> None:
     assert grid[279, 419, 0] == 0
 
 
-def test_marks_are_drawn_on_the_object(stage: Stage) -> None:
-    stage.shape(None)
+def test_marks_are_drawn_on_the_object(stage: SceneRenderer) -> None:
+    stage.deform(None)
     shown = Display(correction="none", stereo="mono")
-    look = Look(False, "object", np.zeros(3), np.array([0.02, 0.0, 0.0]))
+    look = DrawStyle(False, "object", np.zeros(3), np.array([0.02, 0.0, 0.0]))
     picture = stage.draw(shown, stage.sheet_at_rest(), look, read=True)
     assert picture is not None
     assert picture[299, 399, 0] > 2 * picture[299, 399, 2]
@@ -150,11 +152,11 @@ def test_marks_are_drawn_on_the_object(stage: Stage) -> None:
     assert (ring[..., 2] > ring[..., 0].astype(int) + 80).any()
 
 
-def test_second_eye_sees_the_front_shifted_the_other_way(stage: Stage) -> None:
+def test_second_eye_sees_the_front_shifted_the_other_way(stage: SceneRenderer) -> None:
     """The object lies behind the screen: the right eye sees it further right (mirrored: left)."""
-    stage.shape(None)
+    stage.deform(None)
     shown = Display(correction="none", stereo="side_by_side", shading="flat")
-    picture = stage.draw(shown, stage.sheet_at_rest(), Look(True, "object"), read=True)
+    picture = stage.draw(shown, stage.sheet_at_rest(), DrawStyle(True, "object"), read=True)
     assert picture is not None
     assert picture.shape == (600, 800, 3)
     left, right = picture[:, :400, 0], picture[:, 400:, 0]
@@ -203,7 +205,7 @@ def test_surface_is_closed_round_and_outward() -> None:
     volume = np.sum(corners[:, 0] * cross) / 6.0
     assert np.isclose(volume, np.pi * 0.03**2 * 0.1, rtol=1e-3)
     assert (np.sum(cross * corners.mean(axis=1), axis=1) > 0).all()
-    normals = normals_of(surface, surface.rest_world_m)
+    normals = VertexNormals(surface.triangles, len(surface.rest_world_m))(surface.rest_world_m)
     assert np.allclose(normals, surface.normals_world, atol=0.02)
     assert np.allclose(np.linalg.norm(normals, axis=1), 1.0)
 
@@ -215,20 +217,20 @@ def test_surface_follows_a_linear_displacement_of_a_coarse_skin() -> None:
     coarse = cylinder_surface(
         radius_m=0.03, length_m=0.1, world_from_object=np.eye(4), spacing_m=0.005
     )
-    follow = follow_matrix(fine.rest_world_m, coarse.rest_world_m, coarse.triangles)
+    follow = transfer_matrix(fine.rest_world_m, coarse.rest_world_m, coarse.triangles)
     gradient = np.random.default_rng(6).normal(size=(3, 3))
     moved = follow @ (coarse.rest_world_m @ gradient)
     assert np.allclose(moved, fine.rest_world_m @ gradient, atol=2e-4 * np.abs(gradient).sum())
     with pytest.raises(ValueError, match="no triangles"):
-        follow_matrix(fine.rest_world_m, coarse.rest_world_m, coarse.triangles[:0])
+        transfer_matrix(fine.rest_world_m, coarse.rest_world_m, coarse.triangles[:0])
     lost = (
         coarse.rest_world_m * np.where(np.arange(len(coarse.rest_world_m)) == 7, np.nan, 1)[:, None]
     )
     with pytest.raises(ValueError, match="not finite"):
-        follow_matrix(fine.rest_world_m, lost, coarse.triangles)
+        transfer_matrix(fine.rest_world_m, lost, coarse.triangles)
     # Triangles without area are passed over.
     flat = np.concatenate([coarse.triangles, [[3, 3, 4], [5, 5, 5]]]).astype(np.int32)
-    again = follow_matrix(fine.rest_world_m, coarse.rest_world_m, flat)
+    again = transfer_matrix(fine.rest_world_m, coarse.rest_world_m, flat)
     assert abs(again - follow).max() < 1e-6
 
 
@@ -239,19 +241,19 @@ def test_a_skin_finer_in_front_is_followed_by_its_nearest_triangles() -> None:
     vertices = np.concatenate([corners, small])
     triangles = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
     point = np.array([[0.01, 0.3, 0.0], [0.001, 0.01, 0.0]])
-    assert np.allclose(follow_matrix(point, vertices, triangles) @ vertices, point, atol=1e-6)
+    assert np.allclose(transfer_matrix(point, vertices, triangles) @ vertices, point, atol=1e-6)
 
 
 def test_sheet_between_edges_moves_with_its_twist() -> None:
     pose = transform(rotation_from_vector([0.3, 0.0, 0.0]), [0.0, 0.01, 0.02])
     left, right = edge_poses(pose, 0.25)
     twist = np.array([0.0, 0.1, 0.0, 1.0, 0.0, 0.0])
-    still = sheet_between(
+    still = estimate_sheet(
         left, right, height_m=0.24, twist_world=twist, ahead_s=0.0, finger_tip=None
     )
     assert still is not None
     assert np.allclose(still.world_from_sheet, pose)
-    later = sheet_between(
+    later = estimate_sheet(
         left, right, height_m=0.24, twist_world=twist, ahead_s=0.02, finger_tip=pose[:3, 3]
     )
     assert later is not None
@@ -261,7 +263,7 @@ def test_sheet_between_edges_moves_with_its_twist() -> None:
         np.linalg.norm(later.corners - later.plane.point, axis=1), 0.17328, atol=1e-4
     )
     assert (
-        sheet_between(left, left, height_m=0.24, twist_world=twist, ahead_s=0.0, finger_tip=None)
+        estimate_sheet(left, left, height_m=0.24, twist_world=twist, ahead_s=0.0, finger_tip=None)
         is None
     )
 
@@ -279,7 +281,7 @@ def test_finger_pushes_only_below_and_over_the_sheet(
     tip: tuple[float, float, float], pushed: bool
 ) -> None:
     left, right = edge_poses(np.eye(4), 0.25)
-    sheet = sheet_between(
+    sheet = estimate_sheet(
         left,
         right,
         height_m=0.24,
@@ -322,7 +324,7 @@ class Bench:
         edges = edge_poses(world_from_sheet, 0.25)
         for side, edge in zip(("left", "right"), edges, strict=True):
             spec = getattr(self.scene.arms, side)
-            flange = flange_pose(edge, transform_of(spec.flange_from_edge))
+            flange = flange_pose(edge, pose_matrix(spec.flange_from_edge))
             state = arm_state(side, world_from_flange=flange, world_from_flange_commanded=flange)
             await self.step(f"arm_{side}", state, age_ms=age_ms)
 
@@ -392,11 +394,13 @@ async def test_a_frame_says_how_much_of_the_sheet_gets_no_light(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a folded sheet, whose share the stage finds (tests/test_renderer_failures.py)."""
-    monkeypatch.setattr("nodes.renderer.stage.lost_share", lambda mesh, eye, projector: 0.25)
+    monkeypatch.setattr(
+        "nodes.renderer.scene_renderer.occluded_fraction", lambda mesh, eye, projector: 0.25
+    )
     await bench.step("scene", bench.scene)
     await bench.arms(np.eye(4))
     await bench.finger(0.0, 0.0, 0.1)
-    assert bench.sent[0][0].lost_share == 0.25
+    assert bench.sent[0][0].occluded_fraction == 0.25
 
 
 async def test_without_solver_the_fingertip_draws_and_the_rate_is_limited(bench: Bench) -> None:
@@ -452,11 +456,11 @@ async def test_stale_arms_hold_the_last_plane_and_say_so(bench: Bench) -> None:
     pose = transform(rotation_from_vector([0.5, 0.0, 0.0]), [0.0, 0.0, 0.0])
     await bench.arms(pose)
     await bench.finger(0.0, 0.0, 0.1)
-    assert "holding" not in bench.node.note
+    assert "keeping" not in bench.node.note
     bench.forward(500)
     await bench.finger(0.0, 0.0, 0.1)
     assert np.allclose(bench.sent[-1][0].world_from_sheet, pose, atol=1e-9)
-    assert "arm poses 0.50 s old: holding" in bench.node.note
+    assert "arm poses 0.50 s old: keeping" in bench.node.note
 
 
 async def test_sheet_turned_away_holds_the_last_plane(bench: Bench) -> None:
@@ -569,5 +573,5 @@ async def test_displacement_of_another_size_is_reported(bench: Bench) -> None:
     await bench.step("skin", skin)
     short = body.model_copy(update={"displacement_world_m": body.displacement_world_m[:5]})
     await bench.node.step("soft_body", short, Header(1, 0, 0, "virtual", "test", 1))
-    assert "fits no skin" in bench.node.last_error
+    assert "does not fit the skin" in bench.node.last_error
     assert bench.sent == []

@@ -14,10 +14,10 @@ from messages.scene import Scene
 from messages.types import Correction, Display
 from nodes.models.rigid import transform
 from nodes.models.sheet import edge_poses
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.sheet import Sheet
-from nodes.renderer.sheet_mesh import SheetMesh, lost_share, pyramid_mesh
-from nodes.renderer.stage import Stage
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet import SheetPose
+from nodes.renderer.sheet_mesh import SheetMesh, occluded_fraction, pyramid_mesh
 from nodes.twin.eye import proper, seen
 from nodes.twin.membrane import Rubber, solve
 from nodes.twin.true_object import TrueBody
@@ -37,13 +37,13 @@ def context() -> moderngl.Context:
 
 
 @pytest.fixture(scope="module")
-def stage(context: moderngl.Context) -> Stage:
-    return Stage(SCENE, context, spacing_m=0.004)
+def stage(context: moderngl.Context) -> SceneRenderer:
+    return SceneRenderer(SCENE, context, spacing_m=0.004)
 
 
-def drawn(stage: Stage, correction: Correction, sheet: Sheet) -> Image:
+def drawn(stage: SceneRenderer, correction: Correction, sheet: SheetPose) -> Image:
     shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
-    picture = stage.draw(shown, sheet, Look(True, "object"), read=True)
+    picture = stage.draw(shown, sheet, DrawStyle(True, "object"), read=True)
     assert picture is not None
     return picture
 
@@ -58,18 +58,18 @@ def with_object_at(z_m: float) -> Scene:
 
 
 def test_what_is_behind_the_eye_is_not_drawn(context: moderngl.Context) -> None:
-    behind = Stage(with_object_at(0.6), context, spacing_m=0.006)
+    behind = SceneRenderer(with_object_at(0.6), context, spacing_m=0.006)
     for correction in CORRECTIONS:
         assert drawn(behind, correction, behind.sheet_at_rest()).max() == 0
     behind.release()
     # Half of it behind: the rest is there, ahead of the eye it fills the view.
-    half = Stage(with_object_at(0.39), context, spacing_m=0.006)
+    half = SceneRenderer(with_object_at(0.39), context, spacing_m=0.006)
     for correction in CORRECTIONS:
         assert drawn(half, correction, half.sheet_at_rest()).max() in (0, 255)
     half.release()
 
 
-def test_what_is_before_the_sheet_is_seen_at_its_place(stage: Stage) -> None:
+def test_what_is_before_the_sheet_is_seen_at_its_place(stage: SceneRenderer) -> None:
     """A sheet 25 mm behind the object's front is no obstacle to the equations or two passes."""
     pose = transform(np.eye(3), np.array([0.0, 0.0, -0.025]))
     spec = SCENE.sheet
@@ -100,39 +100,43 @@ def test_what_folds_take_is_measured() -> None:
     far_eye, far_light = np.array([0.0, 0.0, 1e3]), np.array([0.0, 0.0, -1e3])
     turned = folded(0.04)
     # 40 mm turned over, and 40 in their shadow, of 120 + 40 + 120.
-    assert lost_share(turned, far_eye, far_light) == pytest.approx(80 / 280, abs=1e-3)
-    assert lost_share(folded(-0.01), far_eye, far_light) == 0.0
+    assert occluded_fraction(turned, far_eye, far_light) == pytest.approx(80 / 280, abs=1e-3)
+    assert occluded_fraction(folded(-0.01), far_eye, far_light) == 0.0
     tip = np.array([0.01, 0.02, -0.025])
-    assert lost_share(pyramid_mesh(sheet_at(SCENE, np.eye(4), tip)), EYE, PROJECTOR) == 0.0
+    assert occluded_fraction(pyramid_mesh(sheet_at(SCENE, np.eye(4), tip)), EYE, PROJECTOR) == 0.0
 
 
-def test_a_folded_sheet_is_drawn_and_told(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folded_sheet_is_drawn_and_told(
+    stage: SceneRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The projector lights what is nearest to it; of two places on its ray one has the light."""
     monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: folded(0.03))
     stage.note = ""
     picture = drawn(stage, "two_pass", stage.sheet_at_rest())
     assert picture.max() == 255
-    assert 0.1 < stage.lost_share < 0.4
+    assert 0.1 < stage.occluded_fraction < 0.4
     assert "is folded and gets no light" in stage.note
     monkeypatch.undo()
     drawn(stage, "two_pass", stage.sheet_at_rest())
-    assert stage.lost_share == 0.0
+    assert stage.occluded_fraction == 0.0
     assert "folded" not in stage.note
 
 
-def test_triangles_without_area_are_nothing(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_triangles_without_area_are_nothing(
+    stage: SceneRenderer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     sheet = stage.sheet_at_rest()
     before, mesh = drawn(stage, "two_pass", sheet), stage.sheet_mesh(sheet)
     needles = np.concatenate([mesh.triangles, [[0, 0, 1], [2, 2, 2]]]).astype(np.int32)
     monkeypatch.setattr(stage, "sheet_mesh", lambda sheet: SheetMesh(mesh.vertices, needles))
     assert np.array_equal(drawn(stage, "two_pass", sheet), before)
-    assert stage.lost_share < 0.001
+    assert stage.occluded_fraction < 0.001
 
 
-def test_what_is_nowhere_is_refused(stage: Stage) -> None:
+def test_what_is_nowhere_is_refused(stage: SceneRenderer) -> None:
     lost = np.full((4, 4), np.nan)
     rest = stage.sheet_at_rest()
-    nowhere = Sheet(lost, rest.corners, None)
+    nowhere = SheetPose(lost, rest.corners, None)
     assert not stage.usable(nowhere)
     for correction in CORRECTIONS:
         with pytest.raises(ValueError, match="pose is not finite"):
@@ -146,6 +150,6 @@ def test_what_is_nowhere_is_refused(stage: Stage) -> None:
             update={"displacement_world_m": displacement.astype(np.float32)}
         )
         with pytest.raises(ValueError, match="NaN or infinity"):
-            stage.shape(bad)
+            stage.deform(bad)
     assert np.array_equal(drawn(stage, "none", rest), before)
     follow(stage, None)

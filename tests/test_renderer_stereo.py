@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from messages.base import Header
 from messages.scene import Lens, Pose
 from messages.types import Correction, Display, Eye, Frame, SoftBody, StereoMode
-from nodes.renderer.dent_ahead import DentAhead
-from nodes.renderer.gl import Look, headless_context
-from nodes.renderer.lead import Lead
+from nodes.renderer.display_latency import DisplayLatencyEstimator
+from nodes.renderer.gl import DrawStyle, headless_context
 from nodes.renderer.lens import clip_lens
-from nodes.renderer.sheet_mesh import finer, flat_mesh
-from nodes.renderer.stage import Stage
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet_mesh import flat_mesh, refine_mesh
+from nodes.renderer.skin_extrapolator import SkinExtrapolator
 from tests.test_renderer import MS, Bench, load_scene, skin_and_body
 
 Image = NDArray[np.uint8]
@@ -171,8 +171,8 @@ def test_the_lens_bends_the_picture_as_opencv_says(
     shown = Display(correction=correction, stereo="mono", shading="flat", pattern="grid")
     pictures = []
     for each in (scene, bent_scene):
-        stage = Stage(each, context, spacing_m=0.004)
-        look = Look(flat=False, pattern="grid")
+        stage = SceneRenderer(each, context, spacing_m=0.004)
+        look = DrawStyle(flat=False, pattern="grid")
         picture = stage.draw(shown, stage.sheet_at_rest(), look, read=True)
         assert picture is not None
         pictures.append(picture[..., 0])
@@ -202,9 +202,9 @@ def test_a_lens_that_folds_the_picture_is_refused() -> None:
 
 
 def test_a_finer_mesh_is_the_same_surface(context: moderngl.Context) -> None:
-    stage = Stage(load_scene(), context, spacing_m=0.01)
+    stage = SceneRenderer(load_scene(), context, spacing_m=0.01)
     mesh = flat_mesh(stage.sheet_at_rest())
-    fine = finer(mesh, halvings=3)
+    fine = refine_mesh(mesh, halvings=3)
 
     def area(vertices: NDArray[np.float64], triangles: NDArray[np.int32]) -> float:
         a, b, c = vertices[triangles].transpose(1, 0, 2)
@@ -216,12 +216,12 @@ def test_a_finer_mesh_is_the_same_surface(context: moderngl.Context) -> None:
 
 
 def test_light_is_foretold_from_how_long_drawing_took() -> None:
-    lead = Lead(first_s=0.016, light_s=0.008)
-    assert lead.light_ns(1000 * MS) == 1016 * MS
+    lead = DisplayLatencyEstimator(first_s=0.016, display_latency_s=0.008)
+    assert lead.predict_light_ns(1000 * MS) == 1016 * MS
     for number, draw_ms in enumerate((5, 5, 40, 5, 5)):
         begun = (1000 + 100 * number) * MS
-        assert lead.drawn(begun, begun + draw_ms * MS) == begun + (draw_ms + 8) * MS
-    assert lead.light_ns(2000 * MS) == 2013 * MS  # the slow one is outvoted
+        assert lead.record_drawn(begun, begun + draw_ms * MS) == begun + (draw_ms + 8) * MS
+    assert lead.predict_light_ns(2000 * MS) == 2013 * MS  # the slow one is outvoted
     assert not lead.is_late(2020 * MS, 2013 * MS)
     assert lead.is_late(2022 * MS, 2013 * MS)
 
@@ -231,13 +231,15 @@ def test_light_is_foretold_to_the_refresh_that_the_picture_makes(
     draw_s: float, phase: float, period_s: float
 ) -> None:
     """Against a projector that swaps at multiples of its period after a picture is drawn."""
-    lead = Lead(first_s=0.016, light_s=0.5 * period_s, period_s=period_s)
+    lead = DisplayLatencyEstimator(
+        first_s=0.016, display_latency_s=0.5 * period_s, period_s=period_s
+    )
     period, draw = round(period_s * 1e9), round(draw_s * 1e9)
     begun = round(phase * period)
     for _ in range(3):
-        predicted = lead.light_ns(begun)
+        predicted = lead.predict_light_ns(begun)
         swapped = -(-(begun + draw) // period) * period
-        light = lead.shown(begun, begun + draw, swapped)
+        light = lead.record_shown(begun, begun + draw, swapped)
         begun = swapped + round((0.3 + phase) * period)
     # Off by a whole refresh only where drawing ends within the margin before one.
     assert abs(predicted - light) < 1000 or 0 <= predicted - light - period < 1000
@@ -249,29 +251,29 @@ def answer(at_ms: int, displacement: float, **changes: object) -> tuple[SoftBody
 
 
 def test_the_dent_is_carried_on_to_the_light() -> None:
-    dent = DentAhead()
-    assert dent.at(1000 * MS, "here") == (None, 0)
+    dent = SkinExtrapolator()
+    assert dent.extrapolate(1000 * MS, "here") == (None, 0)
     for at_ms in (1000, 1016, 1033):
-        dent.take(*answer(at_ms, 1e-6 * at_ms, lead_s=0.005))
-    body, at_ns = dent.at(1060 * MS, "here")
+        dent.add(*answer(at_ms, 1e-6 * at_ms, prediction_horizon_s=0.005))
+    body, at_ns = dent.extrapolate(1060 * MS, "here")
     assert body is not None
     assert at_ns == 1060 * MS
     assert np.allclose(body.displacement_world_m, 1.055e-3, atol=1e-8)  # of the exposure then
-    body, at_ns = dent.at(2000 * MS, "here")  # no farther than 60 ms
+    body, at_ns = dent.extrapolate(2000 * MS, "here")  # no farther than 60 ms
     assert at_ns == 1098 * MS
     for at_ms, clock_id in ((1038, "here"), (1010, "here"), (1060, "elsewhere")):
-        body, at_ns = dent.at(at_ms * MS, clock_id)
+        body, at_ns = dent.extrapolate(at_ms * MS, clock_id)
         assert at_ns == 1038 * MS
         assert body is not None
         assert np.allclose(body.displacement_world_m, 1.033e-3, atol=1e-8)
 
 
 def test_a_dent_of_another_method_is_not_carried_on_from() -> None:
-    dent = DentAhead()
-    dent.take(*answer(1000, 0.0))
-    dent.take(*answer(1033, 1e-3, method="nonlinear_table"))
-    body, at_ns = dent.at(1060 * MS, "here")
+    dent = SkinExtrapolator()
+    dent.add(*answer(1000, 0.0))
+    dent.add(*answer(1033, 1e-3, method="nonlinear_table"))
+    body, at_ns = dent.extrapolate(1060 * MS, "here")
     assert body is not None
     assert (at_ns, float(body.displacement_world_m.max())) == (1033 * MS, np.float32(1e-3))
-    dent.take(*answer(1020, 5e-4, method="nonlinear_table"))  # time went back: a replay
-    assert dent.at(1060 * MS, "here")[1] == 1020 * MS
+    dent.add(*answer(1020, 5e-4, method="nonlinear_table"))  # time went back: a replay
+    assert dent.extrapolate(1060 * MS, "here")[1] == 1020 * MS

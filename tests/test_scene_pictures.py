@@ -21,8 +21,8 @@ from nodes.models.rigid import inverse
 from nodes.models.sheet import edge_poses
 from nodes.renderer.gl import headless_context
 from nodes.renderer.node import Renderer, RendererParameters
-from nodes.renderer.stage import Stage, transform_of
-from nodes.renderer.surface import Follower, normals_of
+from nodes.renderer.object_surface import DeformationTransfer, VertexNormals
+from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
 from nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
 from nodes.twin.true_object import TrueBody
 from tests.fingertips import fingertip
@@ -37,7 +37,7 @@ class Case:
     """A scene, its stage, and a skin coarser than what is drawn."""
 
     scene: Scene
-    stage: Stage
+    stage: SceneRenderer
     skin: Skin
 
     def body(self, displacement: Floats) -> SoftBody:
@@ -70,9 +70,9 @@ def context() -> moderngl.Context:
 @pytest.fixture(scope="module", params=SCENES, ids=lambda path: path.stem)
 def case(request: pytest.FixtureRequest, context: moderngl.Context) -> Case:
     scene = load_scene(request.param)
-    stage = Stage(scene, context, spacing_m=0.003)
+    stage = SceneRenderer(scene, context, spacing_m=0.003)
     # As a solver's skin: coarser, on the true surface, its facets inside.
-    coarse = Stage(scene, context, spacing_m=0.006)
+    coarse = SceneRenderer(scene, context, spacing_m=0.006)
     surface = coarse._surface
     coarse.release()
     skin = Skin(
@@ -112,8 +112,10 @@ def test_the_drawn_surface_is_the_objects_own(case: Case) -> None:
 
 def test_a_dent_is_followed_with_no_triangle_turned_over(case: Case) -> None:
     surface, body = case.stage._surface, case.body(case.dent(0.02, (0.005, -0.004)))
-    follower = Follower(surface, case.skin.vertices_world_m.astype(float), case.skin.triangles)
-    moved = follower.moved(body.displacement_world_m).astype(np.float64)
+    follower = DeformationTransfer(
+        surface, case.skin.vertices_world_m.astype(float), case.skin.triangles
+    )
+    moved = follower.apply(body.displacement_world_m).astype(np.float64)
     before = cross_products(surface.rest_world_m, surface.triangles)
     after = cross_products(moved[:, :3], surface.triangles)
     # Pushed along z, what faced the user still does.
@@ -121,7 +123,7 @@ def test_a_dent_is_followed_with_no_triangle_turned_over(case: Case) -> None:
     assert (after[front, 2] > 0.0).all()
     assert np.ptp(surface.rest_world_m[:, 2] - moved[:, 2]) > 0.015
     # The interpolated normals are those of the drawn triangles, but for the skin's facets.
-    exact = normals_of(surface, moved[:, :3])
+    exact = VertexNormals(surface.triangles, len(moved))(moved[:, :3])
     used = np.unique(surface.triangles[front])
     fast = moved[used, 3:] / np.linalg.norm(moved[used, 3:], axis=1, keepdims=True)
     cosines = np.clip(np.einsum("ij,ij->i", fast, exact[used]), -1.0, 1.0)
@@ -135,8 +137,8 @@ def test_the_twins_body_follows_the_same_dent(case: Case) -> None:
     rigid = true.displaced(vertices, triangles, np.tile(SHIFT_M, (len(vertices), 1)))
     assert np.allclose(rigid.vertices - true.at_rest().vertices, SHIFT_M)
     moved = true.displaced(vertices, triangles, displacement)
-    follower = Follower(case.stage._surface, vertices, triangles)
-    drawn = follower.moved(displacement.astype(np.float32))
+    follower = DeformationTransfer(case.stage._surface, vertices, triangles)
+    drawn = follower.apply(displacement.astype(np.float32))
     for points in (moved.vertices, drawn[:, :3]):
         middle = points[np.linalg.norm(points[:, :2], axis=1) < 0.004]
         assert middle[:, 2].max() == pytest.approx(
@@ -165,7 +167,7 @@ class Chain:
         edges = zip(
             edge_poses(np.eye(4), 0.25), (case.scene.arms.left, case.scene.arms.right), strict=True
         )
-        left, right = (edge @ inverse(transform_of(arm.flange_from_edge)) for edge, arm in edges)
+        left, right = (edge @ inverse(pose_matrix(arm.flange_from_edge)) for edge, arm in edges)
         self.arms = TwinArms(
             joints_left_rad=np.zeros(6),
             joints_right_rad=np.zeros(6),

@@ -25,7 +25,7 @@ from messages.clock import VirtualClock
 from messages.methods import Methods, SoftBodyChoice
 from messages.scene import Scene
 from nodes.arm_bridge.kinematics import KINEMATICS
-from nodes.fem_solver.making import Maker, asked
+from nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from nodes.methods import Case, Family, Point, Trial
 from nodes.planner.force_table import law_by
 from nodes.triangulator.families import TRIANGULATION
@@ -177,7 +177,7 @@ def test_a_miss_is_said_with_how_far_it_misses() -> None:
 def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     there = {
         "launch.methods.families:QUICK_SHAPE": family(
-            "sheet-shape", ["flat", "four_triangles", "dents"]
+            "sheet-shape", ["four_triangles", "reduced_order"]
         ),
         "launch.methods.families:QUICK_CORRECTION": family(
             "correction", ["one_plane", "two_pass_triangles"]
@@ -185,16 +185,16 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
         "launch.methods.families:CORRECTION": family("correction", ["two_pass"]),
     }
     monkeypatch.setattr(tune, "family_at", there.__getitem__)
-    errors = {"flat": 9.0, "four_triangles": 0.2, "dents": 0.1, "one_plane": 9.0}
+    errors = {"four_triangles": 0.2, "reduced_order": 0.1, "one_plane": 9.0}
 
     def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
         return [point(name, errors.get(name, 0.3), took=1e-3) for name in asked.methods]
 
     tunables = tunables_named(["correction", "sheet-shape"])
     shape, correction = tune.tune(SCENE, tunables, measured=measured)
-    assert shape.chosen.setting == "dents"  # as quick as the others, and more exact
+    assert shape.chosen.setting == "reduced_order"  # as quick as the others, and more exact
     assert (correction.chosen.method, correction.chosen.setting) == ("two_pass", "two_pass")
-    errors["dents"] = 9.0
+    errors["reduced_order"] = 9.0
     shape, correction = tune.tune(SCENE, tunables, measured=measured)
     assert shape.chosen.setting == "four_triangles"
     assert correction.chosen.method == "two_pass_triangles"
@@ -448,19 +448,19 @@ async def test_a_node_follows_the_scene_where_it_is_told_auto() -> None:
 
 
 def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path: Path) -> None:
-    assert asked(SCENE_BARE, "auto", "auto") == ("auto", 0.003)
+    assert choose_method(SCENE_BARE, "auto", "auto") == ("auto", 0.003)
     linear = with_methods(soft_body={"method": "linear", "skin_spacing_m": 0.006})
-    assert asked(linear, "auto", "auto") == ("linear", 0.006)
-    assert asked(linear, "nonlinear_table", 0.0045) == ("nonlinear_table", 0.0045)
+    assert choose_method(linear, "auto", "auto") == ("linear", 0.006)
+    assert choose_method(linear, "nonlinear_table", 0.0045) == ("nonlinear_table", 0.0045)
     table = with_methods(soft_body={"method": "nonlinear_table", "skin_spacing_m": 0.0045})
-    assert asked(table, "auto", "auto") == ("auto", 0.0045)
+    assert choose_method(table, "auto", "auto") == ("auto", 0.0045)
     for by_hand_m, effective in (("auto", "0.0045"), (0.003, "0.003")):
-        method, spacing_m = asked(table, "auto", by_hand_m)
-        said = Maker(spacing_m, tmp_path).lacking(table, method, [])
+        method, spacing_m = choose_method(table, "auto", by_hand_m)
+        said = SoftBodyFactory(spacing_m, tmp_path).pending_note(table, method, [])
         assert said.endswith(f"--skin-spacing {effective})")
-        dragging = Maker(spacing_m, tmp_path, friction_ratio=0.3)
-        assert dragging.lacking(table, method, []) == "", "there never is a table"
-    assert Maker(0.006, tmp_path).lacking(linear, "auto", []) == ""
+        dragging = SoftBodyFactory(spacing_m, tmp_path, friction_ratio=0.3)
+        assert dragging.pending_note(table, method, []) == "", "there never is a table"
+    assert SoftBodyFactory(0.006, tmp_path).pending_note(linear, "auto", []) == ""
 
 
 SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.mesh.bisection import CELL, lattice
-from nodes.fem_solver.mesh.curving import curved
-from nodes.fem_solver.mesh.solid import oriented, with_middles
+from nodes.fem_solver.mesh.bisection import CELL, make_lattice
+from nodes.fem_solver.mesh.curving import curve_edges
+from nodes.fem_solver.mesh.solid import add_midside_nodes, orient_tetrahedra
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -20,7 +20,7 @@ def eighth(layers: int) -> tuple[Floats, Ints]:
     """Nodes and elements between the spheres, x, y, z >= 0: this many cells of the lattice across
     the wall and twice as many along each arc; edges on the spheres curved."""
     cells = 2 * layers
-    vertices, tetrahedra = lattice((cells, cells, cells))
+    vertices, tetrahedra = make_lattice((cells, cells, cells))
     u = vertices / (CELL * cells)
     out = np.abs(u).max(axis=1)
     kept = tetrahedra[((u >= 0).all(axis=1) & (out >= 0.5))[tetrahedra].all(axis=1)]
@@ -37,8 +37,8 @@ def eighth(layers: int) -> tuple[Floats, Ints]:
         wanted = np.where(radius < INNER, INNER, np.where(radius > OUTER - near, OUTER, radius))
         return points * (wanted / radius)[:, None]
 
-    nodes, elements = with_middles(corners, oriented(corners, index.reshape(-1, 4)))
-    return curved(nodes, elements, nearest), elements
+    nodes, elements = add_midside_nodes(corners, orient_tetrahedra(corners, index.reshape(-1, 4)))
+    return curve_edges(nodes, elements, nearest), elements
 
 
 def symmetry(nodes: Floats) -> Ints:

@@ -96,8 +96,11 @@ def twin_errors(
     sheet = true_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m
 
-    def errors(places_x: Image, places_y: Image) -> Floats:
-        x, y = (seen(picture, sheet, scene, eye=eye) for picture in (places_x, places_y))
+    def errors(coordinate_ramp_x: Image, coordinate_ramp_y: Image) -> Floats:
+        x, y = (
+            seen(picture, sheet, scene, eye=eye)
+            for picture in (coordinate_ramp_x, coordinate_ramp_y)
+        )
         return error_map(x, y, METRES_PER_PX).sizes_m
 
     return errors

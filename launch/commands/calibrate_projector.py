@@ -23,7 +23,7 @@ from messages.files import write_file
 if TYPE_CHECKING:
     from messages.scene import Projector, Scene, StereoCamera
     from nodes.renderer.gray_code import Image
-    from nodes.renderer.projector_calibration import Fit
+    from nodes.renderer.projector_calibration import ProjectorFit
 
     Views = tuple[list[Image], list[Image]]
 
@@ -87,7 +87,11 @@ def projector(
     """
     from launch.plans.plan import load_scene
     from nodes.renderer import gray_code
-    from nodes.renderer.projector_calibration import ProjectorError, calibrated, measured
+    from nodes.renderer.projector_calibration import (
+        ProjectorError,
+        calibrate_projector,
+        measure_points,
+    )
 
     scene = load_scene(scene_file)
     size = scene.projector.width_px, scene.projector.height_px
@@ -119,7 +123,9 @@ def projector(
                 assert pictures is not None
                 views = list(_read_views(pictures, len(gray_code.patterns(*size))))
             camera = _camera(scene, calibration)
-            fit = calibrated(measured(views, camera, scene.projector), scene.projector)
+            fit = calibrate_projector(
+                measure_points(views, camera, scene.projector), scene.projector
+            )
     except ProjectorError as error:
         raise CommandError(str(error), BAD_INPUT) from error
     if output is not None:
@@ -198,7 +204,7 @@ def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     )
 
 
-def _by_corners(scene: Scene, corners: str, rectangle_mm: str) -> Fit:
+def _by_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     import numpy as np
 
     from nodes.renderer.projector_calibration import keystone
@@ -256,7 +262,7 @@ def _rounded(value: float) -> float:
 
 
 def _tell(
-    scene: Scene, fit: Fit, true: Projector | None, output: Path | None, *, as_json: bool
+    scene: Scene, fit: ProjectorFit, true: Projector | None, output: Path | None, *, as_json: bool
 ) -> None:
     held_out = None if fit.held_out_rms_px != fit.held_out_rms_px else fit.held_out_rms_px
     lens, pose = fit.projector.lens, fit.projector.world_from_projector
@@ -264,7 +270,7 @@ def _tell(
         "scene": None if output is None else str(output),
         "poses": fit.poses,
         "points": fit.points,
-        "strays": fit.strays,
+        "outliers": fit.outliers,
         "rms_px": fit.rms_px,
         "rms_mm": 1e3 * fit.rms_m,
         "held_out_rms_px": held_out,
@@ -293,7 +299,7 @@ def _tell(
     print_fields(
         [
             ("scene", "not written (-o FILE)" if output is None else output),
-            ("points", f"{fit.points} in {fit.poses} poses, {fit.strays} strays left out"),
+            ("points", f"{fit.points} in {fit.poses} poses, {fit.outliers} outliers excluded"),
             ("before", f"{fit.before_rms_px:.2f} px rms"),
             ("after", f"{fit.rms_px:.2f} px rms, {1e3 * fit.rms_m:.2f} mm on the sheet"),
             ("poses held out", apart),
@@ -312,8 +318,8 @@ def _eye_errors_mm(scene: Scene, found: Projector, true: Projector) -> dict[str,
     from nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)
-    told = {}
-    for when, believed in (("before", scene.projector), ("after", found)):
-        errors = 1e3 * errors_at_eye(believed, true, eye, planes, VOLUME_HALF_M)
-        told[when] = {"mean": float(errors.mean()), "max": float(errors.max())}
-    return told
+    result = {}
+    for when, predicted in (("before", scene.projector), ("after", found)):
+        errors = 1e3 * errors_at_eye(predicted, true, eye, planes, VOLUME_HALF_M)
+        result[when] = {"mean": float(errors.mean()), "max": float(errors.max())}
+    return result

@@ -126,7 +126,9 @@ def _print_methods(result: dict[str, Any]) -> None:
 
 
 def _print_points(result: dict[str, Any]) -> None:
-    also = list(dict.fromkeys(name for point in result["points"] for name in point["also"]))
+    extra_names = list(
+        dict.fromkeys(name for point in result["points"] for name in point["extra_metrics"])
+    )
     rows = [
         (
             point["method"],
@@ -134,14 +136,14 @@ def _print_points(result: dict[str, Any]) -> None:
             f"{point['median_s'] * 1e6:.1f}",
             f"{point['p99_s'] * 1e6:.1f}",
             "-" if point["error"] is None else f"{point['error']:.4g}",
-            *(_short(point["also"].get(name)) for name in also),
+            *(_short(point["extra_metrics"].get(name)) for name in extra_names),
             "yes" if point["in_range"] else "no",
             "front" if point["method"] in result["front"] else "",
         )
         for point in result["points"]
     ]
     error = f"error, {result['unit']}"
-    named = (name.replace("_", " ") for name in also)
+    named = (name.replace("_", " ") for name in extra_names)
     print_table(("method", "case", "median, µs", "p99, µs", error, *named, "in range", ""), rows)
 
 

@@ -28,7 +28,7 @@ FAILURES: tuple[type[Exception], ...] = (
 LATE = {
     "messages.scene": "UnfitGeometryError",
     "nodes.fem_solver.mesh.solid": "UnfitMeshError",
-    "nodes.fem_solver.newton": "StuckError",
+    "nodes.fem_solver.newton": "NewtonNotConvergedError",
     "nodes.fem_solver.precompute_table": "WorkersError",
     "nodes.models.sheet.membrane": "NoEquilibriumError",
 }

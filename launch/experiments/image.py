@@ -116,7 +116,7 @@ def pushed_at(along_mm: float, tilt_deg: float) -> Series:
     )
 
 
-PLACES: tuple[Pattern, ...] = ("places_x", "places_y")
+PLACES: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
 """Patterns of which a dense map of the errors is made."""
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from nodes import cache
-from nodes.fem_solver.making import Maker
+from nodes.fem_solver.soft_body_factory import SoftBodyFactory
 from nodes.models.sheet.laws import SheetLaw
 from nodes.planner.compliance import (
     GOOD_RATIO,
@@ -26,7 +26,7 @@ from nodes.planner.compliance import (
 Floats = NDArray[np.float64]
 
 SKIN_SPACING_M = 0.0045
-LINEAR_DEPTH_M, LARGEST_DEPTH_M = 0.006, 0.010
+LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
 SHOWN_SHARES = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Depths that are told, over the deepest push."""
 
@@ -35,10 +35,10 @@ def front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
     """The object's force over depth (n, 2), m and N, where it faces the user: by the nonlinear
     table if that is kept for this object, else by the linear method, which is worked out if it is
     not kept.  cache_dir: None: the user's."""
-    maker = Maker(
+    maker = SoftBodyFactory(
         skin_spacing_m=SKIN_SPACING_M,
         linear_depth_m=LINEAR_DEPTH_M,
-        largest_depth_m=LARGEST_DEPTH_M,
+        max_depth_m=MAX_DEPTH_M,
         friction_ratio=0.0,
         cache_dir=cache_dir or cache.default_cache_dir(),
         workers=0,

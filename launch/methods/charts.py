@@ -20,6 +20,7 @@ from launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
 from launch.running.code_state import git_state
 from messages.files import write_file
 from messages.scene import Scene
+from nodes.cache import EtaEstimator
 from nodes.methods import Family, Point, Trial, measure, pareto_front
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ FAMILIES: dict[str, str] = {
     "triangulation": "nodes.triangulator.families:TRIANGULATION",
     "tracking": "launch.methods.families:TRACKING",
     "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
-    "soft-body": "nodes.fem_solver.families:SOFT_BODY",
+    "soft-body": "nodes.fem_solver.benchmarks:SOFT_BODY",
     "correction": "launch.methods.families:CORRECTION",
     "sheet-force": "launch.methods.families:SHEET_FORCE",
     "sheet-shape": "launch.methods.families:SHEET_SHAPE",
@@ -102,21 +103,18 @@ def measure_family(
 
 
 def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Says (done, total) in words, not more often than `TOLD_EVERY_S`, with the time left."""
-    begun_s, last_s = time.monotonic(), -math.inf
+    """Return a function that reports (done, total) with the time left, every `TOLD_EVERY_S`."""
+    eta, last_s = EtaEstimator(), -math.inf
 
-    def told(done: int, total: int) -> None:
+    def report(done: int, total: int) -> None:
         nonlocal last_s
         now_s = time.monotonic()
-        if now_s - last_s < TOLD_EVERY_S:
-            return
-        last_s, left = now_s, ""
-        if 0 < done < total:
-            left_s = (now_s - begun_s) / done * (total - done)
-            left = f", about {left_s:.0f} s left"
-        progress(f"{what} {done} of {total}{left}")
+        left = f": {eta.text(done, total, now_s)}" if total else ""
+        if now_s - last_s >= TOLD_EVERY_S:
+            last_s = now_s
+            progress(f"{what} {done} of {total}{left}")
 
-    return told
+    return report
 
 
 def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
@@ -127,7 +125,7 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
         "reference": family.reference,
         "scene": scene.name,
         "tolerance": family.tolerance(scene),
-        "along": family.along,
+        "sweep_key": family.sweep_key,
         "machine": machine_name(),
         "load": os.getloadavg()[0],
         "code": json.loads(git_state(ROOT)),
@@ -145,9 +143,11 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
     from matplotlib.figure import Figure
 
     also = (
-        [] if result["along"] is None else sorted({k for p in result["points"] for k in p["also"]})
+        []
+        if result["sweep_key"] is None
+        else sorted({k for p in result["points"] for k in p["extra_metrics"]})
     )
-    panels = 1 if result["along"] is None else 2 + len(also)
+    panels = 1 if result["sweep_key"] is None else 2 + len(also)
     with drawn_for_pages():
         columns = min(panels, 2)
         rows = math.ceil(panels / columns)
@@ -208,14 +208,20 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     """One figure over the case, a line for each method, hollow out of its range; grey: what the
     reference itself does not know."""
-    along, points = result["along"], result["points"]
+    along, points = result["sweep_key"], result["points"]
 
     def value(point: dict[str, Any]) -> float | None:
-        found: float | None = point["error"] if name == "error" else point["also"].get(name)
+        found: float | None = (
+            point["error"] if name == "error" else point["extra_metrics"].get(name)
+        )
         return found
 
     doubts = sorted(
-        {p["case"][along]: p["doubts"][name] for p in points if name in p["doubts"]}.items()
+        {
+            p["case"][along]: p["reference_uncertainty"][name]
+            for p in points
+            if name in p["reference_uncertainty"]
+        }.items()
     )
     if doubts:
         at, doubt = zip(*doubts, strict=True)
@@ -284,8 +290,10 @@ def kept_charts(folder: Path) -> list[dict[str, Any]]:
 
 def _as_today(result: dict[str, Any]) -> dict[str, Any]:
     """Numbers of earlier code, with what they did not have yet."""
-    points = [{"also": {}, "doubts": {}, **point} for point in result["points"]]
-    return {"along": None, "code": None, **result, "points": points}
+    points = [
+        {"extra_metrics": {}, "reference_uncertainty": {}, **point} for point in result["points"]
+    ]
+    return {"sweep_key": None, "code": None, **result, "points": points}
 
 
 def write_overview(folder: Path) -> Path:

@@ -13,8 +13,8 @@ from messages.scene import Cylinder, Scene
 from messages.types import FingerPath
 from nodes.planner import force_table
 from nodes.planner.sheet_force import sheet_force_family
-from nodes.renderer.families import correction_family
-from nodes.renderer.shape_families import sheet_shape_family
+from nodes.renderer.benchmarks import correction_family
+from nodes.renderer.sheet_shape_benchmark import sheet_shape_family
 from nodes.triangulator.tracking_family import Motion, tracking_family
 from nodes.twin.finger import FingerMotion
 from nodes.twin.gestures import GESTURES
@@ -54,7 +54,7 @@ def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
 
 TRACKING = tracking_family(finger_motions)
 true_force = lru_cache(maxsize=1024)(twin_force)
-SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_make(scene, None))
+SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_compute(scene, None))
 SHEET_LAWS = sheet_force_family(true_force, None)
 """Those that are at hand at once."""
 SHEET_SHAPE = sheet_shape_family(twin_points)

@@ -110,7 +110,7 @@ TUNABLES = (
         "sheet-shape",
         "sheet_shape",
         ("launch.methods.families:QUICK_SHAPE", "launch.methods.families:SHEET_SHAPE"),
-        _by_name("flat", "four_triangles", "dents"),
+        _by_name("four_triangles", "reduced_order"),
     ),
     Tunable(
         "correction",
@@ -122,8 +122,8 @@ TUNABLES = (
         "soft-body",
         "soft_body",
         (
-            "nodes.fem_solver.families:SOFT_BODY_LINEAR",
-            "nodes.fem_solver.families:SOFT_BODY_TABLES",
+            "nodes.fem_solver.benchmarks:SOFT_BODY_LINEAR",
+            "nodes.fem_solver.benchmarks:SOFT_BODY_TABLES",
         ),
         {
             "linear, coarse": _soft_body("linear", 0.006),
@@ -136,9 +136,8 @@ TUNABLES = (
 """In the order in which they are tuned: the correction asks which shape two passes go onto."""
 
 TWO_PASS_ONTO = {
-    "flat": "two_pass_flat",
     "four_triangles": "two_pass_triangles",
-    "dents": "two_pass",
+    "reduced_order": "two_pass",
 }
 """What the chart calls two passes, by the sheet's shape."""
 
@@ -324,7 +323,7 @@ def tune(
     Errors of a family whose shape, mesh or sheet cannot be worked with come through.
     """
     choices: list[Choice] = []
-    shape: str = scene.methods.sheet_shape or "dents"
+    shape: str = scene.methods.sheet_shape or "reduced_order"
     for number, tunable in enumerate(tunables, start=1):
         told = partial(_told, progress, f"{tunable.name} ({number} of {len(tunables)})")
         settings = dict(tunable.settings)

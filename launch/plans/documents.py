@@ -35,6 +35,9 @@ from ruamel.yaml.tokens import (
     ScalarToken,
 )
 
+from launch.plans.renamed_keys import LAUNCH_KEYS, NODE_PARAMETERS, SCENE_KEYS, VALUES
+from messages.scene import Scene
+
 M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
@@ -323,16 +326,29 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
         if error["type"] == "missing":
             return document.problem((*at, *inside), f'"{name}" is missing', f'add "{name}"')
         known = sorted(holder.model_fields) if _is_model(holder) else []
-        return document.problem(
-            (*at, *inside, name), f'unknown key "{name}"', did_you_mean(name, known)
-        )
+        key = (*at, *inside, name)
+        renamed = _renamed_keys(model, document, key).get(str(name))
+        remedy = f'it is now "{renamed}"' if renamed else did_you_mean(name, known)
+        return document.problem(key, f'unknown key "{name}"', remedy)
     key = (*at, *_walk(model, location)[0])
     if error["type"] in MAPPING_WANTED:
         return document.problem(
             key, f"is {_kind_name(error['input'])}", "it must hold keys and values"
         )
+    renamed = VALUES.get(str(key[-1]) if key else "", {}).get(str(error["input"]))
+    if renamed is not None:
+        what = f"{_shown(error['input'])} does not fit"
+        return document.problem(key, what, f'it is now "{renamed}"')
     message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
     return document.problem(key, f"{_shown(error['input'])} does not fit", message)
+
+
+def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
+    """Return old to new names of the keys beside `key`."""
+    if key[0] == "nodes" and key[2:3] == ("parameters",):
+        node_type = document.values["nodes"][key[1]].get("type")
+        return NODE_PARAMETERS.get(node_type, {})
+    return SCENE_KEYS if issubclass(model, Scene) else LAUNCH_KEYS
 
 
 def _shown(value: Any) -> str:

@@ -160,11 +160,12 @@ REMEDIES = {
     "version.",
     "MeshError": "repair the mesh (closed, outward, no elements inside out); see meshing.md.",
     "TextureError": "name a PNG or JPEG, and a mesh with texture coordinates.",
+    "SolidMeshError": "raise skin_spacing_m, or hold more of the object; see meshing.md.",
     "UnfitMeshError": "use a coarser or finer spacing, or repair the surface.",
-    "InvertedError": "smaller load steps help; a push beyond the object's range has no answer.",
-    "StuckError": "lessen the push, refine the mesh, or choose the linear method.",
+    "InvertedElementError": "use smaller load steps; deep pushes have no solution.",
+    "NewtonNotConvergedError": "lessen the push, refine the mesh, or choose the linear method.",
     "IndefiniteError": "hold the body at its base; check Poisson's ratio below 0.5.",
-    "LabError": "check the scheduler's address and that its workers run the same version.",
+    "SchedulerError": "check the scheduler's address and that its workers run the same version.",
     "LostWorkersError": "start the workers again and repeat: what was solved is kept.",
     "NoOpenGLError": "`flexsheet doctor` names the packages for EGL.",
     "WindowError": "set the monitor to one that it lists, or run headless.",
@@ -210,8 +211,8 @@ PARTICULAR = {
     "ms are allowed": "quieten the network, set up chrony, or allow more (docs/clocks.md).",
     "no way: <error>": "bring the arms nearer to the sheet by hand, or the sheet to another place "
     "(docs/arms.md).",
-    ": holding the last good sheet plane": "arms that say nothing, or a sheet turned away; it goes "
-    "on by itself.",
+    ": keeping the last valid sheet plane": "the arms are silent, or the sheet faces "
+    "away; it recovers by itself.",
     ", kept until it is reset": "when the danger is over: `flexsheet arms reset`.",
     "watchdog: no command": "its bridge was silent for 100 ms: is it running, and the cable in?",
 }

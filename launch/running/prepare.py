@@ -1,4 +1,4 @@
-"""What is worked out before a graph starts, so that no node has to do without it."""
+"""Compute before a graph starts what its nodes cache."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from messages.methods import SheetShapeMethod, chosen
 from messages.scene import Scene
 from nodes.cache import default_cache_dir
 from nodes.models.sheet.membrane import NoEquilibriumError
-from nodes.renderer import dent_cache
+from nodes.renderer import deflection_cache
 
 Progress = Callable[[str], None]
 
 TOLD_SHARE = 0.1
-"""Progress is told in such steps."""
+"""Steps in which progress is reported."""
 
 
 class NoSoftBodyError(RuntimeError):
-    """A scene whose soft body cannot be made; the text says why, and a remedy."""
+    """The soft body of a scene cannot be computed; the text gives the reason and a remedy."""
 
 
 def prepare_plan(plan: Plan, progress: Progress) -> None:
-    """The dent shapes of the plan's scene, for each of its renderers."""
+    """Compute the deflection shapes of the plan's scene, for each of its renderers."""
     scene = plan.scene_message()
     if scene is None:
         return
@@ -34,52 +34,52 @@ def prepare_plan(plan: Plan, progress: Progress) -> None:
             prepare_dents(scene, node.parameters["cache_dir"], progress)
 
 
-def _takes_dents(scene: Scene, asked: SheetShapeMethod | Literal["auto"]) -> bool:
-    """Whether a renderer takes a pushed sheet for what the membrane makes of it."""
-    shape: SheetShapeMethod = chosen(asked, scene.methods.sheet_shape, "dents")
-    return shape == "dents"
+def _takes_dents(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
+    """Return whether a renderer draws a pushed sheet by the membrane's deflection shapes."""
+    shape: SheetShapeMethod = chosen(requested, scene.methods.sheet_shape, "reduced_order")
+    return shape == "reduced_order"
 
 
 def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress) -> Path:
-    """The file with the dent shapes of a scene's sheet, worked out if it is not there.
+    """Return the file with the deflection shapes of a scene's sheet, computed if it does not exist.
 
-    Where the membrane finds no equilibrium that is said, and the renderer does with four triangles.
+    Where the membrane has no equilibrium, that is reported, and the renderer uses four triangles.
     """
     folder = None if cache_dir is None else Path(cache_dir)
     try:
-        told = _with_time_left("working out how the sheet dents, once", progress)
-        dent_cache.load_or_solve(scene, folder, told)
+        on_progress = _with_time_left("computing the sheet's deflection shapes, once", progress)
+        deflection_cache.load_or_compute(scene, folder, on_progress)
     except NoEquilibriumError as error:
-        progress(f"no dent shapes for this sheet: {error}")
-    return dent_cache.file_of(scene, folder)
+        progress(f"no deflection shapes for this sheet: {error}")
+    return deflection_cache.shapes_cache(scene).path(folder)
 
 
 def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
-    """Says how far (done, total) is and what is left, in steps."""
-    from nodes.fem_solver.remaining import Remaining
+    """Return a function that reports (done, total) in steps, with the time left."""
+    from nodes.cache import EtaEstimator
 
-    remaining, next_share = Remaining(), 0.0
+    remaining, next_share = EtaEstimator(), 0.0
 
-    def told(done: int, total: int) -> None:
+    def on_progress(done: int, total: int) -> None:
         nonlocal next_share
         far = remaining.text(done, total, time.monotonic())
         if done >= next_share * total:
             progress(f"{what}: {far}")
             next_share = done / total + TOLD_SHARE
 
-    return told
+    return on_progress
 
 
 def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
-    """The file with the table of a scene's sheet's force, made if it is not there.
+    """Return the file with the table of a scene's sheet force, computed if it does not exist.
 
-    NoEquilibriumError for a sheet of which the membrane finds none.
+    Raises NoEquilibriumError for a sheet of which the membrane finds none.
     """
     from nodes.planner import force_table
 
-    told = _with_time_left("working out how the sheet pushes back, once", progress)
-    force_table.load_or_make(scene, cache_dir, told)
-    return force_table.file_of(scene, cache_dir)
+    on_progress = _with_time_left("computing the sheet's force, once", progress)
+    force_table.load_or_compute(scene, cache_dir, on_progress)
+    return force_table.table_cache(scene).path(cache_dir)
 
 
 def prepare_soft_body(
@@ -89,31 +89,33 @@ def prepare_soft_body(
     scheduler: str | None,
     progress: Progress,
 ) -> Path:
-    """The file with the nonlinear table of a scene's soft body, made if it is not there.
+    """Return the file with the nonlinear table of a scene's soft body, computed if it does not
+    exist.
 
-    scheduler: as the fem_solver node's parameter.  NoSoftBodyError where that is of no use, the
-    body cannot be meshed, or memory is too little for it.
+    scheduler: as the fem_solver node's parameter. Raises NoSoftBodyError where the scheduler cannot
+    be used, the body cannot be meshed, or memory is insufficient.
     """
+    from nodes.cache import EtaEstimator
     from nodes.fem_solver import body, precompute_table
-    from nodes.fem_solver.making import Maker
-    from nodes.fem_solver.precompute import Need
-    from nodes.fem_solver.remaining import Remaining
+    from nodes.fem_solver.precompute import WorkBudget
+    from nodes.fem_solver.soft_body_factory import SoftBodyFactory
 
     folder = cache_dir or default_cache_dir()
-    remaining, told = Remaining(), -1
+    remaining, reported_percent = EtaEstimator(), -1
 
-    def made(done: int, total: int, need: Need) -> None:
-        nonlocal told
+    def made(done: int, total: int, need: WorkBudget) -> None:
+        nonlocal reported_percent
         far = remaining.text(done, total, time.monotonic())
-        if 100 * done // total != told:
-            progress(f"making the soft body: {far} ({need.text()})")
-            told = 100 * done // total
+        if 100 * done // total != reported_percent:
+            progress(f"computing the soft body: {far} ({need.text()})")
+            reported_percent = 100 * done // total
 
-    maker = Maker(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
+    maker = SoftBodyFactory(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
     try:
         bodies = maker.bodies(scene, "auto", made)
         if len(bodies) == 1:
-            maker.tabulated(scene, bodies[0], made)
+            maker.build_table(scene, bodies[0], made)
     except (ValueError, MemoryError, precompute_table.WorkersError) as error:
         raise NoSoftBodyError(str(error)) from error
-    return precompute_table.table_path(body.table_spec_of(scene, bodies[0].spec), folder)
+    spec = body.make_table_spec(scene, bodies[0].spec)
+    return precompute_table.table_cache(spec).path(folder)

@@ -1,4 +1,4 @@
-"""A scene's soft body: what to precompute for it, where it stands, its answer in world frame."""
+"""Build a scene's soft body and compute its response in the world frame."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from messages.types import Fingertip, Skin, SoftBody
+from nodes.fem_solver.closest_contact import ContactAnchor, locate, locate_sticking, slide_anchor
 from nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
 from nodes.fem_solver.mesh import mesh_spec, world_from_mesh
-from nodes.fem_solver.place import Entry, locate, locate_stuck, slipped
 from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
 from nodes.fem_solver.precompute_table import TableSpec
 from nodes.fem_solver.table import Table, TableSoftBody
@@ -23,29 +23,31 @@ from nodes.models.shapes import Shape, make_shape
 Floats = NDArray[np.float64]
 
 
-def spec_of(scene: Scene, skin_spacing_m: float, *, sticking: bool = False) -> SoftBodySpec:
-    """What has to be precomputed for this scene's object.
+def make_soft_body_spec(
+    scene: Scene, skin_spacing_m: float, *, sticking: bool = False
+) -> SoftBodySpec:
+    """Return what has to be precomputed for this scene's object.
 
-    ValueError as `mesh_spec`, and for a skin coarser than the fingertip, which would resist far too
-    much: twice where it is 1.7 times as coarse, seven times where it is 7 times.
+    Raises ValueError as `mesh_spec`, and for a skin spacing above the fingertip's radius. Such a
+    skin resists too much: twice at 1.7 times the radius, seven times at 7 times the radius.
     """
     if skin_spacing_m > scene.finger.radius_m:
         raise ValueError(
             f"skin_spacing_m: {skin_spacing_m:g} is more than finger.radius_m "
-            f"({scene.finger.radius_m:g}): a skin so coarse would answer so small a fingertip with "
-            "far too much force; lower skin_spacing_m to that or less"
+            f"({scene.finger.radius_m:g}), so that the force would be far too large; lower "
+            "skin_spacing_m to the radius or less"
         )
     mesh = mesh_spec(scene, skin_spacing_m)
     return SoftBodySpec(mesh, scene.object.material.poisson_ratio, sticking)
 
 
-def table_spec_of(scene: Scene, spec: SoftBodySpec) -> TableSpec:
-    """What the nonlinear table of this body depends on."""
+def make_table_spec(scene: Scene, spec: SoftBodySpec) -> TableSpec:
+    """Return what the nonlinear table of this body depends on."""
     return TableSpec(spec, scene.finger.radius_m)
 
 
-def front_of(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
-    """The surface point (3,) nearest to a user far off; rest (s, 3): skin nodes."""
+def find_front_point(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
+    """Return the surface point (3,) nearest to a distant user; rest (s, 3): skin nodes."""
     middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
     away = 2.0 * float(np.ptp(rest, axis=0).max())
     return shape.closest(middle + away * np.array(spec.mesh.towards_user)).point
@@ -53,11 +55,12 @@ def front_of(shape: Shape, spec: SoftBodySpec, rest: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SceneBody:
-    """The soft body standing in its scene.
+    """The soft body of a scene, posed in the world.
 
-    front (3,): the surface point nearest to the user, rest (s, 3): skin nodes, mesh frame.
-    linear_depth_m: to which the linear method is good, and at which the stiffness is told.
-    friction_ratio: of what the finger can pull along the skin to what it presses; 0: it slides.
+    front (3,): the surface point nearest to the user, mesh frame. rest (s, 3): skin nodes, mesh
+    frame. linear_depth_m: the end of the linear method's range, where the stiffness is evaluated.
+    friction_ratio: the tangential over the normal force above which the finger slips; 0: it slides
+    freely.
     """
 
     method: SoftBodyMethod
@@ -70,29 +73,35 @@ class SceneBody:
     linear_depth_m: float
     friction_ratio: float
 
-    def respond(self, point_world: Floats, held: Entry | None) -> tuple[Response, Entry | None]:
-        """Answer to a fingertip at `point_world` (3,), and where it is in the body, to be handed in
-        as `held` the next time.  ValueError for a point that is not finite."""
+    def respond(
+        self, point_world: Floats, anchor: ContactAnchor | None
+    ) -> tuple[Response, ContactAnchor | None]:
+        """Return the response to a fingertip at `point_world` (3,), and its contact anchor.
+
+        anchor: the one that the previous call returned. Raises ValueError for a point that is not
+        finite.
+        """
         point = rigid.apply(rigid.inverse(self.world_from_mesh), point_world)
         if self.friction_ratio == 0.0:
-            push, entry = locate(self.shape, point, held)
-            return self.method.respond(push), entry
-        push, entry = locate_stuck(self.shape, point, held)
-        response = self.method.respond(push)
-        if entry is None or push.drag_m is None:
-            return response, entry
-        pressing = float(response.force_n @ push.normal)
-        aside = float(np.linalg.norm(response.force_n - pressing * push.normal))
-        most = self.friction_ratio * max(pressing, 0.0)
-        if aside > most:
-            # the skin pulls back in proportion to the drag: so much of it is held
-            share = most / aside
-            entry = slipped(self.shape, entry, push.drag_m, share)
-            response = self.method.respond(replace(push, drag_m=share * push.drag_m))
-        return response, entry
+            query, new_anchor = locate(self.shape, point, anchor)
+            return self.method.respond(query), new_anchor
+        query, new_anchor = locate_sticking(self.shape, point, anchor)
+        response = self.method.respond(query)
+        if new_anchor is None or query.drag_m is None:
+            return response, new_anchor
+        normal_n = float(response.force_n @ query.normal)
+        tangential_n = float(np.linalg.norm(response.force_n - normal_n * query.normal))
+        limit_n = self.friction_ratio * max(normal_n, 0.0)
+        if tangential_n > limit_n:
+            # The tangential force is proportional to the drag: keep the fraction that friction can
+            # hold.
+            fraction = limit_n / tangential_n
+            new_anchor = slide_anchor(self.shape, new_anchor, query.drag_m, fraction)
+            response = self.method.respond(replace(query, drag_m=fraction * query.drag_m))
+        return response, new_anchor
 
     def at_rest(self) -> Response:
-        """The untouched body; its stiffness is that of the place nearest to the user."""
+        """Return the response of the untouched body, with the stiffness at its front."""
         return Response(
             displacement=self.method.at_rest,
             force_n=np.zeros(3),
@@ -102,10 +111,10 @@ class SceneBody:
             in_range=True,
         )
 
-    def message(self, response: Response, *, lead_s: float = 0.0) -> SoftBody:
-        """The response as it goes on the wire, to a finger `lead_s` after its exposure."""
+    def message(self, response: Response, *, horizon_s: float = 0.0) -> SoftBody:
+        """Return the response as a message; horizon_s: from exposure to the predicted finger."""
         rotation = self.world_from_mesh[:3, :3]
-        turned = response.displacement @ rotation.T.astype(np.float32)
+        rotated = response.displacement @ rotation.T.astype(np.float32)
         return SoftBody(
             mesh_id=self.skin.mesh_id,
             method=self.method.name,
@@ -114,21 +123,22 @@ class SceneBody:
             force_world_n=rotation @ response.force_n,
             stiffness_n_per_m=response.stiffness_n_per_m,
             force_curve=response.force_curve,
-            lead_s=lead_s,
-            displacement_world_m=np.ascontiguousarray(turned),
+            prediction_horizon_s=horizon_s,
+            displacement_world_m=np.ascontiguousarray(rotated),
         )
 
 
-def scene_body(
+def build_scene_body(
     scene: Scene,
     spec: SoftBodySpec,
     model: SoftBodyModel,
     *,
     linear_depth_m: float,
-    largest_depth_m: float,
+    max_depth_m: float,
     friction_ratio: float = 0.0,
 ) -> SceneBody:
-    """The soft body of a scene from its precomputed model; ValueError as its parts."""
+    """Return the soft body of a scene from its precomputed model; raises ValueError as its
+    parts."""
     pose = world_from_mesh(scene)
     shape = make_shape(dict(scene.object.geometry))
     rest = model.response.rest
@@ -139,7 +149,7 @@ def scene_body(
         young_modulus_pa=scene.object.material.young_modulus_pa,
         finger_radius_m=scene.finger.radius_m,
         linear_depth_m=linear_depth_m,
-        largest_depth_m=largest_depth_m,
+        max_depth_m=max_depth_m,
         push_depth_m=scene.working_range.push_depth_m,
         drag=model.drag,
     )
@@ -153,7 +163,7 @@ def scene_body(
         method=method,
         spec=spec,
         shape=shape,
-        front=front_of(shape, spec, rest),
+        front=find_front_point(shape, spec, rest),
         world_from_mesh=pose,
         rest=rest,
         skin=skin,
@@ -162,8 +172,8 @@ def scene_body(
     )
 
 
-def with_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table) -> SceneBody:
-    """The same body, answered for by its nonlinear table."""
+def attach_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table) -> SceneBody:
+    """Return the same body with its nonlinear table as the method."""
     method = TableSoftBody(
         model.response,
         model.response.rest[model.bounds],
@@ -176,8 +186,11 @@ def with_table(body: SceneBody, scene: Scene, model: SoftBodyModel, table: Table
     return replace(body, method=method)
 
 
-def faded(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
-    """A response after the finger has been lost for `lost_s`: held, then it springs back."""
+def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -> Response:
+    """Return a response `lost_s` after the finger was lost.
+
+    It stays for `hold_s` and then decays with the time constant `relax_s`.
+    """
     if lost_s <= hold_s:
         return response
     left = float(np.exp(-(lost_s - hold_s) / relax_s))
@@ -189,6 +202,6 @@ def faded(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -
     )
 
 
-def position_at(fingertip: Fingertip, lead_s: float) -> Floats:
-    """Where the fingertip is expected `lead_s` after its exposure, m, world."""
-    return path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, lead_s)[0]
+def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
+    """Return the expected fingertip position (3,), m, world, `horizon_s` after its exposure."""
+    return path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, horizon_s)[0]

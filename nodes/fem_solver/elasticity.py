@@ -1,7 +1,7 @@
-"""Linear isotropic elasticity on 10-node tetrahedra: stiffness, supports, a direct solve.
+"""Assemble and solve linear isotropic elasticity on 10-node tetrahedra.
 
 Small strain, Hooke's law with Lame's constants (Zienkiewicz & Taylor, "The Finite Element Method",
-vol. 1, ch. 4-6).  Degrees of freedom are numbered 3 * node + axis.
+vol. 1, ch. 4-6). Degrees of freedom are numbered 3 * node + axis.
 """
 
 from __future__ import annotations
@@ -21,34 +21,35 @@ Ints = NDArray[np.int64]
 
 CHUNK_ELEMENTS = 2048
 MAX_POISSON_RATIO = 0.4999
-"""Nearer to 0.5 a displacement formulation loses all digits to the bulk modulus."""
-LEAST_VOLUME_RATIO = 1e-6
-"""An element's Jacobian is at least this much of its side's cube: flatter ones lose the answer to
+"""Closer to 0.5 a displacement formulation loses all digits to the bulk modulus."""
+MIN_VOLUME_RATIO = 1e-6
+"""Minimum Jacobian of an element over its side's cube: flatter elements lose the solution to
 rounding."""
 
 
-class MeshError(ValueError):
-    """A mesh that cannot be computed with: inverted elements, or a body that nothing holds."""
+class SolidMeshError(ValueError):
+    """A mesh that cannot be computed: inverted elements, or a body without sufficient support."""
 
 
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:
-    """(lambda, mu) in Pa.  ValueError outside E > 0, -1 < nu <= 0.4999."""
+    """Return (lambda, mu) in Pa. Raises ValueError outside E > 0, -1 < nu <= 0.4999."""
     if not (np.isfinite(young_modulus_pa) and young_modulus_pa > 0.0):
         raise ValueError(f"young_modulus_pa: {young_modulus_pa!r} must be a positive number")
     if not -1.0 < poisson_ratio <= MAX_POISSON_RATIO:
         raise ValueError(
-            f"poisson_ratio: {poisson_ratio!r} must lie above -1 and at most at "
-            f"{MAX_POISSON_RATIO}; an incompressible body needs a mixed formulation, take 0.499"
+            f"poisson_ratio: {poisson_ratio!r} must be above -1 and at most "
+            f"{MAX_POISSON_RATIO}; an incompressible body needs a mixed formulation, use 0.499"
         )
     mu = 0.5 * young_modulus_pa / (1.0 + poisson_ratio)
     return 2.0 * mu * poisson_ratio / (1.0 - 2.0 * poisson_ratio), mu
 
 
 def quadrature() -> tuple[Floats, Floats]:
-    """Points (8, 3) and weights (8,) on the unit tetrahedron, exact to degree 3, all positive.
+    """Return points (8, 3) and weights (8,) on the unit tetrahedron, exact to degree 3, all
+    positive.
 
     Conical product of Gauss-Jacobi rules (Stroud, "Approximate Calculation of Multiple Integrals").
-    Degree 3 is what the patch test needs on curved elements; straight ones need degree 2.
+    The patch test needs degree 3 on curved elements and degree 2 on straight ones.
     """
     from scipy.special import roots_jacobi
 
@@ -64,7 +65,8 @@ def quadrature() -> tuple[Floats, Floats]:
 
 
 def shape_gradients(points: Floats) -> Floats:
-    """Gradients (q, 10, 3) of the shape functions at points (q, 3) of the unit tetrahedron."""
+    """Return gradients (q, 10, 3) of the shape functions at points (q, 3) of the unit
+    tetrahedron."""
     barycentric = np.column_stack([1.0 - points.sum(axis=1), points])
     slopes = np.vstack([-np.ones(3), np.eye(3)])
     corner = (4.0 * barycentric - 1.0)[:, :, None] * slopes
@@ -76,24 +78,24 @@ def shape_gradients(points: Floats) -> Floats:
 
 
 def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Floats]:
-    """Derivatives (e, q, 3, 3) of places by the unit tetrahedron's coordinates, and their
-    determinants (e, q), from gradients (q, 10, 3) of the shape functions.
+    """Return Jacobians (e, q, 3, 3) with respect to the unit tetrahedron, and determinants (e, q).
 
-    MeshError where an element is inverted or flat, or a node's place is no finite number.
+    local (q, 10, 3): gradients of the shape functions. Raises SolidMeshError where an element is
+    inverted or flat, or a node's coordinates are not finite.
     """
     corners = nodes[elements]
-    lost = ~np.isfinite(corners).all(axis=(1, 2))
-    if lost.any():
-        raise MeshError(
-            f"nodes of {int(lost.sum())} of {len(elements)} elements are not finite, the first is "
-            f"element number {int(np.argmax(lost))}"
+    invalid = ~np.isfinite(corners).all(axis=(1, 2))
+    if invalid.any():
+        raise SolidMeshError(
+            f"nodes of {int(invalid.sum())} of {len(elements)} elements are not finite, the first "
+            f"is element number {int(np.argmax(invalid))}"
         )
     jacobian: Floats = corners.transpose(0, 2, 1)[:, None] @ local
     determinant: Floats = np.linalg.det(jacobian)
     size = np.ptp(corners[:, :4], axis=1).max(axis=1)
-    bad = determinant.min(axis=1) <= LEAST_VOLUME_RATIO * size**3
+    bad = determinant.min(axis=1) <= MIN_VOLUME_RATIO * size**3
     if bad.any():
-        raise MeshError(
+        raise SolidMeshError(
             f"{int(bad.sum())} of {len(elements)} elements are inverted or flat, the first is "
             f"number {int(np.argmax(bad))} (smallest Jacobian {determinant.min():.3g} m^3)"
         )
@@ -103,15 +105,15 @@ def jacobians(nodes: Floats, elements: Ints, local: Floats) -> tuple[Floats, Flo
 def element_stiffness(
     nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
 ) -> Floats:
-    """Stiffness matrices (e, 30, 30) in N/m.
+    """Return stiffness matrices (e, 30, 30) in N/m.
 
-    MeshError as `jacobians`, ValueError as `lame_constants`.
+    Raises SolidMeshError as `jacobians`, ValueError as `lame_constants`.
     """
     lame, mu = lame_constants(young_modulus_pa, poisson_ratio)
     points, weights = quadrature()
     local = shape_gradients(points)
     jacobian, determinant = jacobians(nodes, elements, local)
-    # gradients in space: J^-T applied to the local ones, one row per (node, axis)
+    # Gradients in space: J^-T applied to the local ones, one row per (node, axis).
     gradient = np.einsum("qak,eqki->eqai", local, np.linalg.inv(jacobian))
     flat = gradient.reshape(len(elements), len(points), 30)
     weighted = flat * (determinant * weights)[:, :, None]
@@ -126,7 +128,7 @@ def element_stiffness(
 def stiffness_matrix(
     nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
 ) -> csc_matrix:
-    """The assembled stiffness (3n, 3n) in N/m; errors as `element_stiffness`."""
+    """Return the assembled stiffness (3n, 3n) in N/m; errors as `element_stiffness`."""
     from scipy.sparse import csc_matrix
 
     size = 3 * len(nodes)
@@ -143,43 +145,48 @@ def stiffness_matrix(
 
 
 def require_support(nodes: Floats, fixed: NDArray[np.bool_]) -> None:
-    """MeshError unless the fixed nodes hold the body: three of them at least, not on one line."""
-    held = nodes[fixed]
+    """Raise SolidMeshError unless at least three fixed nodes, not on one line, hold the body."""
+    fixed_nodes = nodes[fixed]
     extent = np.ptp(nodes, axis=0).max()
     if (
-        len(held) < 3
-        or np.linalg.matrix_rank(held - held.mean(axis=0), tol=1e-6 * extent * len(held) ** 0.5) < 2
+        len(fixed_nodes) < 3
+        or np.linalg.matrix_rank(
+            fixed_nodes - fixed_nodes.mean(axis=0), tol=1e-6 * extent * len(fixed_nodes) ** 0.5
+        )
+        < 2
     ):
-        raise MeshError(
-            f"the body is free to move: {len(held)} fixed nodes, at least three not on one line "
-            "are needed (object.support_angle_rad too small for skin_spacing_m?)"
+        raise SolidMeshError(
+            f"the body is free to move: {len(fixed_nodes)} fixed nodes, at least three not on one "
+            "line are needed (object.support_angle_rad too small for skin_spacing_m?)"
         )
 
 
 def degrees_of_freedom(nodes: NDArray[np.integer] | Ints) -> Ints:
-    """The three degrees of freedom of each node, (3k,)."""
+    """Return the three degrees of freedom of each node, (3k,)."""
     return (3 * np.asarray(nodes, dtype=np.int64)[:, None] + np.arange(3)).ravel()
 
 
-def scattered(places: Ints, values: Floats, size: int) -> Floats:
-    """Values (k,) added up at their places (k,) in an array (size,)."""
-    result: Floats = np.bincount(places, values, size).astype(np.float64, copy=False)
+def scatter_add(indices: Ints, values: Floats, size: int) -> Floats:
+    """Return an array (size,) with values (k,) added at their indices (k,)."""
+    result: Floats = np.bincount(indices, values, size).astype(np.float64, copy=False)
     return result
 
 
-def solve(stiffness: csc_matrix, held: Ints, values: Floats, loads: Floats) -> Floats:
-    """Displacements (3n,) with the degrees of freedom `held` at `values`, nodal `loads` elsewhere.
+def solve(stiffness: csc_matrix, fixed_dofs: Ints, values: Floats, loads: Floats) -> Floats:
+    """Return displacements (3n,) with the degrees of freedom `fixed_dofs` at `values`, and `loads`
+    (3n,) elsewhere.
 
-    One sparse factorisation; MeshError if what is not held can still move freely.
+    It takes one sparse factorisation. Raises SolidMeshError if the body can still move freely.
     """
     from scipy.sparse.linalg import splu
 
-    free = np.setdiff1d(np.arange(stiffness.shape[0]), held)
+    free = np.setdiff1d(np.arange(stiffness.shape[0]), fixed_dofs)
     result = np.zeros(stiffness.shape[0])
-    result[held] = values
+    result[fixed_dofs] = values
     inner = stiffness[free][:, free].tocsc()
     try:
-        # positive definite: the diagonal serves as pivots, which keeps the factor sparse
+        # The matrix is positive definite: the diagonal serves as pivots, which keeps the factor
+        # sparse.
         factor = splu(
             inner,
             permc_spec="MMD_AT_PLUS_A",
@@ -187,9 +194,9 @@ def solve(stiffness: csc_matrix, held: Ints, values: Floats, loads: Floats) -> F
             options={"SymmetricMode": True},
         )
     except RuntimeError as error:
-        raise MeshError(f"the body is free to move: {error}") from error
+        raise SolidMeshError(f"the body is free to move: {error}") from error
     pivots = np.abs(factor.U.diagonal())
     if pivots.min() < 1e-12 * pivots.max():
-        raise MeshError("the body is free to move: the stiffness is singular to rounding")
-    result[free] = factor.solve(loads[free] - stiffness[free][:, held] @ values)
+        raise SolidMeshError("the body is free to move: the stiffness is singular to rounding")
+    result[free] = factor.solve(loads[free] - stiffness[free][:, fixed_dofs] @ values)
     return result

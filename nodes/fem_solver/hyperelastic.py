@@ -1,4 +1,5 @@
-"""A compressible neo-Hookean solid on 10-node tetrahedra: energy, forces, consistent tangent.
+"""Compute energy, forces and consistent tangent of a compressible neo-Hookean solid (10-node
+tetrahedra).
 
 Energy per undeformed volume (Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element
 Analysis", 2nd ed., sec. 6.4.3), with Lame's constants, F the deformation gradient and J its
@@ -6,8 +7,8 @@ determinant:
 
     psi = mu/2 (tr F^T F - 3) - mu ln J + lambda/2 (ln J)^2
 
-First Piola stress P = mu F + (lambda ln J - mu) F^-T.  It is Hooke's law for small strains, and
-grows without bound as J -> 0: no element can be turned inside out at finite energy.
+First Piola stress P = mu F + (lambda ln J - mu) F^-T. It equals Hooke's law for small strains. The
+energy grows without bound as J -> 0: no element inverts at finite energy.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from nodes.fem_solver.elasticity import (
     jacobians,
     lame_constants,
     quadrature,
-    scattered,
+    scatter_add,
     shape_gradients,
 )
 from nodes.fem_solver.mesh import EDGES
@@ -29,12 +30,12 @@ Ints = NDArray[np.int64]
 
 
 CORNERS = np.vstack([np.zeros(3), np.eye(3)])
-NODE_PLACES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
+NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
 """The ten nodes (10, 3) on the unit tetrahedron."""
 
 
-class InvertedError(ArithmeticError):
-    """A displacement that turns an element inside out: it has no energy."""
+class InvertedElementError(ArithmeticError):
+    """A displacement that inverts an element: it has no energy."""
 
 
 class NeoHookeanSolid:
@@ -43,7 +44,7 @@ class NeoHookeanSolid:
     def __init__(
         self, nodes: Floats, elements: Ints, *, young_modulus_pa: float, poisson_ratio: float
     ) -> None:
-        """nodes (n, 3), elements (e, 10).  MeshError as `jacobians`, ValueError as
+        """nodes (n, 3), elements (e, 10). Raises SolidMeshError as `jacobians`, ValueError as
         `lame_constants`."""
         self.nodes, self.elements = nodes, elements
         self._lame, self._mu = lame_constants(young_modulus_pa, poisson_ratio)
@@ -59,11 +60,11 @@ class NeoHookeanSolid:
 
     @property
     def volume(self) -> float:
-        """Of the undeformed solid, m^3."""
+        """Return the volume of the undeformed solid, m^3."""
         return float(self._volumes.sum())
 
     def deformation(self, displacement: Floats) -> tuple[Floats, Floats]:
-        """F (e, 8, 3, 3) and J (e, 8) at the quadrature points."""
+        """Return F (e, 8, 3, 3) and J (e, 8) at the quadrature points."""
         moved = displacement[self.elements].transpose(0, 2, 1)
         gradient = moved[:, None] @ self._gradients
         gradient[..., 0, 0] += 1.0
@@ -72,7 +73,7 @@ class NeoHookeanSolid:
         return gradient, determinants(gradient)
 
     def energy(self, displacement: Floats) -> float:
-        """Elastic energy, J; infinite where an element is turned inside out."""
+        """Return the elastic energy, J; infinite where an element is inverted."""
         gradient, volume_ratio = self.deformation(displacement)
         if volume_ratio.min() <= 0.0:
             return float("inf")
@@ -82,70 +83,71 @@ class NeoHookeanSolid:
         return float((self._volumes * density).sum())
 
     def forces(self, displacement: Floats) -> Floats:
-        """Nodal forces (n, 3) of the deformed material: the gradient of the energy, N.
+        """Return the nodal forces (n, 3) of the deformed material: the gradient of the energy, N.
 
-        InvertedError where an element is turned inside out.
+        Raises InvertedElementError where an element is inverted.
         """
         gradient, inverse, log = self._state(displacement)
         stress = (self._lame * log - self._mu)[..., None, None] * inverse.transpose(0, 1, 3, 2)
         stress += self._mu * gradient
         stress *= self._volumes[..., None, None]
         per_node = (self._gradients @ stress.transpose(0, 1, 3, 2)).sum(axis=1)
-        return scattered(self._rows, per_node.ravel(), 3 * len(self.nodes)).reshape(-1, 3)
+        return scatter_add(self._rows, per_node.ravel(), 3 * len(self.nodes)).reshape(-1, 3)
 
     def tangents(self, displacement: Floats) -> Floats:
-        """Element stiffness matrices (e, 30, 30): the energy's second derivative, N/m.
+        """Return element stiffness matrices (e, 30, 30): the energy's second derivative, N/m.
 
-        With h = F^-T times a shape function's gradient, the block of nodes a and b is
-        mu (g_a . g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T, summed over the points.
-        InvertedError as `forces`.
+        With h = F^-T times a shape function's gradient, the block of nodes a and b is mu (g_a .
+        g_b) I + lambda h_a h_b^T + (mu - lambda ln J) h_b h_a^T, summed over the points. Raises
+        InvertedElementError as `forces`.
         """
         _, inverse, log = self._state(displacement)
         count = len(self.elements)
-        turned = (self._gradients @ inverse).reshape(count, -1, 30)
-        first: Floats = (turned * (self._lame * self._volumes)[..., None]).transpose(
+        spatial_gradients = (self._gradients @ inverse).reshape(count, -1, 30)
+        first: Floats = (spatial_gradients * (self._lame * self._volumes)[..., None]).transpose(
             0, 2, 1
-        ) @ turned
-        scaled = turned * ((self._mu - self._lame * log) * self._volumes)[..., None]
-        second = scaled.transpose(0, 2, 1) @ turned
+        ) @ spatial_gradients
+        scaled = spatial_gradients * ((self._mu - self._lame * log) * self._volumes)[..., None]
+        second = scaled.transpose(0, 2, 1) @ spatial_gradients
         blocks = first.reshape(count, 10, 3, 10, 3)
         blocks += second.reshape(count, 10, 3, 10, 3).transpose(0, 1, 4, 3, 2)
         for axis in range(3):
             blocks[:, :, axis, :, axis] += self._laplacian
         return first
 
-    def stiffen(self, matrices: Floats, share: float) -> None:
-        """Add `share` of mu times the Laplacian, positive in all directions, to tangents."""
+    def stiffen(self, matrices: Floats, weight: float) -> None:
+        """Add `weight` times mu times the Laplacian, which is positive definite, to tangents."""
         blocks = matrices.reshape(-1, 10, 3, 10, 3)
         for axis in range(3):
-            blocks[:, :, axis, :, axis] += share * self._laplacian
+            blocks[:, :, axis, :, axis] += weight * self._laplacian
 
-    def smallest_volume_ratio(self, displacement: Floats) -> float:
-        """The least J at any quadrature point or node: 1 at rest, 0 and less where turned inside
-        out.
+    def min_volume_ratio(self, displacement: Floats) -> float:
+        """Return the minimum J at all quadrature points and nodes: 1 at rest, 0 or less where
+        inverted.
 
-        A quadratic element's corner can turn over while its quadrature points, and so its energy,
-        see nothing of it.
+        A quadratic element's corner can invert unnoticed by its quadrature points, and so by its
+        energy.
         """
-        local = shape_gradients(NODE_PLACES)
+        local = shape_gradients(NODE_COORDINATES)
         rest, moved = (
-            np.linalg.det(places[self.elements].transpose(0, 2, 1)[:, None] @ local)
-            for places in (self.nodes, self.nodes + displacement)
+            np.linalg.det(coordinates[self.elements].transpose(0, 2, 1)[:, None] @ local)
+            for coordinates in (self.nodes, self.nodes + displacement)
         )
         return float(min(self.deformation(displacement)[1].min(), (moved / rest).min()))
 
     def _state(self, displacement: Floats) -> tuple[Floats, Floats, Floats]:
         gradient, volume_ratio = self.deformation(displacement)
         if volume_ratio.min() <= 0.0:
-            raise InvertedError(
-                f"{int((volume_ratio.min(axis=1) <= 0).sum())} elements are turned inside out "
-                f"(least volume ratio {volume_ratio.min():.3g})"
+            raise InvertedElementError(
+                f"{int((volume_ratio.min(axis=1) <= 0).sum())} elements are inverted "
+                f"(minimum volume ratio {volume_ratio.min():.3g})"
             )
         return gradient, inverses(gradient, volume_ratio), np.log(volume_ratio)
 
 
 def determinants(matrices: Floats) -> Floats:
-    """Determinants (...) of 3x3 matrices (..., 3, 3), written out: faster than a general one."""
+    """Return determinants (...) of matrices (..., 3, 3), written out: faster than the general
+    one."""
     a, b, c = matrices[..., 0, :], matrices[..., 1, :], matrices[..., 2, :]
     result: Floats = (
         a[..., 0] * (b[..., 1] * c[..., 2] - b[..., 2] * c[..., 1])
@@ -156,7 +158,7 @@ def determinants(matrices: Floats) -> Floats:
 
 
 def inverses(matrices: Floats, determinant: Floats) -> Floats:
-    """Inverses (..., 3, 3) of 3x3 matrices with known determinants (...)."""
+    """Return inverses (..., 3, 3) of 3x3 matrices with known determinants (...)."""
     result = np.empty_like(matrices)
     for i in range(3):
         for j in range(3):

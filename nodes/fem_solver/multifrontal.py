@@ -1,9 +1,9 @@
-"""A direct solver for stiffness that is given element by element: multifrontal Cholesky.
+"""Factor a stiffness that is given element by element: multifrontal Cholesky.
 
-The elements are bisected again and again across their longest sides (nested dissection: George
-1973).  What the two halves share is eliminated after both: each half leaves a dense matrix on its
-boundary, which is added into its parent's (Duff & Reid 1983).  Nearly all work is in dense
-matrices, so that it runs at the processor's speed; the order is found once and serves every
+Nested dissection bisects the elements recursively across their longest sides (George 1973). The
+degrees of freedom that two halves have in common are eliminated after both. Each half leaves a
+dense matrix on its boundary, which is added into its parent's (Duff & Reid 1983). Nearly all work
+is in dense matrices and so runs at the processor's speed. The order is found once and serves every
 stiffness on the same mesh, as a Newton iteration needs.
 """
 
@@ -16,32 +16,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from nodes.fem_solver.elasticity import degrees_of_freedom, scattered
+from nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LEAF_ELEMENTS = 48
-MANY_RUNS = 40
-NO_HALVES: tuple[int, ...] = ()
+MAX_RUNS = 40
+NO_CHILDREN: tuple[int, ...] = ()
 
 
 class IndefiniteError(ArithmeticError):
-    """The stiffness has a direction that does not resist."""
+    """The stiffness is not positive definite."""
 
 
 @dataclass(frozen=True, slots=True)
 class Front:
     """One node of the elimination tree.
 
-    own, border: degrees of freedom eliminated here, and those left to the parent.  elements: of a
-    leaf.  scatter: where the entries of the leaf's element matrices go in its dense matrix, one
-    past its end for those of nodes that are held.  children: numbers of earlier fronts, with the
-    places of their borders in this front.
+    pivots, boundary: degrees of freedom eliminated here, and those left to the parent. elements: of
+    a leaf. scatter: indices of the leaf's element matrices in its dense matrix; one past its end
+    for fixed nodes. children: numbers of earlier fronts, with the positions of their boundaries in
+    this front.
     """
 
-    own: Ints
-    border: Ints
+    pivots: Ints
+    boundary: Ints
     elements: Ints
     scatter: Ints
     children: tuple[tuple[int, Ints], ...]
@@ -52,93 +52,104 @@ class Factors:
     """K = L L^T, in the precision of its stiffness; solves for one or many right-hand sides."""
 
     fronts: list[Front]
-    pivots: list[Floats]
-    ties: list[Floats]
+    diagonal: list[Floats]
+    off_diagonal: list[Floats]
 
     def solve(self, loads: Floats) -> Floats:
-        """Displacements under loads (3n,) or (3n, k); zero where the body is held."""
-        (trsm,) = get_blas_funcs(("trsm",), dtype=self.pivots[0].dtype)
-        work = loads.reshape(len(loads), -1).astype(self.pivots[0].dtype)
-        for front, pivot, tie in zip(self.fronts, self.pivots, self.ties, strict=True):
-            part = trsm(1.0, pivot, work[front.own], lower=1)
-            work[front.own] = part
-            if len(front.border):
-                work[front.border] -= tie @ part
-        result = np.zeros_like(work)
-        for front, pivot, tie in zip(
-            reversed(self.fronts), reversed(self.pivots), reversed(self.ties), strict=True
+        """Return displacements under loads (3n,) or (3n, k); zero at fixed nodes."""
+        (trsm,) = get_blas_funcs(("trsm",), dtype=self.diagonal[0].dtype)
+        work = loads.reshape(len(loads), -1).astype(self.diagonal[0].dtype)
+        for front, diagonal_block, off_block in zip(
+            self.fronts, self.diagonal, self.off_diagonal, strict=True
         ):
-            part = work[front.own]
-            if len(front.border):
-                part = part - tie.T @ result[front.border]
-            result[front.own] = trsm(1.0, pivot, part, lower=1, trans_a=1)
+            part = trsm(1.0, diagonal_block, work[front.pivots], lower=1)
+            work[front.pivots] = part
+            if len(front.boundary):
+                work[front.boundary] -= off_block @ part
+        result = np.zeros_like(work)
+        for front, diagonal_block, off_block in zip(
+            reversed(self.fronts), reversed(self.diagonal), reversed(self.off_diagonal), strict=True
+        ):
+            part = work[front.pivots]
+            if len(front.boundary):
+                part = part - off_block.T @ result[front.boundary]
+            result[front.pivots] = trsm(1.0, diagonal_block, part, lower=1, trans_a=1)
         return result.reshape(loads.shape).astype(np.float64, copy=False)
 
 
 @dataclass(frozen=True, slots=True)
 class _Part:
-    """A part of the mesh: the nodes eliminated with it, those on its border, its halves if any."""
+    """A part of the mesh: the nodes eliminated with it, those on its boundary, its halves if
+    any."""
 
-    own: Ints
-    border: Ints
+    pivots: Ints
+    boundary: Ints
     members: Ints
     halves: tuple[int, ...]
 
 
-class Dissection:
+class NestedDissection:
     """The order of elimination for one mesh and its supports."""
 
     def __init__(self, nodes: Floats, elements: Ints, fixed: NDArray[np.bool_]) -> None:
-        """nodes (n, 3), elements (e, k), fixed (n,): nodes that are held."""
+        """nodes (n, 3), elements (e, k), fixed (n,): nodes that cannot move."""
         self._elements, self._fixed = elements, fixed
         self._centres = nodes[elements].mean(axis=1)
         self._uses = np.bincount(elements.ravel(), minlength=len(nodes))
         self._parts: list[_Part] = []
         self._split(np.arange(len(elements)))
-        # borders are sorted by when their nodes are eliminated: a part's border then lies in its
-        # parent in the same order, and lower halves of matrices are added into lower halves
-        # within a part, nodes of one leaf stand together, so that they are added in long runs
+        # Boundaries are sorted by elimination order. A part's boundary then has the same order in
+        # its parent, and lower halves of matrices are added into lower halves. Within a part, the
+        # nodes of one leaf are adjacent, so that they are added in long runs.
         self._rank = np.empty(len(nodes), dtype=np.int64)
         leaf = np.zeros(len(nodes), dtype=np.int64)
         for number, part in enumerate(self._parts):
             leaf[elements[part.members]] = number
-        parts = [replace(part, own=part.own[np.argsort(leaf[part.own])]) for part in self._parts]
+        parts = [
+            replace(part, pivots=part.pivots[np.argsort(leaf[part.pivots])]) for part in self._parts
+        ]
         self._parts = parts
-        order = np.concatenate([part.own for part in parts])
+        order = np.concatenate([part.pivots for part in parts])
         self._rank[order] = np.arange(len(order))
-        self._place = np.full(len(nodes), -1)
+        self._position = np.full(len(nodes), -1)
         self.fronts = [self._front(part) for part in self._parts]
 
     def factor(self, matrices: Floats) -> Factors:
-        """Factor the sum of element matrices (e, 3k, 3k), symmetric, float64 or float32: the latter
-        in half the time and memory, to some four digits.
+        """Factor the sum of element matrices (e, 3k, 3k), symmetric, float64 or float32.
 
-        IndefiniteError unless it is positive definite.
+        float32 takes half the time and memory, and gives about four digits. Raises IndefiniteError
+        unless the sum is positive definite.
         """
         dtype = matrices.dtype
         trsm, syrk = get_blas_funcs(("trsm", "syrk"), dtype=dtype)
         (potrf,) = get_lapack_funcs(("potrf",), dtype=dtype)
         left: dict[int, Floats] = {}
-        pivots, ties = [], []
+        diagonal, off_diagonal = [], []
         for number, front in enumerate(self.fronts):
-            own, size = len(front.own), len(front.own) + len(front.border)
+            pivot_count, size = len(front.pivots), len(front.pivots) + len(front.boundary)
             if front.children:
                 dense = np.zeros((size, size), dtype, order="F")
-                for child, places in front.children:
-                    _add(dense, left.pop(child), places)
+                for child, positions in front.children:
+                    _add_block(dense, left.pop(child), positions)
             else:
                 entries = matrices[front.elements].ravel()
-                summed = scattered(front.scatter, entries, size * size + 1)
+                summed = scatter_add(front.scatter, entries, size * size + 1)
                 dense = summed[:-1].reshape(size, size).astype(dtype, copy=False).T
-            pivot, trouble = potrf(dense[:own, :own], lower=1, clean=0)
-            if trouble:
-                raise IndefiniteError(f"pivot {trouble} of front {number} is not positive")
-            tie = trsm(1.0, pivot, dense[own:, :own], side=1, lower=1, trans_a=1)
-            pivots.append(pivot)
-            ties.append(tie)
-            if size > own:
-                left[number] = syrk(-1.0, tie, beta=1.0, c=dense[own:, own:], lower=1)
-        return Factors(self.fronts, pivots, ties)
+            diagonal_block, failed_pivot = potrf(
+                dense[:pivot_count, :pivot_count], lower=1, clean=0
+            )
+            if failed_pivot:
+                raise IndefiniteError(f"pivot {failed_pivot} of front {number} is not positive")
+            off_block = trsm(
+                1.0, diagonal_block, dense[pivot_count:, :pivot_count], side=1, lower=1, trans_a=1
+            )
+            diagonal.append(diagonal_block)
+            off_diagonal.append(off_block)
+            if size > pivot_count:
+                left[number] = syrk(
+                    -1.0, off_block, beta=1.0, c=dense[pivot_count:, pivot_count:], lower=1
+                )
+        return Factors(self.fronts, diagonal, off_diagonal)
 
     def _split(self, members: Ints) -> tuple[int, Ints, Ints]:
         """Add the parts of some elements, halves first.
@@ -149,21 +160,22 @@ class Dissection:
             present, counts = np.unique(self._elements[members], return_counts=True)
             free = ~self._fixed[present]
             present, counts = present[free], counts[free]
-            candidates, halves = present, NO_HALVES
+            candidates, halves = present, NO_CHILDREN
         else:
-            first, second = self._halves(members)
+            first, second = self._bisect(members)
             a, present_a, counts_a = self._split(first)
             b, present_b, counts_b = self._split(second)
             present, where = np.unique(np.append(present_a, present_b), return_inverse=True)
             counts = np.bincount(where, np.append(counts_a, counts_b)).astype(np.int64)
-            candidates = np.union1d(self._parts[a].border, self._parts[b].border)
+            candidates = np.union1d(self._parts[a].boundary, self._parts[b].boundary)
             members, halves = np.empty(0, dtype=np.int64), (a, b)
         done = counts[np.searchsorted(present, candidates)] == self._uses[candidates]
         self._parts.append(_Part(candidates[done], candidates[~done], members, halves))
         return len(self._parts) - 1, present, counts
 
-    def _halves(self, members: Ints) -> tuple[Ints, Ints]:
-        """Two halves of some elements, cut across the axis along which they share fewest nodes."""
+    def _bisect(self, members: Ints) -> tuple[Ints, Ints]:
+        """Return two halves of some elements, cut across the axis that gives the fewest common
+        nodes."""
         cuts = []
         for axis in range(3):
             order = members[np.argsort(self._centres[members, axis], kind="stable")]
@@ -173,42 +185,44 @@ class Dissection:
         _, first, second = min(cuts, key=lambda cut: cut[0])
         return first, second
 
-    def _border(self, part: _Part) -> Ints:
-        return part.border[np.argsort(self._rank[part.border])]
+    def _sorted_boundary(self, part: _Part) -> Ints:
+        return part.boundary[np.argsort(self._rank[part.boundary])]
 
     def _front(self, part: _Part) -> Front:
-        border = self._border(part)
-        nodes = np.append(part.own, border)
-        place, size = self._place, 3 * len(nodes)
-        place[nodes] = np.arange(len(nodes))
+        boundary = self._sorted_boundary(part)
+        nodes = np.append(part.pivots, boundary)
+        position, size = self._position, 3 * len(nodes)
+        position[nodes] = np.arange(len(nodes))
         children = tuple(
-            (half, degrees_of_freedom(place[self._border(self._parts[half])]))
+            (half, degrees_of_freedom(position[self._sorted_boundary(self._parts[half])]))
             for half in part.halves
         )
-        dofs = degrees_of_freedom(place[self._elements[part.members]].ravel())
+        dofs = degrees_of_freedom(position[self._elements[part.members]].ravel())
         dofs = dofs.reshape(len(part.members), 3 * self._elements.shape[1])
         scatter = dofs[:, :, None] * size + dofs[:, None, :]
         scatter[(dofs < 0)[:, :, None] | (dofs < 0)[:, None, :]] = size * size
-        place[nodes] = -1
+        position[nodes] = -1
         return Front(
-            own=degrees_of_freedom(part.own),
-            border=degrees_of_freedom(border),
+            pivots=degrees_of_freedom(part.pivots),
+            boundary=degrees_of_freedom(boundary),
             elements=part.members,
             scatter=scatter.ravel(),
             children=children,
         )
 
 
-def _add(dense: Floats, part: Floats, places: Ints) -> None:
-    """Add the lower half of `part` into that of `dense` at `places`, which rise.
+def _add_block(dense: Floats, part: Floats, positions: Ints) -> None:
+    """Add the lower half of `part` into that of `dense` at `positions`, which increase.
 
-    What lies above the diagonals is never read.
+    Entries above the diagonals are never read.
     """
-    starts = np.concatenate([[0], np.flatnonzero(np.diff(places) != 1) + 1, [len(places)]])
-    if len(starts) > MANY_RUNS:
-        dense[np.ix_(places, places)] += part
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(positions) != 1) + 1, [len(positions)]])
+    if len(starts) > MAX_RUNS:
+        dense[np.ix_(positions, positions)] += part
         return
-    runs = [(a, b, places[a], places[b - 1] + 1) for a, b in itertools.pairwise(starts.tolist())]
+    runs = [
+        (a, b, positions[a], positions[b - 1] + 1) for a, b in itertools.pairwise(starts.tolist())
+    ]
     for number, (c, d, left, right) in enumerate(runs):
         for a, b, top, bottom in runs[number:]:
             dense[top:bottom, left:right] += part[a:b, c:d]

@@ -1,15 +1,15 @@
-"""Full Newton for a neo-Hookean body that a fingertip sphere presses: the reference method.
+"""Solve the contact of a fingertip sphere with a neo-Hookean body by full Newton: the reference
+method.
 
-The finger is a sphere that no skin may enter.  At contact points spread over the skin's faces a
-pressure acts that grows with how far the point is inside the sphere: at first with the square of
-that, so that the forces are C1 in the finger's position, then in proportion to it, on a bed so
-stiff that the skin enters by a hundredth of the radius at most where the material is pressed with
-its own modulus.  All is the minimum of one energy, which a Newton iteration descends; an element
-that is turned inside out has infinite energy and is never accepted.
+The finger is a rigid sphere. Contact points on the skin's faces carry a penalty pressure. It grows
+first with the square of the penetration, so that forces are C1 in the finger's position, and then
+in proportion. The penalty limits the penetration to a hundredth of the radius under a pressure
+equal to Young's modulus. The solution is the minimum of one energy, which a Newton iteration
+descends. An inverted element has infinite energy and is never accepted.
 
-Without friction the answer depends on the finger's place alone.  A sticking finger holds every
-point where it first touched it, by springs as stiff as the bed along the skin, so that the answer
-depends on the way there.
+Without friction the solution depends only on the finger's position. A sticking finger holds each
+point at its first contact, by tangential springs with the penalty stiffness. Then the solution
+depends on the path.
 """
 
 from __future__ import annotations
@@ -21,64 +21,56 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.contact import POINT_SPACING_RATIO, triangle_points
-from nodes.fem_solver.elasticity import degrees_of_freedom, scattered
+from nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
+from nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 from nodes.fem_solver.hyperelastic import NeoHookeanSolid
 from nodes.fem_solver.mesh import FACES, SUBTRIANGLES, boundary_faces
-from nodes.fem_solver.multifrontal import Dissection, Factors, IndefiniteError
+from nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Friction = Literal["none", "stick"]
 
-BED_RATIO = 200.0
-"""Stiffness of the contact bed (Pa/m) in units of E / finger radius."""
+PENALTY_RATIO = 200.0
+"""Penalty stiffness of the contact (Pa/m) in units of E / finger radius."""
 ROUNDING_RATIO = 0.005
-"""Depth over which the bed's pressure rises from nothing, in finger radii."""
+"""Depth over which the penalty pressure rises quadratically from zero, in finger radii."""
 POINTS_PER_EDGE = 4
-LARGEST_STEP_RATIO = 0.35
-"""The finger moves by this much of its radius per load step, or less."""
-SMALLEST_SHARE = 1.0 / 16.0
-"""Load steps that do not settle are halved down to this; then the finger is as deep as it goes."""
+MAX_STEP_RATIO = 0.35
+"""Maximum displacement of the finger per load step, in finger radii."""
+MIN_STEP_FRACTION = 1.0 / 16.0
+"""Load steps that do not converge are halved down to this fraction; then the path ends there."""
 MAX_ITERATIONS = 25
-SAFEGUARDS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
-"""How a tangent is made definite, should it not be: without the turning aside of the contact, then
-stiffened by so many times the shear modulus."""
+REGULARIZATIONS = ((1.0, 0.0), (0.0, 0.0), (0.0, 0.3), (0.0, 2.0), (0.0, 15.0))
+"""Attempts to make a tangent definite: weight of the contact's geometric stiffness, then added
+stiffness in units of the shear modulus."""
 TOLERANCE = 1e-8
-"""Residual forces, as a share of the largest force in the body."""
+"""Residual forces, as a fraction of the largest force in the body."""
 
 
-class StuckError(ArithmeticError):
-    """A load step did not settle."""
-
-
-@dataclass(frozen=True, slots=True)
-class Sphere:
-    """The fingertip: centre (3,) and radius, m."""
-
-    centre: Floats
-    radius_m: float
+class NewtonNotConvergedError(ArithmeticError):
+    """A load step did not converge."""
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
-    """The body in balance with the finger.
+class EquilibriumState:
+    """The body in equilibrium with the finger.
 
-    displacement (n, 3); force_n (3,) of the body on the finger; centre (3,): where the finger is,
-    short of where it was sent if `reached` is false.
+    displacement (n, 3); force_n (3,) of the body on the finger. centre (3,): the finger's position,
+    short of its target if `reached` is false.
     """
 
     displacement: Floats
     force_n: Floats
     centre: Floats
-    least_volume_ratio: float
+    min_volume_ratio: float
     iterations: int
     reached: bool
 
 
 @dataclass(frozen=True, slots=True)
-class _Held:
-    """Contact points (q,) held by a sticking finger: where from its centre (k, 3), their skin's
+class _StickState:
+    """Contact points (k,) that a sticking finger holds: offsets from its centre (k, 3), skin
     normals (k, 3)."""
 
     points: Ints
@@ -86,11 +78,11 @@ class _Held:
     normals: Floats
 
 
-NOTHING_HELD = _Held(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
+NO_STICK = _StickState(np.empty(0, dtype=np.int64), np.empty((0, 3)), np.empty((0, 3)))
 
 
 class SphereObstacle:
-    """The bed that keeps the skin out of the finger."""
+    """The penalty contact that keeps the skin out of the finger."""
 
     def __init__(
         self, nodes: Floats, elements: Ints, faces: Ints, *, modulus_pa: float, radius_m: float
@@ -99,75 +91,84 @@ class SphereObstacle:
         self.radius_m = radius_m
         self._count, self._faces = len(nodes), faces
         corners = nodes[faces[:, :3]]
-        # no finger, however small, falls between the points
-        longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
-        divisions = int(np.ceil(longest / (POINT_SPACING_RATIO * radius_m)))
-        self._shape, _ = triangle_points(max(POINTS_PER_EDGE, divisions))
+        # No finger, however small, fits between the points.
+        max_step_m = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
+        divisions = int(np.ceil(max_step_m / (POINT_SPACING_RATIO * radius_m)))
+        self._shape, _ = sample_triangle(max(POINTS_PER_EDGE, divisions))
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         areas = 0.5 * np.linalg.norm(normals, axis=1)
         points = len(self._shape)
-        self._bed = np.repeat(BED_RATIO * modulus_pa / radius_m * areas / points, points)
+        self._penalty = np.repeat(PENALTY_RATIO * modulus_pa / radius_m * areas / points, points)
         self._rounding = ROUNDING_RATIO * radius_m
-        self.parents, self._local = _parents(elements, faces)
+        self.parents, self._local = _find_parents(elements, faces)
 
     def points(self, positions: Floats) -> Floats:
-        """Contact points (q, 3) of the deformed skin, from node positions (n, 3)."""
+        """Return contact points (q, 3) of the deformed skin, from node positions (n, 3)."""
         result: Floats = (self._shape @ positions[self._faces]).reshape(-1, 3)
         return result
 
     def inside(self, positions: Floats, centre: Floats) -> tuple[Ints, Floats, Floats, Floats]:
-        """Points within the sphere: their numbers (k,), depth (k,), normals (k, 3) out of the
-        sphere, distance from its centre (k,)."""
+        """Return the points within the sphere.
+
+        Their numbers (k,), penetration (k,), normals (k, 3) out of the sphere, distance from its
+        centre (k,).
+        """
         offset = self.points(positions) - centre
         distance = np.linalg.norm(offset, axis=1)
         inner = np.flatnonzero(distance < self.radius_m)
         away = distance[inner]
         return inner, self.radius_m - away, offset[inner] / away[:, None], away
 
-    def energy(self, positions: Floats, centre: Floats, held: _Held) -> float:
-        """Energy of the bed and of the springs along the skin, J."""
+    def energy(self, positions: Floats, centre: Floats, stick: _StickState) -> float:
+        """Return the energy of the penalty and of the tangential springs, J."""
         inner, depth, _, _ = self.inside(positions, centre)
         d = self._rounding
         low = depth < d
         density = np.where(low, depth**3 / (6 * d), 0.5 * depth * (depth - d) + d * d / 6)
-        total = float(self._bed[inner] @ density)
-        if len(held.points):
-            slip = self._slip(positions, centre, held)
-            total += 0.5 * float(self._bed[held.points] @ np.square(slip).sum(axis=1))
+        total = float(self._penalty[inner] @ density)
+        if len(stick.points):
+            slip = self._slip(positions, centre, stick)
+            total += 0.5 * float(self._penalty[stick.points] @ np.square(slip).sum(axis=1))
         return total
 
-    def forces(self, positions: Floats, centre: Floats, held: _Held) -> Floats:
-        """The energy's gradient by node (n, 3): what the skin presses into the finger, N."""
+    def forces(self, positions: Floats, centre: Floats, stick: _StickState) -> Floats:
+        """Return the energy's gradient by node (n, 3): the force of the skin on the finger, N."""
         inner, depth, normals, _ = self.inside(positions, centre)
-        per_point = np.zeros((len(self._bed), 3))
-        per_point[inner] = -(self._bed[inner] * self._pressure(depth))[:, None] * normals
-        if len(held.points):
-            per_point[held.points] += self._bed[held.points][:, None] * self._slip(
-                positions, centre, held
+        per_point = np.zeros((len(self._penalty), 3))
+        per_point[inner] = -(self._penalty[inner] * self._pressure(depth))[:, None] * normals
+        if len(stick.points):
+            per_point[stick.points] += self._penalty[stick.points][:, None] * self._slip(
+                positions, centre, stick
             )
-        pressed = np.flatnonzero(per_point.any(axis=1))
-        faces = np.unique(pressed // len(self._shape))
+        contact_forces = np.flatnonzero(per_point.any(axis=1))
+        faces = np.unique(contact_forces // len(self._shape))
         blocks = per_point.reshape(len(self._faces), -1, 3)[faces]
         per_node = self._shape.T @ blocks
         rows = degrees_of_freedom(self._faces[faces].ravel())
-        return scattered(rows, per_node.ravel(), 3 * self._count).reshape(-1, 3)
+        return scatter_add(rows, per_node.ravel(), 3 * self._count).reshape(-1, 3)
 
     def add_tangents(
-        self, matrices: Floats, positions: Floats, centre: Floats, held: _Held, *, turned: float
+        self,
+        matrices: Floats,
+        positions: Floats,
+        centre: Floats,
+        stick: _StickState,
+        *,
+        geometric_stiffness_weight: float,
     ) -> None:
         """Add the energy's second derivative to the element matrices (e, 30, 30).
 
-        turned: 1; less leaves out of it what makes it indefinite: that a sphere, being round,
-        pushes points aside.
+        geometric_stiffness_weight: 1 for the exact derivative. A smaller weight reduces its
+        indefinite part, which arises because a sphere pushes points sideways.
         """
         inner, depth, normals, away = self.inside(positions, centre)
         slope = np.where(depth < self._rounding, depth / self._rounding, 1.0)
         outer = normals[:, :, None] * normals[:, None, :]
-        turning = (self._pressure(depth) / away)[:, None, None] * turned
+        turning = (self._pressure(depth) / away)[:, None, None] * geometric_stiffness_weight
         inner_blocks = slope[:, None, None] * outer - turning * (np.eye(3) - outer)
-        numbers = np.append(inner, held.points)
-        along = np.eye(3) - held.normals[:, :, None] * held.normals[:, None, :]
-        blocks = np.concatenate([inner_blocks, along]) * self._bed[numbers][:, None, None]
+        numbers = np.append(inner, stick.points)
+        along = np.eye(3) - stick.normals[:, :, None] * stick.normals[:, None, :]
+        blocks = np.concatenate([inner_blocks, along]) * self._penalty[numbers][:, None, None]
         face, point = numbers // len(self._shape), numbers % len(self._shape)
         faces, where = np.unique(face, return_inverse=True)
         shape = self._shape[point]
@@ -180,28 +181,30 @@ class SphereObstacle:
         target = self.parents[faces]
         np.add.at(matrices, (target[:, None, None], rows[:, :, None], rows[:, None, :]), summed)
 
-    def hold(self, positions: Floats, centre: Floats, held: _Held) -> _Held:
-        """What a sticking finger holds once the body has settled: points that it presses stay held
-        where they were first touched, others are let go."""
+    def update_stick(self, positions: Floats, centre: Floats, stick: _StickState) -> _StickState:
+        """Return the points that a sticking finger holds at equilibrium.
+
+        Points under pressure stay held where they were first touched; others are released.
+        """
         inner, _, normals, _ = self.inside(positions, centre)
         offsets = self.points(positions)[inner] - centre
-        kept = np.isin(inner, held.points)
-        offsets[kept] = held.offsets[np.searchsorted(held.points, inner[kept])]
-        return _Held(inner, offsets, normals)
+        still_held = np.isin(inner, stick.points)
+        offsets[still_held] = stick.offsets[np.searchsorted(stick.points, inner[still_held])]
+        return _StickState(inner, offsets, normals)
 
     def _pressure(self, depth: Floats) -> Floats:
         d = self._rounding
         result: Floats = np.where(depth < d, depth * depth / (2 * d), depth - 0.5 * d)
         return result
 
-    def _slip(self, positions: Floats, centre: Floats, held: _Held) -> Floats:
-        slip = self.points(positions)[held.points] - centre - held.offsets
-        result: Floats = slip - (slip * held.normals).sum(axis=1)[:, None] * held.normals
+    def _slip(self, positions: Floats, centre: Floats, stick: _StickState) -> Floats:
+        slip = self.points(positions)[stick.points] - centre - stick.offsets
+        result: Floats = slip - (slip * stick.normals).sum(axis=1)[:, None] * stick.normals
         return result
 
 
 class NeoHookeanBody:
-    """A body of a mesh with its supports, to be pressed by a finger."""
+    """A body with its mesh and supports, to be pushed by a finger."""
 
     def __init__(
         self,
@@ -215,13 +218,13 @@ class NeoHookeanBody:
         finger_radius_m: float,
         friction: Friction = "none",
         tolerance: float = TOLERANCE,
-        smallest_share: float = SMALLEST_SHARE,
-        factored_in: type[np.floating[Any]] = np.float64,
+        min_step_fraction: float = MIN_STEP_FRACTION,
+        factor_dtype: type[np.floating[Any]] = np.float64,
     ) -> None:
-        """faces (f, 6): six-node triangles that a finger can touch, node indices, outward.
-        tolerance, smallest_share: as `TOLERANCE` and `SMALLEST_SHARE`.
-        factored_in: precision of the tangents' factors, which only say where to look next; forces
-        and energies are always of double precision.
+        """faces (f, 6): touchable six-node triangles, node indices, outward. tolerance,
+        min_step_fraction: as `TOLERANCE` and `MIN_STEP_FRACTION`. factor_dtype: precision of the
+        tangents' factors, which only give the search direction. Forces and energies always have
+        double precision.
 
         Errors as `NeoHookeanSolid`.
         """
@@ -232,153 +235,169 @@ class NeoHookeanBody:
             nodes, elements, faces, modulus_pa=young_modulus_pa, radius_m=finger_radius_m
         )
         self.fixed, self.friction = fixed, friction
-        self.tolerance, self.smallest_share = tolerance, smallest_share
-        self.factored_in = factored_in
-        self._order = Dissection(nodes, elements, fixed)
+        self.tolerance, self.min_step_fraction = tolerance, min_step_fraction
+        self.factor_dtype = factor_dtype
+        self._order = NestedDissection(nodes, elements, fixed)
         self._hull = boundary_faces(elements)[:, SUBTRIANGLES].reshape(-1, 3)
 
-    def follow(
+    def solve_load_steps(
         self, centres: Iterable[Floats], *, start: tuple[Floats, Floats] | None = None
-    ) -> Iterator[Solved]:
-        """The body as the sphere's centre goes from place to place (3,), in straight lines.
+    ) -> Iterator[EquilibriumState]:
+        """Yield the equilibrium at each position (3,) of the sphere's centre, along straight lines.
 
-        start: a displacement and the centre that it is in balance with, without friction; None:
-        the first centre, which must not touch the body.  Where the body cannot follow any farther,
-        all answers from there on are the last that it could, with `reached` false: so does a body
-        of which an element turned over, or into which the finger slipped through the skin.
-        ValueError for a centre that is not finite.
+        start: a displacement, and the centre that it is in equilibrium with, without friction.
+        None: the first centre, which must not touch the body. Where a step does not converge, this
+        state and all later ones are the last equilibrium, with `reached` false. Inverted elements
+        and a finger that penetrated the skin count as not converged. Raises ValueError for a centre
+        that is not finite.
         """
-        displacement, at = start or (np.zeros_like(self.solid.nodes), None)
+        displacement, position = start or (np.zeros_like(self.solid.nodes), None)
         factors: Factors | None = None
-        held, stuck = NOTHING_HELD, False
+        stick, failed = NO_STICK, False
         for centre in centres:
             if not np.isfinite(centre).all():
                 raise ValueError(f"the finger's centre {centre} is not finite")
             iterations = 0
-            if at is None:
-                at = centre
-            done, share = 0.0, 1.0
-            begin, way = at, centre - at
-            longest = LARGEST_STEP_RATIO * self.obstacle.radius_m
-            pieces = max(1, int(np.ceil(np.linalg.norm(way) / longest)))
-            while done < 1.0 - 1e-12 and not stuck:
-                step = min(share / pieces, 1.0 - done)
-                target = begin + (done + step) * way
+            if position is None:
+                position = centre
+            done, fraction = 0.0, 1.0
+            start_position, path = position, centre - position
+            max_step_m = MAX_STEP_RATIO * self.obstacle.radius_m
+            step_count = max(1, int(np.ceil(np.linalg.norm(path) / max_step_m)))
+            while done < 1.0 - 1e-12 and not failed:
+                step = min(fraction / step_count, 1.0 - done)
+                target = start_position + (done + step) * path
                 try:
-                    guess = self._predicted(displacement, at, target, held, factors)
-                    settled, count, factors = self.settle(displacement, target, held, guess=guess)
-                    self._require_sound(settled, target)
-                except StuckError:
-                    share *= 0.5
-                    stuck = share < self.smallest_share
+                    guess = self._predict(displacement, position, target, stick, factors)
+                    solution, iteration_count, factors = self.solve_equilibrium(
+                        displacement, target, stick, guess=guess
+                    )
+                    self._check_validity(solution, target)
+                except NewtonNotConvergedError:
+                    fraction *= 0.5
+                    failed = fraction < self.min_step_fraction
                     continue
-                displacement, at = settled, target
-                iterations, done = iterations + count, done + step
-                share = min(1.0, 2.0 * share)
+                displacement, position = solution, target
+                iterations, done = iterations + iteration_count, done + step
+                fraction = min(1.0, 2.0 * fraction)
                 if self.friction == "stick":
-                    held = self.obstacle.hold(self.solid.nodes + displacement, at, held)
-            yield Solved(
+                    stick = self.obstacle.update_stick(
+                        self.solid.nodes + displacement, position, stick
+                    )
+            yield EquilibriumState(
                 displacement=displacement,
-                force_n=self.obstacle.forces(self.solid.nodes + displacement, at, held).sum(axis=0),
-                centre=at,
-                least_volume_ratio=self.solid.smallest_volume_ratio(displacement),
+                force_n=self.obstacle.forces(self.solid.nodes + displacement, position, stick).sum(
+                    axis=0
+                ),
+                centre=position,
+                min_volume_ratio=self.solid.min_volume_ratio(displacement),
                 iterations=iterations,
-                reached=not stuck,
+                reached=not failed,
             )
 
-    def settle(
-        self, displacement: Floats, centre: Floats, held: _Held, *, guess: Floats
+    def solve_equilibrium(
+        self, displacement: Floats, centre: Floats, stick: _StickState, *, guess: Floats
     ) -> tuple[Floats, int, Factors | None]:
-        """The balance (n, 3) with the sphere at `centre`, how many iterations it took, and the
-        factors of the last.
+        """Return the equilibrium (n, 3) with the sphere at `centre`, iterations, and the last
+        factors.
 
-        Starts at `guess` if that has less energy than `displacement`.  StuckError where it does
-        not settle.
+        Starts at `guess` if that has less energy than `displacement`. Raises
+        NewtonNotConvergedError without convergence.
         """
         nodes = self.solid.nodes
-        if self._energy(guess, centre, held) < self._energy(displacement, centre, held):
+        if self._energy(guess, centre, stick) < self._energy(displacement, centre, stick):
             displacement = guess
-        energy = self._energy(displacement, centre, held)
+        energy = self._energy(displacement, centre, stick)
         factors: Factors | None = None
         for iteration in range(MAX_ITERATIONS):
             inner = self.solid.forces(displacement)
-            pressed = self.obstacle.forces(nodes + displacement, centre, held)
-            residual = np.where(self.fixed[:, None], 0.0, inner + pressed)
-            scale = max(np.abs(inner).max(), np.abs(pressed).max())
+            contact_forces = self.obstacle.forces(nodes + displacement, centre, stick)
+            residual = np.where(self.fixed[:, None], 0.0, inner + contact_forces)
+            scale = max(np.abs(inner).max(), np.abs(contact_forces).max())
             if np.abs(residual).max() <= self.tolerance * scale:
                 return displacement, iteration, factors
-            factors = self._factors(displacement, centre, held)
+            factors = self._factorize(displacement, centre, stick)
             step = -factors.solve(residual.ravel()).reshape(-1, 3)
             slope = float((residual * step).sum())
-            share = 1.0
+            fraction = 1.0
             while True:
-                trial = displacement + share * step
-                now = self._energy(trial, centre, held)
-                if now <= energy + 1e-4 * share * slope + 1e-14 * abs(energy):
+                trial = displacement + fraction * step
+                now = self._energy(trial, centre, stick)
+                if now <= energy + 1e-4 * fraction * slope + 1e-14 * abs(energy):
                     break
-                share *= 0.5
-                if share < 1e-4:
-                    raise StuckError(f"no descent after {iteration} iterations")
+                fraction *= 0.5
+                if fraction < 1e-4:
+                    raise NewtonNotConvergedError(f"no descent after {iteration} iterations")
             displacement, energy = trial, now
-        raise StuckError(f"not settled after {MAX_ITERATIONS} iterations")
+        raise NewtonNotConvergedError(f"not converged after {MAX_ITERATIONS} iterations")
 
-    def _require_sound(self, displacement: Floats, centre: Floats) -> None:
-        """StuckError where an element is turned over, or the finger's centre is inside the body:
-        nothing keeps it from where no skin is, so that it has slipped through."""
-        ratio = self.solid.smallest_volume_ratio(displacement)
+    def _check_validity(self, displacement: Floats, centre: Floats) -> None:
+        """Raise NewtonNotConvergedError where an element is inverted, or the finger's centre is
+        inside.
+
+        Where there is no skin, no penalty acts: the finger has passed through.
+        """
+        ratio = self.solid.min_volume_ratio(displacement)
         if ratio <= 0.0:
-            raise StuckError(f"an element is turned over (volume ratio {ratio:.3g})")
+            raise NewtonNotConvergedError(f"an element is inverted (volume ratio {ratio:.3g})")
         triangles = (self.solid.nodes + displacement)[self._hull] - centre
         if winding_number(triangles) > 0.5:
-            raise StuckError("the finger is inside the body")
+            raise NewtonNotConvergedError("the finger is inside the body")
 
-    def _energy(self, displacement: Floats, centre: Floats, held: _Held) -> float:
+    def _energy(self, displacement: Floats, centre: Floats, stick: _StickState) -> float:
         elastic = self.solid.energy(displacement)
         if not np.isfinite(elastic):
             return elastic
-        return elastic + self.obstacle.energy(self.solid.nodes + displacement, centre, held)
+        return elastic + self.obstacle.energy(self.solid.nodes + displacement, centre, stick)
 
-    def _predicted(
+    def _predict(
         self,
         displacement: Floats,
-        at: Floats,
+        position: Floats,
         target: Floats,
-        held: _Held,
+        stick: _StickState,
         factors: Factors | None,
     ) -> Floats:
-        """Where the body goes, to first order, when the finger goes from `at` to `target`."""
+        """Return the displacement, to first order, when the finger moves from `position` to
+        `target`."""
         if factors is None:
             return displacement
-        positions, share = self.solid.nodes + displacement, 1e-3 * (target - at)
-        change = self.obstacle.forces(positions, at + share, held)
-        change -= self.obstacle.forces(positions, at - share, held)
+        positions, fraction = self.solid.nodes + displacement, 1e-3 * (target - position)
+        change = self.obstacle.forces(positions, position + fraction, stick)
+        change -= self.obstacle.forces(positions, position - fraction, stick)
         change[self.fixed] = 0.0
         return displacement - factors.solve(500.0 * change.ravel()).reshape(-1, 3)
 
-    def _factors(self, displacement: Floats, centre: Floats, held: _Held) -> Factors:
-        """Of the tangent, stiffened as far as it has a direction that does not resist.
+    def _factorize(self, displacement: Floats, centre: Floats, stick: _StickState) -> Factors:
+        """Return the factors of the tangent, stiffened where it is indefinite.
 
-        StuckError if that does not help.
+        Raises NewtonNotConvergedError if that does not help.
         """
         positions = self.solid.nodes + displacement
         elastic = self.solid.tangents(displacement)
-        for turned, stiffening in SAFEGUARDS:
+        for geometric_stiffness_weight, stiffening in REGULARIZATIONS:
             matrices = elastic.copy()
-            self.obstacle.add_tangents(matrices, positions, centre, held, turned=turned)
+            self.obstacle.add_tangents(
+                matrices,
+                positions,
+                centre,
+                stick,
+                geometric_stiffness_weight=geometric_stiffness_weight,
+            )
             self.solid.stiffen(matrices, stiffening)
             try:
-                return self._order.factor(matrices.astype(self.factored_in, copy=False))
+                return self._order.factor(matrices.astype(self.factor_dtype, copy=False))
             except IndefiniteError:
                 continue
-        raise StuckError("the stiffness cannot be made definite")
+        raise NewtonNotConvergedError("no regularization makes the stiffness definite")
 
 
 def winding_number(triangles: Floats) -> float:
-    """How often a closed surface of triangles (t, 3, 3), outward, goes around the origin: 1 where
-    that is inside.
+    """Return the winding number of a closed outward surface of triangles (t, 3, 3) about the
+    origin.
 
-    The sum of solid angles over a full one (van Oosterom & Strackee, IEEE Trans. Biomed. Eng. 30,
-    1983).
+    1: the origin is inside. The sum of solid angles over a full one (van Oosterom & Strackee, IEEE
+    Trans. Biomed. Eng. 30, 1983).
     """
     a, b, c = triangles.transpose(1, 0, 2)
     x, y, z = np.linalg.norm(triangles, axis=2).T
@@ -387,13 +406,13 @@ def winding_number(triangles: Floats) -> float:
     return float(np.arctan2(spanned, total).sum() / (2.0 * np.pi))
 
 
-def _parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:
-    """The element that each face (f, 6) belongs to (f,), and the face's nodes in it (f, 6)."""
+def _find_parents(elements: Ints, faces: Ints) -> tuple[Ints, Ints]:
+    """Return the element of each face (f, 6), (f,), and the face's nodes in that element (f, 6)."""
     sides = elements[:, FACES]
     keys = np.sort(sides[..., :3], axis=2).reshape(-1, 3)
     base = int(elements.max()) + 1
     weights = np.array([base * base, base, 1])
-    known, wanted = keys @ weights, np.sort(faces[:, :3], axis=1) @ weights
-    order = np.argsort(known)
-    parents = order[np.searchsorted(known, wanted, sorter=order)] // len(FACES)
+    face_keys, wanted_keys = keys @ weights, np.sort(faces[:, :3], axis=1) @ weights
+    order = np.argsort(face_keys)
+    parents = order[np.searchsorted(face_keys, wanted_keys, sorter=order)] // len(FACES)
     return parents, (elements[parents][:, None, :] == faces[:, :, None]).argmax(axis=2)

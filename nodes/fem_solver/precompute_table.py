@@ -1,14 +1,12 @@
-"""The nonlinear table of a scene's body: its pushes spread over processes, kept on disk.
+"""Compute the nonlinear table of a scene's body from snapshots that many processes solve.
 
-Pushes are independent of one another and take most of the time.  They are handed to an executor of
-`concurrent.futures`: processes of this machine, or a lab's workers (`lab`).  Each is kept as soon
-as it is there.
+Snapshots are independent of one another and take most of the time. An executor of
+`concurrent.futures` solves them: processes of this machine, or a laboratory's workers
+(`dask_executor`). Each is stored as soon as it is solved.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
 import multiprocessing
 import os
 import threading
@@ -23,65 +21,64 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from multiprocessing.synchronize import Event
 from pathlib import Path
 
 import numpy as np
 
 from nodes.background import enter_background
-from nodes.cache import Parts, load_arrays, save_arrays, say_damaged
-from nodes.fem_solver import precompute, pushes
-from nodes.fem_solver.carried import Carrier, Hull, Solved
-from nodes.fem_solver.contact import LinearSoftBody
+from nodes.cache import CheckpointStore, Specification, cached, encode_fields
+from nodes.fem_solver import precompute, snapshots
+from nodes.fem_solver.contact import unit_linear_body
 from nodes.fem_solver.mesh import build_mesh
 from nodes.fem_solver.mesh.from_scene import VERSION as mesh_version
 from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
-from nodes.fem_solver.table import Table, fill, table_bytes
+from nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator, place_snapshots
+from nodes.fem_solver.table import Table, fill_table, table_bytes
 from nodes.models.shapes import make_shape
 
 VERSION = 3
-"""Counts up whenever the same specification gives other numbers."""
-PUSH_STEPS, PLACE_STEPS = 200, 1
-"""How much of the progress a push, and a place that is filled in, are."""
-PULSE_S = 0.2
-"""How often progress is told, and may be stopped, while pushes run."""
-PUSH_BYTES = 600_000_000
-"""About what solving one push takes."""
+"""Increase whenever the same specification gives other numbers."""
+SNAPSHOT_STEPS, NODE_STEPS = 200, 1
+"""Progress steps of a snapshot, and of a node of the table."""
+POLL_S = 0.2
+"""Period at which progress is reported, and may be stopped, while snapshots are solved."""
+SNAPSHOT_BYTES = 600_000_000
+"""Approximate memory that solving one snapshot takes."""
 
 Progress = Callable[[int, int, "TableBudget"], None]
-"""Called with (done, total) steps and what is needed, first before anything starts; may raise
-`precompute.Interrupted` to stop."""
+"""Called with (done, total) steps and the resources needed, first before the work starts. It may
+raise `precompute.Interrupted` to stop the work."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableSpec:
-    """All that a table depends on; equal where their keys are."""
+    """All that a table depends on."""
 
     body: SoftBodySpec
     finger_radius_m: float
 
-    def key(self) -> str:
-        """Digest of the specification and of the code's version."""
-        text = json.dumps([VERSION, self.body.key(), self.finger_radius_m])
-        return hashlib.sha256(text.encode()).hexdigest()[:24]
+    def depends_on(self) -> list[object]:
+        """Return the JSON value that determines the table."""
+        return [VERSION, self.body.key(), self.finger_radius_m]
 
 
 @dataclass(frozen=True, slots=True)
 class TableBudget:
-    """What a table will need, known before it is begun."""
+    """The resources that a table needs, known before it is computed."""
 
-    pushes: int
-    places: int
+    snapshots: int
+    nodes: int
     bytes: int
 
     def text(self) -> str:
-        return f"{self.pushes} deep pushes for {self.places} places, {self.bytes / 1e6:.0f} MB"
+        return f"{self.snapshots} snapshots for {self.nodes} nodes, {self.bytes / 1e6:.0f} MB"
 
 
 @contextmanager
 def local_processes(count: int) -> Iterator[Executor]:
-    """Provide so many processes of this machine; an exception ends them in mid-push."""
+    """Yield an executor with `count` processes of this machine; an exception ends them at once."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     executor = ProcessPoolExecutor(count, context, initializer=_begin, initargs=(stop,))
@@ -94,8 +91,8 @@ def local_processes(count: int) -> Iterator[Executor]:
         executor.shutdown(wait=True, cancel_futures=True)
 
 
-asked_to_stop: ContextVar[Callable[[], bool]] = ContextVar("asked_to_stop", default=lambda: False)
-"""In a worker: whether what it is at shall end."""
+stop_requested: ContextVar[Callable[[], bool]] = ContextVar("stop_requested", default=lambda: False)
+"""In a worker: whether the present job must end."""
 
 
 def _begin(stop: Event) -> None:
@@ -104,56 +101,36 @@ def _begin(stop: Event) -> None:
 
 
 def _exit_on(stop: Event) -> None:
-    """Exit the worker as soon as it is asked to: one depth of a push takes up to a minute.
+    """Exit the worker as soon as it is asked to: one depth of a snapshot takes up to a minute.
 
-    Nothing is lost: whoever asked for the answers keeps them.
+    The process that asked for the results stores them, so none is lost.
     """
     stop.wait()
     os._exit(0)
 
 
-def _solve(job: pushes.PushJob) -> pushes.PushAnswer:
-    return pushes.solve_push(job, asked_to_stop.get())
+def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:
+    return snapshots.solve_snapshot(job, stop_requested.get())
 
 
 class WorkersError(RuntimeError):
-    """Whoever was to solve pushes is of no use."""
+    """The workers that were to solve snapshots cannot be used."""
 
 
 class LostWorkersError(WorkersError):
-    """They are gone; what they had solved is kept."""
+    """The workers are gone; finished snapshots are stored."""
 
 
 def code_version() -> str:
-    """Of all that decides what a push's answer is."""
+    """Return the version of all code that determines a snapshot."""
     return f"{VERSION}.{precompute.VERSION}.{mesh_version}"
 
 
-def table_path(spec: TableSpec, cache_dir: Path) -> Path:
-    return cache_dir / f"soft-body-table-{spec.key()}.npz"
-
-
-def parts_of(spec: TableSpec, cache_dir: Path) -> Parts:
-    return Parts(cache_dir / f"soft-body-table-{spec.key()}.parts")
-
-
-def load_table(spec: TableSpec, cache_dir: Path) -> Table | None:
-    """The table kept for a specification; None if there is none, or (logged) it is damaged."""
-    path = table_path(spec, cache_dir)
-    content = load_arrays(path)
-    if content is None:
-        return None
-    try:
-        return Table(**content)
-    except TypeError as error:
-        say_damaged(path, error)
-        return None
-
-
-def save_table(table: Table, spec: TableSpec, cache_dir: Path) -> None:
-    """Keep a table; a reader sees the whole file or none.  OSError if it cannot be written."""
-    content = {one.name: getattr(table, one.name) for one in fields(table)}
-    save_arrays(table_path(spec, cache_dir), content)
+def table_cache(spec: TableSpec) -> Specification[Table]:
+    """Describe the cache file of a nonlinear table."""
+    return Specification(
+        "soft-body-table", spec.depends_on(), encode_fields, lambda content: Table(**content)
+    )
 
 
 def compute_table(
@@ -165,111 +142,119 @@ def compute_table(
     *,
     workers: int = 1,
 ) -> Table:
-    """Solve the pushes, fill the table, keep it.  model: of the same body; workers: how many of the
-    executor's are on this machine.
+    """Return the cached table, or solve its snapshots, fill it and store it.
 
-    MemoryError, before anything is solved, if this machine, with so many workers on it, has too
-    little; OSError as `save_table`; others as `solve_all`.
+    model: of the same body. workers: how many of the executor's are on this machine. Raises
+    MemoryError, before anything is solved, if the machine has too little memory for so many
+    workers. Other errors as `cached` and `solve_all`.
     """
+    entry = table_cache(spec)
+    checkpoints = entry.checkpoints(cache_dir)
+    return cached(
+        entry,
+        cache_dir,
+        lambda: _compute_table(spec, model, checkpoints, executor, progress, workers=workers),
+    )
+
+
+def _compute_table(
+    spec: TableSpec,
+    model: SoftBodyModel,
+    checkpoints: CheckpointStore,
+    executor: Executor,
+    progress: Progress,
+    *,
+    workers: int,
+) -> Table:
     mesh_spec, response = spec.body.mesh, model.response
     mesh = build_mesh(mesh_spec)
-    mirrors = pushes.mirrors_of(mesh)
-    sites = pushes.sites_of(mesh_spec, mesh, mirrors, spec.finger_radius_m)
-    table = table_bytes(len(response.touch), len(response.rest), len(pushes.DEPTHS_M))
-    need = TableBudget(len(sites), len(response.touch), 2 * table + workers * PUSH_BYTES)
-    total = PUSH_STEPS * len(sites) + PLACE_STEPS * len(response.touch)
+    mirrors = snapshots.find_mirror_planes(mesh)
+    samples = snapshots.choose_sample_points(mesh_spec, mesh, mirrors, spec.finger_radius_m)
+    table = table_bytes(len(response.contact_nodes), len(response.rest), len(snapshots.DEPTHS_M))
+    need = TableBudget(
+        len(samples), len(response.contact_nodes), 2 * table + workers * SNAPSHOT_BYTES
+    )
+    total = SNAPSHOT_STEPS * len(samples) + NODE_STEPS * len(response.contact_nodes)
     progress(0, total, need)
     _require_memory(need, spec)
     jobs = [
-        pushes.job_of(
+        snapshots.make_snapshot_job(
             mesh_spec,
             mesh,
-            site,
+            sample,
             poisson_ratio=spec.body.poisson_ratio,
             finger_radius_m=spec.finger_radius_m,
         )
-        for site in sites
+        for sample in samples
     ]
-    parts = parts_of(spec, cache_dir)
-    answers = solve_all(
-        jobs, executor, parts, lambda count: progress(PUSH_STEPS * count, total, need)
+    solved = solve_all(
+        jobs, executor, checkpoints, lambda count: progress(SNAPSHOT_STEPS * count, total, need)
     )
-    solved, seen = [], set()
-    for site, answer in zip(sites, answers, strict=True):
-        for signs in mirrors:
-            image, place = pushes.reflected(answer, site, signs)
-            name = tuple(np.round(1e7 * place.place).astype(int))
-            if name not in seen:
-                seen.add(name)
-                solved.append(Solved(place, image, Hull(image.rest, image.faces)))
-    carrier = Carrier(solved, np.array(mesh_spec.towards_user), spec.finger_radius_m)
-    linear = LinearSoftBody(
-        response,
-        make_shape(dict(mesh_spec.geometry)),
-        response.rest[model.bounds],
-        young_modulus_pa=1.0,
-        finger_radius_m=spec.finger_radius_m,
-        linear_depth_m=spec.finger_radius_m,
-        largest_depth_m=2.0 * spec.finger_radius_m,
+    interpolator = SnapshotInterpolator(
+        place_snapshots(samples, solved, mirrors),
+        np.array(mesh_spec.towards_user),
+        spec.finger_radius_m,
     )
-    filled = fill(
+    return fill_table(
         response,
         model.triangles,
-        linear,
-        carrier,
-        lambda done, _: progress(PUSH_STEPS * len(sites) + done, total, need),
+        unit_linear_body(
+            response,
+            make_shape(dict(mesh_spec.geometry)),
+            response.rest[model.bounds],
+            spec.finger_radius_m,
+        ),
+        interpolator,
+        lambda done, _: progress(SNAPSHOT_STEPS * len(samples) + done, total, need),
     )
-    save_table(filled, spec, cache_dir)
-    parts.remove()
-    return filled
 
 
 def solve_all(
-    jobs: list[pushes.PushJob], executor: Executor, parts: Parts, told: Callable[[int], None]
-) -> list[pushes.PushAnswer]:
-    """The jobs' answers, those kept before taken from parts; told is called with how many are
-    there, and may raise to stop: jobs that have not begun are then given up.
+    jobs: list[snapshots.SnapshotJob],
+    executor: Executor,
+    checkpoints: CheckpointStore,
+    on_progress: Callable[[int], None],
+) -> list[snapshots.Snapshot]:
+    """Return the jobs' snapshots; those of earlier checkpoints are not solved again.
 
-    LostWorkersError if the executor gives jobs up; errors of the jobs.
+    on_progress: called with the number of finished snapshots. It may raise to stop: jobs that have
+    not begun are then cancelled. Raises LostWorkersError if the executor loses its workers, and the
+    errors of the jobs.
     """
-    answers: dict[int, pushes.PushAnswer] = {}
+    solved: dict[int, snapshots.Snapshot] = {}
     for number in range(len(jobs)):
-        kept = parts.load(f"push-{number:04d}")
-        if kept is not None:
-            reached = int(kept.pop("reached"))
-            answers[number] = pushes.PushAnswer(reached=reached, **kept)
-    told(len(answers))
-    waiting: dict[Future[pushes.PushAnswer], int] = {
+        part = checkpoints.load(f"push-{number:04d}")
+        if part is not None:
+            solved[number] = snapshots.decode_snapshot(part)
+    on_progress(len(solved))
+    waiting: dict[Future[snapshots.Snapshot], int] = {
         executor.submit(_solve, job): number
         for number, job in enumerate(jobs)
-        if number not in answers
+        if number not in solved
     }
     try:
         while waiting:
-            done, _ = wait(waiting, timeout=PULSE_S, return_when=FIRST_COMPLETED)
+            done, _ = wait(waiting, timeout=POLL_S, return_when=FIRST_COMPLETED)
             for future in done:
                 number = waiting.pop(future)
                 try:
-                    answer = future.result()
+                    snapshot = future.result()
                 except CancelledError as error:
                     raise LostWorkersError(
-                        "the workers that solve the pushes are gone; what they solved is kept, "
-                        "start them again and the table goes on from there"
+                        "the workers that solve the snapshots are gone; restart them, and the "
+                        "table continues from the snapshots that they finished"
                     ) from error
-                content = {
-                    one.name: np.asarray(getattr(answer, one.name)) for one in fields(answer)
-                }
-                parts.save(f"push-{number:04d}", content)
-                answers[number] = answer
-            told(len(answers))
+                checkpoints.save(f"push-{number:04d}", encode_fields(snapshot))
+                solved[number] = snapshot
+            on_progress(len(solved))
     finally:
         for future in waiting:
             future.cancel()
-    return [answers[number] for number in range(len(jobs))]
+    return [solved[number] for number in range(len(jobs))]
 
 
 def _require_memory(need: TableBudget, spec: TableSpec) -> None:
-    """MemoryError if the machine has less memory free than the table takes while it is made."""
+    """Raise MemoryError if the machine has less free memory than computing the table takes."""
     import psutil
 
     free = psutil.virtual_memory().available
@@ -277,5 +262,5 @@ def _require_memory(need: TableBudget, spec: TableSpec) -> None:
         raise MemoryError(
             f"the soft body's table takes {need.bytes / 2**30:.1f} GiB ({need.text()}), "
             f"{free / 2**30:.1f} GiB are free; raise skin_spacing_m above "
-            f'{spec.body.mesh.skin_spacing_m:g}, or take method "linear"'
+            f'{spec.body.mesh.skin_spacing_m:g}, or choose method "linear"'
         )

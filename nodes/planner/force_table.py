@@ -1,18 +1,18 @@
-"""Keeps the table of a sheet's force from one run to the next: it takes a minute or two to make."""
+"""Cache the table of a sheet's force, which takes a minute or two to compute."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from messages.methods import SheetForceMethod
 from messages.scene import Scene
-from nodes.cache import default_cache_dir, load_arrays, save_arrays
+from nodes.cache import Specification, cached, load_cached
 from nodes.methods import Progress
 from nodes.models.sheet.laws import CubicLaw, LinearLaw, ScaledLaw, SheetLaw
 from nodes.models.sheet.rubber import Rubber
@@ -20,13 +20,13 @@ from nodes.models.sheet.table import TableLaw
 from nodes.planner.sheet_force import membrane_table, rubber_of
 
 VERSION = 1
-"""Of the table's making; another one makes it anew."""
+"""Version of the computation; another version computes the table again."""
 
-KEPT = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
+FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
 """Fields of `TableLaw` that are in the file."""
 
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
-"""Places, over the sheet's width and height."""
+"""Sample points, over the sheet's width and height."""
 
 LAWS: dict[str, Callable[[Rubber], SheetLaw]] = {
     "linear": LinearLaw,
@@ -35,47 +35,46 @@ LAWS: dict[str, Callable[[Rubber], SheetLaw]] = {
 }
 
 
-def file_of(scene: Scene, cache_dir: Path | None) -> Path:
-    """Where the scene's table is kept: the name tells what it is of.  None: the default."""
-    told = {
+def table_cache(scene: Scene) -> Specification[TableLaw]:
+    """Describe the cache file of the scene's table."""
+    rubber = rubber_of(scene.sheet)
+    depends_on = {
         "version": VERSION,
         "finger_radius_m": scene.finger.radius_m,
         "stretches": [scene.sheet.min_stretch_ratio, scene.sheet.max_stretch_ratio],
-        **asdict(rubber_of(scene.sheet)),
+        **asdict(rubber),
     }
-    digest = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:24]
-    return (cache_dir or default_cache_dir()) / f"sheet-force-{digest}.npz"
+
+    def decode(content: dict[str, NDArray[Any]]) -> TableLaw:
+        stretches, depths_m, xs_m, ys_m, ratios = (content[name] for name in FIELDS)
+        return TableLaw(ScaledLaw(rubber), stretches, depths_m, xs_m, ys_m, ratios)
+
+    return Specification(
+        "sheet-force",
+        depends_on,
+        lambda table: {name: getattr(table, name) for name in FIELDS},
+        decode,
+    )
 
 
-def load(scene: Scene, cache_dir: Path | None) -> TableLaw | None:
-    """The scene's table, or None where it is not kept, or the file is damaged."""
-    kept = load_arrays(file_of(scene, cache_dir))
-    if kept is None or not kept.keys() >= set(KEPT):
-        return None
-    stretches, depths_m, xs_m, ys_m, ratios = (kept[name] for name in KEPT)
-    base = ScaledLaw(rubber_of(scene.sheet))
-    return TableLaw(base, stretches, depths_m, xs_m, ys_m, ratios)
-
-
-def load_or_make(
+def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
 ) -> TableLaw:
-    """The scene's table from the cache; else made by the membrane's finite elements, and kept."""
-    table = load(scene, cache_dir)
-    if table is not None:
-        return table
+    """Return the scene's cached table, or compute it by the membrane's finite elements."""
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
-    table = membrane_table(
-        rubber_of(sheet),
-        stretches=np.array(ends),
-        xs_m=sheet.width_m * XS,
-        ys_m=sheet.height_m * YS,
-        finger_radius_m=scene.finger.radius_m,
-        progress=progress,
+    return cached(
+        table_cache(scene),
+        cache_dir,
+        lambda: membrane_table(
+            rubber_of(sheet),
+            stretches=np.array(ends),
+            xs_m=sheet.width_m * XS,
+            ys_m=sheet.height_m * YS,
+            finger_radius_m=scene.finger.radius_m,
+            progress=progress,
+        ),
     )
-    save_arrays(file_of(scene, cache_dir), {name: getattr(table, name) for name in KEPT})
-    return table
 
 
 def law_by(scene: Scene, method: SheetForceMethod, cache_dir: Path | None) -> tuple[SheetLaw, str]:
@@ -84,7 +83,7 @@ def law_by(scene: Scene, method: SheetForceMethod, cache_dir: Path | None) -> tu
     rubber = rubber_of(scene.sheet)
     if method != "table":
         return LAWS[method](rubber), method
-    table = load(scene, cache_dir)
+    table = load_cached(table_cache(scene), cache_dir)
     if table is None:
         return ScaledLaw(rubber), "scaled law: no table of the sheet's force (flexsheet prepare)"
     return table, method

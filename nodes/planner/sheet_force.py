@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene, SheetSpec
 from messages.sheet_calibration import SheetCalibration, refuse_other_sheet
-from nodes.methods import Family, Trial, up_to
+from nodes.methods import Family, Trial, clip_range
 from nodes.models.sheet.fit import law_of
 from nodes.models.sheet.laws import (
     CubicLaw,
@@ -134,7 +134,7 @@ def _trials(judge: Judge, table_of: TableOf | None, scene: Scene) -> Iterator[Tr
     if table_of is not None:
         laws += [table_of(scene), MembraneLaw(rubber)]
     stretches = (1.0, middle, sheet.max_stretch_ratio)
-    depths_m = up_to(scene.working_range.push_depth_m, CHART_DEPTHS_M)
+    depths_m = clip_range(scene.working_range.push_depth_m, CHART_DEPTHS_M)
     for stretch, depth, (where, x, y) in product(stretches, depths_m, CHART_PLACES):
         if where != "centre" and stretch != middle:
             continue

@@ -1,17 +1,17 @@
-"""Correction of the projected picture for a moved or pushed sheet: equations (1)-(6) of the paper.
+"""Correct the projected image for a moved or pushed sheet: equations (1)-(6) of the paper.
 
-V is the eye, P the projector, A a point of the object.  C is where the line V-A meets the actual
-screen (the sheet), C' where the line C-P meets the imaginary screen, and A' the point of the line
-V-C' at A's depth.  Drawn at A', the object is seen at A.
+V is the eye, P the projector, A a point of the object. C is where the line V-A meets the actual
+screen (the sheet). C' is where the line C-P meets the imaginary screen, and A' the point of the
+line V-C' at A's depth. Drawn at A', the object is seen at A.
 
 The actual screen is one plane, or the four triangles between the pushed point and the sheet's
-corners.  All points are in the world frame, metres.  What cannot be corrected is masked (`valid`
-false), never moved somewhere:
+corners. All points are in the world frame, metres. What cannot be corrected is masked (`valid`
+false), never moved:
 
 - a screen seen edge-on by the eye or the projector, within `GRAZING_SINE`, or from its other side;
 - a point level with the eye or behind it, or one whose C is behind the eye or the projector.
 
-A triangle without area takes the plane of the whole sheet, and so does a push below `LEAST_PUSH_M`.
+A triangle without area takes the plane of the whole sheet, and so does a push below `MIN_PUSH_M`.
 """
 
 from __future__ import annotations
@@ -28,17 +28,18 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 GRAZING_SINE = 0.05
-"""Sine of the least angle (2.9 degrees) between a ray and the sheet; a pixel smears twentyfold."""
+"""Sine of the minimum angle (2.9 degrees) between a ray and the sheet. At that angle a pixel covers
+twenty times its width."""
 
 NEAR_M = 0.02
-"""Object points nearer to the eye's own depth than this are not drawn."""
+"""Object points closer to the eye's own depth than this are not drawn."""
 
-LEAST_PUSH_M = 1e-4
+MIN_PUSH_M = 1e-4
 """Below this depth the four triangles are the plane."""
 
 
 @dataclass(frozen=True, slots=True)
-class Plane:
+class ScreenPlane:
     """A point of the plane (3,) and its unit normal (3,), which points to the user."""
 
     point: Floats
@@ -46,13 +47,12 @@ class Plane:
 
 
 @dataclass(frozen=True, slots=True)
-class Screen:
-    """The actual screen: four planes through one point, told apart by where the corners are.
+class ProjectionScreen:
+    """The actual screen: four planes through one point, distinguished by the corners.
 
-    point: r_s (3,), common to all four.
-    normals: n_si (4, 3), towards the user.
-    corners: (4, 3) counter-clockwise as the user sees them; triangle i lies between corner i and
-        the next.  None when all four normals are one plane's.
+    point: r_s (3,), common to all four. normals: n_si (4, 3), towards the user. corners: (4, 3)
+    counter-clockwise as the user sees them. Triangle i lies between corner i and the next. None
+    when all four normals are one plane's.
     """
 
     point: Floats
@@ -61,45 +61,50 @@ class Screen:
 
 
 @dataclass(frozen=True, slots=True)
-class Corrected:
-    """points: A' (n, 3); on_screen: C' (n, 3); valid: (n,).  Points that are not valid hold A."""
+class CorrectedPoints:
+    """The corrected points A' (n, 3), their points C' on the screen (n, 3), and validity (n,).
+
+    Points that are not valid hold A.
+    """
 
     points: Floats
     on_screen: Floats
     valid: Bools
 
 
-IMAGINARY_SCREEN = Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
+IMAGINARY_SCREEN = ScreenPlane(np.zeros(3), np.array([0.0, 0.0, 1.0]))
 """The world frame is the imaginary screen's: r_o, n_o."""
 
 
-def flat_screen(plane: Plane) -> Screen:
-    """The screen that is one plane."""
-    return Screen(plane.point, np.tile(plane.normal, (4, 1)), None)
+def make_flat_screen(plane: ScreenPlane) -> ProjectionScreen:
+    """Return the screen that is one plane."""
+    return ProjectionScreen(plane.point, np.tile(plane.normal, (4, 1)), None)
 
 
-def pushed_screen(pushed_point: Floats, corners: Floats, plane: Plane) -> Screen:
-    """The four triangles between the pushed point and the sheet's corners (section III-C 3).
+def make_pushed_screen(
+    pushed_point: Floats, corners: Floats, plane: ScreenPlane
+) -> ProjectionScreen:
+    """Return the four triangles between the pushed point and the sheet's corners (section III-C 3).
 
-    pushed_point: (3,).  corners: (4, 3), left bottom, right bottom, right top, left top.
-    plane: of the sheet at rest; stands in for triangles without area, and for all four when the
-    push is less than `LEAST_PUSH_M`.
+    pushed_point: (3,). corners: (4, 3), left bottom, right bottom, right top, left top. plane: of
+    the sheet at rest. It replaces triangles without area, and all four when the push is less than
+    `MIN_PUSH_M`.
     """
-    if abs((pushed_point - plane.point) @ plane.normal) < LEAST_PUSH_M:
-        return flat_screen(plane)
+    if abs((pushed_point - plane.point) @ plane.normal) < MIN_PUSH_M:
+        return make_flat_screen(plane)
     spokes = corners - pushed_point
     normals = np.cross(spokes, np.roll(spokes, -1, axis=0))
     areas = np.linalg.norm(normals, axis=1, keepdims=True)
     smallest = 1e-6 * float(np.max(np.sum(spokes**2, axis=1)))
     normals = np.where(areas > smallest, normals / np.maximum(areas, smallest), plane.normal)
-    return Screen(pushed_point, normals, corners)
+    return ProjectionScreen(pushed_point, normals, corners)
 
 
-def sector_normals(screen: Screen, eye: Floats) -> Floats:
-    """(4, 3) unit normals of the planes through the eye, the pushed point and each corner.
+def sector_normals(screen: ProjectionScreen, eye: Floats) -> Floats:
+    """Return (4, 3) unit normals of the planes through the eye, the pushed point and each corner.
 
-    Seen from the eye the four spokes divide the picture into sectors; a direction d lies in the
-    sector after spoke i when d . normal_i >= 0 > d . normal_(i+1).  Zeros for one plane, and for a
+    Seen from the eye the four spokes divide the image into sectors. A direction d lies in the
+    sector after spoke i when d . normal_i >= 0 > d . normal_(i+1). Zeros for one plane, and for a
     spoke that the eye sees end-on.
     """
     if screen.corners is None:
@@ -109,12 +114,12 @@ def sector_normals(screen: Screen, eye: Floats) -> Floats:
     return np.where(lengths > 1e-9, normals / np.maximum(lengths, 1e-9), 0.0)
 
 
-def triangle_of(points: Floats, screen: Screen, eye: Floats) -> NDArray[np.intp]:
-    """Which triangle (n,) each point belongs to: the one that the line V-A crosses.
+def select_triangles(points: Floats, screen: ProjectionScreen, eye: Floats) -> NDArray[np.intp]:
+    """Return the triangle (n,) of each point: the one that the line V-A crosses.
 
-    It is the sector in which the line lies deepest.  Inside the sheet's outline that is the
-    triangle which is hit; outside, the sectors go on, so that every point has exactly one; where
-    the dent folds over itself as seen from the eye it is decided, though not by which is nearer.
+    It is the sector in which the line lies deepest. Inside the sheet's outline that is the triangle
+    which is hit. Outside, the sectors continue, so that every point has exactly one. Where the
+    indentation folds over itself as seen from the eye, the choice is unique but ignores depth.
     """
     sides = (points - eye) @ sector_normals(screen, eye).T
     depths = np.minimum(sides, -np.roll(sides, -1, axis=1))
@@ -123,9 +128,10 @@ def triangle_of(points: Floats, screen: Screen, eye: Floats) -> NDArray[np.intp]
 
 
 def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple[Floats, Bools]:
-    """C (n, 3) by equations (1) and (2), and where it exists, before the eye and not grazing.
+    """Return C (n, 3) by equations (1) and (2), and where it exists, before the eye and not
+    grazing.
 
-    r_s: (3,).  n_s: (n, 3), a normal per point.
+    r_s: (3,). n_s: (n, 3), a normal per point.
     """
     denominator = np.sum((eye - points) * n_s, axis=1)
     length = np.linalg.norm(eye - points, axis=1)
@@ -136,9 +142,10 @@ def actual_point(points: Floats, eye: Floats, r_s: Floats, n_s: Floats) -> tuple
 
 
 def imaginary_point(
-    on_actual: Floats, projector: Floats, n_s: Floats, imaginary: Plane
+    on_actual: Floats, projector: Floats, n_s: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """C' (n, 3) by equations (3) and (4), and where the projector lights the screen's back."""
+    """Return C' (n, 3) by equations (3) and (4), and where the projector lights the screen's
+    back."""
     light = on_actual - projector
     denominator = light @ imaginary.normal
     length = np.linalg.norm(light, axis=1)
@@ -150,9 +157,9 @@ def imaginary_point(
 
 
 def shifted_point(
-    points: Floats, on_imaginary: Floats, eye: Floats, imaginary: Plane
+    points: Floats, on_imaginary: Floats, eye: Floats, imaginary: ScreenPlane
 ) -> tuple[Floats, Bools]:
-    """A' (n, 3) by equations (5) and (6), and where A is in front of the eye."""
+    """Return A' (n, 3) by equations (5) and (6), and where A is in front of the eye."""
     normal = imaginary.normal
     valid = (eye - points) @ normal > NEAR_M
     denominator = (eye - on_imaginary) @ normal
@@ -165,28 +172,32 @@ def correct(
     *,
     eye: Floats,
     projector: Floats,
-    screen: Screen,
-    imaginary: Plane = IMAGINARY_SCREEN,
-) -> Corrected:
-    """A' of every point A (n, 3) by equations (1)-(6); the shader `object.vert.glsl` does the same.
+    screen: ProjectionScreen,
+    imaginary: ScreenPlane = IMAGINARY_SCREEN,
+) -> CorrectedPoints:
+    """Return A' of every point A (n, 3) by equations (1)-(6); `object.vert.glsl` does the same.
 
-    The eye must stand before the imaginary screen and the projector behind it (ValueError).
+    Raises ValueError unless the eye is in front of the imaginary screen and the projector behind
+    it.
     """
     if (eye - imaginary.point) @ imaginary.normal <= NEAR_M:
         raise ValueError(f"the eye {eye} is not in front of the imaginary screen")
     if (projector - imaginary.point) @ imaginary.normal >= 0.0:
         raise ValueError(f"the projector {projector} is not behind the imaginary screen")
-    n_s = screen.normals[triangle_of(points, screen, eye)]
+    n_s = screen.normals[select_triangles(points, screen, eye)]
     on_actual, seen = actual_point(points, eye, screen.point, n_s)
     on_imaginary, lit = imaginary_point(on_actual, projector, n_s, imaginary)
     shifted, in_front = shifted_point(points, on_imaginary, eye, imaginary)
     valid = seen & lit & in_front
     keep = valid[:, None]
-    return Corrected(np.where(keep, shifted, points), np.where(keep, on_imaginary, points), valid)
+    return CorrectedPoints(
+        np.where(keep, shifted, points), np.where(keep, on_imaginary, points), valid
+    )
 
 
-def plane_is_usable(plane: Plane, eye: Floats, projector: Floats) -> bool:
-    """Whether the eye sees the front and the projector lights the back at the plane's point."""
+def is_plane_usable(plane: ScreenPlane, eye: Floats, projector: Floats) -> bool:
+    """Return whether the eye sees the front and the projector lights the back at the plane's
+    point."""
     to_eye, light = eye - plane.point, plane.point - projector
     return bool(
         to_eye @ plane.normal > GRAZING_SINE * np.linalg.norm(to_eye)
@@ -195,9 +206,9 @@ def plane_is_usable(plane: Plane, eye: Floats, projector: Floats) -> bool:
 
 
 def on_imaginary_screen(points: Floats, eye: Floats) -> Floats:
-    """Where (n, 2) lines from the eye to points (n, 3) cross z = 0, the imaginary screen."""
-    share = eye[2] / (eye[2] - points[:, 2])
-    crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * share[:, None]
+    """Return where (n, 2) lines from the eye to points (n, 3) cross z = 0, the imaginary screen."""
+    fraction = eye[2] / (eye[2] - points[:, 2])
+    crossings: Floats = eye[:2] + (points[:, :2] - eye[:2]) * fraction[:, None]
     return crossings
 
 
@@ -209,9 +220,10 @@ def pixel_from_screen(
     cy_px: float,
     world_from_projector: Floats,
 ) -> Floats:
-    """Homography (3, 3): (x, y, 1) on the imaginary screen, metres, to projector pixels.
+    """Return the homography (3, 3) from (x, y, 1) on the imaginary screen, metres, to projector
+    pixels.
 
-    Of a pinhole; a lens bends the pixels afterwards (`lens.py`).
+    It is that of a pinhole; a lens distorts the pixels afterwards (`lens.py`).
     """
     projector_from_world = inverse(world_from_projector)
     columns = projector_from_world[:3, [0, 1, 3]]
@@ -221,7 +233,7 @@ def pixel_from_screen(
 
 
 def clip_from_screen(pixel_from_screen: Floats, width_px: int, height_px: int) -> Floats:
-    """(3, 3): homogeneous (x, y, w) on the imaginary screen to OpenGL's clip (x, y, w).
+    """Return (3, 3): homogeneous (x, y, w) on the imaginary screen to OpenGL's clip (x, y, w).
 
     Pixel (0, 0) is the centre of the top left pixel.
     """

@@ -1,4 +1,5 @@
-"""OpenGL without a window: draws one eye's picture into a multisampled frame and reads it back."""
+"""Draw one eye's image into a multisampled frame with OpenGL, without a window, and read it
+back."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from nodes.renderer.correction import (
     GRAZING_SINE,
     NEAR_M,
-    Screen,
+    ProjectionScreen,
     sector_normals,
 )
 from nodes.renderer.lens import ClipLens
@@ -27,34 +28,34 @@ SAMPLES = 4
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 GRID_PITCH_M = 0.02
 SCREEN_PATTERNS = {"grid": 1, "checker": 2, "white": 3}
-"""Those that lie on the imaginary screen, and their numbers in the shader."""
+"""Patterns on the imaginary screen, and their numbers in the shader."""
 TEXTURES = {"none": 0, "speckle": 1, "grid": 2, "image": 3}
-PLACES_AXES = {"places_x": 1, "places_y": 2}
+RAMP_AXES = {"coordinate_ramp_x": 1, "coordinate_ramp_y": 2}
 MARK_RADIUS_M = 0.003
 
 
 class NoOpenGLError(RuntimeError):
-    """No OpenGL 3.3 context could be made; the message says what to install."""
+    """No OpenGL 3.3 context could be created; the message names the packages to install."""
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """What one eye's picture is drawn with.
+class EyeView:
+    """The geometry that one eye's image is drawn with.
 
-    eye, projector: (3,) world.  screen: None draws without correction.
-    clip_from_screen: (3, 3), see `correction.clip_from_screen`.  lens: None bends nothing.
+    eye, projector: (3,) world. screen: None draws without correction. clip_from_screen: (3, 3), see
+    `correction.clip_from_screen`. lens: None: no distortion.
     """
 
     eye: Floats
     projector: Floats
-    screen: Screen | None
+    screen: ProjectionScreen | None
     clip_from_screen: Floats
     lens: ClipLens | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
-    """How the object is painted; marks are points of the object at rest, or None."""
+class DrawStyle:
+    """How the object is drawn; marks are points of the object at rest, or None."""
 
     flat: bool
     pattern: str
@@ -63,12 +64,12 @@ class Look:
 
 
 @dataclass(frozen=True, slots=True)
-class Paint:
+class SurfaceMaterial:
     """The object's own colour and texture.
 
-    colour: red, green, blue, 0 to 1.  pitch_m: of the procedural textures.  image: (height, width,
-    3), top row first, or None.  image_from_world: (4, 4), takes points of the object at rest to
-    0..1 across the image from its left and bottom.
+    colour: red, green, blue, 0 to 1. pitch_m: of the procedural textures. image: (height, width,
+    3), top row first, or None. image_from_world: (4, 4), maps points of the object at rest to 0..1
+    across the image from its left and bottom.
     """
 
     colour: tuple[float, float, float] = (0.95, 0.72, 0.60)
@@ -85,7 +86,7 @@ class Canvas:
     def __init__(
         self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
     ) -> None:
-        """samples: to a pixel, at its edges; as many as the driver has, if those are fewer."""
+        """samples: per pixel, at its edges; limited to what the driver supports."""
         self.width_px, self.height_px = width_px, height_px
         self.context = context
         vertex, fragment = shader_text("object.vert.glsl"), shader_text("object.frag.glsl")
@@ -99,13 +100,13 @@ class Canvas:
         )
         picture = self.context.renderbuffer(size, 4)
         self.resolved = self.context.framebuffer(picture)
-        # The same picture, to draw into without samples.  Resolving would copy a depth too.
+        # The same image, to draw into without samples. Resolving would copy a depth too.
         self._single = self.context.framebuffer(picture, self.context.depth_renderbuffer(size))
         self.context.enable(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-        self._object: _Mesh | None = None
+        self._object: _MeshBuffers | None = None
         self._image: moderngl.Texture | None = None
-        self.set_paint(Paint())
-        self._grid = _Mesh(self.context, *_grid_mesh())
+        self.set_material(SurfaceMaterial())
+        self._grid = _MeshBuffers(self.context, *_grid_mesh())
 
     def release(self) -> None:
         """Free the frame and the meshes; the context stays."""
@@ -122,64 +123,67 @@ class Canvas:
             self._image.release()
         self._program.release()
 
-    def set_paint(self, paint: Paint) -> None:
-        """The object's colour and texture from now on."""
+    def set_material(self, material: SurfaceMaterial) -> None:
+        """Set the object's colour and texture."""
         if self._image is not None:
             self._image.release()
             self._image = None
-        if paint.image is not None:
-            height, width = paint.image.shape[:2]
-            rows = np.ascontiguousarray(paint.image[::-1])
+        if material.image is not None:
+            height, width = material.image.shape[:2]
+            rows = np.ascontiguousarray(material.image[::-1])
             self._image = self.context.texture((width, height), 3, rows, alignment=1)
             self._image.build_mipmaps()
             self._image.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
             self._image.repeat_x = self._image.repeat_y = False
         self._uniforms.set(
-            object_colour=paint.colour,
-            texture_kind=TEXTURES[paint.texture],
-            texture_pitch_m=paint.pitch_m,
-            image_from_world=tuple(paint.image_from_world.T.ravel().tolist()),
-            object_from_world=tuple(paint.object_from_world.T.ravel().tolist()),
+            object_colour=material.colour,
+            texture_kind=TEXTURES[material.texture],
+            texture_pitch_m=material.pitch_m,
+            image_from_world=tuple(material.image_from_world.T.ravel().tolist()),
+            object_from_world=tuple(material.object_from_world.T.ravel().tolist()),
         )
 
     def set_mesh(
         self, rest: Floats, triangles: NDArray[np.int32], normals: Floats | None = None
     ) -> None:
-        """The object's vertices at rest (vertices, 3), world, with the unit normals there, and its
-        outward triangles."""
+        """Set the object's vertices at rest (vertices, 3), world, unit normals there, outward
+        triangles."""
         if self._object is not None:
             self._object.release()
-        self._object = _Mesh(self.context, rest, triangles, normals)
+        self._object = _MeshBuffers(self.context, rest, triangles, normals)
 
     def set_shape(self, positions: Floats, normals: Floats) -> None:
-        """Where the vertices are now, and the unit normals there, both (vertices, 3)."""
+        """Set the present positions of the vertices and the unit normals there, both (vertices,
+        3)."""
         if self._object is None:
             raise RuntimeError("set_mesh comes before set_shape")
         self._object.move(_interleaved(positions, normals))
 
     def set_moved(self, moved: NDArray[np.float32]) -> None:
-        """As `set_shape`, side by side (vertices, 6); the normals need not be of unit length."""
+        """Set both as `set_shape`, side by side (vertices, 6); normals need not have unit
+        length."""
         if self._object is None:
             raise RuntimeError("set_mesh comes before set_moved")
         self._object.move(moved)
 
-    def draw(self, view: View, look: Look) -> None:
+    def draw(self, view: EyeView, look: DrawStyle) -> None:
         """Draw and wait until it is drawn."""
-        self.paint(self._frame, view, look)
+        self.draw_into(self._frame, view, look)
         self.finish()
 
-    def draw_unresolved(self, view: View, look: Look) -> None:
-        """The least that any drawing takes, to compare with; its picture cannot be read."""
-        self.paint(self._frame, view, look)
+    def draw_unresolved(self, view: EyeView, look: DrawStyle) -> None:
+        """Draw the minimum of any method, for comparison; the image cannot be read."""
+        self.draw_into(self._frame, view, look)
         self.context.finish()
 
-    def paint(self, frame: moderngl.Framebuffer, view: View, look: Look) -> None:
+    def draw_into(self, frame: moderngl.Framebuffer, view: EyeView, look: DrawStyle) -> None:
         """Draw the object, or the pattern, into a frame."""
         frame.use()
         frame.clear(0.0, 0.0, 0.0, 1.0)
         mesh = self._grid if look.pattern in SCREEN_PATTERNS else self._object
         if look.pattern != "black" and mesh is not None:
-            # A projector behind the screen draws mirrored: then front faces wind the other way.
+            # A projector behind the screen draws mirrored: then front faces have the other
+            # orientation.
             mirrored = _determinant(view.clip_from_screen) < 0.0
             self.context.front_face = "cw" if mirrored else "ccw"
             set_view(self._uniforms, view)
@@ -199,13 +203,14 @@ class Canvas:
         self.context.finish()
 
     def read(self) -> Image:
-        """The picture drawn last: (height, width, 3), top row first."""
+        """Return the last image: (height, width, 3), top row first."""
         data = self.resolved.read(components=3, alignment=1)
         rows = np.frombuffer(data, np.uint8).reshape(self.height_px, self.width_px, 3)
         return np.ascontiguousarray(rows[::-1])
 
-    def shifted_points(self, view: View) -> Floats:
-        """(vertices, 4): A' of each vertex as the shader moves it, and 1 where it is valid."""
+    def shifted_points(self, view: EyeView) -> Floats:
+        """Return (vertices, 4): A' of each vertex as the shader moves it, and 1 where it is
+        valid."""
         if self._object is None:
             raise RuntimeError("set_mesh comes before shifted_points")
         program = self.context.program(
@@ -217,12 +222,12 @@ class Canvas:
         self._object.array(program, indexed=False).transform(captured, moderngl.POINTS)
         return np.frombuffer(captured.read(), np.float32).reshape(-1, 4).astype(np.float64)
 
-    def _set_look(self, look: Look) -> None:
+    def _set_look(self, look: DrawStyle) -> None:
         self._uniforms.set(
             flat_shading=look.flat,
             screen_pattern=SCREEN_PATTERNS.get(look.pattern, 0),
             grid_pitch_m=GRID_PITCH_M,
-            places_axis=PLACES_AXES.get(look.pattern, 0),
+            ramp_axis=RAMP_AXES.get(look.pattern, 0),
             light_direction=tuple(LIGHT.tolist()),
             fingertip_mark=_mark(look.fingertip_mark),
             target_mark=_mark(look.target_mark),
@@ -234,22 +239,22 @@ def _mark(point: Floats | None) -> tuple[float, ...]:
 
 
 class Uniforms:
-    """A program's uniforms; one that has its value already is not written again."""
+    """A program's uniforms; one that already has its value is not written again."""
 
     def __init__(self, program: moderngl.Program) -> None:
         self._program = program
         self._last: dict[str, object] = dict.fromkeys(program)
 
     def set(self, **values: object) -> None:
-        """Give values; uniforms that the shader does not use are optimised away and left out."""
+        """Set values; uniforms that the compiler removed as unused are ignored."""
         last = self._last
         for name, value in values.items():
             if name in last and last[name] != value:
                 self._program[name] = last[name] = value
 
 
-def set_view(uniforms: Uniforms, view: View) -> None:
-    """Hand a view to the vertex shader; uniforms that it does not use are optimised away."""
+def set_view(uniforms: Uniforms, view: EyeView) -> None:
+    """Pass a view to the vertex shader; uniforms that the compiler removed are ignored."""
     screen = view.screen
     uniforms.set(
         eye=tuple(view.eye.tolist()),
@@ -271,8 +276,8 @@ def set_view(uniforms: Uniforms, view: View) -> None:
         uniforms.set(lens=view.lens.focal_centre, lens_distortion=view.lens.distortion)
 
 
-class _Mesh:
-    """Vertex buffers of one mesh: what is fixed, and what moves each frame."""
+class _MeshBuffers:
+    """Vertex buffers of one mesh: the fixed ones, and those that change with each frame."""
 
     def __init__(
         self,
@@ -291,10 +296,11 @@ class _Mesh:
         self._arrays: dict[tuple[int, bool], moderngl.VertexArray] = {}
 
     def move(self, moved: NDArray[np.float32]) -> None:
-        """Positions and normals (vertices, 6); ValueError for another number of vertices."""
+        """Set positions and normals (vertices, 6). Raises ValueError for another number of
+        vertices."""
         if moved.shape != (self.count, 6):
             raise ValueError(f"positions and normals {moved.shape} for {self.count} vertices")
-        # Fresh memory for each frame: the driver need not wait until the last one is drawn.
+        # New memory for each frame: the driver need not wait until the last one is drawn.
         self._moving.orphan()
         self._moving.write(moved)
 
@@ -317,7 +323,7 @@ class _Mesh:
 
 
 def _determinant(matrix: Floats) -> float:
-    """Of (3, 3), without the detours of numpy's for any size."""
+    """Return the determinant of (3, 3), faster than numpy's for any size."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     return float(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
@@ -327,7 +333,7 @@ def _interleaved(positions: Floats, normals: Floats) -> NDArray[np.float32]:
 
 
 def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
-    """A fine sheet of triangles on the imaginary screen, 300 mm square, that carries the grid."""
+    """Return a fine mesh on the imaginary screen, 300 mm square, that carries the grid."""
     cells = 60
     axis = np.linspace(-0.15, 0.15, cells + 1)
     x, y = np.meshgrid(axis, axis)
@@ -341,13 +347,13 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
 
 
 def shader_text(name: str) -> str:
-    """The shader's text; a line `#include "name"` stands for that file's."""
+    """Return the shader's text; the file's text replaces a line `#include "name"`."""
     text = files("nodes.renderer").joinpath(name).read_text()
     return re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
 
 
 def headless_context() -> moderngl.Context:
-    """An OpenGL 3.3 context without a window; NoOpenGLError says what to install."""
+    """Return an OpenGL 3.3 context without a window. Raises NoOpenGLError."""
     # As a dict, because the stub types every further setting as one.
     settings: dict[str, Any] = {"backend": "egl"}
     try:

@@ -1,9 +1,9 @@
-"""Structured light: Gray code patterns, and what two cameras make of pictures of them.
+"""Generate and decode structured light: Gray code patterns, and camera images of them.
 
-A camera's pixel is wider than a projector's, so the finest stripes are not told apart: each picture
-is decoded to cells of a few projector pixels.  Where a projector pixel is in a picture to a small
-part of a camera's pixel follows from the cells around it, by a smooth map fitted to them (after
-Moreno and Taubin 2012, who fit local homographies).
+A camera's pixel is wider than a projector's, so that the finest stripes are not resolved: each
+image is decoded to cells of a few projector pixels. A smooth map fitted to the cells around a
+projector pixel gives its position in the image to a fraction of a camera pixel (after Moreno and
+Taubin 2012, who fit local homographies).
 """
 
 from __future__ import annotations
@@ -19,26 +19,28 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
 
-LEAST_CONTRAST = 24
-"""Levels between white and black below which a camera's pixel is not lit by the projector."""
+MIN_CONTRAST = 24
+"""Minimum difference between white and black, in levels, of a camera pixel that the projector
+lights."""
 
-FINEST_PX = 4
+MIN_STRIPE_PX = 4
 """Width of the finest stripes that are used, projector pixels."""
 
-REACH_PX = 22.0
-"""Half the side of the window that a projector pixel's place is fitted in, projector pixels."""
+WINDOW_HALF_PX = 22.0
+"""Half the side of the window for the fit at a projector pixel, projector pixels."""
 
-LEAST_CELLS = 60
-WORST_FIT_PX = 0.6
+MIN_CELLS = 60
+MAX_FIT_RMS_PX = 0.6
 """A fit that leaves more than this (rms, camera pixels) spans an edge or a fold of the sheet."""
 
 
 class DecodeError(ValueError):
-    """Pictures that are not of the patterns; the message says what is wrong."""
+    """The images do not show the patterns; the message gives the reason."""
 
 
 def patterns(width_px: int, height_px: int) -> list[Image]:
-    """What the projector shows in turn: each stripe and its inverse, then white, then black."""
+    """Return the projector's images in their order: each stripe and its inverse, then white, then
+    black."""
     coder = cv2.structured_light.GrayCodePattern.create(width_px, height_px)
     made, images = coder.generate()
     if not made:
@@ -49,27 +51,31 @@ def patterns(width_px: int, height_px: int) -> list[Image]:
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """Of one camera: pixels (n, 2) that are lit, and the projector's pixels (n, 2) that light them,
-    each the middle of its cell."""
+    """The lit pixels of one camera: pixels (n, 2), and the projector's pixels (n, 2) that light
+    them.
+
+    The latter are the middles of their cells.
+    """
 
     pixels: Floats
     lit_by: Floats
 
 
-def decoded(pictures: Sequence[Image], width_px: int, height_px: int) -> Decoded:
-    """One camera's pictures (height, width) of `patterns(width_px, height_px)`, in their order.
+def decode_patterns(images: Sequence[Image], width_px: int, height_px: int) -> Decoded:
+    """Decode one camera's images (height, width) of `patterns(width_px, height_px)`, in their
+    order.
 
-    DecodeError for another number of pictures, sizes that differ, or nothing lit.
+    Raises DecodeError for another number of images, sizes that differ, or nothing lit.
     """
     bits = [_bits(width_px), _bits(height_px)]
     wanted = 2 * sum(bits) + 2
-    if len(pictures) != wanted:
-        raise DecodeError(f"{len(pictures)} pictures; the patterns are {wanted}")
-    if len({picture.shape for picture in pictures}) != 1:
-        raise DecodeError("the pictures are not of one size")
-    white, black = (picture.astype(np.int16) for picture in pictures[-2:])
-    row, column = np.nonzero(white - black >= LEAST_CONTRAST)
-    if len(row) < LEAST_CELLS:
+    if len(images) != wanted:
+        raise DecodeError(f"{len(images)} images; the patterns are {wanted}")
+    if len({image.shape for image in images}) != 1:
+        raise DecodeError("the images have different sizes")
+    white, black = (image.astype(np.int16) for image in images[-2:])
+    row, column = np.nonzero(white - black >= MIN_CONTRAST)
+    if len(row) < MIN_CELLS:
         raise DecodeError(
             f"{len(row)} of the camera's pixels are lit by the projector: make the room darker, "
             "the exposure longer, or aim both at the sheet"
@@ -78,9 +84,9 @@ def decoded(pictures: Sequence[Image], width_px: int, height_px: int) -> Decoded
     for count in bits:
         value = np.zeros(len(row), np.int64)
         before = np.zeros(len(row), np.int64)
-        unused = min(int(np.log2(FINEST_PX)), count - 1)
+        unused = min(int(np.log2(MIN_STRIPE_PX)), count - 1)
         for number in range(count - unused):
-            shown, inverse = pictures[begin + 2 * number], pictures[begin + 2 * number + 1]
+            shown, inverse = images[begin + 2 * number], images[begin + 2 * number + 1]
             before ^= shown[row, column] > inverse[row, column]
             value = 2 * value + before
         axes.append(value * 2.0**unused + 0.5 * (2.0**unused - 1.0))
@@ -92,26 +98,31 @@ def _bits(size_px: int) -> int:
     return int(np.ceil(np.log2(size_px)))
 
 
-def places(view: Decoded, wanted: Floats) -> tuple[Floats, Bools]:
-    """Where (n, 2) a camera sees the projector's pixels (n, 2), and which it sees at all."""
+def find_pixels(view: Decoded, wanted: Floats) -> tuple[Floats, Bools]:
+    """Return the camera's pixels (n, 2) of the projector's pixels (n, 2), and which are found."""
     found, seen = np.zeros((len(wanted), 2)), np.zeros(len(wanted), np.bool_)
     order = np.argsort(view.lit_by[:, 0], kind="stable")
     lit_by, pixels = view.lit_by[order], view.pixels[order]
     for index, pixel in enumerate(wanted):
-        first, last = np.searchsorted(lit_by[:, 0], [pixel[0] - REACH_PX, pixel[0] + REACH_PX])
-        near = np.abs(lit_by[first:last, 1] - pixel[1]) <= REACH_PX
-        place = _fitted((lit_by[first:last][near] - pixel) / REACH_PX, pixels[first:last][near])
-        if place is not None:
-            found[index], seen[index] = place, True
+        first, last = np.searchsorted(
+            lit_by[:, 0], [pixel[0] - WINDOW_HALF_PX, pixel[0] + WINDOW_HALF_PX]
+        )
+        near = np.abs(lit_by[first:last, 1] - pixel[1]) <= WINDOW_HALF_PX
+        pixel_found = _fit_pixel(
+            (lit_by[first:last][near] - pixel) / WINDOW_HALF_PX, pixels[first:last][near]
+        )
+        if pixel_found is not None:
+            found[index], seen[index] = pixel_found, True
     return found, seen
 
 
-def _fitted(offsets: Floats, pixels: Floats) -> Floats | None:
-    """The camera's pixel (2,) at offset 0 of a quadratic map fitted to offsets (n, 2) in -1..1."""
+def _fit_pixel(offsets: Floats, pixels: Floats) -> Floats | None:
+    """Return the camera's pixel (2,) at offset 0 of a quadratic map fitted to offsets (n, 2) in
+    -1..1."""
     for _ in range(2):
-        # Cells on all sides, or it would be a guess beyond the sheet's edge.
+        # Cells on all sides are required: beyond the sheet's edge the fit would extrapolate.
         quadrants = (offsets > 0.0) @ np.array([1, 2])
-        if len(pixels) < LEAST_CELLS or len(np.unique(quadrants)) < 4:
+        if len(pixels) < MIN_CELLS or len(np.unique(quadrants)) < 4:
             return None
         x, y = offsets.T
         terms = np.column_stack([np.ones(len(x)), x, y, x * x, x * y, y * y])
@@ -121,6 +132,6 @@ def _fitted(offsets: Floats, pixels: Floats) -> Floats | None:
         if keep.all():
             break
         offsets, pixels = offsets[keep], pixels[keep]
-    if float(np.sqrt(np.mean(off[keep] ** 2))) > WORST_FIT_PX * FINEST_PX:
+    if float(np.sqrt(np.mean(off[keep] ** 2))) > MAX_FIT_RMS_PX * MIN_STRIPE_PX:
         return None
     return np.asarray(solution[0], dtype=np.float64)

@@ -1,6 +1,6 @@
-// The projector's lens: Brown's distortion in OpenCV's convention (k1, k2, p1, p2, k3), on the way
-// from a picture without it, homogeneous clip coordinates, to the one that goes into the lens.
-// Nothing beyond `lens_reach`, the greatest slope squared that is told apart, folds back.
+// The projector's lens: Brown's distortion in OpenCV's convention (k1, k2, p1, p2, k3). It maps an
+// image without distortion, in homogeneous clip coordinates, to the one that enters the lens.
+// `lens_reach`, the maximum squared slope, prevents folding beyond it.
 uniform vec4 lens;  // focal lengths and principal point, in clip coordinates
 uniform float lens_distortion[5];
 uniform float lens_reach;  // 0: no distortion

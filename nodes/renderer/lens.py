@@ -1,4 +1,4 @@
-"""The projector's lens distortion, as the shaders apply it to what a pinhole would project."""
+"""Prepare the projector's lens distortion for the shaders, which apply it to a pinhole's image."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import numpy as np
 from messages.scene import Lens
 
 REACH_MARGIN = 1.1
-"""The lens must be told apart this far beyond the picture's corners, as a ratio of slopes."""
+"""Ratio of slopes beyond the image's corners up to which the lens must be invertible."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClipLens:
-    """focal_centre: (fx, fy, cx, cy) in OpenGL's clip coordinates.  distortion: k1 k2 p1 p2 k3.
+    """A lens in OpenGL's clip coordinates.
 
-    reach: the greatest squared slope of a ray that is bent as the model says; farther ones are bent
-    as if they were there, since the polynomial folds them back into the picture somewhere.
+    focal_centre: (fx, fy, cx, cy). distortion: k1 k2 p1 p2 k3. reach: the maximum squared slope of
+    a ray that the model distorts. Steeper rays are treated as if they had that slope, because the
+    polynomial would fold them back into the image.
     """
 
     focal_centre: tuple[float, float, float, float]
@@ -26,9 +27,9 @@ class ClipLens:
 
 
 def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
-    """The lens for the shader `lens.glsl`; None for one without distortion.
+    """Return the lens for the shader `lens.glsl`; None for one without distortion.
 
-    ValueError for a distortion that folds within the picture: no such lens exists.
+    Raises ValueError for a distortion that folds within the image: no such lens exists.
     """
     if not any(lens.distortion):
         return None
@@ -39,16 +40,16 @@ def clip_lens(lens: Lens, width_px: int, height_px: int) -> ClipLens | None:
         for y in (-0.5, height_px - 0.5)
     ]
     # Radii r at which the radial polynomial r (1 + k1 r^2 + ...) stops growing.
-    turns = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
-    real = turns[(np.abs(turns.imag) < 1e-9) & (turns.real > 0.0)].real
+    stationary = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
+    real = stationary[(np.abs(stationary.imag) < 1e-9) & (stationary.real > 0.0)].real
     fold = float(np.sqrt(real.min())) if len(real) else np.inf
     largest = fold * (1.0 + k1 * fold**2 + k2 * fold**4 + k3 * fold**6) if len(real) else np.inf
     needed = REACH_MARGIN * max(float(np.hypot(*corner)) for corner in corners)
     if largest < needed:
         raise ValueError(
-            f"projector.lens.distortion: {lens.distortion} folds the picture over: nothing is "
-            f"bent farther out than {largest:.3f}, its corners are at {needed:.3f}; "
-            "calibrate anew with pixels all over the picture"
+            f"projector.lens.distortion: {lens.distortion} folds the image: its maximum slope is "
+            f"{largest:.3f}, the corners need {needed:.3f}; calibrate again with pixels in all of "
+            "the image"
         )
     reach = min(fold, 4.0 * needed)
     return ClipLens(

@@ -1,4 +1,4 @@
-"""Which monitor the projector is, and a window on it; through GLFW, on the main thread."""
+"""Find the projector's monitor and open a window on it, through GLFW, on the main thread."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ ON_A_PROJECTOR = {
 
 
 class WindowError(RuntimeError):
-    """No window can be had as it was asked for; the message says what to change."""
+    """The requested window cannot be opened; the message gives the remedy."""
 
 
 @contextmanager
 def glfw_errors() -> Iterator[None]:
-    """GLFW's errors as WindowError; it raises them at all after `start_glfw`."""
+    """Convert GLFW's errors to WindowError; GLFW raises them only after `start_glfw`."""
     try:
         yield
     except glfw.GLFWError as error:
-        raise WindowError(f"the window system says: {error}") from error
+        raise WindowError(f"the window system reports: {error}") from error
 
 
 def start_glfw() -> None:
-    """Connect to the display; WindowError when there is none."""
+    """Connect to the display. Raises WindowError when there is none."""
     glfw.ERROR_REPORTING = "raise"
     try:
         with glfw_errors():
@@ -50,18 +50,20 @@ def start_glfw() -> None:
 
 def _no_display(why: str) -> WindowError:
     return WindowError(
-        f"parameter output: window: no display ({why}); set DISPLAY to the screen that the "
-        "projector hangs on (as DISPLAY=:0), or draw without a window: output: headless"
+        f"parameter output: window: no display ({why}); set DISPLAY to the screen of the "
+        "projector (such as DISPLAY=:0), or draw without a window: output: headless"
     )
 
 
 def monitor_names() -> list[str]:
-    """Names of the monitors, the primary one first; the number in this list picks one."""
+    """Return the names of the monitors, the primary one first; an index into this list selects
+    one."""
     return [_text(glfw.get_monitor_name(monitor)) for monitor in glfw.get_monitors()]
 
 
-def chosen_monitor(monitor: str | int) -> Any:
-    """GLFW's monitor of that number or name; WindowError lists those that there are."""
+def find_monitor(monitor: str | int) -> Any:
+    """Return GLFW's monitor of that number or name. Raises WindowError, which lists all
+    monitors."""
     monitors, names = glfw.get_monitors(), monitor_names()
     wanted = monitor
     if isinstance(monitor, str) and monitor not in names and monitor.isdigit():
@@ -74,7 +76,7 @@ def chosen_monitor(monitor: str | int) -> Any:
     have = "; ".join(
         f'{index}: "{name}" {_mode(monitors[index])}' for index, name in enumerate(names)
     )
-    why = f"{len(same)} monitors are of that name, give the number" if same else "there is none"
+    why = f"{len(same)} monitors have that name, give the number" if same else "there is none"
     raise WindowError(f"parameter monitor: {monitor!r}: {why}; monitors: {have or 'none'}")
 
 
@@ -88,23 +90,24 @@ def _text(name: bytes | str) -> str:
 
 
 def refresh_period_s(monitor: Any) -> float:
-    """Of a monitor as it runs now; 0 when it does not say."""
+    """Return the refresh period of a monitor as it runs now; 0 when it is not known."""
     rate_hz = glfw.get_video_mode(monitor).refresh_rate
     return 1.0 / rate_hz if rate_hz > 0 else 0.0
 
 
 def hidden_window() -> Any:
-    """A window that nobody sees: its context is the one to draw in."""
+    """Return an invisible window: its context is the one to draw in."""
     return _create((1, 1), {glfw.VISIBLE: False})
 
 
 def open_window(
     size: tuple[int, int], monitor: Any | None, share: Any, *, stereo: bool
 ) -> tuple[Any, bool]:
-    """A window whose context shares what `share` has; and whether it has a buffer for each eye.
+    """Return a window whose context shares objects with `share`, and whether it has a buffer per
+    eye.
 
-    monitor: full-screen there; None: an ordinary window.  stereo: a buffer for each eye if the
-    driver has that.  WindowError for a monitor that does not know the size.
+    monitor: full-screen there; None: an ordinary window. stereo: a buffer per eye if the driver has
+    that. Raises WindowError for a monitor without a mode of that size.
     """
     width, height = size
     if monitor is not None:
@@ -113,8 +116,8 @@ def open_window(
             have = ", ".join(f"{w}x{h}" for w, h in sorted(modes))
             raise WindowError(
                 f"scene.projector is {width}x{height}; the monitor "
-                f'"{_text(glfw.get_monitor_name(monitor))}" knows {have}; '
-                "write one of these into the scene, which also calibrates anew"
+                f'"{_text(glfw.get_monitor_name(monitor))}" supports {have}; '
+                "set one of these in the scene and calibrate again"
             )
     hints = {**ON_A_PROJECTOR, glfw.VISIBLE: True}
     if stereo:

@@ -1,12 +1,12 @@
 #version 330
 
-// Patterns on the imaginary screen, the object coded with where it should be seen, or the object as
-// a soft thing looks; docs/renderer.md has the formulas.
+// Patterns on the imaginary screen, the object colour-coded with its expected position, or the
+// object with soft shading; docs/renderer.md has the formulas.
 
 uniform bool flat_shading;
 uniform int screen_pattern;  // 0: the object, 1: grid, 2: checker, 3: white
 uniform float grid_pitch_m;
-uniform int places_axis;  // 1 or 2: paint each point with the x or y at which the eye should see it
+uniform int ramp_axis;  // 1 or 2: colour each point by the x or y at which the eye should see it
 uniform vec3 eye;
 uniform vec3 light_direction;
 uniform vec3 object_colour;
@@ -26,19 +26,19 @@ in float valid;
 
 out vec4 colour;
 
-const float PLACES_PERIOD_M = 0.02;
-const float PLACES_RANGE_M = 0.24;
+const float RAMP_PERIOD_M = 0.02;
+const float RAMP_RANGE_M = 0.24;
 
-const float WRAP = 0.35;  // light reaches round the edge of the lit side: cosine down to -0.35
+const float WRAP = 0.35;  // light extends past the edge of the lit side: cosine down to -0.35
 const float AMBIENT = 0.25;
-const vec3 GLOW = vec3(0.16, 0.03, 0.02);  // red light from within, where the surface turns away
-const float HALF_DARK_M = 0.025;  // sunk so far in, half of the light is kept out
-const vec3 DARKENING = vec3(0.8, 1.0, 1.05);  // what is left there is redder
-const mat3 ASLANT = mat3(0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6);  // to no usual face
+const vec3 GLOW = vec3(0.16, 0.03, 0.02);  // subsurface red light near the terminator
+const float HALF_DARK_M = 0.025;  // depth at which half of the light is lost
+const vec3 DARKENING = vec3(0.8, 1.0, 1.05);  // light there is redder
+const mat3 ASLANT = mat3(0.36, 0.48, -0.8, -0.8, 0.6, 0.0, 0.48, 0.64, 0.6);  // aligned with no face
 const float SHEEN = 0.10;
 const float SHEEN_EXPONENT = 20.0;
 
-// Lines a pitch apart, at zero and its multiples, their edges as soft as a pixel is wide.
+// Lines a pitch apart, at zero and its multiples, with edges antialiased over a pixel.
 vec2 lines(vec2 place, float pitch, float half_width) {
     vec2 from_line = abs(fract(place / pitch + 0.5) - 0.5) * pitch;
     vec2 softness = fwidth(place);
@@ -51,7 +51,7 @@ vec3 on_screen(vec2 place) {
         return vec3(max(line.x, line.y));
     }
     if (screen_pattern == 2) {
-        // A triangle wave, steep: +1 on even squares, -1 on odd ones, soft over a pixel.
+        // A steep triangle wave: +1 on even squares, -1 on odd ones, antialiased over a pixel.
         vec2 wave = 1.0 - 2.0 * abs(2.0 * fract(place / (2.0 * grid_pitch_m) + 0.25) - 1.0);
         vec2 steep = 0.5 * grid_pitch_m / max(fwidth(place), vec2(1e-9));
         vec2 side = clamp(wave * steep, -1.0, 1.0);
@@ -60,7 +60,7 @@ vec3 on_screen(vec2 place) {
     return vec3(1.0);
 }
 
-// One number from 0 to 1 for each cell of a lattice, without order.
+// One pseudo-random number from 0 to 1 for each cell of a lattice.
 float scattered(ivec3 cell, uint which) {
     uint h = uint(cell.x) * 0x8da6b343u + uint(cell.y) * 0xd8163841u + uint(cell.z) * 0xcb1ab31fu;
     h = (h ^ (h >> 15) ^ (which * 0x9e3779b9u)) * 0x2c1b3c6du;
@@ -77,7 +77,8 @@ vec3 albedo() {
         vec2 line = lines(place.xy, texture_pitch_m, 0.0004);
         return mix(object_colour, 0.45 * object_colour, max(line.x, line.y));
     }
-    // A ball somewhere in each cell of half a pitch; where the surface cuts one, there is a spot.
+    // A ball at a random position in each cell of half a pitch; where the surface cuts one, there
+    // is a spot.
     vec3 in_cells = ASLANT * place / (0.5 * texture_pitch_m);
     ivec3 cell = ivec3(floor(in_cells));
     float radius = 0.25 + 0.2 * scattered(cell, 4u);
@@ -101,7 +102,7 @@ vec3 soft() {
     return albedo() * light * dark + SHEEN * sheen * dark;
 }
 
-// How much of a ring between two radii covers this point, its edges as soft as a pixel is wide.
+// Coverage of this point by a ring between two radii, antialiased over a pixel.
 float ring(vec4 mark, float inner) {
     float away = distance(rest_point, mark.xyz) / max(mark.w, 1e-6);
     float softness = max(0.5 * fwidth(away), 1e-6);
@@ -116,12 +117,13 @@ void main() {
         colour = vec4(on_screen(rest_point.xy), 1.0);
         return;
     }
-    if (places_axis > 0) {
-        // On the imaginary screen, coded: fine by a phase in red and green, coarse in blue.
+    if (ramp_axis > 0) {
+        // The position on the imaginary screen, coded: fine by a phase in red and green, coarse in
+        // blue.
         vec2 seen = eye.xy + (true_point.xy - eye.xy) * (eye.z / (eye.z - true_point.z));
-        float place = places_axis == 1 ? seen.x : seen.y;
-        float phase = 6.283185307 * place / PLACES_PERIOD_M;
-        float coarse = clamp(place / PLACES_RANGE_M + 0.5, 0.0, 1.0);
+        float place = ramp_axis == 1 ? seen.x : seen.y;
+        float phase = 6.283185307 * place / RAMP_PERIOD_M;
+        float coarse = clamp(place / RAMP_RANGE_M + 0.5, 0.0, 1.0);
         colour = vec4(0.5 + 0.5 * cos(phase), 0.5 + 0.5 * sin(phase), 0.2 + 0.8 * coarse, 1.0);
         return;
     }

@@ -1,6 +1,6 @@
 #version 330
 
-// Equations (1)-(6) of the paper per vertex, as nodes/renderer/correction.py has them.
+// Equations (1)-(6) of the paper per vertex, as in nodes/renderer/correction.py.
 
 uniform vec3 eye;
 uniform vec3 projector;
@@ -23,7 +23,7 @@ in vec3 normal;
 out vec3 rest_point;
 out vec3 true_point;  // A
 out vec3 surface_normal;
-out float sunk_m;  // how far it is pushed in
+out float sunk_m;  // depth below the surface at rest
 out float valid;
 out vec4 shifted;  // A', and 1 where it is valid
 

@@ -1,4 +1,4 @@
-"""The two eyes: where they are, which of them a frame is for, and how the projector takes both."""
+"""Select the eyes to draw for, which of them a frame is for, and how the projector packs both."""
 
 from __future__ import annotations
 
@@ -14,37 +14,38 @@ Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]
 WhichEye = Literal["both", "left", "right"]
 
-NEAREST_EYE_M = 0.05
-"""An eye nearer to the imaginary screen than this is not believed: nothing can be drawn for it."""
+MIN_EYE_DISTANCE_M = 0.05
+"""Minimum distance of an eye from the imaginary screen. For closer eyes nothing can be drawn."""
 
 
-def believed(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
-    """The eyes to draw for, the unit direction (3,) from left to right, and why not as tracked.
+def select_eyes(eyes: Eyes, tracked: Eye | None) -> tuple[Eyes, Floats, str]:
+    """Return the eyes to draw for, the unit direction (3,) from left to right, and a reason.
 
-    tracked: the newest `eye` message, or None when there is none or it is stale.
+    tracked: the newest `eye` message, or None when there is none or it is too old. The reason tells
+    why the eyes are not the tracked ones; empty if they are.
     """
     across = np.array([1.0, 0.0, 0.0])
     if tracked is None:
         return eyes, across, ""
     if not tracked.valid:
-        return eyes, across, "the eyes are not seen: taken to be where the scene has them"
+        return eyes, across, "the eyes are not seen: using the scene's"
     length = float(np.linalg.norm(tracked.right_world))
     if length < 1e-6:
-        return eyes, across, "eye.right_world is zero: eyes taken to be where the scene has them"
+        return eyes, across, "eye.right_world is zero: using the scene's eyes"
     across = np.asarray(tracked.right_world / length, dtype=np.float64)
     reach = 0.5 * eyes.interocular_m * abs(float(across[2]))
-    if tracked.centre_world_m[2] - reach < NEAREST_EYE_M:
+    if tracked.centre_world_m[2] - reach < MIN_EYE_DISTANCE_M:
         where = f"{tracked.centre_world_m[2] - reach:.3f} m"
         return (
             eyes,
             np.array([1.0, 0.0, 0.0]),
-            f"an eye {where} before the screen: eyes taken to be where the scene has them",
+            f"an eye {where} before the screen: using the scene's eyes",
         )
     return eyes.model_copy(update={"centre_world_m": tracked.centre_world_m}), across, ""
 
 
 def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Floats:
-    """(2, 3): left and right eye in the world; twice the point of view when mono.
+    """Return (2, 3): left and right eye in the world; twice the point of view when mono.
 
     across: (3,) unit direction from left to right; None: along x.
     """
@@ -56,20 +57,22 @@ def both_eyes(eyes: Eyes, mode: StereoMode, across: Floats | None = None) -> Flo
 
 
 def which_eye(mode: StereoMode, number: int, *, shows_both: bool) -> WhichEye:
-    """Whose picture frame `number` is: in frame_sequential the left eye's are the odd ones.
+    """Return the eye that frame `number` is for: in frame_sequential odd frames are the left eye's.
 
-    shows_both: what shows the frame alternates by itself, and takes both pictures of each.
+    shows_both: the output alternates by itself, and takes both images of each frame.
     """
     if mode != "frame_sequential" or shows_both:
         return "both"
     return "left" if number % 2 else "right"
 
 
-def drawn_for(pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool) -> Floats:
-    """(1 or 2, 3): the eyes of a pair (2, 3) that a frame draws, each a picture.
+def select_drawn_eyes(
+    pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: bool
+) -> Floats:
+    """Return (1 or 2, 3): the eyes of a pair (2, 3) that a frame draws, one image each.
 
-    One that is for one eye only shows the other's picture where the eyes are swapped: the glasses
-    then open the other way round.  Pictures of both are swapped where they are packed.
+    A frame for one eye shows the other's image where the eyes are swapped: the glasses then open
+    the other way round. Images of both eyes are swapped where they are packed.
     """
     if which != "both":
         row = int((which == "right") != swap_eyes)
@@ -78,15 +81,15 @@ def drawn_for(pair: Floats, mode: StereoMode, which: WhichEye, *, swap_eyes: boo
 
 
 def pack(left: Image, right: Image, mode: StereoMode, *, swap_eyes: bool = False) -> Image:
-    """One picture (height, width, 3) of two of that size.
+    """Return one image (height, width, 3) of two of that size.
 
-    mono: the left picture.  side_by_side, top_bottom: each squeezed to half the width or height by
-    averaging neighbours, left first.  anaglyph: red of the left, green and blue of the right, each
-    from its grey.  frame_sequential: nothing is packed, the left one comes first.  swap_eyes
-    exchanges the two first.  ValueError if the sizes differ or are odd.
+    mono: the left image. side_by_side, top_bottom: each squeezed to half the width or height by
+    averaging neighbours, left first. anaglyph: red of the left, green and blue of the right, each
+    from its grey. frame_sequential: nothing is packed, the left one comes first. swap_eyes
+    exchanges the two first. Raises ValueError if the sizes differ or are odd.
     """
     if left.shape != right.shape:
-        raise ValueError(f"pictures of {left.shape} and {right.shape} cannot be packed")
+        raise ValueError(f"images of {left.shape} and {right.shape} cannot be packed")
     if swap_eyes:
         left, right = right, left
     if mode in ("mono", "frame_sequential"):
@@ -107,6 +110,6 @@ def _gray(image: Image) -> Image:
 
 def _halved(image: Image, axis: int) -> Image:
     if image.shape[axis] % 2:
-        raise ValueError(f"a picture of {image.shape[1]}x{image.shape[0]} cannot be halved")
+        raise ValueError(f"an image of {image.shape[1]}x{image.shape[0]} cannot be halved")
     even, odd = (image[:, i::2] if axis == 1 else image[i::2] for i in (0, 1))
     return ((even.astype(np.uint16) + odd + 1) // 2).astype(np.uint8)

@@ -1,11 +1,11 @@
 #version 330
 
-// Both eyes' pictures as the projector takes them, pixel for pixel, as nodes/renderer/output.py.
+// Pack both eyes' images for the projector, pixel for pixel, as nodes/renderer/output.py.
 
 uniform sampler2D left;
 uniform sampler2D right;
 uniform int mode;  // 0: left alone, 1: side by side, 2: top and bottom, 3: anaglyph
-uniform ivec2 origin;  // of the picture in the window
+uniform ivec2 origin;  // of the image in the window
 
 out vec4 colour;
 

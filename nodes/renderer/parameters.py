@@ -1,4 +1,4 @@
-"""What the renderer can be told in a launch file."""
+"""Define the renderer's parameters, as a launch file gives them."""
 
 from __future__ import annotations
 
@@ -15,44 +15,50 @@ from nodes.renderer.gl import SAMPLES
 
 
 class RendererParameters(NodeParameters):
-    rate_hz: Positive = Field(default=30.0, description="most frames a second")
-    still_rate_hz: Positive = Field(
-        default=1.0, description="of frames while nobody touches and nothing moves"
+    rate_hz: Positive = Field(default=30.0, description="Maximum frame rate.")
+    idle_rate_hz: Positive = Field(
+        default=1.0, description="Frame rate while nothing touches or moves."
     )
     output: Literal["headless", "window"] = "headless"
     monitor: str | int | None = Field(
         default=None,
-        description="the projector's, by name or number; null: an ordinary window",
+        description="Monitor of the projector, by name or number. null: an ordinary window.",
     )
     swap_interval: int = Field(
-        default=1, ge=0, le=4, description="the projector's refreshes to a swap; 0: none, tears"
+        default=1, ge=0, le=4, description="Refreshes per swap. 0: no wait, with tearing."
     )
-    lead_s: NonNegative = Field(
+    prediction_horizon_s: NonNegative = Field(
         default=0.016,
-        description="from the start of drawing to the middle of the light, until it is measured",
+        description="Initial time from the start of drawing to the middle of the light.",
     )
-    light_s: NonNegative = Field(
+    display_latency_s: NonNegative = Field(
         default=0.008,
-        description="from the swap (without a window: the end of drawing) to the middle of the "
-        "light: half a frame, and the projector's own delay",
+        description="Time from the swap (without a window: the end of drawing) to the middle of "
+        "the light: half a frame plus the projector's own delay.",
     )
-    stale_s: Positive = Field(
-        default=0.1, description="older poses, fingertips, eyes and soft bodies are not used"
+    max_age_s: Positive = Field(
+        default=0.1, description="Maximum age of poses, fingertips, eyes and soft bodies."
     )
-    spacing_m: Positive = Field(default=0.0025, description="between vertices of the drawn surface")
+    spacing_m: Positive = Field(
+        default=0.0025, description="Distance between vertices of the drawn surface."
+    )
     samples: int = Field(
-        default=SAMPLES, ge=0, le=16, description="of a pixel; fewer draw faster without a GPU"
+        default=SAMPLES,
+        ge=0,
+        le=16,
+        description="Samples per pixel; fewer are faster without a GPU.",
     )
     correction: Correction | Literal["auto"] = Field(
         default="auto",
-        description="until a display message; auto: as the scene's methods say, else two_pass",
+        description="Correction until a display message. auto: the scene's, else two_pass.",
     )
     sheet_shape: SheetShapeMethod | Literal["auto"] = Field(
         default="auto",
-        description="what two_pass takes the sheet for; auto: as the scene's methods say, else "
-        "dents",
+        description="Sheet shape for two_pass. auto: the scene's, else reduced_order.",
     )
     cache_dir: Path | None = Field(
-        default=None, description="of the sheet's dent shapes; null: the user's cache"
+        default=None, description="Folder of the sheet's deflection shapes. null: the user's cache."
     )
-    stereo: StereoMode = Field(default="side_by_side", description="until a display message")
+    stereo: StereoMode = Field(
+        default="side_by_side", description="Stereo mode until a display message."
+    )

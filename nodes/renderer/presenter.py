@@ -1,8 +1,8 @@
-"""Shows the newest picture in a window, from a thread of its own that waits for the refresh.
+"""Show the newest image in a window, from a thread of its own that waits for the refresh.
 
-A swap that waits for the projector holds up this thread and no other: the event loop goes on
-drawing into textures that both contexts share.  Three pairs of them go round: one is shown, one is
-ready, one is drawn into.
+A swap that waits for the projector blocks this thread only. The event loop continues to draw into
+textures that both contexts share. Three pairs of them are used in turn: one is shown, one is ready,
+one is drawn into.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from nodes.renderer.monitors import WindowError, glfw_errors
 
 SLOTS = 3
 IDLE_S = 0.1
-REDRAWN = 4
+REDRAW_COUNT = 4
 """Swaps after a resize: a driver's buffers may take their new size two swaps later."""
 
 _NO_WINDOW: Any = None
@@ -37,13 +37,13 @@ MODES: dict[StereoMode, int] = {
 GL_BACK_LEFT, GL_BACK_RIGHT = 0x0402, 0x0403
 
 Shown = Callable[[Any, int], None]
-"""Called in the presenter's thread with a picture's tag and when it was swapped to the front, ns;
-0 for a picture that a newer one took the place of."""
+"""Called in the presenter's thread with an image's tag and its swap time, ns; 0 for an image that a
+newer one replaced."""
 
 
 @dataclass(slots=True)
 class Slot:
-    """Two textures, left and right, and what they hold."""
+    """Two textures, left and right, and their content."""
 
     textures: tuple[moderngl.Texture, moderngl.Texture]
     frames: tuple[moderngl.Framebuffer, moderngl.Framebuffer]
@@ -59,7 +59,7 @@ def make_slot(context: moderngl.Context, size: tuple[int, int]) -> Slot:
 
 
 class Presenter:
-    """Owns a window's context in a thread; pictures are handed over by `put`."""
+    """Own a window's context in a thread; `put` hands over images."""
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class Presenter:
         self._now_ns, self._shown = now_ns, shown
         self._changed = threading.Condition()
         self._ready: Slot | None = None
-        self._held: Slot | None = None
+        self._shown_slot: Slot | None = None
         self._stop, self._again = False, 0
         self._right_is_next = False
         self.framebuffer_px = glfw.get_framebuffer_size(window)
@@ -85,14 +85,16 @@ class Presenter:
         self._thread.start()
 
     def free_slot(self) -> Slot:
-        """One to draw into: neither shown nor ready to be."""
+        """Return a slot to draw into: neither shown nor ready."""
         with self._changed:
             return next(
-                slot for slot in self._slots if slot is not self._ready and slot is not self._held
+                slot
+                for slot in self._slots
+                if slot is not self._ready and slot is not self._shown_slot
             )
 
     def put(self, slot: Slot) -> None:
-        """Show this from the next refresh on; it must be drawn, and waits for nothing."""
+        """Show this slot from the next refresh on; it must be drawn. Does not wait."""
         with self._changed:
             superseded, self._ready = self._ready, slot
             self._changed.notify()
@@ -100,13 +102,13 @@ class Presenter:
             self._shown(superseded.tag, 0)
 
     def redraw(self, framebuffer_px: tuple[int, int]) -> None:
-        """Show the same once more: the window was resized or uncovered."""
+        """Show the same again: the window was resized or uncovered."""
         with self._changed:
-            self.framebuffer_px, self._again = framebuffer_px, REDRAWN
+            self.framebuffer_px, self._again = framebuffer_px, REDRAW_COUNT
             self._changed.notify()
 
     def stop(self) -> None:
-        """End the thread; its context is free then."""
+        """End the thread; then its context is free."""
         with self._changed:
             self._stop = True
             self._changed.notify()
@@ -126,15 +128,17 @@ class Presenter:
             glfw.make_context_current(_NO_WINDOW)
 
     def _next(self) -> tuple[Slot, bool] | None:
-        """The slot to show now, and whether it is a new one; None at the end."""
+        """Return the slot to show now, and whether it is a new one; None at the end."""
         with self._changed:
             while not self._stop:
                 if self._ready is not None:
-                    self._held, self._ready = self._ready, None
-                    return self._held, True
-                if self._held is not None and (self._again or self._alternates(self._held)):
+                    self._shown_slot, self._ready = self._ready, None
+                    return self._shown_slot, True
+                if self._shown_slot is not None and (
+                    self._again or self._alternates(self._shown_slot)
+                ):
                     self._again = max(0, self._again - 1)
-                    return self._held, False
+                    return self._shown_slot, False
                 self._changed.wait(IDLE_S)
         return None
 
@@ -162,7 +166,7 @@ class Presenter:
 
 
 class _Pane:
-    """The window's own drawing: one triangle over it all, that takes the slots' textures.
+    """Draw into the window: one triangle over all of it, with the slots' textures.
 
     GL functions that wait are called through ctypes, which lets the other threads run.
     """
@@ -192,7 +196,7 @@ class _Pane:
         left: moderngl.Texture,
         right: moderngl.Texture,
     ) -> None:
-        """Pixel for pixel, in the middle of a window of another size."""
+        """Draw pixel for pixel, in the middle of a window of another size."""
         origin = (np.array(framebuffer_px) - self._size) // 2
         screen = self._context.screen
         screen.viewport = (0, 0, *framebuffer_px)
@@ -208,7 +212,8 @@ class _Pane:
 
 
 def _function(name: str, result: Any, *arguments: Any) -> Any:
-    """A function of OpenGL of the current context; None if the driver has none of that name."""
+    """Return a function of OpenGL of the current context; None if the driver has none of that
+    name."""
     address = glfw.get_proc_address(name)
     if not address:
         return None

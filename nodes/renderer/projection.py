@@ -1,9 +1,9 @@
-"""Two-pass projection: what the eye should see, drawn first, is then lit onto the sheet's mesh.
+"""Project in two passes: draw what the eye should see, then map it onto the sheet's mesh.
 
-The first pass draws the object as the eye sees it, through a window in the imaginary screen.  The
-second draws the sheet as the projector sees it; each of its points takes the colour that the eye
-should see there.  Any shape of the sheet will do, depth is right, and there is no seam between
-triangles, for nothing is moved vertex by vertex.
+The first pass draws the object as the eye sees it, through a rectangle on the imaginary screen. The
+second draws the sheet as the projector sees it. Each of its points takes the colour that the eye
+should see there. Any sheet shape works and depth is exact. There is no seam between triangles,
+because nothing is moved vertex by vertex.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.renderer.gl import SAMPLES, Canvas, Look, Uniforms, View, set_view, shader_text
+from nodes.renderer.gl import SAMPLES, Canvas, DrawStyle, EyeView, Uniforms, set_view, shader_text
 from nodes.renderer.sheet_mesh import SheetMesh
 
 Floats = NDArray[np.float64]
@@ -24,7 +24,7 @@ CLIP_DISTANCE_0, CLIP_PLANES = 0x3000, 5
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ScreenRectangle:
     """A rectangle on the imaginary screen, metres."""
 
     left: float
@@ -34,7 +34,7 @@ class Window:
 
     @property
     def clip_from_screen(self) -> Floats:
-        """(3, 3): (x, y, 1) on the imaginary screen to OpenGL's clip, the window filling it."""
+        """(3, 3): (x, y, 1) on the imaginary screen to OpenGL's clip, filled by the rectangle."""
         return np.array(
             [
                 [2.0 / self.width, 0.0, -2.0 * self.left / self.width - 1.0],
@@ -44,13 +44,13 @@ class Window:
         )
 
 
-class Projection:
+class TwoPassProjector:
     """The frame of the first pass, and the sheet that the second one draws."""
 
     def __init__(
         self, context: moderngl.Context, width_px: int, height_px: int, *, samples: int = SAMPLES
     ) -> None:
-        """width_px, height_px: of the eye's picture; samples as in `Canvas`."""
+        """width_px, height_px: of the eye's image; samples as in `Canvas`."""
         self._context = context
         samples = min(samples, context.max_samples)
         size = (width_px, height_px)
@@ -58,9 +58,9 @@ class Projection:
             context.renderbuffer(size, 4, samples=samples),
             context.depth_renderbuffer(size, samples=samples),
         )
-        self._picture = context.texture(size, 4)
-        self._picture.repeat_x = self._picture.repeat_y = False
-        self._resolved = context.framebuffer([self._picture])
+        self._image = context.texture(size, 4)
+        self._image.repeat_x = self._image.repeat_y = False
+        self._resolved = context.framebuffer([self._image])
         self._program = context.program(
             vertex_shader=shader_text("sheet.vert.glsl"),
             fragment_shader=shader_text("sheet.frag.glsl"),
@@ -72,18 +72,23 @@ class Projection:
         self._triangles: NDArray[np.int32] | None = None
 
     def draw(
-        self, canvas: Canvas, sheet: SheetMesh, view: View, look: Look, window: Window
+        self,
+        canvas: Canvas,
+        sheet: SheetMesh,
+        view: EyeView,
+        look: DrawStyle,
+        window: ScreenRectangle,
     ) -> None:
-        """Draw one eye's picture onto the sheet, into the canvas's frame; wait until it is done."""
+        """Draw one eye's image onto the sheet, into the canvas's frame; wait until it is done."""
         seen = replace(view, screen=None, clip_from_screen=window.clip_from_screen, lens=None)
-        canvas.paint(self._frame, seen, look)
+        canvas.draw_into(self._frame, seen, look)
         self._context.copy_framebuffer(self._resolved, self._frame)
         array = self._sheet_array(sheet)
         set_view(self._uniforms, view)
         self._uniforms.set(window=(window.left, window.bottom, window.width, window.height))
-        self._picture.use()
+        self._image.use()
         canvas.begin()
-        # The projector stands behind the sheet and sees its back.
+        # The projector is behind the sheet and sees its back.
         self._context.disable(moderngl.CULL_FACE)
         for plane in range(CLIP_PLANES):
             self._context.enable_direct(CLIP_DISTANCE_0 + plane)
@@ -94,12 +99,12 @@ class Projection:
         self._context.finish()
 
     def _sheet_array(self, sheet: SheetMesh) -> moderngl.VertexArray:
-        """The sheet's vertices in a buffer, with its triangles; made anew when those change."""
+        """Return the sheet's vertices in a buffer, with its triangles; new when those change."""
         if self._array is not None and sheet is self._drawn:
             return self._array
-        vertices, known = np.ascontiguousarray(sheet.vertices, np.float32), self._triangles
-        same = known is sheet.triangles or (
-            known is not None and np.array_equal(known, sheet.triangles)
+        vertices, previous = np.ascontiguousarray(sheet.vertices, np.float32), self._triangles
+        same = previous is sheet.triangles or (
+            previous is not None and np.array_equal(previous, sheet.triangles)
         )
         if self._array is None or self._vertices is None or not same:
             self._release_sheet()
@@ -123,7 +128,7 @@ class Projection:
             self._vertices.release()
 
     def release(self) -> None:
-        """Free all; the context stays."""
+        """Free all buffers; the context stays."""
         self._release_sheet()
         for frame in (self._frame, self._resolved):
             for attachment in (*frame.color_attachments, frame.depth_attachment):

@@ -1,7 +1,7 @@
-"""The projector's optics and where it stands, from the points that its pixels light.
+"""Calibrate the projector's optics and pose from the points that its pixels light.
 
-A projector is a camera run backwards: each of its pixels lights a point, and two cameras measure
-that point.  So points are measured, not assumed, and the sheet may be held anywhere.
+A projector is an inverse camera: each of its pixels lights a point, and two cameras measure that
+point. So points are measured, not assumed, and the sheet may be held anywhere.
 """
 
 from __future__ import annotations
@@ -25,34 +25,34 @@ from nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from nodes.renderer.gray_code import DecodeError, Image, decoded, places
+from nodes.renderer.gray_code import DecodeError, Image, decode_patterns, find_pixels
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
 GRID_PX = 20
-"""Between the projector pixels that are looked for."""
+"""Distance between the projector pixels that are searched."""
 
-LEAST_POSES, LEAST_POINTS = 3, 200
-LEAST_DEPTH_M = 0.03
-LEAST_COVERAGE = 0.25
-WORST_RMS_PX = 0.7
+MIN_POSES, MIN_POINTS = 3, 200
+MIN_DEPTH_RANGE_M = 0.03
+MIN_COVERAGE = 0.25
+MAX_RMS_PX = 0.7
 COVERAGE_CELLS = (8, 6)
-STRAY_RATIO = 4.0
-USUAL_OFF = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
-"""How far a projector is from a scene's by tape measure: turn (rad), place (m), focal length (as a
-share), principal point (px).  Only the ratios count."""
+OUTLIER_RATIO = 4.0
+TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
+"""Typical errors of a scene's projector from a tape measure: rotation (rad), position (m), focal
+length (relative), principal point (px). Only the ratios count."""
 
 
 class ProjectorError(ValueError):
-    """Pictures or points that make no calibration; the message says what to change."""
+    """Images or points that give no calibration; the message gives the remedy."""
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
+class ProjectorPoints:
     """World points (n, 3), the projector's pixels (n, 2) that light them, the pose (n,) of each.
 
-    skew_m: (n,) how far the two cameras' rays pass one another.
+    skew_m: (n,) the distance between the two cameras' rays.
     """
 
     world: Floats
@@ -62,11 +62,11 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
-    """A calibrated projector and what it leaves, in projector pixels and, on the sheet, metres.
+class ProjectorFit:
+    """A calibrated projector and its residuals, in projector pixels and, on the sheet, metres.
 
-    held_out_rms_px: of poses that it was fitted without.  before_rms_px: of the projector that it
-    began with.  coverage_ratio: share of the picture's cells with points.
+    held_out_rms_px: of poses that it was fitted without. before_rms_px: of the initial projector.
+    coverage_ratio: fraction of the image's cells with points.
     """
 
     projector: Projector
@@ -78,39 +78,40 @@ class Fit:
     depth_range_m: float
     poses: int
     points: int
-    strays: int
+    outliers: int
 
 
-def measured(
+def measure_points(
     poses: Sequence[tuple[Sequence[Image], Sequence[Image]]],
     camera: StereoCamera,
     projector: Projector,
-) -> Points:
-    """Triangulate what the projector's pixels light: left and right pictures of each pose.
+) -> ProjectorPoints:
+    """Triangulate what the projector's pixels light, from left and right images of each pose.
 
-    camera: its optics as calibrated, `world_from_left` from the scene.  ProjectorError names the
-    pose whose pictures are not of the patterns.
+    camera: its optics as calibrated, `world_from_left` from the scene. Raises ProjectorError, which
+    names the pose whose images do not show the patterns.
     """
     size = projector.width_px, projector.height_px
     columns, rows = (np.arange(GRID_PX // 2, side, GRID_PX, dtype=np.float64) for side in size)
-    wanted = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
+    grid_pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
     parts: list[tuple[Floats, Floats, Indices, Floats]] = []
     for number, views in enumerate(poses):
         found = []
-        for side, pictures in zip(("left", "right"), views, strict=True):
+        for side, images in zip(("left", "right"), views, strict=True):
             try:
-                found.append(places(decoded(pictures, *size), wanted))
+                found.append(find_pixels(decode_patterns(images, *size), grid_pixels))
             except DecodeError as error:
                 raise ProjectorError(f"pose {number + 1}, {side} camera: {error}") from error
         both = found[0][1] & found[1][1]
-        world, skew_m = triangulated(found[0][0][both], found[1][0][both], camera)
-        parts.append((world, wanted[both], np.full(int(both.sum()), number), skew_m))
+        world, skew_m = triangulate_points(found[0][0][both], found[1][0][both], camera)
+        parts.append((world, grid_pixels[both], np.full(int(both.sum()), number), skew_m))
     world, pixels, pose, skew = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    return Points(world, pixels, pose, skew)
+    return ProjectorPoints(world, pixels, pose, skew)
 
 
-def triangulated(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
-    """World points (n, 3) midway between the rays of pixels (n, 2), and the rays' distance (n,)."""
+def triangulate_points(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Floats, Floats]:
+    """Return world points (n, 3) midway between the rays of pixels (n, 2), and the rays' distance
+    (n,)."""
     from_right = inverse(camera.right_from_left)
     slopes = [
         normalize(
@@ -125,83 +126,87 @@ def triangulated(left: Floats, right: Floats, camera: StereoCamera) -> tuple[Flo
     base = from_right[:3, 3]
     aa, ab, bb = ((p * q).sum(axis=1) for p, q in ((a, a), (a, b), (b, b)))
     da, db = a @ base, b @ base
-    share = aa * bb - ab * ab
-    on_a = ((bb * da - ab * db) / share)[:, None] * a
-    on_b = base + ((ab * da - aa * db) / share)[:, None] * b
+    denominator = aa * bb - ab * ab
+    on_a = ((bb * da - ab * db) / denominator)[:, None] * a
+    on_b = base + ((ab * da - aa * db) / denominator)[:, None] * b
     pose = camera.world_from_left
     world_from_left = transform_from_rpy(pose.position_m, pose.rpy_rad)
     return apply(world_from_left, 0.5 * (on_a + on_b)), np.linalg.norm(on_a - on_b, axis=1)
 
 
-def projected(projector: Projector, world: Floats) -> Floats:
-    """The projector's pixels (n, 2) that light world points (n, 3)."""
+def project_points(projector: Projector, world: Floats) -> Floats:
+    """Return the projector's pixels (n, 2) that light world points (n, 3)."""
     lens, pose = projector.lens, projector.world_from_projector
     local = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), world)
     matrix = camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
     return project(local, matrix, np.array(lens.distortion))
 
 
-def calibrated(points: Points, guess: Projector) -> Fit:
-    """The projector that lights the points, fitted from a rough one.
+def calibrate_projector(points: ProjectorPoints, guess: Projector) -> ProjectorFit:
+    """Fit the projector that lights the points, from an initial one.
 
-    ProjectorError where the points are too few, too alike in depth, cover too little of the
-    picture, or are not of one projector.
+    Raises ProjectorError where the points are too few, too similar in depth, cover too little of
+    the image, or are not of one projector.
     """
-    kept = np.ones(len(points.world), np.bool_)
+    inliers = np.ones(len(points.world), np.bool_)
     poses, depth_m = len(np.unique(points.pose)), _depth_range(points, guess)
     coverage = _coverage(points.pixels, guess)
-    if poses < LEAST_POSES or len(points.world) < LEAST_POINTS:
+    if poses < MIN_POSES or len(points.world) < MIN_POINTS:
         raise ProjectorError(
-            f"{len(points.world)} points in {poses} poses: hold the sheet in {LEAST_POSES} or "
-            f"more, lit and seen by both cameras, for {LEAST_POINTS} points at least"
+            f"{len(points.world)} points in {poses} poses: hold the sheet in {MIN_POSES} or "
+            f"more, lit and seen by both cameras, for {MIN_POINTS} points at least"
         )
-    if depth_m < LEAST_DEPTH_M:
+    if depth_m < MIN_DEPTH_RANGE_M:
         raise ProjectorError(
             f"all points lie within {1e3 * depth_m:.0f} mm along the light: tilt the sheet and "
-            f"hold it nearer and farther, over {1e3 * LEAST_DEPTH_M:.0f} mm at least"
+            f"hold it nearer and farther, over {1e3 * MIN_DEPTH_RANGE_M:.0f} mm at least"
         )
-    if coverage < LEAST_COVERAGE:
+    if coverage < MIN_COVERAGE:
         raise ProjectorError(
-            f"the points cover {100 * coverage:.0f} % of the projector's picture, "
-            f"{100 * LEAST_COVERAGE:.0f} % are needed: the lens is not told elsewhere"
+            f"the points cover {100 * coverage:.0f} % of the projector's image, "
+            f"{100 * MIN_COVERAGE:.0f} % are needed: the lens is not determined elsewhere"
         )
     for _ in range(3):
-        projector = _fitted(points, kept, guess)
-        off = np.linalg.norm(projected(projector, points.world) - points.pixels, axis=1)
-        now = off <= STRAY_RATIO * np.median(off)
-        if (now == kept).all():
+        projector = _fitted(points, inliers, guess)
+        residual_px = np.linalg.norm(
+            project_points(projector, points.world) - points.pixels, axis=1
+        )
+        now = residual_px <= OUTLIER_RATIO * np.median(residual_px)
+        if (now == inliers).all():
             break
-        kept = now
-    rms = _rms(off[kept])
-    if rms > WORST_RMS_PX or kept.mean() < 0.8:
+        inliers = now
+    rms = _rms(residual_px[inliers])
+    if rms > MAX_RMS_PX or inliers.mean() < 0.8:
         raise ProjectorError(
-            f"{rms:.2f} px rms and {int((~kept).sum())} strays of {len(kept)} points: not one "
-            "projector, or the sheet moved between its pictures; hold it still, check the cameras "
-            "(flexsheet calibrate check)"
+            f"{rms:.2f} px rms and {int((~inliers).sum())} outliers of {len(inliers)} points: not "
+            "one projector, or the sheet moved between its images; hold it still, check "
+            "the cameras (flexsheet calibrate check)"
         )
     held_out = [
         np.linalg.norm(
-            projected(_fitted(points, kept & (points.pose != pose), guess), points.world[here])
+            project_points(
+                _fitted(points, inliers & (points.pose != pose), guess), points.world[here]
+            )
             - points.pixels[here],
             axis=1,
         )
         for pose in np.unique(points.pose)
-        if (here := kept & (points.pose == pose)).any()
+        if (here := inliers & (points.pose == pose)).any()
     ]
     position = projector.world_from_projector.position_m
     distance_m = float(np.median(np.linalg.norm(points.world - position, axis=1)))
-    before = np.linalg.norm(projected(guess, points.world) - points.pixels, axis=1)
-    return Fit(
+    before = np.linalg.norm(project_points(guess, points.world) - points.pixels, axis=1)
+    return ProjectorFit(
         projector=projector,
         rms_px=rms,
         held_out_rms_px=_rms(np.concatenate(held_out)),
-        before_rms_px=_rms(before[kept]),
+        before_rms_px=_rms(before[inliers]),
         rms_m=rms * distance_m / projector.lens.fx_px,
         coverage_ratio=coverage,
         depth_range_m=depth_m,
         poses=poses,
-        points=int(kept.sum()),
-        strays=int((~kept).sum()),
+        points=int(inliers.sum()),
+        outliers=int((~inliers).sum()),
     )
 
 
@@ -209,7 +214,7 @@ def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _depth_range(points: Points, guess: Projector) -> float:
+def _depth_range(points: ProjectorPoints, guess: Projector) -> float:
     """How far (m) the points reach along the projector's axis, the middle nine tenths of them."""
     pose = guess.world_from_projector
     along = apply(inverse(transform_from_rpy(pose.position_m, pose.rpy_rad)), points.world)[:, 2]
@@ -222,13 +227,13 @@ def _coverage(pixels: Floats, projector: Projector) -> float:
     return len(np.unique(cells, axis=0)) / (COVERAGE_CELLS[0] * COVERAGE_CELLS[1])
 
 
-def _fitted(points: Points, kept: NDArray[np.bool_], guess: Projector) -> Projector:
+def _fitted(points: ProjectorPoints, inliers: NDArray[np.bool_], guess: Projector) -> Projector:
     """The projector of least squared pixels: square pixels, k1, k2, p1, p2; k3 as guessed.
 
     OpenCV's own fit refuses a principal point outside the picture, where lens shift puts it; its
     projection and that one's derivatives serve here.
     """
-    world, pixels = points.world[kept], points.pixels[kept]
+    world, pixels = points.world[inliers], points.pixels[inliers]
     lens, pose = guess.lens, guess.world_from_projector
     from_world = inverse(transform_from_rpy(pose.position_m, pose.rpy_rad))
     aspect, k3 = lens.fy_px / lens.fx_px, lens.distortion[4]
@@ -281,59 +286,60 @@ def _projector(
 
 def keystone(
     corners_px: Floats, half_width_m: float, half_height_m: float, guess: Projector
-) -> Fit:
-    """The projector whose pixels (4, 2) light the corners of a rectangle on the imaginary screen.
+) -> ProjectorFit:
+    """Fit the projector whose pixels (4, 2) light the corners of a rectangle on the imaginary
+    screen.
 
-    corners_px: left bottom, right bottom, right top, left top, as the user sees them.  The picture
-    on the screen, a homography, is met exactly; eight numbers (pose, focal length, one of the
-    principal point's) take it up, nearest to the guess's, whose distortion stays.  ProjectorError
-    where the corners are no convex quadrangle.
+    corners_px: left bottom, right bottom, right top, left top, as the user sees them. The image on
+    the screen, a homography, is matched exactly. Eight numbers (pose, focal length, one of the
+    principal point's) realize it, nearest to the guess's, whose distortion stays. Raises
+    ProjectorError where the corners are no convex quadrangle.
     """
     x, y = half_width_m, half_height_m
     world = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]], dtype=np.float64)
     edges = np.roll(corners_px, -1, axis=0) - corners_px
     after = np.roll(edges, -1, axis=0)
-    turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
-    if not ((turns > 1.0).all() or (turns < -1.0).all()):
+    cross_products = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+    if not ((cross_products > 1.0).all() or (cross_products < -1.0).all()):
         raise ProjectorError(
-            f"corners {corners_px.tolist()} are no convex quadrangle: give them left bottom, right "
-            "bottom, right top, left top, as the user sees them"
+            f"corners {corners_px.tolist()} are no convex quadrangle: give them as left bottom, "
+            "right bottom, right top, left top, as the user sees them"
         )
     lens, pose = guess.lens, guess.world_from_projector
     start = transform_from_rpy(pose.position_m, pose.rpy_rad)
 
     def projector(numbers: Floats) -> Projector:
-        x = numbers * USUAL_OFF
-        turned = transform(rotation_from_vector(x[:3]), x[3:6])
+        x = numbers * TYPICAL_ERRORS
+        correction = transform(rotation_from_vector(x[:3]), x[3:6])
         focal = np.exp(x[6])
         matrix = camera_matrix(
             lens.fx_px * focal, lens.fy_px * focal, lens.cx_px + x[7], lens.cy_px + x[8]
         )
-        return _projector(guess, matrix, np.array(lens.distortion), start @ turned)
+        return _projector(guess, matrix, np.array(lens.distortion), start @ correction)
 
     def residuals(numbers: Floats) -> Floats:
-        off = projected(projector(numbers), world) - corners_px
-        return np.concatenate([off.ravel(), 1e-2 * numbers])
+        residual_px = project_points(projector(numbers), world) - corners_px
+        return np.concatenate([residual_px.ravel(), 1e-2 * numbers])
 
     solved = least_squares(residuals, np.zeros(9), x_scale="jac", max_nfev=60)
     found = projector(solved.x)
-    off = np.linalg.norm(projected(found, world) - corners_px, axis=1)
-    before = np.linalg.norm(projected(guess, world) - corners_px, axis=1)
-    if _rms(off) > WORST_RMS_PX:
+    residual_px = np.linalg.norm(project_points(found, world) - corners_px, axis=1)
+    before = np.linalg.norm(project_points(guess, world) - corners_px, axis=1)
+    if _rms(residual_px) > MAX_RMS_PX:
         raise ProjectorError(
-            f"no projector near the scene's lights these corners ({_rms(off):.1f} px left): "
-            "check their order, and the pose in the scene"
+            f"no projector near the scene's lights these corners "
+            f"({_rms(residual_px):.1f} px left): check their order, and the pose in the scene"
         )
     distance_m = float(np.linalg.norm(found.world_from_projector.position_m))
-    return Fit(
+    return ProjectorFit(
         projector=found,
-        rms_px=_rms(off),
+        rms_px=_rms(residual_px),
         held_out_rms_px=float("nan"),
         before_rms_px=_rms(before),
-        rms_m=_rms(off) * distance_m / found.lens.fx_px,
+        rms_m=_rms(residual_px) * distance_m / found.lens.fx_px,
         coverage_ratio=_coverage(corners_px, guess),
         depth_range_m=0.0,
         poses=1,
         points=4,
-        strays=0,
+        outliers=0,
     )

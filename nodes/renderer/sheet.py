@@ -1,4 +1,4 @@
-"""Where the sheet is believed to be, and the screen that the paper's equations take it for."""
+"""Estimate the sheet's pose, and the screen that the paper's equations assume for it."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ from numpy.typing import NDArray
 from messages.types import Correction
 from nodes.models.rigid import apply, inverse, moved
 from nodes.models.sheet import corners, sheet_from_edges
-from nodes.renderer.correction import Plane, Screen, flat_screen, pushed_screen
+from nodes.renderer.correction import (
+    ProjectionScreen,
+    ScreenPlane,
+    make_flat_screen,
+    make_pushed_screen,
+)
 
 Floats = NDArray[np.float64]
 
-LEAST_EDGE_DISTANCE_M = 0.05
-"""Flanges nearer to one another than this hold no sheet: the poses are not believed."""
+MIN_EDGE_DISTANCE_M = 0.05
+"""Minimum distance of the flanges; closer poses are implausible for a sheet."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sheet:
-    """The sheet as it is believed to be when the light leaves.
+class SheetPose:
+    """The predicted sheet when the light leaves.
 
-    world_from_sheet: (4, 4).  corners: (4, 3).  pushed_point: (3,) in the world, or None.
+    world_from_sheet: (4, 4). corners: (4, 3). pushed_point: (3,) in the world, or None.
     """
 
     world_from_sheet: Floats
@@ -30,22 +35,22 @@ class Sheet:
     pushed_point: Floats | None
 
     @property
-    def plane(self) -> Plane:
-        return Plane(self.world_from_sheet[:3, 3], self.world_from_sheet[:3, 2])
+    def plane(self) -> ScreenPlane:
+        return ScreenPlane(self.world_from_sheet[:3, 3], self.world_from_sheet[:3, 2])
 
     @property
     def edge_distance_m(self) -> float:
-        """Between the middles of both clamped edges."""
+        """Distance between the middles of both clamped edges."""
         left_bottom, right_bottom, right_top, left_top = self.corners
         return float(np.linalg.norm(right_bottom + right_top - left_bottom - left_top)) / 2.0
 
     @property
-    def foremost_point(self) -> Floats:
+    def contact_point(self) -> Floats:
         """The pushed point, or the sheet's centre when nothing pushes it."""
         return self.plane.point if self.pushed_point is None else self.pushed_point
 
 
-def sheet_between(
+def estimate_sheet(
     world_from_left_edge: Floats,
     world_from_right_edge: Floats,
     *,
@@ -53,18 +58,18 @@ def sheet_between(
     twist_world: Floats,
     ahead_s: float,
     finger_tip: Floats | None,
-) -> Sheet | None:
-    """The sheet between two edges, moved on by `twist_world` (6,) for `ahead_s`.
+) -> SheetPose | None:
+    """Return the sheet between two edges, moved by `twist_world` (6,) for `ahead_s`.
 
-    finger_tip: (3,) at that instant, or None.  It pushes the sheet when it is below the plane and
-    over the sheet.  None when the edges are too near to one another to hold a sheet, or a pose or
-    the twist is not finite.
+    finger_tip: (3,) at that instant, or None. It pushes the sheet when it is below the plane and
+    over the sheet. Returns None when the edges are too close for a sheet, or a pose or the twist is
+    not finite.
     """
     left, right = world_from_left_edge, world_from_right_edge
     if not all(np.isfinite(each).all() for each in (left, right, twist_world)):
         return None
     distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
-    if distance < LEAST_EDGE_DISTANCE_M:
+    if distance < MIN_EDGE_DISTANCE_M:
         return None
     measured = sheet_from_edges(left, right)
     later = moved(measured, twist_world, ahead_s)
@@ -75,13 +80,13 @@ def sheet_between(
         if z < 0.0 and abs(x) < 0.5 * distance and abs(y) < 0.5 * height_m:
             pushed_point = finger_tip
     corner_points = corners(later_from_measured @ left, later_from_measured @ right, height_m)
-    return Sheet(later, corner_points, pushed_point)
+    return SheetPose(later, corner_points, pushed_point)
 
 
-def screen_for(method: Correction, sheet: Sheet) -> Screen | None:
-    """The screen that the equations assume; None for no correction, or one without equations."""
+def screen_for(method: Correction, sheet: SheetPose) -> ProjectionScreen | None:
+    """Return the screen that the equations assume; None for a method without equations."""
     if method in ("none", "two_pass"):
         return None
     if method == "four_triangles" and sheet.pushed_point is not None:
-        return pushed_screen(sheet.pushed_point, sheet.corners, sheet.plane)
-    return flat_screen(sheet.plane)
+        return make_pushed_screen(sheet.pushed_point, sheet.corners, sheet.plane)
+    return make_flat_screen(sheet.plane)

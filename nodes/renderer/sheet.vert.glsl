@@ -1,13 +1,13 @@
 #version 330
 
-// A point of the sheet, as the projector sees it.
+// Project a point of the sheet to the projector's image.
 
 uniform vec3 projector;
 uniform mat3 clip_from_screen;
 uniform float near_m;
 uniform float far_m;
 uniform vec3 eye;
-uniform vec4 window;  // of the picture on the imaginary screen: left, bottom, width, height
+uniform vec4 window;  // of the image on the imaginary screen: left, bottom, width, height
 
 #include "lens.glsl"
 
@@ -25,7 +25,8 @@ void main() {
     float z = ((far_m + near_m) * clip.z - 2.0 * far_m * near_m) / (far_m - near_m);
     gl_Position = vec4(clip.xy, z, clip.z);
 
-    // Only what the eye sees through the window is lit: four planes through the eye, and its depth.
+    // Light only what the eye sees through the rectangle: four planes through the eye, and its
+    // depth.
     float before_eye = eye.z - position.z;
     vec2 seen = eye.xy * before_eye + (position.xy - eye.xy) * eye.z;
     vec2 low = seen - window.xy * before_eye;

@@ -1,4 +1,4 @@
-"""The sheet as a mesh to project onto: flat, four triangles, or dented as the membrane dents."""
+"""Build the sheet's mesh to project onto: flat, four triangles, or deflected as the membrane."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from nodes.models.rigid import apply, inverse
 from nodes.models.sheet.dents import DentShapes, triangles_of
-from nodes.renderer.correction import GRAZING_SINE, LEAST_PUSH_M
-from nodes.renderer.sheet import Sheet
+from nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
+from nodes.renderer.sheet import SheetPose
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
-FLAT_TO_M, TRIANGLES_TO_M = 0.0005, 0.0035
-"""To these pushes the sheet is flat, or a pyramid, as far as a picture tells it."""
+MAX_TRIANGLES_DEPTH_M = 0.0035
+"""Maximum push for which four triangles are visually as good as the sheet's shape."""
 
 PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 """Triangles between neighbouring corners and the pushed point."""
@@ -25,9 +25,9 @@ PYRAMID = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int32)
 
 @dataclass(frozen=True, slots=True)
 class SheetMesh:
-    """vertices: (n, 3) in the world.  triangles: (m, 3), counter-clockwise for the user.
+    """vertices: (n, 3) in the world. triangles: (m, 3), counter-clockwise for the user.
 
-    note: why the shape is not quite the sheet's; empty where it is.
+    note: why the shape is not exactly the sheet's; empty where it is.
     """
 
     vertices: Floats
@@ -35,21 +35,21 @@ class SheetMesh:
     note: str = ""
 
 
-def flat_mesh(sheet: Sheet) -> SheetMesh:
-    """The sheet that nothing pushes: its corners, and its middle, so that a twist is halved."""
+def flat_mesh(sheet: SheetPose) -> SheetMesh:
+    """Return the sheet without a push: its corners, and its middle, which halves a twist."""
     vertices = np.vstack([sheet.corners, sheet.corners.mean(axis=0)])
     return SheetMesh(vertices, PYRAMID)
 
 
-def pyramid_mesh(sheet: Sheet) -> SheetMesh:
-    """The paper's four triangles between the corners and the fingertip."""
+def pyramid_mesh(sheet: SheetPose) -> SheetMesh:
+    """Return the paper's four triangles between the corners and the fingertip."""
     if sheet.pushed_point is None:
         return flat_mesh(sheet)
     return SheetMesh(np.vstack([sheet.corners, sheet.pushed_point]), PYRAMID)
 
 
-def finer(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
-    """The same surface in smaller triangles, so that a lens can bend what was straight."""
+def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
+    """Return the same surface in smaller triangles, so that a lens can distort straight lines."""
     vertices, triangles = mesh.vertices, mesh.triangles
     for _ in range(halvings):
         edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
@@ -65,57 +65,57 @@ def finer(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
 
 
 _grid_triangles = cache(triangles_of)
-"""The same array for the same grid, so that nobody need compare it."""
+"""The same array for the same grid, so that no comparison of content is needed."""
 
 
-def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
-    """The sheet as it narrows by its stretch and dents by its fingertip.
+def deflected_mesh(sheet: SheetPose, dents: DentShapes) -> SheetMesh:
+    """Return the sheet narrowed by its stretch and deflected by its fingertip.
 
-    Edges that are turned to one another turn the flat sheet evenly between them; the dent is added
-    to that as to a flat one.
+    Edges that are rotated relative to one another rotate the flat sheet evenly between them. The
+    deflection is added to that as to a flat one.
     """
     stretch = sheet.edge_distance_m / dents.rubber.width_m
     x, y, depth_m = 0.0, 0.0, 0.0
     if sheet.pushed_point is not None:
         x, y, z = apply(inverse(sheet.world_from_sheet), sheet.pushed_point).tolist()
         depth_m = max(0.0, -z)
-    place = (x, y)
-    flat = dents.grid(stretch, place)
-    offsets = dents.offsets(stretch, place, depth_m if depth_m >= LEAST_PUSH_M else 0.0)
+    position = (x, y)
+    flat = dents.grid(stretch, position)
+    offsets = dents.offsets(stretch, position, depth_m if depth_m >= MIN_PUSH_M else 0.0)
     rows, columns = flat.shape[:2]
     across = (flat[..., 0] / sheet.edge_distance_m + 0.5).ravel()
     up = (flat[..., 1] / dents.rubber.height_m + 0.5).ravel()
     left_bottom, right_bottom, right_top, left_top = sheet.corners
-    # Ruled between the edges: each point is bilinear in how far it is across and up.
-    ways = np.stack([right_bottom - left_bottom, left_top - left_bottom])
-    turn = right_top - right_bottom - left_top + left_bottom
+    # Ruled between the edges: each point is bilinear in its position across and up.
+    edge_vectors = np.stack([right_bottom - left_bottom, left_top - left_bottom])
+    twist = right_top - right_bottom - left_top + left_bottom
     vertices = offsets.reshape(-1, 3) @ sheet.world_from_sheet[:3, :3].T
-    vertices += np.stack([across, up, across * up], axis=1) @ np.vstack([ways, turn])
+    vertices += np.stack([across, up, across * up], axis=1) @ np.vstack([edge_vectors, twist])
     vertices += left_bottom
     return SheetMesh(
         vertices,
         _grid_triangles(rows, columns),
-        dents.outside(stretch, place, depth_m),
+        dents.outside(stretch, position, depth_m),
     )
 
 
-def lost_share(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
-    """About what share of the sheet, by its area as the eye sees it, folds keep the light from.
+def occluded_fraction(mesh: SheetMesh, eye: Floats, projector: Floats) -> float:
+    """Estimate the fraction of the sheet's visible area that folds keep the light from.
 
-    Lost is what the projector sees turned away or edge-on, within `GRAZING_SINE`, and as much again
-    that lies in its shadow.  0 for a sheet without folds, 1 at most.
+    Without light is what the projector sees facing away or edge-on, within `GRAZING_SINE`. The same
+    area again is counted for its shadow. 0 for a sheet without folds, 1 at most.
     """
     # By rows of one coordinate, which is several times faster than by points.
-    places = np.ascontiguousarray(mesh.vertices.T)
-    a, b, c = (places.take(mesh.triangles[:, i], axis=1) for i in range(3))
+    coordinates = np.ascontiguousarray(mesh.vertices.T)
+    a, b, c = (coordinates.take(mesh.triangles[:, i], axis=1) for i in range(3))
     b -= a
     c -= a
     x = b[1] * c[2] - b[2] * c[1]
     y = b[2] * c[0] - b[0] * c[2]
     z = b[0] * c[1] - b[1] * c[0]
     light = (a[0] - projector[0]) * x + (a[1] - projector[1]) * y + (a[2] - projector[2]) * z
-    way = a - projector[:, None]
-    lengths = np.sqrt((x * x + y * y + z * z) * (way * way).sum(axis=0))
+    rays = a - projector[:, None]
+    lengths = np.sqrt((x * x + y * y + z * z) * (rays * rays).sum(axis=0))
     unlit = light <= GRAZING_SINE * lengths
     if not unlit.any():
         return 0.0

@@ -1,9 +1,9 @@
 """Where each seen point of the object ought to be: reads the places that it is painted with.
 
-In the patterns `places_x` and `places_y` every point of the drawn object has the colour of the x or
-y at which the eye ought to see it on the imaginary screen: red and green the cosine and sine of a
-phase, blue the same over the whole screen, coarsely.  What the eye's picture shows elsewhere is the
-error of the image, at each point and not on its outline only.
+In the patterns `coordinate_ramp_x` and `coordinate_ramp_y` every point of the drawn object has the
+colour of the x or y at which the eye ought to see it on the imaginary screen: red and green the
+cosine and sine of a phase, blue the same over the whole screen, coarsely. What the eye's picture
+shows elsewhere is the error of the image, at each point and not on its outline only.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ class ErrorMap:
         return np.asarray(sizes[np.isfinite(sizes)])
 
 
-def error_map(places_x: Image, places_y: Image, metres_per_px: float) -> ErrorMap:
+def error_map(coordinate_ramp_x: Image, coordinate_ramp_y: Image, metres_per_px: float) -> ErrorMap:
     """Compare the eye's pictures (rows, columns, 3) of both patterns with where things are."""
-    seen = _lit(places_x) & _lit(places_y)
+    seen = _lit(coordinate_ramp_x) & _lit(coordinate_ramp_y)
     kernel = np.ones((2 * RIM_PX + 1,) * 2, np.uint8)
     seen = cv2.erode(seen.astype(np.uint8), kernel, borderValue=0) > 0
     rows, columns = seen.shape
     here_x = (np.arange(columns) + 0.5 * (1 - columns)) * metres_per_px
     here_y = (0.5 * (rows - 1) - np.arange(rows)) * metres_per_px
-    wanted_x, pure_x = _places(places_x)
-    wanted_y, pure_y = _places(places_y)
+    wanted_x, pure_x = _places(coordinate_ramp_x)
+    wanted_y, pure_y = _places(coordinate_ramp_y)
     errors = np.stack([here_x[None, :] - wanted_x, here_y[:, None] - wanted_y], axis=-1)
     errors[~(seen & pure_x & pure_y)] = np.nan
     return ErrorMap(errors)

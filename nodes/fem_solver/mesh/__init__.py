@@ -1,6 +1,6 @@
-"""Meshes of the scene's object, see `solid.SolidMesh` for what they hold.
+"""Mesh the scene's object; `solid.SolidMesh` describes the result.
 
-spec = mesh_spec(scene, skin_spacing_m)     # `spec.key()` names the mesh
+spec = mesh_spec(scene, skin_spacing_m)     # `spec.key()` identifies the mesh
 mesh_budget(spec)                           # nodes and memory, before any work
 mesh = build_mesh(spec)                     # in the frame of `world_from_mesh(scene)`
 """
@@ -13,7 +13,7 @@ from nodes.fem_solver.mesh.from_scene import (
     MeshSpec,
     build_mesh,
     mesh_budget,
-    mesh_of_scene,
+    mesh_scene,
     mesh_spec,
     world_from_mesh,
 )
@@ -39,7 +39,7 @@ __all__ = [
     "build_mesh",
     "cylinder_mesh",
     "mesh_budget",
-    "mesh_of_scene",
+    "mesh_scene",
     "mesh_spec",
     "world_from_mesh",
 ]

@@ -1,11 +1,11 @@
-"""Quadratic tetrahedra of a solid cylinder, graded towards the side that fingers touch.
+"""Mesh a solid cylinder with quadratic tetrahedra, graded towards the side that fingers touch.
 
 The mesh frame has the cylinder's axis along x, its middle in the origin, and z away from the
-support.  A cross-section is triangulated once (rings of points, Delaunay), extruded along x to
-prisms, and each prism split into three tetrahedra by the order of its vertices' numbers, so that
-neighbours agree on the diagonal (Dompierre et al., "How to subdivide pyramids, prisms and hexahedra
-into tetrahedra", 1999).  Elements have 10 nodes; the edges on the curved side are curved: their
-middle nodes lie on the true cylinder (isoparametric), all other edges are straight.
+support. A cross-section is triangulated once (rings of points, Delaunay) and extruded along x to
+prisms. Each prism is split into three tetrahedra by the order of its vertices' numbers, so that
+neighbours use the same diagonal (Dompierre et al., "How to subdivide pyramids, prisms and hexahedra
+into tetrahedra", 1999). Elements have 10 nodes. The midpoints of edges on the curved side lie on
+the true cylinder (isoparametric); all other edges are straight.
 """
 
 from __future__ import annotations
@@ -24,19 +24,22 @@ Ints = NDArray[np.int64]
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
-"""Elements grow by this much per length of depth below the side."""
+"""Growth of the element size per depth below the side."""
 RAMP_RAD = 0.6
 FOCUS_GROWTH = 0.35
-"""About a focus, elements grow by this much per length of way from it, ..."""
-COARSEST_RATIO = 0.35
-"""... up to this share of the radius."""
+"""Growth of the element size per distance from a focus."""
+MAX_SIZE_RATIO = 0.35
+"""Maximum element size about a focus, over the radius."""
 SPIRAL, FLAT_RATIO = 1e-3, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class Focus:
-    """The one place of the side that is to be meshed finely: its station along the axis, its angle
-    from +z, and how far around it elements are as small as asked."""
+    """The one point of the side that is meshed finely.
+
+    x_m: its position along the axis. angle_rad: its angle from +z. near_m: the distance within
+    which elements have the requested size.
+    """
 
     x_m: float
     angle_rad: float
@@ -52,13 +55,13 @@ def cylinder_mesh(
     skin_spacing_m: float,
     focus: Focus | None = None,
 ) -> SolidMesh:
-    """The solid cylinder, its skin nodes `skin_spacing_m` apart within `touch_angle_rad` of +z.
+    """Return the solid cylinder, its skin nodes `skin_spacing_m` apart within `touch_angle_rad` of
+    +z.
 
-    support_angle_rad: full angle of the fixed strip about -z; touch_angle_rad: half angle about +z
-    that fingers can load.  Farther back, elements grow to twice the size; inwards, likewise.  With
-    a focus, they grow away from that instead.
-    Raises ValueError where no sound mesh results: spacing too coarse for the radius, support all
-    around, touchable part reaching into the support.
+    support_angle_rad: full angle of the fixed strip about -z. touch_angle_rad: half angle about +z
+    that fingers can load. Farther back and inwards, elements grow to twice the size. With a focus,
+    they grow away from that instead. Raises ValueError where no valid mesh results: spacing too
+    coarse for the radius, support all around, touchable part reaching into the support.
     """
     half_support = 0.5 * support_angle_rad
     if not 0.0 < half_support < np.pi:
@@ -67,8 +70,8 @@ def cylinder_mesh(
         )
     if touch_angle_rad <= 0.0 or touch_angle_rad > np.pi - half_support + 1e-9:
         raise ValueError(
-            f"touchable half angle {touch_angle_rad:g} rad must be positive and stay clear of the "
-            f"support, which begins at {np.pi - half_support:g} rad"
+            f"touchable half angle: {touch_angle_rad:g} rad must be positive and less than the "
+            f"support's begin at {np.pi - half_support:g} rad; lower object.support_angle_rad"
         )
     if not 0.0 < skin_spacing_m <= 0.25 * min(radius_m, length_m):
         raise ValueError(
@@ -84,7 +87,7 @@ def cylinder_mesh(
     stations = _stations(length_m, sizes)
     corners, tetrahedra = _extrude(points, triangles, stations)
     layer = np.repeat(np.arange(len(stations)), len(points))
-    return _with_midnodes(
+    return _finish_mesh(
         corners,
         tetrahedra,
         layer,
@@ -97,7 +100,7 @@ def cylinder_mesh(
 
 @dataclass(frozen=True, slots=True)
 class _Sizes:
-    """Wanted edge lengths on the side, by the angle from +z (n,) and along the axis."""
+    """Required edge lengths on the side, by the angle from +z (n,) and along the axis."""
 
     element_m: float
     touch_angle: float
@@ -111,22 +114,24 @@ class _Sizes:
             result: Floats = self.element_m * (1.0 + (BACK_COARSENING - 1.0) * behind)
             return result
         apart = (wrapped - self.focus.angle_rad + np.pi) % (2 * np.pi) - np.pi
-        return self._away(self.radius_m * np.abs(apart), self.focus)
+        return self._sizes_at_distance(self.radius_m * np.abs(apart), self.focus)
 
     def along(self, x: Floats) -> Floats:
         if self.focus is None:
             return np.full(len(x), self.element_m)
-        return self._away(np.abs(x - self.focus.x_m), self.focus)
+        return self._sizes_at_distance(np.abs(x - self.focus.x_m), self.focus)
 
-    def _away(self, way_m: Floats, focus: Focus) -> Floats:
-        grown = self.element_m + FOCUS_GROWTH * np.maximum(way_m - focus.near_m, 0.0)
-        result: Floats = np.minimum(grown, max(COARSEST_RATIO * self.radius_m, self.element_m))
+    def _sizes_at_distance(self, distance_m: Floats, focus: Focus) -> Floats:
+        grown = self.element_m + FOCUS_GROWTH * np.maximum(distance_m - focus.near_m, 0.0)
+        result: Floats = np.minimum(grown, max(MAX_SIZE_RATIO * self.radius_m, self.element_m))
         return result
 
 
 def _stations(length_m: float, sizes: _Sizes) -> Floats:
-    """Where the cross-sections stand along the axis, ends included; one at the focus, with the same
-    steps to both sides as far as elements are small."""
+    """Return the positions of the cross-sections along the axis, ends included.
+
+    With a focus one lies there, with equal steps to both sides as far as elements are small.
+    """
     half = 0.5 * length_m
     stops = [-half, half]
     if sizes.focus is not None:
@@ -136,27 +141,31 @@ def _stations(length_m: float, sizes: _Sizes) -> Floats:
     stations = []
     for start, stop in itertools.pairwise(stops):
         fine = np.linspace(start, stop, 2001)
-        stations.append(_spaced(fine, 1.0 / sizes.along(fine), fewest=1))
+        stations.append(_sample_by_density(fine, 1.0 / sizes.along(fine), min_count=1))
     return np.concatenate([*stations, stops[-1:]])
 
 
-def _arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
-    """Angles from `start` (included) to `stop` (not), spaced as sizes ask, on a ring of this radius
-    at this depth below the side."""
+def _sample_arc(start: float, stop: float, radius: float, depth: float, sizes: _Sizes) -> Floats:
+    """Return angles from `start` (included) to `stop` (not), spaced by the sizes.
+
+    The arc has this radius and lies at this depth below the side.
+    """
     fine = np.linspace(start, stop, 2001)
-    return _spaced(fine, radius / (sizes.around(fine) + DEPTH_GROWTH * depth), fewest=2)
+    return _sample_by_density(
+        fine, radius / (sizes.around(fine) + DEPTH_GROWTH * depth), min_count=2
+    )
 
 
-def _spaced(fine: Floats, density: Floats, *, fewest: int) -> Floats:
-    """Places among `fine` with so many per length, from its first on, without its last."""
+def _sample_by_density(fine: Floats, density: Floats, *, min_count: int) -> Floats:
+    """Return points among `fine` with this density, from its first on, without its last."""
     total = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
-    pieces = max(fewest, round(float(total[-1])))
+    pieces = max(min_count, round(float(total[-1])))
     result: Floats = np.interp(np.arange(pieces) * total[-1] / pieces, total, fine)
     return result
 
 
 def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
-    """Radius and depth of the rings of points below the rim, inwards."""
+    """Yield radius and depth of the rings of points below the rim, inwards."""
     depth, step = 0.0, sizes.element_m
     while True:
         depth += 0.85 * step
@@ -168,20 +177,20 @@ def _rings(radius_m: float, sizes: _Sizes) -> Iterator[tuple[float, float]]:
 
 
 def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, Ints]:
-    """Points (y, z) of the cross-section and its triangles, counter-clockwise seen from +x.
+    """Return points (y, z) of the cross-section and its triangles, counter-clockwise seen from +x.
 
     One point of the rim is on each end of the support.
     """
     free = np.pi - half_support
     ends = [-free, free, 2 * np.pi - free]
     rim = np.concatenate(
-        [_arc(start, stop, radius_m, 0.0, sizes) for start, stop in itertools.pairwise(ends)]
+        [_sample_arc(start, stop, radius_m, 0.0, sizes) for start, stop in itertools.pairwise(ends)]
     )
     rings = [_circle(radius_m, rim)]
     for inner, depth in _rings(radius_m, sizes):
         step = sizes.element_m + DEPTH_GROWTH * depth
         offset = 0.5 * step / inner if len(rings) % 2 else 0.0
-        angles = _arc(-np.pi + offset, np.pi + offset, inner, depth, sizes)
+        angles = _sample_arc(-np.pi + offset, np.pi + offset, inner, depth, sizes)
         if len(angles) < 4:
             break
         rings.append(_circle(inner, angles))
@@ -192,14 +201,14 @@ def _disc(radius_m: float, half_support: float, sizes: _Sizes) -> tuple[Floats, 
 def _focused_disc(
     radius_m: float, half_support: float, sizes: _Sizes, focus: Focus
 ) -> tuple[Floats, Ints]:
-    """As `_disc`; the halves beside the diameter through the focus are mirror images, but for where
-    the support's ends are.
+    """Return a cross-section as `_disc`, symmetric about the diameter through the focus.
 
-    A mesh that leans pushes a sphere that is pressed into it aside, by some percent of the force;
-    without friction the whole body then gives way to that side.
+    Only the ends of the support may break the symmetry. An asymmetric mesh deflects a sphere that
+    is pressed into it sideways, by some percent of the force. Without friction the whole body then
+    moves to that side.
     """
     near = focus.near_m / radius_m
-    inner = [(r, _arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
+    inner = [(r, _sample_arc(0.0, np.pi, r, depth, sizes)) for r, depth in _rings(radius_m, sizes)]
     radii = np.array([radius_m, *(r for r, _ in inner)])
     axis = np.concatenate([radii, -radii, [0.0]])
     points = [np.column_stack([0.0 * axis, axis])]
@@ -208,10 +217,10 @@ def _focused_disc(
         ends = side * (np.pi + half_support * np.array([-1.0, 1.0]) - focus.angle_rad)
         ends = np.sort(ends % (2.0 * np.pi))
         stops = [0.0, near, *ends[(near < ends) & (ends < np.pi)], np.pi]
-        rim = [_arc(a, b, radius_m, 0.0, sizes) for a, b in itertools.pairwise(stops)]
+        rim = [_sample_arc(a, b, radius_m, 0.0, sizes) for a, b in itertools.pairwise(stops)]
         rings = [(radius_m, np.concatenate(rim)), *inner]
         off = np.concatenate([_circle(r * (1.0 + SPIRAL * p[1:]), p[1:]) for r, p in rings])
-        # on a spiral, no four points are on a circle: both halves are triangulated alike
+        # On a spiral, no four points are on a circle: both halves have the same triangulation.
         flat = np.column_stack([0.0 * axis, axis * np.where(axis < 0.0, 1.0 + SPIRAL * np.pi, 1.0)])
         number = np.append(np.arange(len(axis)), count + np.arange(len(off)))
         true = np.concatenate([_circle(np.full(len(p) - 1, r), p[1:]) for r, p in rings])
@@ -227,13 +236,13 @@ def _focused_disc(
 
 
 def _circle(radius: float | Floats, angles: Floats) -> Floats:
-    """Points (n, 2) at angles (n,) from +z."""
+    """Return points (n, 2) at angles (n,) from +z."""
     return np.column_stack([radius * np.sin(angles), radius * np.cos(angles)])
 
 
 def _triangles(points: Floats, where: Floats) -> Ints:
-    """Triangles (t, 3) of points (n, 2), counter-clockwise: Delaunay's, were they at `where`."""
-    from scipy.spatial import Delaunay  # late, as all of scipy: the process must start quickly
+    """Return Delaunay triangles (t, 3) of points (n, 2), counter-clockwise, computed at `where`."""
+    from scipy.spatial import Delaunay  # late: scipy is slow to import
 
     triangles = Delaunay(where).simplices.astype(np.int64)
     edges = points[triangles[:, 1:]] - points[triangles[:, :1]]
@@ -245,9 +254,10 @@ def _triangles(points: Floats, where: Floats) -> Ints:
 
 
 def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
-    """Corner nodes (k, 3) and tetrahedra (e, 4) of the extruded cross-section, slice by slice.
+    """Return corner nodes (k, 3) and tetrahedra (e, 4) of the extruded cross-section, slice by
+    slice.
 
-    The diagonals lean to the other side in every second slice, lest the whole solid lean.
+    The diagonals alternate from slice to slice, so that the solid has no preferred direction.
     """
     count, slices = len(points), len(x) - 1
     corners = np.column_stack([np.repeat(x, count), np.tile(points, (len(x), 1))])
@@ -273,7 +283,7 @@ def _extrude(points: Floats, triangles: Ints, x: Floats) -> tuple[Floats, Ints]:
     return corners, elements
 
 
-def _with_midnodes(
+def _finish_mesh(
     corners: Floats,
     tetrahedra: Ints,
     layer: Ints,
@@ -283,7 +293,8 @@ def _with_midnodes(
     half_support: float,
     touch_angle: float,
 ) -> SolidMesh:
-    """Add the edge middles, bend the side's edges onto the cylinder, name the parts of the skin."""
+    """Add the edge midpoints, curve the side's edges onto the cylinder, and identify the skin's
+    parts."""
     pairs = np.sort(tetrahedra[:, EDGES], axis=2).reshape(-1, 2)
     unique, inverse = np.unique(pairs, axis=0, return_inverse=True)
     middles = inverse.reshape(-1, 6) + len(corners)
@@ -310,9 +321,9 @@ def _with_midnodes(
     touchable = np.zeros(len(nodes), dtype=bool)
     touchable[rim] = np.abs(angle[rim]) <= touch_angle + 1e-9
     touchable &= ~fixed
-    touch_faces = side[touchable[side].all(axis=1)]
-    touch = np.unique(touch_faces)
-    normals = nodes[touch] / radius_m
+    contact_faces = side[touchable[side].all(axis=1)]
+    contact_nodes = np.unique(contact_faces)
+    normals = nodes[contact_nodes] / radius_m
     normals[:, 0] = 0.0
     return SolidMesh(
         nodes=nodes,
@@ -323,7 +334,7 @@ def _with_midnodes(
         skin_triangles=np.searchsorted(skin, faces[:, SUBTRIANGLES].reshape(-1, 3)).astype(
             np.int32
         ),
-        touch=touch,
-        touch_normals=normals,
-        touch_faces=np.searchsorted(touch, touch_faces),
+        contact_nodes=contact_nodes,
+        contact_normals=normals,
+        contact_faces=np.searchsorted(contact_nodes, contact_faces),
     )

@@ -1,15 +1,15 @@
-"""Any smooth closed surface, filled from a lattice: a core of tetrahedra, drawn to the surface.
+"""Mesh any smooth closed surface: a core of lattice tetrahedra, fitted to the surface.
 
 After Molino, Bridson, Teran, Fedkiw ("A crystalline, red green strategy for meshing highly
 deformable objects with tetrahedra", 2003), on a bisected lattice:
 
-1. The lattice is bisected to the sizes wanted, and finer where the surface is sharply curved.
-2. Vertices that lie deep enough inside are the core, and all tetrahedra about them are taken.  So
-   every tetrahedron has a corner inside and at most one face on the hull.  Where the hull touches
-   itself in an edge or a vertex, the core is thinned out.
-3. The hull is drawn to the surface while the elements are kept in shape (`smoothing`).
+1. The lattice is bisected to the required sizes, and finer where the surface is sharply curved.
+2. Vertices that lie deep enough inside are the core, and all tetrahedra about them are taken. So
+   every tetrahedron has a corner inside and at most one face on the hull. Where the hull touches
+   itself in an edge or a vertex, vertices are removed from the core.
+3. The hull is moved to the surface while the elements keep their shape (`smoothing`).
 
-The same surface gives the same mesh.  Parts thinner than the finest elements are left out.
+The same surface gives the same mesh. Parts thinner than the finest elements are left out.
 """
 
 from __future__ import annotations
@@ -17,112 +17,119 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.bisection import CELL, bisected, lattice
-from nodes.fem_solver.mesh.curving import curved
-from nodes.fem_solver.mesh.grading import LONGEST_EDGE, Grading, longest_edges
-from nodes.fem_solver.mesh.quality import LEAST_RATIO, radius_ratios
-from nodes.fem_solver.mesh.smoothing import FROM_AFAR, settled, surface_of
-from nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError, oriented, with_middles
+from nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
+from nodes.fem_solver.mesh.curving import curve_edges
+from nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
+from nodes.fem_solver.mesh.quality import MIN_RADIUS_RATIO, radius_ratios
+from nodes.fem_solver.mesh.smoothing import SPRINGS_OFF_SURFACE, make_surface_query, smooth_mesh
+from nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError, add_midside_nodes, orient_tetrahedra
 from nodes.models.shapes import Shape
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-COARSEST = 2
-"""Cells before bisection are this many of the smallest wanted elements wide."""
-FINEST = 0.5
-"""Where the surface is sharply curved, elements may be this much smaller than in front."""
-BEND = 0.8
-"""There, they are this many radii of curvature wide."""
-NEAR = 0.5
-"""A tetrahedron is at the surface if a corner is nearer to it than this share of an edge."""
-DEEP = 0.4
-"""The core's vertices lie this share of their shortest edge below the surface, or more."""
-MOST_THINNED = 0.05
-"""A core that loses more than this share of its vertices was too thin for these elements."""
+INITIAL_CELL_RATIO = 2
+"""Width of cells before bisection, in smallest required elements."""
+MIN_SIZE_RATIO = 0.5
+"""Minimum element size at sharp curvature, over the size in front."""
+CURVATURE_SIZE_RATIO = 0.8
+"""Element size at sharp curvature, in radii of curvature."""
+SURFACE_DISTANCE_RATIO = 0.5
+"""A tetrahedron is at the surface if a corner is nearer to it than this fraction of an edge."""
+CORE_DEPTH_RATIO = 0.4
+"""Minimum depth of the core's vertices below the surface, over their shortest edge."""
+MAX_THINNED_FRACTION = 0.05
+"""A core that loses more than this fraction of its vertices was too thin for these elements."""
 GOOD_RATIO = 0.2
 ATTEMPTS = 5
-"""While an element is flatter than `GOOD_RATIO` the core is thinned out there and the hull drawn
-anew, so many times at most; the best is taken."""
+"""Maximum number of fits. While an element is flatter than `GOOD_RATIO`, core vertices there are
+removed and the hull is fitted again; the best fit is used."""
 
 
 class _Field:
-    """Depth, facing and curvature at lattice vertices; the surface is asked once for each."""
+    """Depth, normal and curvature at lattice vertices; the surface is queried once for each."""
 
     def __init__(self, shape: Shape, origin: Floats, cell_m: float) -> None:
         self.shape, self.origin, self.cell_m = shape, origin, cell_m
-        self._known: dict[bytes, int] = {}
+        self._row_numbers: dict[bytes, int] = {}
         self._rows = np.empty((0, 5))
 
-    def place(self, vertices: Ints) -> Floats:
+    def positions(self, vertices: Ints) -> Floats:
         return self.origin + vertices * (self.cell_m / CELL)
 
     def at(self, vertices: Ints) -> tuple[Floats, Floats, Floats]:
-        """Signed distance (n,), normal of the nearest surface (n, 3), its curvature (n,)."""
+        """Return signed distance (n,), normal of the nearest surface (n, 3), its curvature (n,)."""
         keys = [vertex.tobytes() for vertex in vertices]
-        new = [i for i, key in enumerate(keys) if key not in self._known]
+        new = [i for i, key in enumerate(keys) if key not in self._row_numbers]
         if new:
-            found = self.shape.closest(self.place(vertices[new]))
+            found = self.shape.closest(self.positions(vertices[new]))
             bend = np.sqrt(np.square(found.shape_operator).sum(axis=(1, 2)))
             rows = np.column_stack([found.height_m, found.normal, bend])
             for number, i in enumerate(new, len(self._rows)):
-                self._known[keys[i]] = number
+                self._row_numbers[keys[i]] = number
             self._rows = np.concatenate([self._rows, rows])
-        rows = self._rows[[self._known[key] for key in keys]]
+        rows = self._rows[[self._row_numbers[key] for key in keys]]
         return rows[:, 0], rows[:, 1:4], rows[:, 4]
 
 
-def fitted_solid(
-    shape: Shape, low_m: Floats, high_m: Floats, grading: Grading
-) -> tuple[Floats, Ints]:
-    """Nodes (n, 3) and elements (e, 10) of the solid within the shape's surface.
+def fit_mesh(shape: Shape, low_m: Floats, high_m: Floats, grading: Grading) -> tuple[Floats, Ints]:
+    """Return nodes (n, 3) and elements (e, 10) of the solid within the shape's surface.
 
-    low_m, high_m (3,): corners of a box that holds it.  UnfitMeshError where the shape is too thin
-    for elements of that size.
+    low_m, high_m (3,): corners of a box around it. Raises UnfitMeshError where the shape is too
+    thin for elements of that size.
     """
-    cell = COARSEST * grading.element_m
+    cell = INITIAL_CELL_RATIO * grading.element_m
     field = _Field(shape, 0.5 * (low_m + high_m), cell)
-    vertices, tetrahedra = _lattice_about(field, 0.5 * (high_m - low_m), grading)
+    vertices, tetrahedra = _cover_with_lattice(field, 0.5 * (high_m - low_m), grading)
     distance, _, _ = field.at(vertices)
-    points = field.place(vertices)
-    core = distance < -DEEP * _shortest_edges(points, tetrahedra)
+    points = field.positions(vertices)
+    core = distance < -CORE_DEPTH_RATIO * _shortest_edges(points, tetrahedra)
 
-    best, best_ratio = None, LEAST_RATIO
+    best, best_ratio = None, MIN_RADIUS_RATIO
     for _ in range(ATTEMPTS):
-        chosen = _without_pinches(tetrahedra, core, distance)
+        chosen = _remove_pinches(tetrahedra, core, distance)
         used, index = np.unique(chosen, return_inverse=True)
-        begun = points[used]
-        cells = oriented(begun, index.reshape(-1, 4))
+        start_points = points[used]
+        cells = orient_tetrahedra(start_points, index.reshape(-1, 4))
         hull = np.unique(hull_faces(cells))
-        corners = settled(begun, cells, hull, surface_of(shape), springs=FROM_AFAR, anchor=0.0)
+        corners = smooth_mesh(
+            start_points,
+            cells,
+            hull,
+            make_surface_query(shape),
+            springs=SPRINGS_OFF_SURFACE,
+            anchor=0.0,
+        )
         ratios = radius_ratios(corners, cells)
         if ratios.min() > best_ratio:
             best, best_ratio = (corners, cells), float(ratios.min())
         bad = ratios < GOOD_RATIO
         if not bad.any():
             break
-        # the highest core vertex of each bad element gives way
+        # The highest core vertex of each bad element is removed.
         ends = used[cells[bad]]
         height = np.where(core[ends], distance[ends], -np.inf)
         core[ends[np.arange(len(ends)), height.argmax(axis=1)]] = False
     if best is None:
         raise UnfitMeshError(
             f"skin_spacing_m: no well shaped elements of {grading.element_m:.3g} m fill the "
-            "object; take a smaller spacing, or a longer object.geometry.smoothing_m"
+            "object; lower it, or raise object.geometry.smoothing_m"
         )
-    nodes, elements = with_middles(*best)
-    return curved(nodes, elements, lambda points: shape.closest(points).point), elements
+    nodes, elements = add_midside_nodes(*best)
+    return curve_edges(nodes, elements, lambda points: shape.closest(points).point), elements
 
 
-def bent_sizes(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
-    """Sizes (n,) of elements, m, at skin of those curvatures (n,), 1/m: not over `BEND` radii."""
-    finest = np.maximum(BEND / np.maximum(bend, 1e-9), FINEST * grading.element_m)
+def limit_sizes_by_curvature(sizes: Floats, bend: Floats, grading: Grading) -> Floats:
+    """Return sizes (n,), m, limited to `CURVATURE_SIZE_RATIO` radii at curvatures (n,), 1/m."""
+    finest = np.maximum(
+        CURVATURE_SIZE_RATIO / np.maximum(bend, 1e-9), MIN_SIZE_RATIO * grading.element_m
+    )
     return np.asarray(np.minimum(sizes, finest))
 
 
 def hull_faces(tetrahedra: Ints) -> Ints:
-    """Corners (f, 3), sorted, of the faces that belong to one tetrahedron only."""
+    """Return the corners (f, 3), sorted, of the faces that belong to one tetrahedron only."""
     faces = np.sort(
         tetrahedra[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1
     )
@@ -130,27 +137,27 @@ def hull_faces(tetrahedra: Ints) -> Ints:
     return np.asarray(unique[counts == 1])
 
 
-def _lattice_about(field: _Field, half_m: Floats, grading: Grading) -> tuple[Ints, Ints]:
-    """Lattice vertices (n, 3) and tetrahedra (e, 4), bisected, that cover the solid."""
+def _cover_with_lattice(field: _Field, half_m: Floats, grading: Grading) -> tuple[Ints, Ints]:
+    """Return bisected lattice vertices (n, 3) and tetrahedra (e, 4) that cover the solid."""
 
     def too_large(vertices: Ints, tetrahedra: Ints) -> Bools:
         distance, normals, bend = field.at(vertices)
-        length = longest_edges(field.place(vertices), tetrahedra)
+        length = longest_edges(field.positions(vertices), tetrahedra)
         sizes = grading.sizes(normals, -distance)[tetrahedra].min(axis=1)
         corners = distance[tetrahedra]
-        at_surface = np.abs(corners).min(axis=1) < NEAR * length
-        bent = bent_sizes(sizes, bend[tetrahedra].max(axis=1), grading)
+        at_surface = np.abs(corners).min(axis=1) < SURFACE_DISTANCE_RATIO * length
+        bent = limit_sizes_by_curvature(sizes, bend[tetrahedra].max(axis=1), grading)
         sizes = np.where(at_surface, bent, sizes)
         matters = at_surface | (corners.min(axis=1) < 0.0)
-        return np.asarray(matters & (length > LONGEST_EDGE * sizes))
+        return np.asarray(matters & (length > EDGE_SIZE_RATIO * sizes))
 
-    # one more cell about the solid: no core vertex may be at the lattice's end
+    # One more cell about the solid: no core vertex may be at the lattice's end.
     counts = np.ceil(half_m / field.cell_m).astype(np.int64) + 1
-    return bisected(*lattice((int(counts[0]), int(counts[1]), int(counts[2]))), too_large)
+    return bisect(*make_lattice((int(counts[0]), int(counts[1]), int(counts[2]))), too_large)
 
 
 def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
-    """Length (n,) of the shortest edge at each vertex."""
+    """Return the length (n,) of the shortest edge at each vertex."""
     ends = tetrahedra[:, EDGES].reshape(-1, 2)
     length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
     shortest = np.full(len(points), np.inf)
@@ -158,28 +165,32 @@ def _shortest_edges(points: Floats, tetrahedra: Ints) -> Floats:
     return shortest
 
 
-def _without_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
-    """The tetrahedra (k, 4) about the core, whose hull is a surface without edges or vertices in
-    which it touches itself; core (n,) is thinned out for that, in place."""
+def _remove_pinches(tetrahedra: Ints, core: Bools, distance: Floats) -> Ints:
+    """Return the tetrahedra (k, 4) about the core, after vertices of the core (n,) were removed in
+    place.
+
+    The hull of the result does not touch itself in an edge or a vertex.
+    """
     before = int(core.sum())
     while True:
         chosen = tetrahedra[core[tetrahedra].any(axis=1)]
-        pinches = _pinches(hull_faces(chosen)) if len(chosen) else np.empty(0, dtype=np.int64)
+        pinches = _find_pinches(hull_faces(chosen)) if len(chosen) else np.empty(0, dtype=np.int64)
         if not len(pinches) and len(chosen):
             return _largest_piece(chosen)
         about = np.unique(chosen[np.isin(chosen, pinches).any(axis=1)])
         about = about[core[about]]
-        if not len(about) or core.sum() < (1.0 - MOST_THINNED) * before:
+        if not len(about) or core.sum() < (1.0 - MAX_THINNED_FRACTION) * before:
             raise UnfitMeshError(
-                "skin_spacing_m: the object is too thin for elements of this size; take a smaller "
-                "spacing"
+                "skin_spacing_m: the object is too thin for elements of this size; lower it"
             )
         core[about[distance[about].argmax()]] = False
 
 
-def _pinches(faces: Ints) -> Ints:
-    """Vertices at which a hull of faces (f, 3) touches itself: of edges of more than two faces, and
-    those about which the faces make more than one fan."""
+def _find_pinches(faces: Ints) -> Ints:
+    """Return the vertices at which a hull of faces (f, 3) touches itself.
+
+    They belong to edges of more than two faces, or their faces form more than one fan.
+    """
     edges, uses = np.unique(
         np.sort(faces[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1),
         axis=0,
@@ -188,8 +199,8 @@ def _pinches(faces: Ints) -> Ints:
     crowded = np.unique(edges[uses != 2])
     if len(crowded):
         return crowded
-    # With every edge in two faces, the faces about a vertex make closed fans.  Corners of faces
-    # are joined over the edges they share; each fan is one piece, and each vertex should have one.
+    # With every edge in two faces, the faces about a vertex form closed fans. Corners of faces are
+    # connected over their common edges. Each fan is one component, and each vertex should have one.
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -210,7 +221,7 @@ def _pinches(faces: Ints) -> Ints:
 
 
 def _largest_piece(tetrahedra: Ints) -> Ints:
-    """The tetrahedra (k, 4) of the piece with most of them; pieces share no vertex."""
+    """Return the tetrahedra (k, 4) of the largest component; components share no vertex."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

@@ -1,4 +1,4 @@
-"""The mesh of a scene's object: what it depends on, what it will need, and the mesh itself."""
+"""Mesh a scene's object: the specification, the required memory, and the mesh itself."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from messages.scene import (
     Support,
 )
 from nodes.fem_solver.mesh.cylinder import cylinder_mesh
-from nodes.fem_solver.mesh.fitted import bent_sizes, fitted_solid
+from nodes.fem_solver.mesh.fitted import fit_mesh, limit_sizes_by_curvature
 from nodes.fem_solver.mesh.grading import Grading
-from nodes.fem_solver.mesh.mapped import below_rectangle, mapped_solid, slab_solid
-from nodes.fem_solver.mesh.quality import volumes
+from nodes.fem_solver.mesh.mapped import distance_to_rectangle, mesh_by_map, mesh_slab
+from nodes.fem_solver.mesh.quality import signed_volumes
 from nodes.fem_solver.mesh.solid import (
     SolidMesh,
     UnfitMeshError,
     boundary_faces,
-    solid_mesh,
-    touched_where,
+    make_solid_mesh,
+    restrict_touchable,
 )
-from nodes.fem_solver.mesh.supports import held
+from nodes.fem_solver.mesh.supports import select_fixed
 from nodes.models import rigid
 from nodes.models.shapes import Shape, make_shape
 from nodes.models.shapes.triangles import volume_m3
@@ -45,32 +45,32 @@ Ints = NDArray[np.int64]
 Vector = tuple[float, float, float]
 
 VERSION = 1
-"""Counts up whenever the same specification gives another mesh."""
+"""Increase whenever the same specification gives another mesh."""
 TOUCH_MARGIN_RAD = 0.45
-"""The touchable skin exceeds the working range's tilt by this much."""
+"""Angle by which the touchable skin exceeds the working range's tilt."""
 SLAB_DEPTHS = 2.0
-"""A half-space is meshed to this many of the working range's push depths."""
-LEAST_SPACINGS = 4.0
-"""The object is at least this many skin spacings thick: two elements."""
-MOST_NODES = 250_000
+"""Depth of the slab that represents a half-space, in the working range's push depths."""
+MIN_THICKNESS_SPACINGS = 4.0
+"""Minimum thickness of the object, in skin spacings: two elements."""
+MAX_NODES = 250_000
 BYTES_PER_NODE = 6000
-"""Peak while meshing, see docs/meshing.md."""
+"""Peak memory while meshing, see docs/meshing.md."""
 SAMPLES = 16
-"""Places along each side of the bounding box at which the number of nodes is estimated."""
+"""Sample points along each side of the bounding box for the estimate of the number of nodes."""
 INNER_FACTOR, SKIN_FACTOR = 2.5, 5.0
 CYLINDER_FACTOR, MESH_FACTOR = 0.6, 1.3
-"""What meshes had, over the sums in `mesh_budget`."""
-MOST_LOST = 0.1
-"""A mesh object of which more than this share of the volume is lost is too thin."""
+"""Measured numbers of nodes over the sums in `mesh_budget`."""
+MAX_LOST_FRACTION = 0.1
+"""A mesh object that loses more than this fraction of its volume is too thin."""
 
 
 @dataclass(frozen=True, slots=True)
 class MeshSpec:
     """All that a mesh depends on.
 
-    towards_user: unit vector in the mesh frame.  down: of a base, in the object's frame.
-    turn_rad: by which the mesh frame is turned about the object's x, for cylinders.
-    slab_depth_m: of the slab that stands for a half-space.
+    towards_user: unit vector in the mesh frame. down: of a base, in the object's frame.
+    rotation_rad: of the mesh frame about the object's x, for cylinders. slab_depth_m: of the slab
+    that represents a half-space.
     """
 
     geometry: Geometry
@@ -79,11 +79,11 @@ class MeshSpec:
     skin_spacing_m: float
     towards_user: Vector
     down: Vector
-    turn_rad: float
+    rotation_rad: float
     slab_depth_m: float
 
     def key(self) -> str:
-        """Digest: equal for equal meshes."""
+        """Return a digest that is equal for equal meshes."""
         digest = hashlib.sha256(f"mesh {VERSION}".encode())
         for part in (self.geometry, self.support):
             for name, value in sorted(dict(part).items()):
@@ -91,7 +91,7 @@ class MeshSpec:
                     digest.update(name.encode())
                     array = isinstance(value, np.ndarray)
                     digest.update(value.tobytes() if array else json.dumps(value).encode())
-        numbers = (self.touch_angle_rad, self.skin_spacing_m, self.turn_rad, self.slab_depth_m)
+        numbers = (self.touch_angle_rad, self.skin_spacing_m, self.rotation_rad, self.slab_depth_m)
         digest.update(json.dumps([numbers, self.towards_user, self.down]).encode())
         return digest.hexdigest()[:24]
 
@@ -102,14 +102,15 @@ class MeshSpec:
 
 @dataclass(frozen=True, slots=True)
 class MeshBudget:
-    """What meshing will need, about, known before it starts."""
+    """The approximate resources that meshing needs, known before it starts."""
 
     nodes: int
     bytes: int
 
 
 def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
-    """What the mesh of this scene's object depends on; ValueError as `world_from_mesh`."""
+    """Return what the mesh of this scene's object depends on; raises ValueError as
+    `world_from_mesh`."""
     body = scene.object
     object_from_world = rigid.inverse(_world_from_object(scene))[:3, :3]
     mesh_from_world = rigid.inverse(world_from_mesh(scene))[:3, :3]
@@ -125,7 +126,7 @@ def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
         skin_spacing_m=skin_spacing_m,
         towards_user=_rounded(mesh_from_world @ np.array([0.0, 0.0, 1.0])),
         down=_rounded(object_from_world @ np.array(down)),
-        turn_rad=_turn_rad(scene) if cylinder else 0.0,
+        rotation_rad=_cylinder_rotation_rad(scene) if cylinder else 0.0,
         slab_depth_m=SLAB_DEPTHS * scene.working_range.push_depth_m
         if isinstance(body.geometry, Plane)
         else 0.0,
@@ -133,16 +134,17 @@ def mesh_spec(scene: Scene, skin_spacing_m: float) -> MeshSpec:
 
 
 def world_from_mesh(scene: Scene) -> Floats:
-    """Pose of the mesh: the object's; a cylinder is turned about its axis until its z is as near to
-    the user as can be.
+    """Return the pose of the mesh.
 
-    ValueError if a cylinder's axis points at the user, who then has no side before him to touch.
+    It is the object's; a cylinder is rotated about its axis until its z points to the user as
+    closely as possible. Raises ValueError if a cylinder's axis points at the user, who then has no
+    side in front to touch.
     """
     world_from_object = _world_from_object(scene)
     if not isinstance(scene.object.geometry, Cylinder):
         return world_from_object
-    turned = rigid.transform_from_rpy(np.zeros(3), [_turn_rad(scene), 0.0, 0.0])
-    return np.asarray(world_from_object @ turned)
+    rotation = rigid.transform_from_rpy(np.zeros(3), [_cylinder_rotation_rad(scene), 0.0, 0.0])
+    return np.asarray(world_from_object @ rotation)
 
 
 def _world_from_object(scene: Scene) -> Floats:
@@ -150,52 +152,52 @@ def _world_from_object(scene: Scene) -> Floats:
     return rigid.transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
-def _turn_rad(scene: Scene) -> float:
+def _cylinder_rotation_rad(scene: Scene) -> float:
     towards_user = _world_from_object(scene)[:3, :3].T @ np.array([0.0, 0.0, 1.0])
     if np.hypot(towards_user[1], towards_user[2]) < 0.1:
         raise ValueError(
-            f"object.world_from_object.rpy_rad: {scene.object.world_from_object.rpy_rad} turns the "
-            "cylinder's axis towards the user; lay it across (its x axis away from the world's z)"
+            f"object.world_from_object.rpy_rad: {scene.object.world_from_object.rpy_rad} points "
+            "the cylinder's axis towards the user; rotate its x axis away from the world's z"
         )
     return float(np.arctan2(-towards_user[1], towards_user[2]))
 
 
 def _rounded(vector: Floats) -> Vector:
-    """A vector without the noise of rotation, so that the same scene has the same key."""
-    # adding zero turns -0.0, which prints otherwise, into 0.0
+    """Return a vector without the noise of rotation, so that the same scene has the same key."""
+    # Adding zero converts -0.0, which prints differently, to 0.0.
     x, y, z = (float(value) + 0.0 for value in np.round(vector, 12))
     return x, y, z
 
 
 def mesh_budget(spec: MeshSpec) -> MeshBudget:
-    """What `build_mesh` will need; errors as `_budget`.  Takes a second for a mesh object."""
+    """Return what `build_mesh` needs; errors as `_budget`. Takes a second for a mesh object."""
     return _budget(spec, make_shape(dict(spec.geometry)))
 
 
 def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
-    """About how many nodes the mesh has, within a factor of two.
+    """Estimate the number of nodes of the mesh, within a factor of two.
 
-    Nodes are half a size apart: that gives those within by the sum of (2 / size)^3 over the volume,
-    and those on the skin by (2 / size)^2 over a shell about it.  Meshes have more, by the factors
-    above: few elements are as large as they may be.
+    Nodes are half a size apart. So the sum of (2 / size)^3 over the volume estimates those inside,
+    and the sum of (2 / size)^2 over a shell those on the skin. Meshes have more, by the factors
+    above: few elements have the maximum size.
 
-    UnfitMeshError where the spacing does not fit the object, or the mesh would have more than
-    `MOST_NODES`.
+    Raises UnfitMeshError where the spacing does not fit the object, or the mesh would have more
+    than `MAX_NODES`.
     """
     low, high = _box(spec)
     spacing, thickness = spec.skin_spacing_m, float((high - low).min())
     if isinstance(spec.geometry, Plane):
         thickness = min(thickness, spec.geometry.width_m, spec.geometry.height_m)
-    if not 0.0 < spacing <= thickness / LEAST_SPACINGS * (1.0 + 1e-9):
+    if not 0.0 < spacing <= thickness / MIN_THICKNESS_SPACINGS * (1.0 + 1e-9):
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} must be positive and at most a quarter of the object's "
-            f"least extent, {thickness:g} m"
+            f"minimum extent, {thickness:g} m"
         )
     steps = (np.arange(SAMPLES) + 0.5) / SAMPLES
     grid = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     points = low + grid * (high - low)
     if isinstance(spec.geometry, Plane):
-        depth = below_rectangle(points, spec.geometry)
+        depth = distance_to_rectangle(points, spec.geometry)
         normals = np.broadcast_to(np.array(spec.towards_user), points.shape)
         bend = np.zeros(len(points))
     else:
@@ -204,25 +206,25 @@ def _budget(spec: MeshSpec, shape: Shape) -> MeshBudget:
         bend = np.sqrt(np.square(found.shape_operator).sum(axis=(1, 2)))
     sizes, on_skin = spec.grading.sizes(normals, depth), spec.grading.sizes(normals, 0.0 * depth)
     if isinstance(spec.geometry, Mesh):
-        on_skin = bent_sizes(on_skin, bend, spec.grading)
-    share = float((high - low).prod()) / len(points)
+        on_skin = limit_sizes_by_curvature(on_skin, bend, spec.grading)
+    weight = float((high - low).prod()) / len(points)
     shell = float((high - low).max()) / SAMPLES
-    inner = share * np.sum((2.0 / sizes[depth > 0.0]) ** 3)
-    skin = share / shell * np.sum((2.0 / on_skin[(depth > 0.0) & (depth <= shell)]) ** 2)
+    inner = weight * np.sum((2.0 / sizes[depth > 0.0]) ** 3)
+    skin = weight / shell * np.sum((2.0 / on_skin[(depth > 0.0) & (depth <= shell)]) ** 2)
     usual = {"cylinder": CYLINDER_FACTOR, "mesh": MESH_FACTOR}.get(spec.geometry.shape, 1.0)
     nodes = int(usual * (INNER_FACTOR * inner + SKIN_FACTOR * skin)) + 100
     budget = MeshBudget(nodes, nodes * BYTES_PER_NODE)
-    if nodes > MOST_NODES:
+    if nodes > MAX_NODES:
         raise UnfitMeshError(
             f"skin_spacing_m: {spacing:g} asks for about {nodes} nodes "
-            f"({budget.bytes / 2**30:.1f} GiB while meshing), at most {MOST_NODES} are made; "
-            "take a larger spacing"
+            f"({budget.bytes / 2**30:.1f} GiB while meshing), the maximum is {MAX_NODES}; "
+            "raise the spacing"
         )
     return budget
 
 
 def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
-    """Corners of the box about what is meshed."""
+    """Return the corners of the box around what is meshed."""
     match spec.geometry:
         case Cylinder(radius_m=radius, length_m=length):
             half = np.array([0.5 * length, radius, radius])
@@ -242,14 +244,17 @@ def _box(spec: MeshSpec) -> tuple[Floats, Floats]:
     return -half, half
 
 
-def mesh_of_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
-    """The mesh of the scene's object in the frame of `world_from_mesh`; errors as `build_mesh`."""
+def mesh_scene(scene: Scene, skin_spacing_m: float) -> SolidMesh:
+    """Return the mesh of the scene's object in the frame of `world_from_mesh`; errors as
+    `build_mesh`."""
     return build_mesh(mesh_spec(scene, skin_spacing_m))
 
 
 def build_mesh(spec: MeshSpec) -> SolidMesh:
-    """The mesh; UnfitMeshError (a ValueError) as `mesh_budget`, for an object too thin for these
-    elements, for a support that holds too little, or all that there is to touch.
+    """Return the mesh.
+
+    Raises UnfitMeshError (a ValueError) as `mesh_budget`. It also raises that for an object too
+    thin for these elements, and for a support that holds too little or all touchable skin.
     """
     geometry = spec.geometry
     shape = make_shape(dict(geometry))
@@ -257,16 +262,16 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
     if isinstance(geometry, Cylinder):
         return _cylinder(geometry, spec)
     if isinstance(geometry, Plane):
-        nodes, elements = slab_solid(geometry, spec.slab_depth_m, spec.grading)
+        nodes, elements = mesh_slab(geometry, spec.slab_depth_m, spec.grading)
         normals = _slab_normals(nodes)
         half = 0.5 * np.array([geometry.width_m, geometry.height_m]) + 1e-9
         touchable = (normals[:, 2] > 0.0) & (np.abs(nodes[:, :2]) <= half).all(axis=1)
     else:
         if isinstance(geometry, Mesh):
-            nodes, elements = fitted_solid(shape, *_box(spec), spec.grading)
+            nodes, elements = fit_mesh(shape, *_box(spec), spec.grading)
             _require_volume(geometry, nodes, elements, spec)
         else:
-            nodes, elements = mapped_solid(geometry, shape, spec.grading)
+            nodes, elements = mesh_by_map(geometry, shape, spec.grading)
         skin = np.unique(boundary_faces(elements))
         normals = np.zeros_like(nodes)
         normals[skin] = shape.closest(nodes[skin]).normal
@@ -274,12 +279,15 @@ def build_mesh(spec: MeshSpec) -> SolidMesh:
     touchable &= spec.grading.touchable(normals)
     skin = np.unique(boundary_faces(elements))
     fixed = np.zeros(len(nodes), dtype=bool)
-    fixed[skin] = _held(spec, nodes[skin], normals[skin])
-    return solid_mesh(nodes, elements, touchable=touchable, fixed=fixed, normals=normals)
+    fixed[skin] = _select_fixed(spec, nodes[skin], normals[skin])
+    return make_solid_mesh(nodes, elements, touchable=touchable, fixed=fixed, normals=normals)
 
 
 def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
-    """The cylinder's own mesh: a strip's edges are nodes, other supports take the nodes there."""
+    """Return the cylinder's own mesh.
+
+    The edges of a strip support are nodes; other supports take the nodes within them.
+    """
     strip = isinstance(spec.support, StripSupport)
     mesh = cylinder_mesh(
         radius_m=cylinder.radius_m,
@@ -295,14 +303,14 @@ def _cylinder(cylinder: Cylinder, spec: MeshSpec) -> SolidMesh:
     points = mesh.nodes[mesh.skin]
     normals = np.column_stack([np.zeros(len(points)), points[:, 1:] / cylinder.radius_m])
     fixed = np.zeros(len(mesh.nodes), dtype=bool)
-    fixed[mesh.skin] = _held(spec, points, normals)
-    return touched_where(replace(mesh, fixed=fixed), np.ones(len(mesh.nodes), dtype=bool))
+    fixed[mesh.skin] = _select_fixed(spec, points, normals)
+    return restrict_touchable(replace(mesh, fixed=fixed), np.ones(len(mesh.nodes), dtype=bool))
 
 
-def _held(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
-    """Which skin points (n, 3) of the mesh frame are held; see `supports.held`."""
-    object_from_mesh = rigid.transform_from_rpy(np.zeros(3), [spec.turn_rad, 0.0, 0.0])[:3, :3]
-    return held(
+def _select_fixed(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
+    """Return which skin points (n, 3) of the mesh frame are fixed; see `supports.select_fixed`."""
+    object_from_mesh = rigid.transform_from_rpy(np.zeros(3), [spec.rotation_rad, 0.0, 0.0])[:3, :3]
+    return select_fixed(
         spec.support,
         points @ object_from_mesh.T,
         normals @ object_from_mesh.T,
@@ -312,8 +320,8 @@ def _held(spec: MeshSpec, points: Floats, normals: Floats) -> Bools:
 
 
 def _slab_normals(nodes: Floats) -> Floats:
-    """Outward normals (n, 3) at the nodes of a slab: of its top and bottom, rims included; level
-    elsewhere."""
+    """Return outward normals (n, 3) at the nodes of a slab: top and bottom with their rims;
+    horizontal elsewhere."""
     normals = np.zeros_like(nodes)
     normals[:, 0] = 1.0
     low, high = nodes[:, 2].min(), nodes[:, 2].max()
@@ -324,11 +332,12 @@ def _slab_normals(nodes: Floats) -> Floats:
 
 
 def _require_volume(mesh: Mesh, nodes: Floats, elements: Ints, spec: MeshSpec) -> None:
-    """UnfitMeshError where too much of the object is missing: parts too thin for the elements."""
-    wanted = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
-    lost = 1.0 - float(volumes(nodes, elements).sum()) / wanted
-    if lost > MOST_LOST:
+    """Raise UnfitMeshError where too much of the object is missing: parts too thin for the
+    elements."""
+    required_m3 = volume_m3(mesh.vertices_m, mesh.triangles.astype(np.int64))
+    lost_fraction = 1.0 - float(signed_volumes(nodes, elements).sum()) / required_m3
+    if lost_fraction > MAX_LOST_FRACTION:
         raise UnfitMeshError(
-            f"skin_spacing_m: {100 * lost:.0f} % of the object is too thin for elements of "
-            f"{2.0 * spec.skin_spacing_m:g} m; take a smaller spacing"
+            f"skin_spacing_m: {100 * lost_fraction:.0f} % of the object is too thin for elements "
+            f"of {2.0 * spec.skin_spacing_m:g} m; lower it"
         )

@@ -1,4 +1,4 @@
-"""How large elements may be: fine on the skin that fingers reach, coarser behind and below it."""
+"""Define element sizes: fine on the skin that fingers reach, coarser behind and below it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ Ints = NDArray[np.int64]
 
 BACK_COARSENING = 2.0
 DEPTH_GROWTH = 0.35
-"""Elements grow by this much per length of depth below the skin."""
+"""Growth of the element size per depth below the skin."""
 RAMP_RAD = 0.6
-"""Behind the touchable part the skin coarsens over this angle."""
-LONGEST_EDGE = 1.1 * np.sqrt(2.0)
-"""A tetrahedron's longest edge over its size: that of a half cube's face, and what maps stretch."""
+"""Angle behind the touchable part over which the skin coarsens."""
+EDGE_SIZE_RATIO = 1.1 * np.sqrt(2.0)
+"""A tetrahedron's longest edge over its size: that of a half cube's face, with the stretch of
+maps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,15 +31,15 @@ class Grading:
 
     @property
     def element_m(self) -> float:
-        """Size of the smallest elements: there is a node in the middle of each edge."""
+        """Size of the smallest elements: each edge has a node at its midpoint."""
         return 2.0 * self.skin_spacing_m
 
     def touchable(self, normals: Floats) -> Bools:
-        """Whether skin with these unit normals (n, 3) can be touched."""
+        """Return whether skin with these unit normals (n, 3) can be touched."""
         return np.asarray(self._angles(normals) <= self.touch_angle_rad + 1e-9)
 
     def sizes(self, normals: Floats, depth_m: Floats) -> Floats:
-        """Wanted size (n,), m, below skin with these unit normals (n, 3), at depths (n,)."""
+        """Return required sizes (n,), m, below skin with unit normals (n, 3), at depths (n,)."""
         behind = np.clip((self._angles(normals) - self.touch_angle_rad) / RAMP_RAD, 0.0, 1.0)
         coarser = 1.0 + (BACK_COARSENING - 1.0) * behind
         return np.asarray(self.element_m * coarser + DEPTH_GROWTH * np.maximum(depth_m, 0.0))
@@ -49,7 +50,7 @@ class Grading:
 
 
 def longest_edges(points: Floats, tetrahedra: Ints) -> Floats:
-    """Length (e,) of the longest of each tetrahedron's six edges."""
+    """Return the length (e,) of the longest of each tetrahedron's six edges."""
     corners = points[tetrahedra]
     pairs = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
     square = [np.square(corners[:, i] - corners[:, j]).sum(axis=1) for i, j in pairs]

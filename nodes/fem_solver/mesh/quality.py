@@ -1,4 +1,4 @@
-"""How well tetrahedra are shaped, and whether curved ones are valid."""
+"""Measure the shape of tetrahedra, and the validity of curved ones."""
 
 from __future__ import annotations
 
@@ -10,31 +10,32 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LEAST_RATIO = 0.1
-"""Meshes with a radius ratio below this are refused."""
-LEAST_JACOBIAN = 0.1
-"""A curved element's Jacobian stays above this share of the straight one's."""
+MIN_RADIUS_RATIO = 0.1
+"""Meshes with a smaller radius ratio are refused."""
+MIN_JACOBIAN_RATIO = 0.1
+"""Minimum Jacobian of a curved element over that of the straight one."""
 
 _EDGE_OF = np.array([[-1, 4, 6, 7], [4, -1, 5, 8], [6, 5, -1, 9], [7, 8, 9, -1]])
-"""Number of the node in the middle between two corners."""
+"""Number of the midside node between two corners."""
 
 
-def volumes(points: Floats, tetrahedra: Ints) -> Floats:
-    """Signed volumes (e,) of the straight tetrahedra on the first four nodes, m^3."""
+def signed_volumes(points: Floats, tetrahedra: Ints) -> Floats:
+    """Return signed volumes (e,) of the straight tetrahedra on the first four nodes, m^3."""
     corners = points[tetrahedra[:, :4]]
     volume: Floats = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
     return volume
 
 
 def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
-    """Three times the inscribed over the circumscribed radius (e,), of the straight tetrahedra: 1
-    for a regular one, 0 for a flat one, negative for an inverted one.
+    """Return three times the inscribed over the circumscribed radius (e,) of the straight
+    tetrahedra.
 
-    Circumradius by the sides' products (Crelle): 24 V R = sqrt of p (p - 2 a) (p - 2 b) (p - 2 c)
-    with a, b, c the products of opposite edges and p their sum.
+    1 for a regular one, 0 for a flat one, negative for an inverted one. Circumradius by the sides'
+    products (Crelle): 24 V R = sqrt of p (p - 2 a) (p - 2 b) (p - 2 c) with a, b, c the products of
+    opposite edges and p their sum.
     """
     corners = points[tetrahedra[:, :4]]
-    volume = volumes(points, tetrahedra)
+    volume = signed_volumes(points, tetrahedra)
     area = np.zeros(len(tetrahedra))
     for triple in itertools.combinations(range(4), 3):
         a, b, c = (corners[:, i] for i in triple)
@@ -48,35 +49,19 @@ def radius_ratios(points: Floats, tetrahedra: Ints) -> Floats:
     )
     total = products.sum(axis=0)
     heron = total * (total - 2.0 * products).prod(axis=0)
-    # 3 r / R with r = 3 V / area and R = sqrt(heron) / (24 V); a flat one may have R = 0 / 0
+    # 3 r / R with r = 3 V / area and R = sqrt(heron) / (24 V); a flat one may have R = 0 / 0.
     root = np.sqrt(np.maximum(heron, 1e-300))
     ratio: Floats = 216.0 * volume * np.abs(volume) / (area * root)
     return ratio
 
 
-def least_dihedral_rad(points: Floats, tetrahedra: Ints) -> Floats:
-    """The smallest angle between two faces of each straight tetrahedron (e,)."""
-    corners = points[tetrahedra[:, :4]]
-    normals = []
-    for i in range(4):
-        a, b, c = (corners[:, j] for j in range(4) if j != i)
-        normal = np.cross(b - a, c - a)
-        inwards = ((corners[:, i] - a) * normal).sum(axis=1, keepdims=True) > 0.0
-        normal = np.where(inwards, -normal, normal)
-        normals.append(normal / np.linalg.norm(normal, axis=1, keepdims=True))
-    cosines = [-(a * b).sum(axis=1) for a, b in itertools.combinations(normals, 2)]
-    least: Floats = np.arccos(np.clip(np.max(cosines, axis=0), -1.0, 1.0))
-    return least
+def min_jacobian_ratios(nodes: Floats, elements: Ints) -> Floats:
+    """Return a lower bound of each 10-node tetrahedron's Jacobian over the straight one's, (e,).
 
-
-def least_jacobians(nodes: Floats, elements: Ints) -> Floats:
-    """A lower bound of the Jacobian's determinant in each 10-node tetrahedron, over that of the
-    straight one on its corners, (e,).
-
-    The determinant is a cubic; it lies between the least and the greatest of its coefficients in
-    Bernstein's basis (Johnen, Remacle, Geuzaine, "Geometrical validity of curvilinear finite
-    elements", 2013).  The three derivatives are linear, so that the coefficient of three corners is
-    the mean, over their orders, of the determinant with one derivative taken at each.
+    The determinant is a cubic; its coefficients in Bernstein's basis bound it (Johnen, Remacle,
+    Geuzaine, "Geometrical validity of curvilinear finite elements", 2013). The three derivatives
+    are linear. So the coefficient of three corners is the mean, over their orders, of the
+    determinant with one derivative taken at each.
     """
     points = nodes[elements]
     slopes = np.empty((len(elements), 4, 4, 3))
@@ -88,8 +73,8 @@ def least_jacobians(nodes: Floats, elements: Ints) -> Floats:
     derivative = slopes[:, :, 1:] - slopes[:, :, :1]
     crossed = np.cross(derivative[:, :, None, 0], derivative[:, None, :, 1])
     triple = np.einsum("eijx,ekx->eijk", crossed, derivative[:, :, 2])
-    least = np.full(len(elements), np.inf)
+    minimum = np.full(len(elements), np.inf)
     for corners in itertools.combinations_with_replacement(range(4), 3):
         orders = list(itertools.permutations(corners))
-        least = np.minimum(least, sum(triple[:, i, j, k] for i, j, k in orders) / len(orders))
-    return least / (6.0 * volumes(nodes, elements))
+        minimum = np.minimum(minimum, sum(triple[:, i, j, k] for i, j, k in orders) / len(orders))
+    return minimum / (6.0 * signed_volumes(nodes, elements))

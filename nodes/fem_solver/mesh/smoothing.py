@@ -1,11 +1,12 @@
-"""Moves the corners of tetrahedra until all are well shaped and the hull lies on a surface.
+"""Move the corners of tetrahedra until all have a good shape and the hull lies on a surface.
 
-What is minimised is the sum over tetrahedra of w^2, with w = (|A|^2 / 3)^(3/2) / det A and A the
-map from the regular tetrahedron: the inverse of the mean ratio, 1 for a regular one of any size,
-endless for a flat one (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp,
-"Tetrahedral mesh improvement via optimization of the element condition number", 2002).  So a mesh
-that begins without inverted elements stays without.  The hull's corners are drawn to the surface by
-springs along its normals, which grow stronger from round to round, and slide along it freely.
+The objective is the sum over tetrahedra of w^2, with w = (|A|^2 / 3)^(3/2) / det A and A the map
+from the regular tetrahedron. w is the inverse of the mean ratio: 1 for a regular tetrahedron of any
+size, infinite for a flat one (Knupp, "Algebraic mesh quality metrics", 2001; Freitag and Knupp,
+"Tetrahedral mesh improvement via optimization of the element condition number", 2002). So a mesh
+without inverted elements stays without. Springs along the normals pull the hull's corners to the
+surface, with a stiffness that increases from round to round. The corners slide along the surface
+freely.
 """
 
 from __future__ import annotations
@@ -24,15 +25,17 @@ Ints = NDArray[np.int64]
 Surface = Callable[[Floats], tuple[Floats, Floats]]
 """Points (n, 3) to the nearest points of the surface (n, 3) and its outward normals there."""
 
-FROM_AFAR = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
-ON_SURFACE = (300.0, 1000.0, 3000.0)
+SPRINGS_OFF_SURFACE = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
+"""Stiffness of the springs round by round, for lengths in usual edges. The hull begins up to an
+element off the surface, or on it."""
+SPRINGS_ON_SURFACE = (300.0, 1000.0, 3000.0)
 """Stiffness of the springs round by round, for lengths in usual edges: where the hull begins up to
 an element off the surface, and where it begins on it."""
-FLATTEST = 0.15
-"""Radius ratio of the flattest element that may come of the last, small step to the surface."""
+MIN_FINAL_RADIUS_RATIO = 0.15
+"""Minimum radius ratio of an element after the last, small step to the surface."""
 ROUND_STEPS = 20
 MEMORY = 8
-"""Pairs of steps and slopes that the minimiser remembers."""
+"""Pairs of steps and gradient changes that the minimiser stores."""
 
 _REGULAR = np.array(
     [[1.0, 0.5, 0.5], [0.0, np.sqrt(0.75), np.sqrt(1.0 / 12.0)], [0.0, 0.0, np.sqrt(2.0 / 3.0)]]
@@ -40,8 +43,8 @@ _REGULAR = np.array(
 _FROM_REGULAR = np.linalg.inv(_REGULAR)
 
 
-def surface_of(shape: Shape) -> Surface:
-    """A shape as `settled` asks for it."""
+def make_surface_query(shape: Shape) -> Surface:
+    """Return a shape as the `Surface` that `smooth_mesh` needs."""
 
     def nearest(points: Floats) -> tuple[Floats, Floats]:
         found = shape.closest(points)
@@ -50,7 +53,7 @@ def surface_of(shape: Shape) -> Surface:
     return nearest
 
 
-def settled(
+def smooth_mesh(
     corners: Floats,
     tetrahedra: Ints,
     hull: Ints,
@@ -59,16 +62,17 @@ def settled(
     springs: tuple[float, ...],
     anchor: float,
 ) -> Floats:
-    """Places (n, 3) of the corners after they were moved; tetrahedra must have positive volume.
+    """Return the positions (n, 3) of the corners after smoothing; tetrahedra need a positive
+    volume.
 
-    anchor: stiffness of springs that hold each corner to where it began, and so keep the grading.
-    hull: numbers of the corners to be drawn to the surface.  They end on it, but where an element
-    would become flatter than `FLATTEST`: there they stay as near as they came.
+    anchor: stiffness of springs from each corner to its start, which keep the grading. hull:
+    numbers of the corners that move to the surface. They end on it, except where an element would
+    be flatter than `MIN_FINAL_RADIUS_RATIO`: there they stay at their nearest valid position.
     """
     sides = corners[tetrahedra[:, 1]] - corners[tetrahedra[:, 0]]
     unit = float(np.median(np.linalg.norm(sides, axis=1)))
-    begun = corners / unit
-    points = begun
+    start_points = corners / unit
+    points = start_points
     for spring in springs:
         feet, normals = surface(points[hull] * unit)
         feet = feet / unit
@@ -76,29 +80,29 @@ def settled(
         def energy(
             x: Floats, pull: tuple[Floats, Floats, float] = (feet, normals, spring)
         ) -> tuple[float, Floats]:
-            value, gradient = _badness(x, tetrahedra)
+            value, gradient = _distortion(x, tetrahedra)
             feet, normals, spring = pull
-            away = ((x[hull] - feet) * normals).sum(axis=1)
-            gradient[hull] += 2.0 * spring * away[:, None] * normals
-            gradient += 2.0 * anchor * (x - begun)
-            value += spring * float(np.square(away).sum())
-            return value + anchor * float(np.square(x - begun).sum()), gradient
+            distance = ((x[hull] - feet) * normals).sum(axis=1)
+            gradient[hull] += 2.0 * spring * distance[:, None] * normals
+            gradient += 2.0 * anchor * (x - start_points)
+            value += spring * float(np.square(distance).sum())
+            return value + anchor * float(np.square(x - start_points).sum()), gradient
 
-        points = _minimised(points, energy)
+        points = _minimize(points, energy)
     points = points * unit
-    wanted = points.copy()
-    wanted[hull] = surface(points[hull])[0]
+    targets = points.copy()
+    targets[hull] = surface(points[hull])[0]
     while True:
-        flat = radius_ratios(wanted, tetrahedra) < FLATTEST
+        flat = radius_ratios(targets, tetrahedra) < MIN_FINAL_RADIUS_RATIO
         moved = np.unique(tetrahedra[flat])
-        moved = moved[(wanted[moved] != points[moved]).any(axis=1)]
+        moved = moved[(targets[moved] != points[moved]).any(axis=1)]
         if not len(moved):
-            return wanted
-        wanted[moved] = points[moved]
+            return targets
+        targets[moved] = points[moved]
 
 
-def _badness(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
-    """The sum of w^2 and its gradient (n, 3); infinite where a tetrahedron is inverted."""
+def _distortion(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
+    """Return the sum of w^2 and its gradient (n, 3); infinite where a tetrahedron is inverted."""
     first = points[tetrahedra[:, 0]]
     edges = np.swapaxes(points[tetrahedra[:, 1:]] - first[:, None], 1, 2)
     shape = edges @ _FROM_REGULAR
@@ -117,9 +121,12 @@ def _badness(points: Floats, tetrahedra: Ints) -> tuple[float, Floats]:
     return float(np.square(badness).sum()), gradient
 
 
-def _minimised(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
-    """Some steps of L-BFGS with backtracking (Nocedal and Wright, Numerical Optimization, alg. 7.5;
-    scipy's own line search does not take infinite values)."""
+def _minimize(points: Floats, energy: Callable[[Floats], tuple[float, Floats]]) -> Floats:
+    """Take some steps of L-BFGS with backtracking.
+
+    (Nocedal and Wright, Numerical Optimization, alg. 7.5.) scipy's own line search does not accept
+    infinite values.
+    """
     value, gradient = energy(points)
     steps: list[tuple[Floats, Floats, float]] = []
     for _ in range(ROUND_STEPS):
@@ -128,35 +135,35 @@ def _minimised(points: Floats, energy: Callable[[Floats], tuple[float, Floats]])
         if slope >= 0.0:
             steps, direction = [], -gradient
             slope = -float(np.square(gradient).sum())
-        # never farther than a fifth of an edge at once
-        longest = float(np.sqrt(np.square(direction).sum(axis=1).max()))
-        way = min(1.0, 0.2 / max(longest, 1e-300))
-        while way > 1e-6:
-            new_value, new_gradient = energy(points + way * direction)
-            if new_value <= value + 1e-4 * way * slope:
+        # Limit the step to a fifth of an edge.
+        max_step = float(np.sqrt(np.square(direction).sum(axis=1).max()))
+        step = min(1.0, 0.2 / max(max_step, 1e-300))
+        while step > 1e-6:
+            new_value, new_gradient = energy(points + step * direction)
+            if new_value <= value + 1e-4 * step * slope:
                 break
-            way *= 0.5
+            step *= 0.5
         else:
             return points
-        moved, turned = way * direction, new_gradient - gradient
-        curvature = float((moved * turned).sum())
+        moved, gradient_change = step * direction, new_gradient - gradient
+        curvature = float((moved * gradient_change).sum())
         if curvature > 0.0:
-            steps = [*steps[1 - MEMORY :], (moved, turned, 1.0 / curvature)]
+            steps = [*steps[1 - MEMORY :], (moved, gradient_change, 1.0 / curvature)]
         points, value, gradient = points + moved, new_value, new_gradient
     return points
 
 
 def _times_inverse_hessian(gradient: Floats, steps: list[tuple[Floats, Floats, float]]) -> Floats:
-    """The two loops of L-BFGS."""
+    """Apply the two loops of L-BFGS."""
     result = gradient.copy()
-    shares = []
-    for moved, turned, inverse in reversed(steps):
-        share = inverse * float((moved * result).sum())
-        shares.append(share)
-        result -= share * turned
+    weights = []
+    for moved, gradient_change, inverse in reversed(steps):
+        weight = inverse * float((moved * result).sum())
+        weights.append(weight)
+        result -= weight * gradient_change
     if steps:
-        moved, turned, inverse = steps[-1]
-        result /= inverse * float((turned * turned).sum())
-    for (moved, turned, inverse), share in zip(steps, reversed(shares), strict=True):
-        result += (share - inverse * float((turned * result).sum())) * moved
+        moved, gradient_change, inverse = steps[-1]
+        result /= inverse * float((gradient_change * gradient_change).sum())
+    for (moved, gradient_change, inverse), weight in zip(steps, reversed(weights), strict=True):
+        result += (weight - inverse * float((gradient_change * result).sum())) * moved
     return result

@@ -1,4 +1,4 @@
-"""Which skin a scene's support holds fixed."""
+"""Select the skin that a scene's support fixes."""
 
 from __future__ import annotations
 
@@ -17,42 +17,45 @@ from nodes.fem_solver.mesh.solid import UnfitMeshError
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SAME_M = 1e-9
+TOLERANCE_M = 1e-9
 
 
-def held(
+def select_fixed(
     support: Support, points: Floats, normals: Floats, *, towards_user: Floats, down: Floats
 ) -> Bools:
-    """Which of some skin points (n, 3) with outward unit normals (n, 3) are held, (n,).
+    """Return which skin points (n, 3) with outward unit normals (n, 3) are fixed, (n,).
 
     All in the object's frame: towards_user (3,) unit vector; down (3,) of a base, of any length.
-    UnfitMeshError for a support that holds nothing, or too little for the body to stay in place.
+    Raises UnfitMeshError for a support that fixes nothing, or too little for the body to stay in
+    place.
     """
     chosen: Bools
     match support:
         case StripSupport():
             if support.angle_rad >= 2.0 * np.pi:
                 raise UnfitMeshError(
-                    f"object.support.angle_rad: {support.angle_rad:g} must be below 2 pi, or no "
-                    "skin is left to touch"
+                    f"object.support.angle_rad: {support.angle_rad:g} must be below 2 pi, so "
+                    "that some skin can be touched"
                 )
             away = np.arccos(np.clip(-(normals @ towards_user), -1.0, 1.0))
             chosen = np.asarray(away <= 0.5 * support.angle_rad + 1e-9)
         case BaseSupport():
             height = points @ (-down / np.linalg.norm(down))
-            chosen = np.asarray(height <= height.min() + support.height_m + SAME_M)
+            chosen = np.asarray(height <= height.min() + support.height_m + TOLERANCE_M)
         case SpherePatchSupport():
             away = np.linalg.norm(points - support.centre_m, axis=1)
-            chosen = np.asarray(away <= support.radius_m + SAME_M)
+            chosen = np.asarray(away <= support.radius_m + TOLERANCE_M)
         case BoxPatchSupport():
-            inside = (points >= support.min_m - SAME_M) & (points <= support.max_m + SAME_M)
+            inside = (points >= support.min_m - TOLERANCE_M) & (
+                points <= support.max_m + TOLERANCE_M
+            )
             chosen = np.asarray(inside.all(axis=1))
-    _require_hold(support.kind, points, chosen)
+    _require_fixation(support.kind, points, chosen)
     return chosen
 
 
-def _require_hold(kind: str, points: Floats, chosen: Bools) -> None:
-    """UnfitMeshError unless three chosen points are not on one line."""
+def _require_fixation(kind: str, points: Floats, chosen: Bools) -> None:
+    """Raise UnfitMeshError unless three chosen points are not on one line."""
     some = points[chosen]
     extent = float(np.ptp(points, axis=0).max())
     if len(some) >= 3:
@@ -60,6 +63,6 @@ def _require_hold(kind: str, points: Floats, chosen: Bools) -> None:
         if spread[1] > 1e-3 * extent:
             return
     raise UnfitMeshError(
-        f"object.support: this {kind} holds {len(some)} of {len(points)} skin nodes, at least "
-        "three not on one line are needed; hold a larger part, or take a smaller skin_spacing_m"
+        f"object.support: this {kind} fixes {len(some)} of {len(points)} skin nodes; at least "
+        "three not on one line are needed; enlarge it, or lower skin_spacing_m"
     )

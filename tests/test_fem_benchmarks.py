@@ -11,13 +11,21 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
+from benchmarks import external_solvers
 from launch.health.compliance import SKIN_SPACING_M, front_curve
 from launch.methods.charts import write_overview
 from messages.scene import Scene
-from nodes.fem_solver import charted, peers, precompute, pushes
-from nodes.fem_solver.body import spec_of, table_spec_of
-from nodes.fem_solver.families import FORCE, LARGEST, NEWTON, SOFT_BODY, Charted
-from nodes.fem_solver.precompute_table import save_table
+from nodes.cache import load_cached, save_cached
+from nodes.fem_solver import precompute, reference, snapshots
+from nodes.fem_solver.benchmarks import (
+    FORCE,
+    MAX_DISPLACEMENT,
+    NEWTON,
+    SOFT_BODY,
+    SoftBodyBenchmark,
+)
+from nodes.fem_solver.body import make_soft_body_spec, make_table_spec
+from nodes.fem_solver.precompute_table import table_cache
 from nodes.fem_solver.table import Table
 from nodes.methods import measure
 from tests.soft_bodies import Here
@@ -37,71 +45,79 @@ def small_scene() -> Scene:
 def test_every_method_is_judged_by_a_finer_newton(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pushes, "DEPTHS_M", (0.0015, 0.003, 0.005, 0.0075))
-    monkeypatch.setattr(pushes, "SPACING_RATIO", 1.0)
-    monkeypatch.setattr(pushes, "STATIONS", (0.0,))
-    monkeypatch.setattr(pushes, "ANGLE_STEP_RAD", 2.0)
+    monkeypatch.setattr(snapshots, "DEPTHS_M", (0.0015, 0.003, 0.005, 0.0075))
+    monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
+    monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
+    monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
     # pushes are solved here: other processes would not know of the few sites
-    monkeypatch.setattr(charted, "local_processes", lambda count: nullcontext(Here()))
-    chart = Charted(
+    monkeypatch.setattr(reference, "local_processes", lambda count: nullcontext(Here()))
+    chart = SoftBodyBenchmark(
         small_scene(),
         tmp_path,
         depths_m=(0.001, 0.003, 0.0075, 0.05),
         linear_m={"linear": 0.005},
         table_m={"table": 0.005},
         newton_m=(0.003,),
-        peers_m=(0.003,),
         focused=(0.7,),
         even_m=(0.005,),
     )
-    told: list[tuple[int, int]] = []
-    chart.prepare(lambda done, total: told.append((done, total)))
-    assert told[0][0] == 0
-    assert told[-1][0] == told[-1][1]
-    monkeypatch.setattr(charted, "local_processes", pytest.fail)  # what was solved is kept
+    reports: list[tuple[int, int]] = []
+    chart.prepare(lambda done, total: reports.append((done, total)))
+    assert reports[0][0] == 0
+    assert reports[-1][0] == reports[-1][1]
+    monkeypatch.setattr(reference, "local_processes", pytest.fail)  # what was solved is kept
+    external = external_solvers.external_trials(chart, chart.reference_set(), (0.003,))
     points = {
-        (p.method, p.case["depth_mm"]): p for p in (measure(t, repeats=1) for t in chart.trials())
+        (p.method, p.case["depth_mm"]): p
+        for p in (measure(t, repeats=1) for t in (*chart.trials(), *external))
     }
-    assert {method for method, _ in points} >= {"linear", "table", NEWTON, peers.SCIKIT_FEM}
+    assert {method for method, _ in points} >= {
+        "linear",
+        "table",
+        NEWTON,
+        external_solvers.SCIKIT_FEM,
+    }
     linear, table = points["linear", 3.0], points["table", 3.0]
     assert points["linear", 1.0].in_range
     assert points["linear", 1.0].error < 0.2
     assert not points["linear", 7.5].in_range
-    assert abs(table.also[FORCE]) < abs(linear.also[FORCE])
-    assert 0.0 < linear.doubts["error"] < 1.0
+    assert abs(table.extra_metrics[FORCE]) < abs(linear.extra_metrics[FORCE])
+    assert 0.0 < linear.reference_uncertainty["error"] < 1.0
     # others get the same skin from the same forces
-    for peer in (peers.SPARSE_FACTOR, peers.SCIKIT_FEM):
-        assert points[peer, 3.0].error == pytest.approx(linear.error, rel=1e-3)
-        assert points[peer, 3.0].also[FORCE] == pytest.approx(linear.also[FORCE])
+    for solver in (external_solvers.SPARSE_FACTOR, external_solvers.SCIKIT_FEM):
+        assert points[solver, 3.0].error == pytest.approx(linear.error, rel=1e-3)
+        assert points[solver, 3.0].extra_metrics[FORCE] == pytest.approx(
+            linear.extra_metrics[FORCE]
+        )
     assert points[NEWTON, 3.0].error < 0.3
     assert points[NEWTON, 3.0].median_s > linear.median_s
     # so deep no mesh can be followed: nothing is said of the error, the skin is held
     deep = [points[method, 50.0] for method in ("linear", "table")]
     assert all(np.isnan(point.error) and not point.in_range for point in deep)
-    assert all(point.also[LARGEST] < 12.0 for point in deep)
+    assert all(point.extra_metrics[MAX_DISPLACEMENT] < 12.0 for point in deep)
 
 
-def test_a_peer_that_is_not_there_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_solver_that_is_not_installed_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "skfem", None)
-    assert peers.peer("skfem") is None
+    assert external_solvers.import_optional("skfem") is None
 
 
 def test_the_objects_curve_is_the_tables_where_one_is_kept(tmp_path: Path) -> None:
     scene = small_scene()
     by_linear = front_curve(scene, tmp_path)
-    spec = spec_of(scene, SKIN_SPACING_M)
-    model = precompute.load(spec, tmp_path)
+    spec = make_soft_body_spec(scene, SKIN_SPACING_M)
+    model = load_cached(precompute.response_cache(spec), tmp_path)
     assert model is not None
     response, depths = model.response, np.linspace(0.0, 0.02, 6)
     pascals = 1.0 / scene.object.material.young_modulus_pa
-    count = len(response.touch)
+    count = len(response.contact_nodes)
     table = Table(
         depths_m=depths,
         fields=np.zeros((count, 5, response.rest.size), dtype=np.float32),
         force_n=100.0 * pascals * depths[:, None] * response.normals[:, None],
         reach_m=np.full(count, 0.02),
     )
-    save_table(table, table_spec_of(scene, spec), tmp_path)
+    save_cached(table_cache(make_table_spec(scene, spec)), tmp_path, table)
     by_table = front_curve(scene, tmp_path)
     assert by_table[:, 1] == pytest.approx(100.0 * by_table[:, 0], rel=1e-3, abs=1e-9)
     assert by_linear[-1, 1] != pytest.approx(by_table[-1, 1], rel=0.05)

@@ -1,8 +1,8 @@
-"""The drawn surface: a fine mesh of the scene's object that follows the solver's skin.
+"""Build the drawn surface: a fine mesh of the scene's object that follows the solver's skin.
 
-The equations correct at vertices only, and a silhouette is as round as its facets, so the drawn
-mesh is finer than the solver's and lies on the true shape; between the skin's vertices the
-displacement, and how the normal turns, are interpolated.
+The equations correct at vertices only, and facets are visible in a silhouette. So the drawn mesh is
+finer than the solver's and lies on the true shape. Between the skin's vertices the displacement and
+the rotation of the normal are interpolated.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Indices = NDArray[np.int32]
 Real = TypeVar("Real", np.float32, np.float64)
 Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
 
-FEWEST_AROUND = 128
-"""Vertices around a cylinder, sphere or ellipsoid: its outline must not show corners."""
+MIN_AROUND = 128
+"""Minimum number of vertices around a cylinder, sphere or ellipsoid, for a smooth outline."""
 CANDIDATES = 16
 """Sample points of a skin, next to a drawn vertex, whose triangles may hold the nearest point."""
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class ObjectSurface:
     """The object at rest, world frame.
 
-    rest_world_m, normals_world: (vertices, 3); along a sharp edge vertices are doubled.
-    triangles: (triangles, 3), outward.
+    rest_world_m, normals_world: (vertices, 3); along a sharp edge vertices are doubled. triangles:
+    (triangles, 3), outward.
     """
 
     rest_world_m: Floats
@@ -47,22 +47,22 @@ class Surface:
     @staticmethod
     def placed(
         points: Floats, normals: Floats, triangles: NDArray[np.integer], world_from_object: Floats
-    ) -> Surface:
-        """A surface given in the object's frame."""
-        return Surface(
+    ) -> ObjectSurface:
+        """Return a surface given in the object's frame."""
+        return ObjectSurface(
             apply(world_from_object, points),
             normals @ world_from_object[:3, :3].T,
             triangles.astype(np.int32),
         )
 
 
-def surface_of(
+def make_surface(
     geometry: Geometry, shape: Shape, *, world_from_object: Floats, spacing_m: float
-) -> Surface:
-    """The surface of a scene's geometry, whose shape is `shape`; vertices about `spacing_m` apart.
+) -> ObjectSurface:
+    """Return the surface of a scene's geometry with this shape; vertices about `spacing_m` apart.
 
-    Of a plane only the touchable rectangle is drawn, of a mesh the smooth surface that it stands
-    for.  ValueError for a spacing that would take too many triangles.
+    Only the touchable rectangle of a plane is drawn, and the smooth surface of a mesh. Raises
+    ValueError for a spacing that needs too many triangles.
     """
     match geometry:
         case Cylinder(radius_m=radius, length_m=length):
@@ -85,20 +85,20 @@ def surface_of(
             found = shape.closest(points)
             points, normals = found.point, found.normal
         case _:
-            points, triangles = _blown_cuboid(geometry, shape, spacing_m)
+            points, triangles = _inflate_cuboid(geometry, shape, spacing_m)
             normals = shape.closest(points).normal
-    return Surface.placed(points, normals, triangles, world_from_object)
+    return ObjectSurface.placed(points, normals, triangles, world_from_object)
 
 
 def cylinder_surface(
     *, radius_m: float, length_m: float, world_from_object: Floats, spacing_m: float
-) -> Surface:
-    """A closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
+) -> ObjectSurface:
+    """Return a closed cylinder about the object's x axis with vertices at most `spacing_m` apart.
 
     Its side comes first, ring by ring; then each end cap, with a rim of its own and a centre.
     """
     rings = int(np.ceil(length_m / spacing_m)) + 1
-    around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), FEWEST_AROUND)
+    around = max(int(np.ceil(2.0 * np.pi * radius_m / spacing_m)), MIN_AROUND)
     x = np.linspace(-0.5 * length_m, 0.5 * length_m, rings)
     angle = 2.0 * np.pi * np.arange(around) / around
     outward = np.column_stack([np.zeros(around), np.sin(angle), np.cos(angle)])
@@ -122,7 +122,7 @@ def cylinder_surface(
             np.column_stack([np.full(around, last + around), last + after, last + j]),
         ]
     )
-    return Surface.placed(points, normals, triangles, world_from_object)
+    return ObjectSurface.placed(points, normals, triangles, world_from_object)
 
 
 def _cells(length_m: float, spacing_m: float) -> int:
@@ -130,7 +130,7 @@ def _cells(length_m: float, spacing_m: float) -> int:
 
 
 def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
-    """Points (n, 2) of a grid over -0.5..0.5, and its triangles, counter-clockwise."""
+    """Return points (n, 2) of a grid over -0.5..0.5, and its triangles, counter-clockwise."""
     u, v = np.meshgrid(
         np.linspace(-0.5, 0.5, columns + 1), np.linspace(-0.5, 0.5, rows + 1), indexing="xy"
     )
@@ -145,13 +145,13 @@ def _grid(columns: int, rows: int) -> tuple[Floats, NDArray[np.int64]]:
     return np.column_stack([u.ravel(), v.ravel()]), triangles
 
 
-def _blown_cuboid(
+def _inflate_cuboid(
     geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape, spacing_m: float
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """A cuboid's surface grid drawn onto a rounder solid: points (n, 3), triangles (t, 3).
+    """Return a cuboid's surface grid mapped onto a rounder solid: points (n, 3), triangles (t, 3).
 
     Onto a box by the nearest points; onto an ellipsoid by the map of a cube to the sphere that
-    nearly keeps areas, (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and in turn).
+    nearly keeps areas, (w1 sqrt(1 - w2^2/2 - w3^2/2 + w2^2 w3^2/3), and cyclically).
     """
     if isinstance(geometry, RoundedBox):
         half = 0.5 * np.array(geometry.size_m)
@@ -159,7 +159,7 @@ def _blown_cuboid(
     else:
         axes = geometry.semi_axes_m if isinstance(geometry, Ellipsoid) else (geometry.radius_m,) * 3
         half = np.array(axes)
-        quarter = max(_cells(0.5 * np.pi * float(half.max()), spacing_m), FEWEST_AROUND // 4)
+        quarter = max(_cells(0.5 * np.pi * float(half.max()), spacing_m), MIN_AROUND // 4)
         cells = [quarter] * 3
     points, triangles, count = [], [], 0
     for axis in range(3):
@@ -181,13 +181,8 @@ def _blown_cuboid(
     return onto, joined.ravel()[np.concatenate(triangles)]
 
 
-def normals_of(surface: Surface, positions: Floats) -> Floats:
-    """Smooth unit normals (vertices, 3) of the surface moved to `positions` (vertices, 3)."""
-    return _Normals(surface.triangles, len(positions))(positions)
-
-
-class _Normals:
-    """Unit normals at the vertices of moving triangles: their triangles' mean, by area."""
+class VertexNormals:
+    """Compute unit normals at the vertices of moving triangles: their triangles' mean, by area."""
 
     def __init__(self, triangles: NDArray[np.integer], vertices: int) -> None:
         columns = np.repeat(np.arange(len(triangles)), 3)
@@ -198,11 +193,11 @@ class _Normals:
         self._corners = [np.ascontiguousarray(triangles[:, i]) for i in range(3)]
 
     def __call__(self, positions: NDArray[Real]) -> NDArray[Real]:
-        """(vertices, 3) for positions (vertices, 3)."""
-        # By rows of one coordinate: gathering and multiplying run over whole memory then.  np.cross
-        # is several times slower than its own six products.
-        places = np.ascontiguousarray(positions.T)
-        a, b, c = (places.take(corner, axis=1) for corner in self._corners)
+        """Return (vertices, 3) for positions (vertices, 3)."""
+        # By rows of one coordinate: gathering and multiplying then access contiguous memory.
+        # np.cross is several times slower than its own six products.
+        coordinates = np.ascontiguousarray(positions.T)
+        a, b, c = (coordinates.take(corner, axis=1) for corner in self._corners)
         b -= a
         c -= a
         area = np.empty((len(self._corners[0]), 3), positions.dtype)
@@ -214,38 +209,40 @@ class _Normals:
         return total
 
 
-class Follower:
-    """A drawn surface that moves as a skin does.
+class DeformationTransfer:
+    """Transfer a skin's displacement to a drawn surface.
 
-    A drawn vertex moves as the nearest point of the skin; its normal, exact at rest, turns as the
-    skin's own smooth normals there turn on the mean.
+    A drawn vertex moves as the nearest point of the skin. Its normal, exact at rest, rotates as the
+    skin's own smooth normals there rotate on average.
     """
 
-    def __init__(self, surface: Surface, skin_vertices: Floats, skin_triangles: Indices) -> None:
+    def __init__(
+        self, surface: ObjectSurface, skin_vertices: Floats, skin_triangles: Indices
+    ) -> None:
         """skin_vertices: (s, 3) at rest, world; skin_triangles: (t, 3), outward.
 
-        ValueError for a skin without triangles, or with places that are not finite.
+        Raises ValueError for a skin without triangles, or with coordinates that are not finite.
         """
         self.vertices = len(skin_vertices)
-        self._weights = follow_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
+        self._weights = transfer_matrix(surface.rest_world_m, skin_vertices, skin_triangles)
         self._skin = skin_vertices.astype(np.float32)
-        self._normals = _Normals(skin_triangles, len(skin_vertices))
+        self._normals = VertexNormals(skin_triangles, len(skin_vertices))
         self._rest_normals = self._normals(self._skin)
         self._rest = np.concatenate(
             [surface.rest_world_m, surface.normals_world], axis=1, dtype=np.float32
         )
         self._moves = np.empty((self.vertices, 6), np.float32)
 
-    def moved(self, displacement: Singles | None) -> Singles:
-        """Positions and normals, not of unit length, side by side (vertices, 6).
+    def apply(self, displacement: Singles | None) -> Singles:
+        """Return positions and normals, not of unit length, side by side (vertices, 6).
 
-        displacement: (s, 3) of the skin; None for the rest.  ValueError for one of another skin, or
-        that is not finite.
+        displacement: (s, 3) of the skin; None: at rest. Raises ValueError for one of another skin,
+        or one that is not finite.
         """
         if displacement is None:
             return self._rest
         if displacement.shape != self._skin.shape:
-            raise ValueError(f"displacement of {len(displacement)} vertices fits no skin")
+            raise ValueError(f"displacement of {len(displacement)} vertices does not fit the skin")
         moves = self._moves
         moves[:, :3] = displacement
         # A sum is NaN or infinite as soon as one of its terms is.
@@ -257,11 +254,12 @@ class Follower:
         return result
 
 
-def follow_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
-    """(points, skin vertices), float32: interpolates what the skin's vertices carry at the points.
+def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices) -> csr_array:
+    """Return (points, skin vertices), float32: interpolates values of the skin's vertices at
+    points.
 
     Each point takes the barycentric weights of the nearest point of the skin; triangles without
-    area are passed over.  ValueError for a skin that has no others, or with NaN.
+    area are ignored. Raises ValueError for a skin that has no others, or with NaN.
     """
     if not np.isfinite(skin_vertices).all():
         raise ValueError("the skin has vertices that are not finite")
@@ -274,12 +272,12 @@ def follow_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices
     _, near = cKDTree(samples).query(points, k=candidates)
     near = owners[near.reshape(len(points), candidates)]
     weights = np.empty((len(points), candidates, 3))
-    away = np.empty((len(points), candidates))
+    distances = np.empty((len(points), candidates))
     for i in range(candidates):
         weights[:, i] = nearest_in_triangles(points, corners[near[:, i]])
         foot = np.einsum("pc,pcx->px", weights[:, i], corners[near[:, i]])
-        away[:, i] = np.linalg.norm(foot - points, axis=1)
-    rows, best = np.arange(len(points)), np.argmin(away, axis=1)
+        distances[:, i] = np.linalg.norm(foot - points, axis=1)
+    rows, best = np.arange(len(points)), np.argmin(distances, axis=1)
     columns = skin_triangles[near[rows, best]]
     return csr_array(
         (
@@ -292,10 +290,10 @@ def follow_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indices
 
 
 def _samples(corners: Floats) -> tuple[Floats, NDArray[np.intp]]:
-    """Points (n, 3) spread over triangles (t, 3, 3), and whose they are (n,).
+    """Return points (n, 3) spread over triangles (t, 3, 3), and their triangle (n,).
 
-    Large triangles get more, so that of a skin finer in front the nearest samples tell the nearest
-    triangle everywhere.
+    Large triangles get more. So the nearest samples find the nearest triangle also on a skin that
+    is finer in front.
     """
     sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2).max(axis=1)
     parts = np.clip(np.ceil(sides / max(float(np.median(sides)), 1e-12)), 1, 12).astype(int)

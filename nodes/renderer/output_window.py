@@ -1,4 +1,4 @@
-"""What the renderer draws on: nothing that is seen, or a window on the projector's monitor."""
+"""Provide the renderer's output: offscreen, or a window on the projector's monitor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import moderngl
 from messages.types import Display
 from nodes.renderer.gl import headless_context
 from nodes.renderer.monitors import (
-    chosen_monitor,
+    find_monitor,
     hidden_window,
     open_window,
     refresh_period_s,
@@ -20,30 +20,30 @@ from nodes.renderer.monitors import (
 from nodes.renderer.parameters import RendererParameters
 from nodes.renderer.presenter import SLOTS, Presenter, Shown, Slot, make_slot
 
-CLOSED = "the window was closed: what is drawn is seen by nobody; restart the node to open it"
+CLOSED = "the window was closed and frames are not shown; restart the node to open it"
 
 
-class Screen(Protocol):
-    """Takes eyes' pictures; `context` is the one to draw in, current in the caller's thread."""
+class OutputWindow(Protocol):
+    """Take eyes' images; `context` is the one to draw in, current in the caller's thread."""
 
     context: moderngl.Context
     is_seen: bool
-    """Whether pictures are shown, and `shown` tells when."""
+    """Whether images are shown, and `shown` reports when."""
     shows_both: bool
     """Whether it alternates the eyes of frame_sequential by itself."""
     period_s: float
-    """Of the refresh that swaps wait for; 0: none."""
+    """Refresh period that swaps wait for; 0: none."""
     note: str
 
     def open(self, size: tuple[int, int]) -> None: ...
-    def take(self, number: int, picture: moderngl.Framebuffer) -> None: ...
+    def take(self, number: int, image: moderngl.Framebuffer) -> None: ...
     def show(self, tag: Any, display: Display) -> None: ...
     def poll(self) -> bool: ...
     def close(self) -> None: ...
 
 
-class Offscreen:
-    """Nothing is shown: frames are drawn for whoever reads them."""
+class OffscreenOutput:
+    """Show nothing: frames are drawn for readers only."""
 
     is_seen = shows_both = False
     period_s = 0.0
@@ -53,13 +53,13 @@ class Offscreen:
         self.context = headless_context()
 
     def open(self, size: tuple[int, int]) -> None:
-        """Nothing to open."""
+        """Do nothing: there is no window."""
 
-    def take(self, number: int, picture: moderngl.Framebuffer) -> None:
-        """Nothing to keep."""
+    def take(self, number: int, image: moderngl.Framebuffer) -> None:
+        """Do nothing: no image is stored."""
 
     def show(self, tag: Any, display: Display) -> None:
-        """Nobody to show it to."""
+        """Do nothing: no image is shown."""
 
     def poll(self) -> bool:
         return True
@@ -68,10 +68,12 @@ class Offscreen:
         self.context.release()
 
 
-def open_screen(parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown) -> Screen:
-    """The screen that the parameters ask for; WindowError or NoOpenGLError if there is none."""
+def open_output(
+    parameters: RendererParameters, now_ns: Callable[[], int], shown: Shown
+) -> OutputWindow:
+    """Return the output that the parameters select. Raises WindowError or NoOpenGLError."""
     if parameters.output == "headless":
-        return Offscreen()
+        return OffscreenOutput()
     return ProjectorWindow(
         monitor=parameters.monitor,
         swap_interval=parameters.swap_interval,
@@ -83,7 +85,7 @@ def open_screen(parameters: RendererParameters, now_ns: Callable[[], int], shown
 class ProjectorWindow:
     """A window, full-screen on the projector's monitor, that swaps in a thread of its own.
 
-    Called on the main thread only, which the window system asks for.
+    Called on the main thread only, which the window system requires.
     """
 
     def __init__(
@@ -94,13 +96,13 @@ class ProjectorWindow:
         now_ns: Callable[[], int],
         shown: Shown,
     ) -> None:
-        """monitor: its name or number; None: an ordinary window, to try things out.
+        """monitor: its name or number; None: an ordinary window, for tests.
 
-        swap_interval: refreshes to a swap; 0 does not wait, and tears.  WindowError without a
+        swap_interval: refreshes per swap; 0 does not wait, and tears. Raises WindowError without a
         display or such a monitor.
         """
         start_glfw()
-        self._monitor = None if monitor is None else chosen_monitor(monitor)
+        self._monitor = None if monitor is None else find_monitor(monitor)
         self._swap_interval, self._now_ns, self._shown = swap_interval, now_ns, shown
         self._hidden = hidden_window()
         glfw.make_context_current(self._hidden)
@@ -114,7 +116,7 @@ class ProjectorWindow:
         self._filling: Slot | None = None
 
     def open(self, size: tuple[int, int]) -> None:
-        """Open the window for pictures of that size, in the place of one of another size."""
+        """Open the window for images of that size, and replace one of another size."""
         if self._presenter is not None and self._slots[0].textures[0].size == size:
             return
         self._shut()
@@ -139,16 +141,16 @@ class ProjectorWindow:
         self.is_seen, self.note = True, ""
         self._note_size(size, self._presenter.framebuffer_px)
 
-    def take(self, number: int, picture: moderngl.Framebuffer) -> None:
-        """Keep an eye's picture, 0 the first, for the next `show`."""
+    def take(self, number: int, image: moderngl.Framebuffer) -> None:
+        """Store an eye's image, 0 the first, for the next `show`."""
         if self._presenter is None:
             return
         if self._filling is None:
             self._filling = self._presenter.free_slot()
-        self.context.copy_framebuffer(self._filling.frames[number], picture)
+        self.context.copy_framebuffer(self._filling.frames[number], image)
 
     def show(self, tag: Any, display: Display) -> None:
-        """Have the pictures taken shown at the next refresh; `shown(tag, when)` tells of it."""
+        """Show the stored images at the next refresh; `shown(tag, when)` reports it."""
         slot, self._filling = self._filling, None
         if self._presenter is None or slot is None:
             return
@@ -159,13 +161,14 @@ class ProjectorWindow:
         self._presenter.put(slot)
 
     def poll(self) -> bool:
-        """See to the window's events; False once its context is lost and all must be made anew.
+        """Handle the window's events; return False once its context is lost.
 
-        A closed window is gone for good; `note` says so.  WindowError tells why it was lost.
+        Then all must be created again. A closed window stays closed; `note` reports that.
+        WindowError gives the reason of the loss.
         """
         glfw.poll_events()
         if self._presenter is not None and self._presenter.problem is not None:
-            self.note = f"the window was lost ({self._presenter.problem}): opening it anew"
+            self.note = f"the window was lost ({self._presenter.problem}): opening it again"
             return False
         if self._window is not None and glfw.window_should_close(self._window):
             self._shut()
@@ -187,12 +190,12 @@ class ProjectorWindow:
         self.note = (
             ""
             if fits
-            else f"window of {width}x{height} for pictures of {size[0]}x{size[1]}: shown unscaled, "
+            else f"window of {width}x{height} for images of {size[0]}x{size[1]}: shown unscaled, "
             "in the middle"
         )
 
     def _shut(self) -> None:
-        """Close the window; drawing can go on."""
+        """Close the window; drawing can continue."""
         if self._presenter is not None:
             self._presenter.stop()
             self._presenter = None
@@ -207,7 +210,7 @@ class ProjectorWindow:
             self._window = None
 
     def close(self) -> None:
-        """Close the window and free all that was drawn with."""
+        """Close the window and free all resources."""
         self._shut()
         self.context.release()
         glfw.destroy_window(self._hidden)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from nodes.fem_solver.remaining import Remaining
+from nodes.cache import EtaEstimator
 
 
 def test_time_left_is_reckoned_from_what_steps_took() -> None:
-    far = Remaining()
+    far = EtaEstimator()
     assert far.text(0, 10, 100.0) == "0 %"
     assert far.text(1, 10, 105.0) == "10 %, about 45 s left"
     assert far.text(2, 10, 150.0) == "20 %, about 3 min left"
@@ -14,7 +14,7 @@ def test_time_left_is_reckoned_from_what_steps_took() -> None:
 
 
 def test_steps_kept_from_before_say_nothing_of_the_others() -> None:
-    far = Remaining()
+    far = EtaEstimator()
     assert far.text(0, 20, 0.0) == "0 %"
     assert far.text(10, 20, 0.2) == "50 %"
     assert far.text(10, 20, 8.0) == "50 %"
@@ -22,7 +22,7 @@ def test_steps_kept_from_before_say_nothing_of_the_others() -> None:
 
 
 def test_something_new_is_reckoned_anew() -> None:
-    far = Remaining()
+    far = EtaEstimator()
     far.text(0, 10, 0.0)
     far.text(5, 10, 50.0)
     assert far.text(0, 10, 60.0) == "0 %"

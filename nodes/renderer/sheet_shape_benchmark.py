@@ -1,7 +1,7 @@
-"""The sheet-shape method family: how long the sheet's shape takes, how far it is from the sheet.
+"""Measure the sheet-shape methods: the time of a shape, and its distance from the true sheet.
 
-What is judged is the height of each method's mesh over the flat sheet against the true sheet's, at
-the true sheet's own points; the true sheet is brought along by whoever asks for the family.
+The error is the height of each method's mesh over the flat sheet against the true sheet's, at the
+true sheet's own points. The caller provides the true sheet.
 """
 
 from __future__ import annotations
@@ -15,30 +15,29 @@ from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
 from messages.scene import Scene
-from nodes.methods import Case, Family, Trial, up_to
+from nodes.methods import Case, Family, Trial, clip_range
 from nodes.models.sheet import edge_poses
 from nodes.models.sheet.dents import triangles_of
 from nodes.models.sheet.membrane import push_path
-from nodes.renderer import dent_cache
-from nodes.renderer.sheet import Sheet, sheet_between
+from nodes.renderer import deflection_cache
+from nodes.renderer.sheet import SheetPose, estimate_sheet
 from nodes.renderer.sheet_mesh import (
-    FLAT_TO_M,
-    TRIANGLES_TO_M,
+    MAX_TRIANGLES_DEPTH_M,
     SheetMesh,
-    dented_mesh,
-    flat_mesh,
+    deflected_mesh,
     pyramid_mesh,
 )
 
 Floats = NDArray[np.float64]
 
-Judge = Callable[[Scene, Floats, Floats, Floats], Floats]
-"""Points (n, 3) of the true sheet in the world, between two edges and under a fingertip (3,)."""
+ReferenceFactory = Callable[[Scene, Floats, Floats, Floats], Floats]
+"""Returns points (n, 3) of the true sheet in the world, between two edges and under a fingertip
+(3,)."""
 
-UNSOLVED = ("flat", "four_triangles")
-METHODS = (*UNSOLVED, "dents", "membrane")
+WITHOUT_SHAPES = ("four_triangles",)
+METHODS = (*WITHOUT_SHAPES, "reduced_order", "membrane")
 DEPTHS_M = (0.002, 0.01, 0.02, 0.035, 0.05)
-PLACES: tuple[tuple[str, float, float], ...] = (
+SAMPLE_POINTS: tuple[tuple[str, float, float], ...] = (
     ("centre", 0.0, 0.0),
     ("off-centre", 0.17, 0.21),
     ("near the clamp", 0.29, 0.0),
@@ -47,32 +46,34 @@ PLACES: tuple[tuple[str, float, float], ...] = (
 """Names, and x over the width, y over the height."""
 
 
-def sheet_shape_family(judge: Judge, *, solved: bool = True) -> Family:
-    """Every shape at the scene's stretches, over depths and places; without `solved`, those alone
-    that nothing need be solved for."""
+def sheet_shape_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
+    """Return every shape at the scene's stretches, over depths and points.
+
+    Without `solved`, only shapes that need no solution beforehand.
+    """
     return Family(
         name="sheet-shape",
         unit="mm",
         reference="the twin's membrane, rms height",
-        methods=METHODS if solved else UNSOLVED,
-        trials=partial(_trials, judge, solved),
+        methods=METHODS if solved else WITHOUT_SHAPES,
+        trials=partial(_trials, reference, solved),
         tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
     )
 
 
-def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
-    dents = dent_cache.load_or_solve(scene, None) if solved else None
-    rubber, _ = dent_cache.wanted(scene)
+def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
+    dents = deflection_cache.load_or_compute(scene, None) if solved else None
+    rubber, _ = deflection_cache.required_shapes(scene)
     spec = scene.sheet
     middle = 0.5 * (spec.min_stretch_ratio + spec.max_stretch_ratio)
     stretches = (spec.min_stretch_ratio, middle, spec.max_stretch_ratio)
-    depths_m = up_to(scene.working_range.push_depth_m, DEPTHS_M)
-    for stretch, depth, (where, x, y) in product(stretches, depths_m, PLACES):
+    depths_m = clip_range(scene.working_range.push_depth_m, DEPTHS_M)
+    for stretch, depth, (where, x, y) in product(stretches, depths_m, SAMPLE_POINTS):
         if where != "centre" and stretch != middle:
             continue
         tip = np.array([x * spec.width_m, y * spec.height_m, -depth])
         edges = edge_poses(np.eye(4), stretch * spec.width_m)
-        sheet = sheet_between(
+        sheet = estimate_sheet(
             *edges,
             height_m=spec.height_m,
             twist_world=np.zeros(6),
@@ -80,9 +81,9 @@ def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
             finger_tip=tip,
         )
         assert sheet is not None
-        place = (float(tip[0]), float(tip[1]))
+        position = (float(tip[0]), float(tip[1]))
 
-        def elements(sheet: Sheet, stretch: float = stretch, depth: float = depth) -> SheetMesh:
+        def elements(sheet: SheetPose, stretch: float = stretch, depth: float = depth) -> SheetMesh:
             assert sheet.pushed_point is not None
             pushed = push_path(
                 rubber,
@@ -94,18 +95,19 @@ def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
             rows, columns = pushed.rest_m.shape[:2]
             return SheetMesh(pushed.positions[0].reshape(-1, 3), triangles_of(rows, columns))
 
-        shapes: dict[str, Callable[[Sheet], SheetMesh]] = {
-            "flat": flat_mesh,
+        shapes: dict[str, Callable[[SheetPose], SheetMesh]] = {
             "four_triangles": pyramid_mesh,
         }
         in_range = {
-            "flat": depth <= FLAT_TO_M,
-            "four_triangles": depth <= TRIANGLES_TO_M,
+            "four_triangles": depth <= MAX_TRIANGLES_DEPTH_M,
         }
         if dents is not None:
-            shapes |= {"dents": partial(dented_mesh, dents=dents), "membrane": elements}
-            in_range |= {"dents": not dents.outside(stretch, place, depth), "membrane": True}
-        truth = judge(scene, *edges, tip)
+            shapes |= {"reduced_order": partial(deflected_mesh, dents=dents), "membrane": elements}
+            in_range |= {
+                "reduced_order": not dents.outside(stretch, position, depth),
+                "membrane": True,
+            }
+        truth = reference(scene, *edges, tip)
         case: Case = {"stretch": stretch, "depth_mm": 1e3 * depth, "place": where}
         for method, shape in shapes.items():
             yield Trial(
@@ -119,9 +121,9 @@ def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
 
 
 def height_error_mm(mesh: SheetMesh, *, truth: Floats) -> float:
-    """Root mean square of the mesh's height less the truth's, at the truth's points (n, 3), mm.
+    """Return the root mean square height difference at the reference's points (n, 3), mm.
 
-    Heights are along the world's z, as the sheets of the family lie.
+    Heights are along the world's z, because the sheets of the family are horizontal.
     """
     heights = LinearNDInterpolator(mesh.vertices[:, :2], mesh.vertices[:, 2])(truth[:, :2])
     off = (heights - truth[:, 2])[np.isfinite(heights)]

@@ -16,11 +16,11 @@ import numpy as np
 import psutil
 import pytest
 
-from nodes.cache import Parts
-from nodes.fem_solver.lab import LabError, lab_workers
+from nodes.cache import CheckpointStore
+from nodes.fem_solver.dask_executor import SchedulerError, connect_workers
 from nodes.fem_solver.mesh import boundary_faces
 from nodes.fem_solver.precompute_table import LostWorkersError, solve_all
-from nodes.fem_solver.pushes import PushJob, Site, solve_push
+from nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.solids import box
 from tests.waiting import DEADLINE_S
 
@@ -79,16 +79,16 @@ def lab() -> Iterator[Lab]:
     one.close()
 
 
-def job(depth_m: float = 0.0005) -> PushJob:
+def job(depth_m: float = 0.0005) -> SnapshotJob:
     """A block of 30 x 30 x 20 mm, glued to the ground, pushed in the middle of its top."""
     nodes, elements = box((4, 4, 2), (0.03, 0.03, 0.02))
     faces = boundary_faces(elements)
-    return PushJob(
+    return SnapshotJob(
         nodes=nodes,
         elements=elements,
         fixed=np.isclose(nodes[:, 2], 0.0),
         faces=faces[np.isclose(nodes[faces, 2], 0.02).all(axis=1)],
-        site=Site(np.array([0.015, 0.015, 0.02]), np.array([0.0, 0.0, 1.0])),
+        sample=SamplePoint(np.array([0.015, 0.015, 0.02]), np.array([0.0, 0.0, 1.0])),
         poisson_ratio=0.45,
         finger_radius_m=0.007,
         depths_m=(depth_m, 2.0 * depth_m),
@@ -102,15 +102,18 @@ def cpu_s(process: subprocess.Popen[str]) -> float:
 
 def test_a_scheduler_without_workers_is_an_error_that_says_what_to_do(lab: Lab) -> None:
     with (
-        pytest.raises(LabError, match=r"dask worker tcp://127\.0\.0\.1"),
-        lab_workers(lab.address, connect_s=0.3),
+        pytest.raises(SchedulerError, match=r"dask worker tcp://127\.0\.0\.1"),
+        connect_workers(lab.address, connect_s=0.3),
     ):
         pass
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1", "post://127.0.0.1:8786"])
 def test_no_scheduler_is_an_error_that_says_what_to_do(address: str) -> None:
-    with pytest.raises(LabError, match=r"no scheduler answers.*null"), lab_workers(address):
+    with (
+        pytest.raises(SchedulerError, match=r"no scheduler answers.*null"),
+        connect_workers(address),
+    ):
         pass
 
 
@@ -118,22 +121,22 @@ def test_what_a_lost_worker_was_at_is_done_by_others_and_a_lost_scheduler_is_sai
     lab: Lab, tmp_path: Path
 ) -> None:
     first = lab.add_worker()
-    parts = Parts(tmp_path / "parts")
+    parts = CheckpointStore(tmp_path / "parts")
     jobs = [job(), job(0.001)]
-    with lab_workers(lab.address, connect_s=2.0) as executor:
+    with connect_workers(lab.address, connect_s=2.0) as executor:
         # it is given the first push, and never ends it
         psutil.Process(first.pid).suspend()
-        told: list[int] = []
+        counts: list[int] = []
 
         def lose(count: int) -> None:
-            told.append(count)
-            if len(told) == 2:
+            counts.append(count)
+            if len(counts) == 2:
                 first.send_signal(signal.SIGKILL)
                 lab.add_worker()
 
         answers = solve_all(jobs, executor, parts, lose)
         for answer, one in zip(answers, jobs, strict=True):
-            here = solve_push(one)
+            here = solve_snapshot(one)
             assert np.allclose(answer.moved, here.moved, atol=1e-9)
             assert answer.reached == here.reached == 2
 
@@ -141,7 +144,7 @@ def test_what_a_lost_worker_was_at_is_done_by_others_and_a_lost_scheduler_is_sai
             if count == 2:
                 lab.scheduler.kill()
 
-        with pytest.raises(LostWorkersError, match="goes on from there"):
+        with pytest.raises(LostWorkersError, match="table continues"):
             solve_all([*jobs, job(0.002)], executor, parts, leave)
 
 
@@ -158,7 +161,7 @@ def test_a_push_that_is_given_up_ends_in_the_lab(lab: Lab, tmp_path: Path) -> No
 
     long = [replace(job(), depths_m=(1e-4,) * 400)] * 3
     begun = cpu_s(worker)
-    with lab_workers(lab.address) as executor, pytest.raises(GivenUpError):
-        solve_all(long, executor, Parts(tmp_path / "parts"), give_up)
-    with lab_workers(lab.address) as executor:
+    with connect_workers(lab.address) as executor, pytest.raises(GivenUpError):
+        solve_all(long, executor, CheckpointStore(tmp_path / "parts"), give_up)
+    with connect_workers(lab.address) as executor:
         assert executor.submit(pow, 2, 3).result(timeout=DEADLINE_S) == 8

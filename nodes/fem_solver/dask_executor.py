@@ -1,7 +1,7 @@
-"""The machines of a lab: the workers of a `dask.distributed` scheduler, as an executor.
+"""Run functions on the workers of a `dask.distributed` scheduler, as an executor.
 
-A worker needs this project installed in the version that asks it, and nothing else: what is to be
-solved travels with each job.  Imported late, as `distributed` takes half a second.
+A worker needs the same version of this project and nothing else: each job carries its own data.
+This module is imported late, because `distributed` takes half a second.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ import distributed
 from nodes.fem_solver import precompute_table
 
 untyped: Any = distributed
-"""What it takes and returns is not said in types."""
+"""`distributed` without types: its arguments and results are not annotated."""
 
 CONNECT_S = 10.0
-"""A scheduler answers, and has a worker, within this time."""
+"""Time in which a scheduler must answer and have a worker."""
 TRIES = 3
-"""A push whose worker is lost is given to others so many times."""
+"""Number of times that a job of a lost worker is given to other workers."""
 
 
-class LabError(precompute_table.WorkersError):
-    """The lab's machines are of no use; the text names the parameter, its value and a remedy."""
+class SchedulerError(precompute_table.WorkersError):
+    """The scheduler's workers cannot be used; the text names the parameter, its value and a
+    remedy."""
 
     def __init__(self, address: str, what: str, remedy: str) -> None:
         super().__init__(
@@ -36,8 +37,8 @@ class LabError(precompute_table.WorkersError):
         )
 
 
-class LabExecutor(Executor):
-    """Hands functions to a scheduler's workers, where they can be asked to stop."""
+class DaskExecutor(Executor):
+    """Submit functions to a scheduler's workers, which can be asked to stop them."""
 
     def __init__(self, client: distributed.Client) -> None:
         self._client = client
@@ -50,37 +51,40 @@ class LabExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """As `Executor.shutdown`; cancel_futures: what runs ends soon, too."""
-        # a scheduler that is gone has nobody left to tell
+        """Shut down as `Executor.shutdown`; cancel_futures: running functions end soon, too."""
+        # A lost scheduler has no workers left to notify.
         if cancel_futures and self._client.status == "running":
             self._stop.set()
         self._executor.shutdown(wait=wait and not cancel_futures)
 
 
 @contextmanager
-def lab_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Executor]:
-    """The workers of the scheduler at an address such as tcp://host:8786; when left, what they are
-    at ends.  LabError if it does not answer, has no worker, or one of other code."""
+def connect_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Executor]:
+    """Yield the workers of the scheduler at an address such as tcp://host:8786.
+
+    Leaving the context stops what they are running. Raises SchedulerError if the scheduler does not
+    answer, has no worker, or has one of another version.
+    """
     try:
-        # a client that cannot connect is slow to go away again: knock first
+        # A client that cannot connect takes long to close: test the connection first.
         with socket.create_connection(
             untyped.comm.get_address_host_port(address), timeout=connect_s
         ):
             pass
         client = untyped.Client(address, timeout=connect_s, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise LabError(
+        raise SchedulerError(
             address, f"no scheduler answers ({error})", "start one with `dask scheduler`"
         ) from error
     with client:
         try:
             client.wait_for_workers(1, timeout=connect_s)
         except TimeoutError as error:
-            raise LabError(
+            raise SchedulerError(
                 address, "it has no worker", f"start some with `dask worker {address}`"
             ) from error
         _require_same_code(client, address)
-        executor = LabExecutor(client)
+        executor = DaskExecutor(client)
         try:
             yield executor
         finally:
@@ -88,22 +92,25 @@ def lab_workers(address: str, *, connect_s: float = CONNECT_S) -> Iterator[Execu
 
 
 def _require_same_code(client: distributed.Client, address: str) -> None:
-    """LabError if a worker cannot import this project, or has another version of it."""
-    remedy = "install the same flexsheet there and start its workers anew"
+    """Raise SchedulerError if a worker cannot import this project, or has another version of it."""
+    remedy = "install the same flexsheet version there and restart its workers"
     try:
         found = client.run(precompute_table.code_version)
     except ImportError as error:
-        raise LabError(address, f"a worker lacks this project ({error})", remedy) from error
+        raise SchedulerError(
+            address, f"a worker cannot import flexsheet ({error})", remedy
+        ) from error
     for worker, version in found.items():
         if version != precompute_table.code_version():
-            raise LabError(address, f"the worker {worker} has other code ({version})", remedy)
+            problem = f"the worker {worker} has another version ({version})"
+            raise SchedulerError(address, problem, remedy)
 
 
 def _until_told(name: str, fn: Callable[..., Any], args: Any, kwargs: Any) -> Any:
-    """In a worker: do it, stopping once the event of this name is set."""
-    told = untyped.Event(name)
-    token = precompute_table.asked_to_stop.set(told.is_set)
+    """Run a function in a worker, and stop it once the event of this name is set."""
+    stop_event = untyped.Event(name)
+    token = precompute_table.stop_requested.set(stop_event.is_set)
     try:
         return fn(*args, **kwargs)
     finally:
-        precompute_table.asked_to_stop.reset(token)
+        precompute_table.stop_requested.reset(token)

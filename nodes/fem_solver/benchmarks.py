@@ -1,0 +1,339 @@
+"""Measure the soft body's methods for `flexsheet chart soft-body`: linear, table, Newton.
+
+Full Newton solutions of one push on meshes of their own are the references. At each depth the
+reference is the finest mesh that reaches the depth. Its distance to the next finer one is the
+reference uncertainty. Where no mesh reaches the depth, the chart shows only the time and how far
+the skin moves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import structlog
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from nodes.cache import default_cache_dir
+from nodes.fem_solver import snapshots
+from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from nodes.fem_solver.closest_contact import ContactQuery
+from nodes.fem_solver.mesh import boundary_faces
+from nodes.fem_solver.newton import EquilibriumState, NeoHookeanBody
+from nodes.fem_solver.precompute import SoftBodyModel, WorkBudget, load_or_compute
+from nodes.fem_solver.reference import (
+    LocalTable,
+    ReferenceSolution,
+    has_focused_meshes,
+    load_full_table,
+    make_even_job,
+    make_focused_job,
+    select_references,
+    solve_cached_jobs,
+)
+from nodes.fem_solver.snapshot_interpolator import SurfaceLocator
+from nodes.fem_solver.snapshots import SamplePoint, SnapshotJob
+from nodes.methods import Family, Progress, Trial, clip_range
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+
+LINEAR_SPACINGS_M = {"linear, coarse": 0.006, "linear, medium": 0.0045, "linear, fine": 0.003}
+TABLE_SPACINGS_M = {"nonlinear table, medium": 0.0045}
+NEWTON = "neo-Hookean Newton, 0.1 mm further"
+NEWTON_RATIO = 0.64
+FOCUSED_RATIOS, EVEN_SPACINGS_M = (0.32, 0.64), (0.003, 0.006)
+"""Skin spacings of the references: on meshes that are fine about the finger, in finger radii; on
+evenly fine meshes, in metres. The order is: the first of each, then the second of each. The meshes
+have nothing but the push in common."""
+SHALLOW_M = (0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175)
+DEPTHS_M = (*SHALLOW_M, 0.020, 0.0225, 0.025, 0.0275, 0.030, 0.040, 0.050)
+NEWTON_DEPTHS_M = (0.003, 0.010, 0.015)
+NEWTON_STEP_M = 1e-4
+SAMPLE_OFFSET_M = np.array([0.004, 0.003, 0.0])
+"""Offset of the push from the point nearest to the user: at no node of any mesh, so that no method
+has an advantage."""
+LINEAR_DEPTH_M, MAX_DEPTH_M = 0.006, 0.010
+RIM_RATIO = 1.5
+"""Errors count farther than this many finger radii from the push, where the image shows skin."""
+FORCE = "force_error_percent"
+MAX_DISPLACEMENT = "largest_move_mm"
+
+
+class SkinSolution(Protocol):
+    """A method's answer to a push: skin displacement (s, 3), m, and force (3,), N."""
+
+    @property
+    def displacement(self) -> Floats | Floats32: ...
+
+    @property
+    def force_n(self) -> Floats: ...
+
+
+@dataclass(frozen=True, slots=True)
+class SoftBodyBenchmark:
+    """One push of a scene's object, and the methods that are measured on it.
+
+    linear_m, table_m: skin spacings by method name. newton_m: depths of the full Newton method.
+    focused, even_m: skin spacings of the references, in finger radii and in metres.
+    """
+
+    scene: Scene
+    cache_dir: Path
+    depths_m: Sequence[float]
+    linear_m: Mapping[str, float]
+    table_m: Mapping[str, float]
+    newton_m: Sequence[float]
+    focused: Sequence[float]
+    even_m: Sequence[float]
+
+    def linear(self, spacing_m: float) -> tuple[SceneBody, SoftBodyModel]:
+        """Return the body by its linear method, precomputed if it is not cached."""
+        spec = make_soft_body_spec(self.scene, spacing_m)
+
+        def log_start(done: int, total: int, need: WorkBudget) -> None:
+            if done == 0:
+                log = structlog.get_logger()
+                log.info("precomputing: soft body", spacing_m=spacing_m, need=need.text())
+
+        model = load_or_compute(spec, self.cache_dir, log_start)
+        body = build_scene_body(
+            self.scene,
+            spec,
+            model,
+            linear_depth_m=LINEAR_DEPTH_M,
+            max_depth_m=MAX_DEPTH_M,
+        )
+        return body, model
+
+    def coarsest(self) -> SceneBody:
+        """Return the linear body with the largest skin spacing."""
+        return self.linear(max([*self.linear_m.values(), *self.table_m.values()]))[0]
+
+    def sample(self) -> SamplePoint:
+        """Return the surface point that is pushed."""
+        body = self.coarsest()
+        found = body.shape.closest(body.front + SAMPLE_OFFSET_M)
+        return SamplePoint(found.point, found.normal)
+
+    def reference_jobs(self) -> list[tuple[str, SnapshotJob]]:
+        """Return names and jobs of the references, the best first."""
+        body, sample = self.coarsest(), self.sample()
+        jobs = []
+        for focused, even in zip(self.focused, self.even_m, strict=True):
+            if has_focused_meshes(body):
+                job = make_focused_job(body, self.scene, sample, focused, self.depths_m)
+                spacing = 1e3 * focused * self.scene.finger.radius_m
+                jobs.append((f"{spacing:.2g} mm about the finger", job))
+            job = make_even_job(body, self.scene, sample, even, self.depths_m)
+            jobs.append((f"{1e3 * even:g} mm everywhere", job))
+        return jobs
+
+    def local_tables(self) -> dict[str, LocalTable]:
+        """Return tables around the push, for the methods whose full table is not cached."""
+        found = {}
+        for name, spacing in self.table_m.items():
+            body, model = self.linear(spacing)
+            if load_full_table(body, self.scene, model, self.cache_dir) is None:
+                found[name] = LocalTable(body, self.scene, model, self.sample())
+        return found
+
+    def prepare(self, on_progress: Progress) -> None:
+        """Solve and cache all jobs of references and tables; takes minutes the first time."""
+        jobs = [job for _, job in self.reference_jobs()]
+        for table in self.local_tables().values():
+            jobs += table.jobs
+        solve_cached_jobs(jobs, self.cache_dir, on_progress)
+
+    def reference_set(self) -> ReferenceSet:
+        """Return the references, solved if they are not cached."""
+        sample, named = self.sample(), self.reference_jobs()
+        solved = solve_cached_jobs([job for _, job in named], self.cache_dir, _ignore_progress)
+        references = [
+            ReferenceSolution(name, sample, one, SurfaceLocator(one.rest, one.faces))
+            for (name, _), one in zip(named, solved, strict=True)
+        ]
+        return ReferenceSet(references, sample, self.scene)
+
+    def trials(self) -> Iterator[Trial]:
+        """Yield each method at each depth.
+
+        The error (mm) is the largest of a skin node off the finger; the force error is extra.
+        """
+        sample, references = self.sample(), self.reference_set()
+        bodies = {name: self.linear(spacing)[0] for name, spacing in self.linear_m.items()}
+        local = self.local_tables()
+        for name, spacing in self.table_m.items():
+            body, model = self.linear(spacing)
+            with_table = load_full_table(body, self.scene, model, self.cache_dir)
+            if with_table is None:
+                table = local[name]
+                with_table = table.body(
+                    solve_cached_jobs(table.jobs, self.cache_dir, _ignore_progress)
+                )
+            bodies[name] = with_table
+        for name, body in bodies.items():
+            for depth in self.depths_m:
+                query = ContactQuery(sample.point, sample.normal, depth)
+                run = partial(body.method.respond, query)
+                yield references.trial(name, depth, body.rest, run, in_range=run().in_range)
+        yield from self._newton_trials(references)
+
+    def _newton_trials(self, references: ReferenceSet) -> Iterator[Trial]:
+        """Yield one step of the full Newton method, from the solution at a smaller depth."""
+        if not self.newton_m:
+            return
+        job = make_focused_job(
+            self.coarsest(), self.scene, references.sample, NEWTON_RATIO, self.newton_m
+        )
+        modulus = self.scene.object.material.young_modulus_pa
+        solver = NeoHookeanBody(
+            job.nodes,
+            job.elements,
+            job.fixed,
+            job.faces,
+            young_modulus_pa=modulus,
+            poisson_ratio=job.poisson_ratio,
+            finger_radius_m=job.finger_radius_m,
+            tolerance=snapshots.TOLERANCE,
+        )
+        skin = np.unique(boundary_faces(job.elements))
+
+        def centre(depth_m: float) -> Floats:
+            return job.sample.point + (job.finger_radius_m - depth_m) * job.sample.normal
+
+        start_depths = [depth - NEWTON_STEP_M for depth in self.newton_m]
+        path = [centre(depth) for depth in (0.0, *start_depths)]
+        states = list(solver.solve_load_steps(path))[1:]
+
+        def run(state: EquilibriumState, depth: float) -> EquilibriumState:
+            start = (state.displacement, state.centre)
+            end = next(solver.solve_load_steps([centre(depth)], start=start))
+            return replace(end, displacement=end.displacement[skin])
+
+        for depth, state in zip(self.newton_m, states, strict=True):
+            if state.reached:
+                step = partial(run, state, depth)
+                yield references.trial(NEWTON, depth, job.nodes[skin], step, in_range=True)
+
+
+class ReferenceSet:
+    """The reference solutions of one push, the best first."""
+
+    def __init__(
+        self, references: Sequence[ReferenceSolution], sample: SamplePoint, scene: Scene
+    ) -> None:
+        self._references, self.sample = references, sample
+        self._modulus = scene.object.material.young_modulus_pa
+        self._rim_m = RIM_RATIO * scene.finger.radius_m
+
+    def trial(
+        self,
+        method: str,
+        depth_m: float,
+        rest: Floats,
+        run: Callable[[], SkinSolution],
+        *,
+        in_range: bool,
+    ) -> Trial:
+        """Return the trial of a method at a depth, for skin nodes at rest (s, 3).
+
+        The error is NaN where no reference reaches the depth.
+        """
+        off_finger = np.linalg.norm(rest - self.sample.point, axis=1) > self._rim_m
+        present = select_references(self._references, depth_m)
+        expected = [reference.evaluate(depth_m, rest) for reference in present[:2]]
+        uncertainty: dict[str, float] = {}
+        if len(expected) > 1:
+            (best_m, best_n), (second_m, second_n) = expected
+            difference = np.linalg.norm(best_m - second_m, axis=1)[off_finger].max()
+            uncertainty = {
+                "error": 1e3 * float(difference),
+                FORCE: 100.0 * abs(second_n / best_n - 1.0),
+            }
+
+        def error(solution: SkinSolution) -> float:
+            if not expected:
+                return float("nan")
+            difference = np.linalg.norm(solution.displacement - expected[0][0], axis=1)
+            return 1e3 * float(difference[off_finger].max())
+
+        def extra_metrics(solution: SkinSolution) -> dict[str, float]:
+            largest = float(np.linalg.norm(solution.displacement, axis=1).max())
+            metrics = {MAX_DISPLACEMENT: 1e3 * largest}
+            if expected:
+                force = float(solution.force_n @ self.sample.normal) / self._modulus
+                metrics[FORCE] = 100.0 * (force / expected[0][1] - 1.0)
+            return metrics
+
+        return Trial(
+            method=method,
+            case={"depth_mm": 1e3 * depth_m},
+            size={"skin_nodes": len(rest), "judge": present[0].name if present else "none"},
+            run=run,
+            error=error,
+            in_range=in_range,
+            extra_metrics=extra_metrics,
+            reference_uncertainty=uncertainty,
+        )
+
+
+def _ignore_progress(done: int, total: int) -> None:
+    """Report nothing: all jobs are cached by now."""
+
+
+def make_benchmark(scene: Scene) -> SoftBodyBenchmark:
+    """Return the benchmark over a scene's working range, with the user's cache."""
+    max_depth_m = scene.working_range.push_depth_m
+    return SoftBodyBenchmark(
+        scene,
+        default_cache_dir(),
+        depths_m=clip_range(max_depth_m, DEPTHS_M),
+        linear_m=LINEAR_SPACINGS_M,
+        table_m=TABLE_SPACINGS_M,
+        newton_m=[depth for depth in NEWTON_DEPTHS_M if depth <= max_depth_m],
+        focused=FOCUSED_RATIOS,
+        even_m=EVEN_SPACINGS_M,
+    )
+
+
+def linear_benchmark(scene: Scene) -> SoftBodyBenchmark:
+    """Return the part of the benchmark that a node has ready at once."""
+    return replace(make_benchmark(scene), table_m={}, newton_m=())
+
+
+def table_benchmark(scene: Scene) -> SoftBodyBenchmark:
+    """Return the part of the benchmark whose methods take minutes to precompute."""
+    return replace(make_benchmark(scene), linear_m={}, newton_m=())
+
+
+SOFT_BODY = Family(
+    name="soft-body",
+    unit="mm",
+    reference=(
+        "a neo-Hookean body of 10-node tetrahedra by Newton's method, at each depth on the finest "
+        "mesh that reaches it; beyond 1.5 finger radii from the push"
+    ),
+    methods=(*LINEAR_SPACINGS_M, *TABLE_SPACINGS_M, NEWTON),
+    trials=lambda scene: make_benchmark(scene).trials(),
+    tolerance=lambda scene: 1e3 * scene.tolerances.skin_m,
+    sweep_key="depth_mm",
+    prepare=lambda scene, on_progress: make_benchmark(scene).prepare(on_progress),
+)
+SOFT_BODY_LINEAR = replace(
+    SOFT_BODY,
+    methods=tuple(LINEAR_SPACINGS_M),
+    trials=lambda scene: linear_benchmark(scene).trials(),
+    prepare=lambda scene, on_progress: linear_benchmark(scene).prepare(on_progress),
+)
+SOFT_BODY_TABLES = replace(
+    SOFT_BODY,
+    methods=tuple(TABLE_SPACINGS_M),
+    trials=lambda scene: table_benchmark(scene).trials(),
+    prepare=lambda scene, on_progress: table_benchmark(scene).prepare(on_progress),
+)

@@ -1,0 +1,224 @@
+"""Solve the references of the soft body's chart, and tables that are filled only around one point.
+
+All of it comes from Newton solutions at one point and around it. Worker processes solve them, as
+for a table, and the cache stores them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Cylinder, Scene
+from nodes.cache import CheckpointStore, encode_fields, load_arrays, load_cached, save_arrays
+from nodes.fem_solver import snapshots
+from nodes.fem_solver.body import SceneBody, attach_table, make_table_spec
+from nodes.fem_solver.contact import unit_linear_body
+from nodes.fem_solver.mesh import build_mesh
+from nodes.fem_solver.precompute import SoftBodyModel
+from nodes.fem_solver.precompute_table import local_processes, solve_all, table_cache
+from nodes.fem_solver.snapshot_interpolator import (
+    NEIGHBOURS,
+    SnapshotInterpolator,
+    SurfaceLocator,
+    place_snapshots,
+)
+from nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob
+from nodes.fem_solver.table import CANDIDATE_FACES, END_SPAN_M, Table, fill_table
+from nodes.methods import Progress
+
+Floats = NDArray[np.float64]
+
+VERSION = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceSolution:
+    """A push solved on one mesh, with a locator on its surface; name: for the reader."""
+
+    name: str
+    sample: SamplePoint
+    snapshot: Snapshot
+    locator: SurfaceLocator
+
+    def reaches(self, depth_m: float) -> bool:
+        """Return whether the solution exists at a depth."""
+        depths = self.snapshot.depths_m[: self.snapshot.reached]
+        return bool((np.abs(depths - depth_m) < 1e-9).any())
+
+    def evaluate(self, depth_m: float, points: Floats) -> tuple[Floats, float]:
+        """Return the displacement (q, 3) of skin points (q, 3), and the normal force for 1 Pa."""
+        level = int(np.abs(self.snapshot.depths_m - depth_m).argmin())
+        nodes, weights = self.locator.weights(points)
+        displacement: Floats = np.einsum("qa,qai->qi", weights, self.snapshot.moved[level][nodes])
+        return displacement, float(self.snapshot.force_n[level] @ self.sample.normal)
+
+
+def select_references(
+    references: Sequence[ReferenceSolution], depth_m: float
+) -> list[ReferenceSolution]:
+    """Return the references that reach a depth, the best first.
+
+    Errors are measured against the first; the second gives the uncertainty of the first.
+    """
+    return [reference for reference in references if reference.reaches(depth_m)]
+
+
+def make_focused_job(
+    body: SceneBody, scene: Scene, sample: SamplePoint, ratio: float, depths_m: Sequence[float]
+) -> SnapshotJob:
+    """Return a push on a mesh with `ratio` finger radii between skin nodes.
+
+    Where the shape has such meshes, only the skin about the finger is that fine.
+    """
+    spacing = ratio * scene.finger.radius_m
+    spec = replace(body.spec.mesh, skin_spacing_m=spacing)
+    job = snapshots.make_snapshot_job(
+        spec,
+        build_mesh(spec),
+        sample,
+        poisson_ratio=body.spec.poisson_ratio,
+        finger_radius_m=scene.finger.radius_m,
+        spacing_m=spacing,
+    )
+    return replace(job, depths_m=tuple(depths_m))
+
+
+def make_even_job(
+    body: SceneBody, scene: Scene, sample: SamplePoint, spacing_m: float, depths_m: Sequence[float]
+) -> SnapshotJob:
+    """Return the same push on a mesh that is equally fine on all touchable skin."""
+    mesh = build_mesh(replace(body.spec.mesh, skin_spacing_m=spacing_m))
+    return SnapshotJob(
+        nodes=mesh.nodes,
+        elements=mesh.elements,
+        fixed=mesh.fixed,
+        faces=mesh.contact_nodes[mesh.contact_faces],
+        sample=sample,
+        poisson_ratio=body.spec.poisson_ratio,
+        finger_radius_m=scene.finger.radius_m,
+        depths_m=tuple(depths_m),
+    )
+
+
+def solve_cached_jobs(
+    jobs: Sequence[SnapshotJob], cache_dir: Path, on_progress: Progress
+) -> list[Snapshot]:
+    """Return the jobs' snapshots; the cache holds each under a digest of its job."""
+    cache = CheckpointStore(cache_dir)
+    names = [f"soft-body-push-{_digest(job)}" for job in jobs]
+    missing = [number for number, name in enumerate(names) if cache.load(name) is None]
+    if missing:
+        folder = CheckpointStore(cache_dir / "soft-body-pushes.parts")
+        with local_processes(min(os.cpu_count() or 1, len(missing))) as executor:
+            solved = solve_all(
+                [jobs[number] for number in missing],
+                executor,
+                CheckpointStore(folder.folder / _digest(*[jobs[number] for number in missing])),
+                lambda count: on_progress(len(jobs) - len(missing) + count, len(jobs)),
+            )
+        for number, snapshot in zip(missing, solved, strict=True):
+            save_arrays(cache_dir / f"{names[number]}.npz", encode_fields(snapshot))
+        folder.remove()
+    return [_load_snapshot(cache_dir / f"{name}.npz") for name in names]
+
+
+def _load_snapshot(path: Path) -> Snapshot:
+    content = load_arrays(path)
+    if content is None:
+        raise OSError(f"{path}: was written and cannot be read; check the disk")
+    return snapshots.decode_snapshot(content)
+
+
+def _digest(*jobs: SnapshotJob) -> str:
+    digest = hashlib.sha256(f"{VERSION}".encode())
+    for job in jobs:
+        digest.update(f"{job.poisson_ratio} {job.finger_radius_m} {job.depths_m}".encode())
+        sample = job.sample
+        arrays = (job.nodes, job.elements, job.fixed, job.faces, sample.point, sample.normal)
+        for array in arrays:
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:24]
+
+
+class LocalTable:
+    """The nonlinear table of a body, filled only near one point.
+
+    It has the same numbers there as the full table, from the few snapshots that contribute.
+    """
+
+    def __init__(
+        self, body: SceneBody, scene: Scene, model: SoftBodyModel, sample: SamplePoint
+    ) -> None:
+        self._body, self._scene, self._model = body, scene, model
+        response, spec = model.response, body.spec.mesh
+        mesh = build_mesh(spec)
+        self._mirrors = snapshots.find_mirror_planes(mesh)
+        samples = snapshots.choose_sample_points(spec, mesh, self._mirrors, scene.finger.radius_m)
+        touchable = response.rest[response.contact_nodes]
+        distance = np.linalg.norm(touchable[response.faces].mean(axis=1) - sample.point, axis=1)
+        self._near = np.unique(response.faces[np.argsort(distance)[:CANDIDATE_FACES]])
+        points = np.array([one.point * signs for one in samples for signs in self._mirrors])
+        # A sample on a plane of symmetry is its own image: it counts once.
+        _, first = np.unique(np.round(points, 7), axis=0, return_index=True)
+        distances = np.linalg.norm(touchable[self._near][:, None] - points[None, first], axis=2)
+        closest = np.argsort(distances, axis=1)[:, : NEIGHBOURS + 1]
+        self._samples = [samples[k] for k in np.unique(first[closest] // len(self._mirrors))]
+        self.jobs = [
+            snapshots.make_snapshot_job(
+                spec,
+                mesh,
+                one,
+                poisson_ratio=body.spec.poisson_ratio,
+                finger_radius_m=scene.finger.radius_m,
+            )
+            for one in self._samples
+        ]
+
+    def body(self, solved: Sequence[Snapshot]) -> SceneBody:
+        """Return the body with this table, from the snapshots of `jobs`."""
+        response, radius = self._model.response, self._scene.finger.radius_m
+        linear = unit_linear_body(
+            response, self._body.shape, response.rest[self._model.bounds], radius
+        )
+        interpolator = SnapshotInterpolator(
+            place_snapshots(self._samples, solved, self._mirrors),
+            np.array(self._body.spec.mesh.towards_user),
+            radius,
+        )
+        near = replace(
+            response,
+            contact_nodes=response.contact_nodes[self._near],
+            normals=response.normals[self._near],
+        )
+        part = fill_table(near, self._model.triangles, linear, interpolator, lambda *_: None)
+        count = len(response.contact_nodes)
+        table = Table(
+            depths_m=part.depths_m,
+            fields=np.zeros((count, *part.fields.shape[1:]), dtype=np.float32),
+            force_n=np.zeros((count, *part.force_n.shape[1:])),
+            reach_m=np.full(count, 2.0 * END_SPAN_M),
+        )
+        table.fields[self._near] = part.fields
+        table.force_n[self._near] = part.force_n
+        table.reach_m[self._near] = part.reach_m
+        return attach_table(self._body, self._scene, self._model, table)
+
+
+def load_full_table(
+    body: SceneBody, scene: Scene, model: SoftBodyModel, cache_dir: Path
+) -> SceneBody | None:
+    """Return the body with its full table; None if the table is not cached."""
+    table = load_cached(table_cache(make_table_spec(scene, body.spec)), cache_dir)
+    return None if table is None else attach_table(body, scene, model, table)
+
+
+def has_focused_meshes(body: SceneBody) -> bool:
+    """Return whether the shape has meshes that are fine about the finger only."""
+    return isinstance(body.spec.mesh.geometry, Cylinder)

@@ -1,0 +1,180 @@
+"""Interpolate snapshots between their sample points: this fills a table.
+
+Near the finger the skin moves as at the solved sample, seen in that sample's frame: the field is
+transported with the point and its normal. Far from the finger the field belongs to the body and is
+not transported. So ends and supports, which do not move with the finger, keep their effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.fem_solver.mesh.solid import SUBTRIANGLES, triangle_shape_functions
+from nodes.fem_solver.snapshots import SamplePoint, Snapshot, reflect_snapshot
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+TRANSPORTED_RATIO, FIXED_RATIO = 2.5, 6.5
+"""The field is fully transported within the first distance from the point, in finger radii, and not
+at all beyond the second."""
+NEIGHBOURS = 7
+CANDIDATES = 4
+RIDGE = 1e-2
+"""Penalty of a slope against the spread of the neighbours, where these do not determine it."""
+
+
+CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [0.5, 0.0], [0.5, 0.5], [0.0, 0.5]])
+"""Local coordinates of the six nodes."""
+
+
+class SurfaceLocator:
+    """The skin of a mesh, with a search for points on it."""
+
+    def __init__(self, rest: Floats, faces: Ints) -> None:
+        """rest (s, 3) nodes, faces (f, 6)."""
+        from scipy.spatial import cKDTree
+
+        self._faces = faces
+        triangles = faces[:, SUBTRIANGLES].reshape(-1, 3)
+        corners = rest[triangles]
+        self._tree = cKDTree(corners.mean(axis=1))
+        self._origin = corners[:, 0]
+        sides = corners[:, 1:] - corners[:, :1]
+        gram = np.linalg.inv(sides @ sides.transpose(0, 2, 1))
+        self._sides, self._inverse = sides, gram @ sides
+
+    def weights(self, points: Floats) -> tuple[Ints, Floats]:
+        """Return nodes (q, 6) and shape functions (q, 6) at the skin points nearest to `points` (q,
+        3)."""
+        _, near = self._tree.query(points, k=CANDIDATES)
+        offset = points[:, None] - self._origin[near]
+        local = np.einsum("qkij,qkj->qki", self._inverse[near], offset)
+        local = np.maximum(local, 0.0)
+        local /= np.maximum(local.sum(axis=2, keepdims=True), 1.0)
+        residual = offset - np.einsum("qki,qkij->qkj", local, self._sides[near])
+        best = np.square(residual).sum(axis=2).argmin(axis=1)
+        rows = np.arange(len(points))
+        triangle, local = near[rows, best], local[rows, best]
+        part = CORNERS[SUBTRIANGLES[triangle % len(SUBTRIANGLES)]]
+        inner = part[:, 0] + np.einsum("qi,qij->qj", local, part[:, 1:] - part[:, :1])
+        return self._faces[triangle // len(SUBTRIANGLES)], triangle_shape_functions(inner)
+
+
+def minimal_rotation(start: Floats, end: Floats) -> Floats:
+    """Return the smallest rotation (3, 3) from one unit vector (3,) to another that is not
+    opposite."""
+    axis = np.cross(start, end)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + start @ end))
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedSnapshot:
+    """A snapshot, its sample point and a locator on its mesh."""
+
+    sample: SamplePoint
+    snapshot: Snapshot
+    locator: SurfaceLocator
+
+
+class SnapshotInterpolator:
+    """Interpolate snapshots at any point from the solved ones around it."""
+
+    def __init__(
+        self, solved: Sequence[PlacedSnapshot], towards_user: Floats, radius_m: float
+    ) -> None:
+        """solved: all at the same depths. towards_user (3,): a direction less than 180 degrees from
+        all normals. radius_m: the finger's."""
+        self._solved, self._user, self._radius = solved, towards_user, radius_m
+        self._points = np.array([one.sample.point for one in solved])
+        self.depths_m = solved[0].snapshot.depths_m
+
+    def interpolate(self, sample: SamplePoint, rest: Floats) -> tuple[Floats32, Floats, float]:
+        """Return skin displacement, force and reached depths of a push at a sample point.
+
+        rest (s, 3): skin nodes. Displacement (k, s, 3); force (k, 3) for 1 Pa; the mean number of
+        the k depths that the neighbours reached.
+        """
+        weights = self.neighbour_weights(sample)
+        moved: Floats32 | None = None
+        force = np.zeros(self._solved[0].snapshot.force_n.shape)
+        reached = 0.0
+        for number, weight in weights:
+            part, force_part = self._transport(self._solved[number], sample, rest)
+            moved = (
+                np.float32(weight) * part if moved is None else moved + np.float32(weight) * part
+            )
+            force += weight * force_part
+            reached += weight * self._solved[number].snapshot.reached
+        assert moved is not None
+        return moved, force, reached
+
+    def neighbour_weights(self, sample: SamplePoint) -> list[tuple[int, float]]:
+        """Return solved snapshots around a point with weights, which sum to one.
+
+        The weights are those of a local fit, linear over the surface: moving least squares
+        (Lancaster & Salkauskas 1981).
+        """
+        offset = self._points - sample.point
+        distances = np.linalg.norm(offset, axis=1)
+        order = np.argsort(distances, kind="stable")[: NEIGHBOURS + 1]
+        if distances[order[0]] < 1e-9:
+            return [(int(order[0]), 1.0)]
+        reach = 1.001 * distances[order[-1]]
+        near = np.flatnonzero(distances < reach)
+        frame = minimal_rotation(self._user, sample.normal)
+        across = (offset[near] @ frame)[:, _tangents(self._user)]
+        length = np.linalg.norm(across, axis=1, keepdims=True)
+        across *= distances[near, None] / np.maximum(length, 1e-12) / reach
+        weight = distances[near] / reach
+        kernel = (1.0 - weight) ** 4 * (4.0 * weight + 1.0) / np.maximum(weight, 1e-6)
+        basis = np.column_stack([np.ones(len(near)), across])
+        normal = (basis * kernel[:, None]).T @ basis
+        normal[1:, 1:] += RIDGE * kernel.sum() * np.eye(2)
+        weights = kernel * (basis @ np.linalg.solve(normal, np.array([1.0, 0.0, 0.0])))
+        return list(zip(near.tolist(), weights.tolist(), strict=True))
+
+    def _transport(
+        self, solved: PlacedSnapshot, sample: SamplePoint, rest: Floats
+    ) -> tuple[Floats32, Floats]:
+        rotation = (
+            minimal_rotation(self._user, solved.sample.normal)
+            @ minimal_rotation(self._user, sample.normal).T
+        )
+        distances = np.linalg.norm(rest - sample.point, axis=1) / self._radius
+        weight = np.clip((FIXED_RATIO - distances) / (FIXED_RATIO - TRANSPORTED_RATIO), 0.0, 1.0)
+        weight = (weight * weight * (3.0 - 2.0 * weight))[:, None]
+        there = solved.sample.point + (rest - sample.point) @ rotation.T
+        nodes, weights = solved.locator.weights(weight * there + (1.0 - weight) * rest)
+        moved = np.einsum(
+            "qa,kqai->kqi", weights.astype(np.float32), solved.snapshot.moved[:, nodes]
+        )
+        back = rotation.astype(np.float32)
+        part = weight.astype(np.float32)
+        return part * (moved @ back) + (1.0 - part) * moved, solved.snapshot.force_n @ rotation
+
+
+def _tangents(towards_user: Floats) -> list[int]:
+    """Return the two coordinate axes most nearly perpendicular to the direction to the user."""
+    return [axis for axis in range(3) if axis != int(np.abs(towards_user).argmax())]
+
+
+def place_snapshots(
+    samples: Sequence[SamplePoint], solved: Sequence[Snapshot], mirrors: Sequence[Floats]
+) -> list[PlacedSnapshot]:
+    """Return the snapshots with their mirror images; a sample on a mirror plane counts once."""
+    placed: dict[tuple[int, ...], PlacedSnapshot] = {}
+    for sample, snapshot in zip(samples, solved, strict=True):
+        for signs in mirrors:
+            image, at = reflect_snapshot(snapshot, sample, signs)
+            key = tuple(np.round(1e7 * at.point).astype(int))
+            placed.setdefault(
+                key, PlacedSnapshot(at, image, SurfaceLocator(image.rest, image.faces))
+            )
+    return list(placed.values())

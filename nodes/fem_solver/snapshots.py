@@ -1,0 +1,258 @@
+"""Define and solve the neo-Hookean snapshots of a table: sample points, depths, meshes, solutions.
+
+Young's modulus only scales the forces: all is solved for 1 Pa. A snapshot is one job, arrays in and
+arrays out, so that another process or machine can solve it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Cylinder, StripSupport
+from nodes.fem_solver.mesh import Focus, MeshSpec, SolidMesh, boundary_faces, cylinder_mesh
+
+Floats = NDArray[np.float64]
+Floats32 = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+DEPTHS_M = (0.0015, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.0175, 0.020, 0.0225)
+SPACING_RATIO = 0.35
+"""Skin spacing of the mesh at the push, in finger radii: 2.5 mm for the usual finger."""
+NEAR_RATIO = 1.5
+"""The mesh has this spacing within this many finger radii."""
+STATIONS = (0.0, 0.4, 0.7, 0.9)
+"""Positions of pushes on a cylinder along its axis, over half its length."""
+ANGLE_STEP_RAD, RIM_RAD = 0.42, 0.25
+"""Angles between pushes around a cylinder, and of the last one from the edge of the touchable
+part."""
+APART_RATIO, RIM_RATIO = 2.2, 0.9
+"""Pushes on other shapes: their distance, and that from untouchable skin, in finger radii."""
+TOLERANCE, MIN_STEP_FRACTION = 1e-5, 0.25
+"""Solver tolerance and minimum step, looser than the reference: a table needs no more."""
+SAME_RATIO = 1e-6
+
+
+class SnapshotCancelledError(Exception):
+    """The solution of a snapshot was asked to end."""
+
+
+@dataclass(frozen=True, slots=True)
+class SamplePoint:
+    """A surface point (3,) and its outward normal (3,), mesh frame."""
+
+    point: Floats
+    normal: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class SnapshotJob:
+    """The input of a snapshot: a finger pushed in at one point, depth by depth.
+
+    nodes (n, 3), elements (e, 10), fixed (n,); faces (f, 6) that the finger can touch.
+    """
+
+    nodes: Floats
+    elements: Ints
+    fixed: Bools
+    faces: Ints
+    sample: SamplePoint
+    poisson_ratio: float
+    finger_radius_m: float
+    depths_m: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The solution of a job.
+
+    rest (s, 3), six-node faces (f, 6). moved (k, s, 3): skin displacement at depths (k,). force (k,
+    3) on the finger for 1 Pa. reached: number of depths that converged; the last solution stands
+    for the others.
+    """
+
+    rest: Floats
+    faces: Ints
+    depths_m: Floats
+    moved: Floats32
+    force_n: Floats
+    reached: int
+
+
+def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False) -> Snapshot:
+    """Solve a job.
+
+    Raises SnapshotCancelledError once `stopped` returns true; other errors as `NeoHookeanBody`.
+    """
+    from nodes.fem_solver.newton import NeoHookeanBody  # late, as all that needs scipy
+
+    body = NeoHookeanBody(
+        job.nodes,
+        job.elements,
+        job.fixed,
+        job.faces,
+        young_modulus_pa=1.0,
+        poisson_ratio=job.poisson_ratio,
+        finger_radius_m=job.finger_radius_m,
+        tolerance=TOLERANCE,
+        min_step_fraction=MIN_STEP_FRACTION,
+        factor_dtype=np.float32,
+    )
+    skin_faces = boundary_faces(job.elements)
+    skin = np.unique(skin_faces)
+    path = [
+        job.sample.point + (job.finger_radius_m - d) * job.sample.normal for d in (0, *job.depths_m)
+    ]
+    states = []
+    for state in body.solve_load_steps(path):
+        if stopped():
+            raise SnapshotCancelledError
+        states.append(state)
+    states = states[1:]
+    return Snapshot(
+        rest=job.nodes[skin],
+        faces=np.searchsorted(skin, skin_faces),
+        depths_m=np.array(job.depths_m),
+        moved=np.array([state.displacement[skin] for state in states], dtype=np.float32),
+        force_n=np.array([state.force_n for state in states]),
+        reached=sum(state.reached for state in states),
+    )
+
+
+def find_mirror_planes(mesh: SolidMesh) -> list[Floats]:
+    """Return the reflections (3,) of signs that map the body and its support to themselves.
+
+    The identity is first. Only reflections across x and y are considered.
+    """
+    from scipy.spatial import cKDTree
+
+    # Other nodes need not be symmetric: they do not determine whether the body is.
+    some = np.union1d(mesh.contact_nodes, np.flatnonzero(mesh.fixed))
+    points, is_fixed = mesh.nodes[some], mesh.fixed[some]
+    tree, same = cKDTree(points), SAME_RATIO * float(np.ptp(points, axis=0).max())
+    free = [np.ones(3)]
+    for axis in (0, 1):
+        signs = np.ones(3)
+        signs[axis] = -1.0
+        distances, partner = tree.query(points * signs)
+        if distances.max() < same and np.array_equal(is_fixed[partner], is_fixed):
+            free += [one * signs for one in free]
+    return free
+
+
+def choose_sample_points(
+    spec: MeshSpec, mesh: SolidMesh, mirrors: list[Floats], radius_m: float
+) -> list[SamplePoint]:
+    """Return the points that have to be pushed so that, with mirror images, all touchable skin is
+    near.
+
+    radius_m: the finger's.
+    """
+    if isinstance(spec.geometry, Cylinder):
+        return _cylinder_sites(spec.geometry, spec.touch_angle_rad, mirrors)
+    points, normals = mesh.nodes[mesh.contact_nodes], mesh.contact_normals
+    chosen = np.ones(len(points), dtype=bool)
+    for axis in (0, 1):
+        if any(signs[axis] < 0.0 for signs in mirrors):
+            chosen &= points[:, axis] >= -1e-9
+    others = np.setdiff1d(mesh.skin, mesh.contact_nodes)
+    if len(others):
+        from scipy.spatial import cKDTree
+
+        rim, _ = cKDTree(mesh.nodes[others]).query(points)
+        inner = chosen & (rim > RIM_RATIO * radius_m)
+        chosen = inner if inner.any() else chosen
+    points, normals = points[chosen], normals[chosen]
+    # Farthest first: each next point is the farthest from all before.
+    numbers = [int((points @ np.array(spec.towards_user)).argmax())]
+    distances = np.linalg.norm(points - points[numbers[0]], axis=1)
+    while distances.max() > APART_RATIO * radius_m:
+        numbers.append(int(distances.argmax()))
+        distances = np.minimum(distances, np.linalg.norm(points - points[numbers[-1]], axis=1))
+    return [SamplePoint(points[number], normals[number]) for number in numbers]
+
+
+def _cylinder_sites(
+    cylinder: Cylinder, touch_rad: float, mirrors: list[Floats]
+) -> list[SamplePoint]:
+    last = max(touch_rad - RIM_RAD, 0.5 * touch_rad)
+    angles = np.linspace(0.0, last, int(np.ceil(last / ANGLE_STEP_RAD)) + 1)
+    x = 0.5 * cylinder.length_m * np.array(STATIONS)
+    if not any(signs[0] < 0.0 for signs in mirrors):
+        x = np.append(-x[:0:-1], x)
+    if not any(signs[1] < 0.0 for signs in mirrors):
+        angles = np.append(-angles[:0:-1], angles)
+    samples = []
+    for station, angle in itertools.product(x, angles):
+        normal = np.array([0.0, np.sin(angle), np.cos(angle)])
+        samples.append(SamplePoint(cylinder.radius_m * normal + [station, 0.0, 0.0], normal))
+    return samples
+
+
+def make_snapshot_job(
+    spec: MeshSpec,
+    mesh: SolidMesh,
+    sample: SamplePoint,
+    *,
+    poisson_ratio: float,
+    finger_radius_m: float,
+    spacing_m: float | None = None,
+) -> SnapshotJob:
+    """Return the job of a push.
+
+    Its mesh is fine only at the push where the shape has such meshes; otherwise it is `mesh`.
+    spacing_m: of skin nodes at the push; None: that of a table.
+    """
+    geometry, support = spec.geometry, spec.support
+    if isinstance(geometry, Cylinder) and isinstance(support, StripSupport):
+        focus = Focus(
+            x_m=float(sample.point[0]),
+            angle_rad=float(np.arctan2(sample.normal[1], sample.normal[2])),
+            near_m=NEAR_RATIO * finger_radius_m,
+        )
+        mesh = cylinder_mesh(
+            radius_m=geometry.radius_m,
+            length_m=geometry.length_m,
+            support_angle_rad=support.angle_rad,
+            touch_angle_rad=np.pi - 0.5 * support.angle_rad,
+            skin_spacing_m=spacing_m or min(SPACING_RATIO * finger_radius_m, spec.skin_spacing_m),
+            focus=focus,
+        )
+    return SnapshotJob(
+        nodes=mesh.nodes,
+        elements=mesh.elements,
+        fixed=mesh.fixed,
+        faces=mesh.contact_nodes[mesh.contact_faces],
+        sample=sample,
+        poisson_ratio=poisson_ratio,
+        finger_radius_m=finger_radius_m,
+        depths_m=DEPTHS_M,
+    )
+
+
+def reflect_snapshot(
+    answer: Snapshot, sample: SamplePoint, signs: Floats
+) -> tuple[Snapshot, SamplePoint]:
+    """Return the same snapshot on the body's mirror image."""
+    faces = answer.faces
+    if signs.prod() < 0.0:
+        faces = faces[:, [0, 2, 1, 5, 4, 3]]
+    image = replace(
+        answer,
+        rest=answer.rest * signs,
+        faces=faces,
+        moved=answer.moved * signs.astype(np.float32),
+        force_n=answer.force_n * signs,
+    )
+    return image, SamplePoint(sample.point * signs, sample.normal * signs)
+
+
+def decode_snapshot(content: dict[str, NDArray[Any]]) -> Snapshot:
+    """Return the snapshot that `nodes.cache.encode_fields` stored."""
+    return Snapshot(reached=int(content.pop("reached")), **content)

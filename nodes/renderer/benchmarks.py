@@ -1,0 +1,254 @@
+"""Measure the image correction's methods: the time of a stereo frame, and its image error.
+
+The time is that of a whole stereo frame: both eyes are drawn and the drawing is waited for; nothing
+is read. `floor` is the minimum of any method: clear, draw the same triangles once for each eye,
+with as many samples. The error is measured at each point that the eye sees on the true sheet. The
+reference shares no code with the renderer; the caller provides it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from typing import get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Cylinder, Scene, cylinder_of
+from messages.types import Correction, Display, Pattern
+from nodes.methods import Case, Family, Trial
+from nodes.models.rigid import rotation_from_vector, transform
+from nodes.models.shapes import make_shape
+from nodes.models.sheet import edge_poses
+from nodes.renderer import deflection_cache
+from nodes.renderer.gl import DrawStyle, headless_context
+from nodes.renderer.object_surface import make_surface
+from nodes.renderer.output import Image
+from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from nodes.renderer.sheet import SheetPose, estimate_sheet
+from nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
+
+Floats = NDArray[np.float64]
+
+ErrorMeasure = Callable[[Image, Image], Floats]
+"""Projector images of `coordinate_ramp_x` and `coordinate_ramp_y` to the errors (n,), m, at all
+points of the object that the eye sees."""
+
+ReferenceFactory = Callable[[Scene, Floats, Floats, Floats | None], ErrorMeasure]
+"""Returns an `ErrorMeasure` for a scene whose sheet has its left and right edge at two poses (4, 4)
+and is pushed by a fingertip (3,), or by none."""
+
+CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
+SHAPES: dict[str, Callable[[SheetPose], SheetMesh]] = {
+    "two_pass_triangles": pyramid_mesh,
+}
+"""Two passes onto cheaper shapes than the deflected sheet's own."""
+FLOOR = "floor"
+METHODS = (FLOOR, *CORRECTIONS, *SHAPES)
+WITHOUT_SHAPES = tuple(method for method in METHODS if method != "two_pass")
+CASES: tuple[tuple[float, float], ...] = (
+    *((tilt, 0) for tilt in (-50, -30, 30, 50)),
+    *((0, depth) for depth in (0, 10, 20, 30, 40, 50)),
+)
+"""Tilts (degrees) and pushes (mm)."""
+LARGE_CASES: tuple[tuple[float, float], ...] = ((-30, 0), (0, 30))
+SIZES_PX = ((800, 600), (1280, 720))
+STRETCH = 1.05
+SPACING_M = 0.0025
+
+
+def correction_family(reference: ReferenceFactory, *, solved: bool = True) -> Family:
+    """Return every correction over the tilts and pushes of the paper's figures 11 and 13.
+
+    The ends of the scene's working range are included. Without `solved`, only methods that need no
+    deflection shapes.
+    """
+    return Family(
+        name="correction",
+        unit="mm",
+        reference="rms error at the points the eye sees on the twin's sheet",
+        methods=METHODS if solved else WITHOUT_SHAPES,
+        trials=partial(_trials, reference, solved),
+        tolerance=lambda scene: 1e3 * scene.tolerances.image_m,
+    )
+
+
+MAX_TRIANGLES_DEPTH_MM = 3.5
+"""For this push a pyramid leaves half a millimetre (rms) of the true deflection."""
+
+
+def is_in_range(method: str, *, tilt_deg: float, push_mm: float) -> bool:
+    """Return whether a method's stated range covers a case.
+
+    `none` is for the sheet on the imaginary screen, `one_plane` for a flat one, `four_triangles`
+    for a push up to `MAX_TRIANGLES_DEPTH_MM`. Two passes have the range of their shape, up to 50
+    degrees of tilt.
+    """
+    if method == "none":
+        return tilt_deg == 0 and push_mm == 0
+    deepest_mm = {
+        FLOOR: -1.0,
+        "four_triangles": MAX_TRIANGLES_DEPTH_MM,
+        "two_pass_triangles": MAX_TRIANGLES_DEPTH_MM,
+        "two_pass": 60.0,
+    }.get(method, 0.0)
+    return push_mm <= deepest_mm and abs(tilt_deg) <= 50.0
+
+
+def roll_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float] | None = None) -> Floats:
+    """Return world_from_sheet tangent to the cylinder at a tilt.
+
+    place_m: (x, y) of the sheet where it touches; None: after rolling without slip from the upright
+    pose. Any other object is touched at its farthest skin point, by the sheet's middle.
+    """
+    if not isinstance(scene.object.geometry, Cylinder):
+        return _lay_sheet(scene, tilt_rad, place_m or (0.0, 0.0))
+    radius = cylinder_of(scene).radius_m
+    axis = pose_matrix(scene.object.world_from_object)[:3, 3]
+    rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
+    x, y = (0.0, -radius * tilt_rad) if place_m is None else place_m
+    return transform(rotation, axis + rotation @ np.array([-x, -y, radius]))
+
+
+def _lay_sheet(scene: Scene, tilt_rad: float, place_m: tuple[float, float]) -> Floats:
+    geometry = scene.object.geometry
+    skin = make_surface(
+        geometry,
+        make_shape(dict(geometry)),
+        world_from_object=pose_matrix(scene.object.world_from_object),
+        spacing_m=SPACING_M,
+    ).rest_world_m
+    rotation = rotation_from_vector([tilt_rad, 0.0, 0.0])
+    foremost = skin[(skin @ rotation[:, 2]).argmax()]
+    return transform(rotation, foremost - rotation @ np.array([*place_m, 0.0]))
+
+
+def scene_cases(scene: Scene) -> tuple[tuple[float, float], ...]:
+    """Return the ends of the scene's working range, as `CASES`."""
+    tilt = round(float(np.degrees(scene.working_range.tilt_rad)), 1)
+    return ((-tilt, 0.0), (tilt, 0.0), (0.0, round(1e3 * scene.working_range.push_depth_m, 3)))
+
+
+def scale_projector(scene: Scene, width_px: int, height_px: int) -> Scene:
+    """Return the scene with a projector of other pixels that lights the same width, and its
+    middle."""
+    projector = scene.projector
+    lens, scale = projector.lens, width_px / projector.width_px
+    cut = 0.5 * (projector.height_px * scale - height_px)
+    lens = lens.model_copy(
+        update={
+            "fx_px": lens.fx_px * scale,
+            "fy_px": lens.fy_px * scale,
+            "cx_px": (lens.cx_px + 0.5) * scale - 0.5,
+            "cy_px": (lens.cy_px + 0.5) * scale - 0.5 - cut,
+        }
+    )
+    size = {"width_px": width_px, "height_px": height_px, "lens": lens}
+    return scene.model_copy(update={"projector": projector.model_copy(update=size)})
+
+
+def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator[Trial]:
+    dents = deflection_cache.load_or_compute(scene, None) if solved else None
+    context = headless_context()
+    largest_deg = np.degrees(scene.working_range.tilt_rad) + 0.1
+    for size in SIZES_PX:
+        shown = scale_projector(scene, *size)
+        stage = SceneRenderer(shown, context, spacing_m=SPACING_M, dents=dents)
+        cases = (*CASES, *scene_cases(scene)) if size == SIZES_PX[0] else LARGE_CASES
+        for tilt_deg, push_mm in dict.fromkeys(cases):
+            if push_mm > 1e3 * scene.working_range.push_depth_m + 1e-9:
+                continue
+            case: Case = {
+                "tilt_deg": tilt_deg,
+                "push_mm": push_mm,
+                "width_px": size[0],
+                "height_px": size[1],
+            }
+            sheet, judgement = _situation(shown, reference, tilt_deg=tilt_deg, push_mm=push_mm)
+            in_scene = size == SIZES_PX[0] and abs(tilt_deg) <= largest_deg
+            for method in METHODS if solved else WITHOUT_SHAPES:
+                yield Trial(
+                    method=method,
+                    case=case,
+                    run=partial(draw_stereo, stage, method, sheet),
+                    error=partial(_error_mm, stage, method, sheet, judgement),
+                    in_range=is_in_range(method, tilt_deg=tilt_deg, push_mm=push_mm),
+                    in_scene=in_scene,
+                )
+        stage.release()
+    context.release()
+
+
+def _situation(
+    scene: Scene, reference: ReferenceFactory, *, tilt_deg: float, push_mm: float
+) -> tuple[SheetPose, Callable[[], ErrorMeasure]]:
+    """Return the predicted sheet, and a function that computes its error measure at the first
+    call."""
+    pose = roll_sheet(scene, np.radians(tilt_deg))
+    edges = edge_poses(pose, scene.sheet.width_m * STRETCH)
+    tip = pose[:3, 3] - 1e-3 * push_mm * pose[:3, 2] if push_mm else None
+    predicted = estimate_sheet(
+        *edges,
+        height_m=scene.sheet.height_m,
+        twist_world=np.zeros(6),
+        ahead_s=0.0,
+        finger_tip=tip,
+    )
+    assert predicted is not None
+    return predicted, cache(lambda: reference(scene, *edges, tip))
+
+
+def draw_stereo(stage: SceneRenderer, method: str, sheet: SheetPose) -> None:
+    """Draw one stereo frame by a method, or the floor."""
+    display = Display(correction=_correction_name(method), stereo="side_by_side")
+    look = DrawStyle(flat=False, pattern="object")
+    if method == FLOOR:
+        for eye in stage.eyes(display):
+            stage.canvas.draw_unresolved(stage.view(eye), look)
+    elif method in SHAPES:
+        stage.draw_onto(display, SHAPES[method](sheet), look, read=False)
+    else:
+        stage.draw(display, sheet, look, read=False)
+
+
+def draw_coordinate_ramps(
+    stage: SceneRenderer, method: str, sheet: SheetPose
+) -> tuple[Image, Image]:
+    """Return the projector's images of both coordinate ramps, for the scene's point of view."""
+    images = []
+    for pattern in COORDINATE_RAMPS:
+        display = Display(correction=_correction_name(method), stereo="mono", pattern=pattern)
+        look = DrawStyle(flat=True, pattern=pattern)
+        if method in SHAPES:
+            image = stage.draw_onto(display, SHAPES[method](sheet), look, read=True)
+        else:
+            image = stage.draw(display, sheet, look, read=True)
+        assert image is not None
+        images.append(image)
+    return images[0], images[1]
+
+
+COORDINATE_RAMPS: tuple[Pattern, Pattern] = ("coordinate_ramp_x", "coordinate_ramp_y")
+
+
+def _error_mm(
+    stage: SceneRenderer,
+    method: str,
+    sheet: SheetPose,
+    judgement: Callable[[], ErrorMeasure],
+    _drawn: None,
+) -> float:
+    """Return the root mean square error of all points seen; infinite when none is.
+
+    The floor corrects nothing.
+    """
+    errors_m = judgement()(*draw_coordinate_ramps(stage, method, sheet))
+    return 1e3 * float(np.sqrt(np.mean(errors_m**2))) if len(errors_m) else float("inf")
+
+
+def _correction_name(method: str) -> Correction:
+    for correction in CORRECTIONS:
+        if method == correction:
+            return correction
+    return "none" if method == FLOOR else "two_pass"

@@ -1,0 +1,99 @@
+"""Cache the sheet's deflection shapes, which take half a minute to solve."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from nodes.background import enter_background
+from nodes.cache import Specification, cached
+from nodes.models.sheet.dents import DentRange, DentShapes, Push, solve_dents, solve_push
+from nodes.models.sheet.rubber import Rubber
+
+Floats = NDArray[np.float64]
+
+VERSION = 2
+"""Version of the computation; another version solves the shapes again."""
+
+STRETCH_SLACK = 0.01
+"""Margin of stretch that the arms may add to the scene's limits."""
+
+FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
+"""Fields of `DentShapes` that are in the file, in their order."""
+
+MAX_DEPTH_RATIO = 1.2
+"""Maximum solved depth over the scene's push depth."""
+
+Progress = Callable[[int, int], None]
+
+
+def required_shapes(scene: Scene) -> tuple[Rubber, DentRange]:
+    """Return the sheet of a scene, and the pushes for which the scene needs shapes."""
+    sheet = scene.sheet
+    rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
+    within = DentRange(
+        least_stretch=max(1.005, sheet.min_stretch_ratio - STRETCH_SLACK),
+        largest_stretch=sheet.max_stretch_ratio + STRETCH_SLACK,
+        deepest_m=MAX_DEPTH_RATIO * scene.working_range.push_depth_m,
+    )
+    return rubber, within
+
+
+def shapes_cache(scene: Scene) -> Specification[DentShapes]:
+    """Describe the cache file of the scene's deflection shapes.
+
+    A sheet's shapes depend neither on its thickness nor on its modulus; so neither does the name.
+    """
+    rubber, within = required_shapes(scene)
+    depends_on = {
+        "version": VERSION,
+        "width_m": rubber.width_m,
+        "height_m": rubber.height_m,
+        "finger_radius_m": scene.finger.radius_m,
+        **asdict(within),
+    }
+
+    def decode(content: dict[str, Floats]) -> DentShapes:
+        return DentShapes(
+            rubber,
+            scene.finger.radius_m,
+            within.deepest_m,
+            *(content[name] for name in FIELDS),
+        )
+
+    return Specification(
+        "dents",
+        depends_on,
+        lambda shapes: {name: getattr(shapes, name) for name in FIELDS},
+        decode,
+    )
+
+
+def load_or_compute(
+    scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
+) -> DentShapes:
+    """Return the scene's cached shapes, or solve them on all cores and store them."""
+    rubber, within = required_shapes(scene)
+
+    def solve_all(pushes: Sequence[Push]) -> Iterator[Floats]:
+        with ProcessPoolExecutor(
+            mp_context=get_context("spawn"), initializer=enter_background
+        ) as workers:
+            for done, solved in enumerate(workers.map(solve_push, pushes), start=1):
+                progress(done, len(pushes))
+                yield solved
+
+    return cached(
+        shapes_cache(scene),
+        cache_dir,
+        lambda: solve_dents(
+            rubber, within=within, finger_radius_m=scene.finger.radius_m, solve_all=solve_all
+        ),
+    )

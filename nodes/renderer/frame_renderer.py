@@ -1,0 +1,201 @@
+"""Draw one frame from the newest messages, and describe it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from messages.base import Header
+from messages.clock import Clock
+from messages.types import (
+    ArmState,
+    Display,
+    Eye,
+    Fingertip,
+    Frame,
+    SheetTarget,
+    Skin,
+    SoftBody,
+)
+from nodes.node import Input
+from nodes.renderer.display_latency import DisplayLatencyEstimator
+from nodes.renderer.output import both_eyes, select_drawn_eyes, select_eyes, which_eye
+from nodes.renderer.output_window import OutputWindow
+from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.renderer.sheet_pose_predictor import SheetPosePredictor, predict_fingertip
+from nodes.renderer.skin_extrapolator import SkinExtrapolator
+
+VISIBLE_CHANGE_M = 1e-4
+"""A fifth of a pixel of half a millimetre. A smaller change is shown a second late."""
+
+FLANGE_TO_SHEET_M = 0.15
+"""Distance of the sheet's points from the flange that holds its edge."""
+
+
+@dataclass(frozen=True, slots=True)
+class RendererInputs:
+    """The inputs that a frame is drawn from."""
+
+    skin: Input[Skin]
+    soft_body: Input[SoftBody]
+    fingertip: Input[Fingertip]
+    sheet_target: Input[SheetTarget]
+    arm_left: Input[ArmState]
+    arm_right: Input[ArmState]
+    eye: Input[Eye]
+
+
+class FrameRenderer:
+    """Draw a scene's frames on an output; count them, and those whose light was late."""
+
+    def __init__(
+        self,
+        scene_renderer: SceneRenderer,
+        screen: OutputWindow,
+        ports: RendererInputs,
+        latency: DisplayLatencyEstimator,
+        clock: Clock,
+        *,
+        max_age_s: float,
+    ) -> None:
+        self.scene_renderer = scene_renderer
+        self.note = ""
+        self.late = self.superseded = 0
+        self._output, self._ports, self._latency, self._clock = screen, ports, latency, clock
+        self._max_age_s = max_age_s
+        self._sheet_predictor = SheetPosePredictor(max_age_s=max_age_s)
+        self._extrapolator = SkinExtrapolator()
+        self._number = 0
+        self._drawn_of: tuple[object, ...] = ()
+        self._drawn_arms: tuple[ArmState | None, ArmState | None] = (None, None)
+        if ports.soft_body.message is not None and ports.soft_body.header is not None:
+            self.on_soft_body(ports.soft_body.message, ports.soft_body.header)
+
+    def is_unchanged(self, shown: Display) -> bool:
+        """Return whether a frame would equal the last one: nothing touches, nothing moves."""
+        ports = self._ports
+        arms = (ports.arm_left.message, ports.arm_right.message)
+        others = (ports.skin.message, ports.eye.message, shown)
+        return (
+            len(self._drawn_of) == len(others)
+            and all(one is other for one, other in zip(self._drawn_of, others, strict=True))
+            and not is_touched(ports.fingertip.message, ports.soft_body.message)
+            and not any(map(has_moved, self._drawn_arms, arms))
+        )
+
+    def render(self, shown: Display, begun_ns: int, *, with_pixels: bool) -> tuple[Frame, int]:
+        """Draw a frame and hand it to the output; also return its exposure (ns).
+
+        The frame's light times assume that no window shows it; see `on_shown`.
+        """
+        ports, scene_renderer = self._ports, self.scene_renderer
+        self._drawn_of = (ports.skin.message, ports.eye.message, shown)
+        self._drawn_arms = (ports.arm_left.message, ports.arm_right.message)
+        predicted_to_ns = self._latency.predict_light_ns(begun_ns)
+        horizon_s = (predicted_to_ns - self._clock.now_ns()) * 1e-9
+        source_ns, shaped_for_ns = self._shape(begun_ns, predicted_to_ns)
+        tracked = ports.eye.message if ports.eye.age_s() <= self._max_age_s else None
+        eyes, across, eye_note = select_eyes(scene_renderer.scene.eyes, tracked)
+        finger_tip = predict_fingertip(ports.fingertip, horizon_s, max_age_s=self._max_age_s)
+        sheet = self._sheet_predictor.update(
+            scene_renderer,
+            ports.arm_left,
+            ports.arm_right,
+            ports.sheet_target,
+            finger_tip,
+            horizon_s=horizon_s,
+            eye=eyes.centre_world_m,
+        )
+        self._number += 1
+        pair = both_eyes(eyes, shown.stereo, across)
+        which = which_eye(shown.stereo, self._number, shows_both=self._output.shows_both)
+        picture = scene_renderer.draw(
+            shown,
+            sheet,
+            scene_renderer.draw_style(shown, finger_tip, ports.sheet_target.message),
+            read=with_pixels,
+            eyes=select_drawn_eyes(pair, shown.stereo, which, swap_eyes=shown.swap_eyes),
+            drawn=lambda number: self._output.take(number, scene_renderer.canvas.resolved),
+        )
+        drawn_ns = self._clock.now_ns()
+        light_ns = 0
+        if not self._output.is_seen:
+            light_ns = self._latency.record_drawn(begun_ns, drawn_ns)
+            self.late += self._latency.is_late(light_ns, predicted_to_ns)
+        self.note = "; ".join(
+            filter(None, (self._sheet_predictor.note, scene_renderer.note, eye_note))
+        )
+        frame = Frame(
+            number=self._number,
+            correction=shown.correction,
+            stereo=shown.stereo,
+            label=shown.label,
+            eye=which,
+            eyes_world_m=pair,
+            world_from_sheet=sheet.world_from_sheet,
+            pushed_point_world_m=sheet.contact_point,
+            predicted_to_ns=predicted_to_ns,
+            draw_s=(drawn_ns - begun_ns) * 1e-9,
+            drawn_ns=drawn_ns,
+            light_ns=light_ns,
+            late_frames=self.late,
+            shaped_for_ns=shaped_for_ns,
+            fingertip_world_m=np.zeros((0, 3)) if finger_tip is None else finger_tip[None],
+            occluded_fraction=scene_renderer.occluded_fraction,
+            pixels=() if picture is None else (picture,),
+        )
+        return frame, source_ns
+
+    def on_shown(self, frame: Frame, swapped_ns: int) -> Frame:
+        """Return the frame with the window's measured times; `swapped_ns` 0: a newer frame replaced
+        it."""
+        if not swapped_ns:
+            self.superseded += 1
+            return frame
+        begun_ns = frame.drawn_ns - round(frame.draw_s * 1e9)
+        light_ns = self._latency.record_shown(begun_ns, frame.drawn_ns, swapped_ns)
+        self.late += self._latency.is_late(light_ns, frame.predicted_to_ns)
+        return frame.model_copy(
+            update={"swapped_ns": swapped_ns, "light_ns": light_ns, "late_frames": self.late}
+        )
+
+    def on_soft_body(self, body: SoftBody, header: Header) -> None:
+        """Add a response of the solver."""
+        self._extrapolator.add(body, header)
+
+    def _shape(self, now_ns: int, light_ns: int) -> tuple[int, int]:
+        """Deform the drawn object as predicted; the last response of a silent solver stays, at any
+        age.
+
+        Returns the exposure (ns) of the frame, and the instant of the indentation.
+        """
+        ports, scene_renderer = self._ports, self.scene_renderer
+        skin, fresh = ports.skin.message, ports.soft_body.age_s() <= self._max_age_s
+        if skin is not None and scene_renderer.mesh_id != skin.mesh_id:
+            scene_renderer.set_skin(skin)
+        body, shaped_for_ns = self._extrapolator.extrapolate(
+            light_ns if fresh else 0, self._clock.id
+        )
+        if body is None or body.mesh_id != scene_renderer.mesh_id:
+            body, shaped_for_ns = None, 0
+        scene_renderer.deform(body)
+        header = ports.soft_body.header if fresh else ports.fingertip.header
+        recent = fresh or ports.fingertip.age_s() <= self._max_age_s
+        return (header.source_ns if recent and header is not None else now_ns), shaped_for_ns
+
+
+def is_touched(fingertip: Fingertip | None, soft_body: SoftBody | None) -> bool:
+    """Return whether there is a finger, or an indentation that it has left."""
+    if fingertip is not None and fingertip.valid:
+        return True
+    return soft_body is not None and bool(soft_body.displacement_world_m.any())
+
+
+def has_moved(before: ArmState | None, now: ArmState | None) -> bool:
+    """Return whether an arm moved its edge of the sheet visibly, more than servo ripple does."""
+    if before is None or now is None:
+        return before is not now
+    change = np.abs(now.world_from_flange - before.world_from_flange)
+    shift_m = change[:3, 3].max() + FLANGE_TO_SHEET_M * change[:3, :3].max()
+    return bool(shift_m > VISIBLE_CHANGE_M)

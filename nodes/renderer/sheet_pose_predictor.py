@@ -1,0 +1,79 @@
+"""Predict the sheet and the fingertip at the instant when the light leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.types import ArmState, Fingertip, SheetTarget
+from nodes.models.prediction import path_at
+from nodes.node import Input
+from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from nodes.renderer.sheet import SheetPose, estimate_sheet
+
+Floats = NDArray[np.float64]
+
+
+class SheetPosePredictor:
+    """Predict the sheet from the measured flange poses; keep the last valid sheet without them.
+
+    Poses older than `max_age_s` are not used. `note` gives the reason why the last plane is kept;
+    empty otherwise.
+    """
+
+    def __init__(self, *, max_age_s: float) -> None:
+        self._max_age_s = max_age_s
+        self._sheet: SheetPose | None = None
+        self.note = ""
+
+    def update(
+        self,
+        scene_renderer: SceneRenderer,
+        left: Input[ArmState],
+        right: Input[ArmState],
+        target: Input[SheetTarget],
+        finger_tip: Floats | None,
+        *,
+        horizon_s: float,
+        eye: Floats,
+    ) -> SheetPose:
+        """Return the sheet `horizon_s` from now; before the first measured pose, the one at rest.
+
+        finger_tip: (3,) at that instant, or None. eye: (3,) the point of view.
+        """
+        sheet, age_s = None, max(left.age_s(), right.age_s())
+        if left.message is not None and right.message is not None and age_s <= self._max_age_s:
+            arms = scene_renderer.scene.arms
+            moving = target.message is not None and target.age_s() <= self._max_age_s
+            sheet = estimate_sheet(
+                left.message.world_from_flange @ pose_matrix(arms.left.flange_from_edge),
+                right.message.world_from_flange @ pose_matrix(arms.right.flange_from_edge),
+                height_m=scene_renderer.scene.sheet.height_m,
+                twist_world=target.message.twist_world
+                if moving and target.message is not None
+                else np.zeros(6),
+                ahead_s=age_s + horizon_s,
+                finger_tip=finger_tip,
+            )
+        if sheet is not None and scene_renderer.usable(sheet, eye):
+            self._sheet, self.note = sheet, ""
+            return sheet
+        why = "sheet edge-on or facing away"
+        if sheet is None:
+            fresh = age_s <= self._max_age_s
+            why = "flange poses fit no sheet" if fresh else f"arm poses {age_s:.2f} s old"
+        self.note = f"{why}: keeping the last valid sheet plane"
+        if self._sheet is None:
+            self._sheet = scene_renderer.sheet_at_rest()
+        return self._sheet
+
+
+def predict_fingertip(
+    finger: Input[Fingertip], horizon_s: float, *, max_age_s: float
+) -> Floats | None:
+    """Return the fingertip (3,) `horizon_s` from now, or None when it is not known."""
+    age_s = finger.age_s()
+    if finger.message is None or not finger.message.valid or age_s > max_age_s:
+        return None
+    message = finger.message
+    return path_at(message.ahead_world_m, message.ahead_step_s, age_s + horizon_s)[0]
