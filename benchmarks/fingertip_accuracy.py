@@ -30,10 +30,10 @@ from numpy.typing import NDArray
 from benchmarks.tracking_bench import (
     CALIBRATION_FILE,
     MACHINE,
+    DiscCutouts,
     Frame,
-    Motion,
     Observer,
-    Seen,
+    TruePathCase,
     bench_scene,
     twin_camera,
 )
@@ -97,7 +97,7 @@ def exact_calibration(scene: Scene, folder: Path) -> Path:
     return folder / "true.yaml"
 
 
-async def follow(scene: Scene, walk: Walk, calibration: Path) -> list[Seen]:
+async def follow(scene: Scene, walk: Walk, calibration: Path) -> list[DiscCutouts]:
     camera = twin_camera(scene, CLUTTER["lab"])
     frames = [Frame(t, camera) for t in walk.moments(1.0 / scene.camera.rate_hz)]
     observer = await Observer(scene, calibration=calibration).start()
@@ -108,7 +108,7 @@ def bound_m2(scene: Scene, walk: Walk) -> Floats:
     """(3,) mean over the places of the least variance per axis."""
     camera = twin_camera(scene, CLUTTER["lab"])
 
-    def around(place: int) -> Motion:
+    def around(place: int) -> TruePathCase:
         return lambda offset_s: walk.at(place * APART_S + offset_s)
 
     bounds = [
@@ -118,7 +118,7 @@ def bound_m2(scene: Scene, walk: Walk) -> Floats:
     return np.asarray(np.mean([np.diag(bound.position_m2) for bound in bounds], axis=0))
 
 
-def single_errors(seen: Sequence[Seen]) -> Floats:
+def single_errors(seen: Sequence[DiscCutouts]) -> Floats:
     """(n, 3) m of single pictures that have a measured point."""
     return np.array(
         [
@@ -129,7 +129,7 @@ def single_errors(seen: Sequence[Seen]) -> Floats:
     )
 
 
-def tracked_errors(seen: Sequence[Seen]) -> Floats:
+def tracked_errors(seen: Sequence[DiscCutouts]) -> Floats:
     """(n, 3) m of valid fingertips of settled tracks."""
     settled = [one for place, one in enumerate(seen) if place % FRAMES >= SETTLED_FRAMES]
     return np.array([one.error_m for one in settled if one.valid])

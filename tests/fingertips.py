@@ -23,8 +23,8 @@ def fingertip(
         position_world_m=position,
         velocity_world_m_per_s=moving,
         covariance=np.eye(6) * 1e-8,
-        ahead_world_m=even_path(position, moving, count=13, step_s=STEP_S),
-        ahead_step_s=STEP_S,
+        predicted_path_world_m=even_path(position, moving, count=13, step_s=STEP_S),
+        prediction_step_s=STEP_S,
         measured_world_m=position,
         reprojection_px=0.1,
     )

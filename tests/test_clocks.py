@@ -287,8 +287,8 @@ async def test_a_stamp_that_is_passed_on_is_of_the_clock_that_the_header_names()
     zeros = np.zeros(3)
     fingertip = Fingertip(
         valid=True, state="tracking", reason="ok", position_world_m=zeros,
-        velocity_world_m_per_s=zeros, covariance=np.eye(6), ahead_world_m=np.zeros((1, 3)),
-        ahead_step_s=0.01, measured_world_m=zeros, reprojection_px=0.0,
+        velocity_world_m_per_s=zeros, covariance=np.eye(6), predicted_path_world_m=np.zeros((1, 3)),
+        prediction_step_s=0.01, measured_world_m=zeros, reprojection_px=0.0,
     )  # fmt: skip
     stamped = replace(SOME_HEADER, clock_id="there", source_ns=50_099 * S, publish_ns=50_100 * S)
     await node.step("fingertip", fingertip, stamped)

@@ -25,12 +25,12 @@ from nodes.twin.clutter import (
     Highlight,
     Moving,
     Occluder,
-    SecondMark,
+    SecondMarker,
     Sheet,
     Still,
     Swinging,
     covered,
-    second_mark,
+    second_marker,
     together,
     touching_highlight,
 )
@@ -236,7 +236,8 @@ def plain(rig: StereoCamera) -> TwinCamera:
 def of_the_mark(camera: TwinCamera, time_s: float = 0.0) -> tuple[Floats, Floats]:
     """The light (height, width) that the mark adds to each view."""
     lit, unlit = (
-        camera.levels(still, exposure_s=0.004, mark=mark, time_s=time_s) for mark in (True, False)
+        camera.levels(still, exposure_s=0.004, marker=marker, time_s=time_s)
+        for marker in (True, False)
     )
     left, right = (np.asarray(a, float) - b for a, b in zip(lit, unlit, strict=True))
     return left, right
@@ -269,12 +270,12 @@ def test_a_second_mark_is_where_it_was_asked_for(
 ) -> None:
     if np.hypot(*offset) < 0.015:
         offset = (offset[0] + 0.03, offset[1])
-    camera = looking(rig, Clutter(marks=(SecondMark(Still((*offset, 0.0)), carried=True),)))
+    camera = looking(rig, Clutter(markers=(SecondMarker(Still((*offset, 0.0)), carried=True),)))
     ground = plain.levels(still, exposure_s=0.004)
     changes = of_the_clutter(camera, plain)
     for eye, change, under in zip(camera.eyes, changes, ground, strict=True):
         # Where it lies over the first mark's fringe it changes nothing.
-        share = change / np.maximum(camera.sensor.mark_level - under, 5.0)
+        share = change / np.maximum(camera.sensor.marker_level - under, 5.0)
         place = eye.see(TIP + np.array([*offset, 0.0]))[0]
         assert np.abs(centre_and_spread(share)[0] - place).max() < 0.1
 
@@ -444,7 +445,7 @@ def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera)
 def test_nothing_in_the_lab_looks_like_a_mark(rig: StereoCamera) -> None:
     """Neither as bright over six pixels as half of the mark's height, nor as large."""
     camera = looking(rig, CLUTTER["lab"])
-    for image in camera.picture(still, exposure_s=0.004, mark=False):
+    for image in camera.picture(still, exposure_s=0.004, marker=False):
         bright = (image > 140).astype(np.uint8)
         sizes = cv2.connectedComponentsWithStats(bright)[2][1:, cv2.CC_STAT_AREA]
         assert max(sizes.tolist(), default=0) < 6
@@ -465,7 +466,7 @@ BESIDE = np.array([0.05, 0.0, 0.0])
 @pytest.fixture(scope="module")
 def disc(rig: StereoCamera) -> TwinCamera:
     """A mark on even ground, beside the finger."""
-    return looking(rig, sensor=EVEN).altered(mark_offset_m=BESIDE)
+    return looking(rig, sensor=EVEN).altered(marker_offset_m=BESIDE)
 
 
 def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera) -> None:
@@ -477,7 +478,7 @@ def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera
         background_level=40.0, texture_level=0.0, photons_per_level=1e9, read_noise=3.0,
         noisy_backgrounds=1, aperture_m=1e-6,
     )  # fmt: skip
-    camera = looking(rig, sensor=sensor).altered(mark_radius_m=0.006, mark_offset_m=BESIDE)
+    camera = looking(rig, sensor=sensor).altered(marker_radius_m=0.006, marker_offset_m=BESIDE)
     bound = fingertip_bound(camera, still, exposure_s=0.0)
     for eye, covariance in zip(camera.eyes, bound.views_px2, strict=True):
         _, depth_m = eye.see(TIP + BESIDE)
@@ -530,7 +531,7 @@ def test_the_bound_widens_with_defocus_speed_and_saturation(disc: TwinCamera) ->
     blurred = Sensor(background_level=40.0, texture_level=0.0, blur_px=2.5)
     assert size(disc.altered(sensor=blurred)) > 1.5 * plain
     assert size(disc, 1.5) > 1.2 * plain
-    dim = Sensor(background_level=40.0, texture_level=0.0, mark_level=100.0)
+    dim = Sensor(background_level=40.0, texture_level=0.0, marker_level=100.0)
     assert size(disc.altered(sensor=dim)) > 2.0 * plain
 
 
@@ -550,4 +551,4 @@ def test_there_is_no_bound_where_the_mark_cannot_be_seen(rig: StereoCamera) -> N
             fingertip_bound(looking(rig), lambda _, p=place: np.array(p), exposure_s=0.004)
     with pytest.raises(BoundError, match="right view"):
         fingertip_bound(looking(rig, covered(1.0, views="right")), still, exposure_s=0.004)
-    assert fingertip_bound(looking(rig, second_mark((0.03, 0.0, 0.0))), still, exposure_s=0.004)
+    assert fingertip_bound(looking(rig, second_marker((0.03, 0.0, 0.0))), still, exposure_s=0.004)

@@ -175,7 +175,7 @@ class Seen:
         ahead = fg.LinePrimitive(
             type=fg.LinePrimitiveLineType.LineStrip,
             thickness=0.001,
-            points=[_point(one) for one in message.ahead_world_m],
+            points=[_point(one) for one in message.predicted_path_world_m],
             color=colour,
         )
         entity = fg.SceneEntity(

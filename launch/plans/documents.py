@@ -248,8 +248,31 @@ def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:
             yield from _lines(item, (*key, i))
 
 
+RENAMED_KEYS = {
+    "ahead_s": "prediction_horizon_s",
+    "forget_after_s": "track_timeout_s",
+    "mark": "marker",
+    "mark_max_area_px": "marker_max_area_px",
+    "mark_min_area_px": "marker_min_area_px",
+    "mark_min_contrast": "marker_min_contrast",
+    "mark_noise_px": "marker_noise_px",
+    "mark_radius_m": "marker_radius_m",
+}
+"""Keys of launch files, scenes and parameters that were renamed, and their names of today."""
+
+RENAMED_VALUES = {
+    ("tracking", "hand"): "singer_tremor",
+    ("tracking", "exponential"): "one_euro",
+    ("triangulation", "midpoint"): "dlt",
+    ("triangulation", "optimal"): "dlt",
+}
+"""Values that a key no longer takes, and the one to write instead."""
+
+
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """The remedy for a name that does not exist: the nearest one, or all there are."""
+    """Return the remedy for an unknown name: its new name, the nearest one, or all there are."""
+    if RENAMED_KEYS.get(str(name)) in known:
+        return f'it was renamed: write "{RENAMED_KEYS[str(name)]}"'
     near = get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
@@ -264,9 +287,8 @@ def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise BadInputError(
-            [_problem_of(item, model, document, at) for item in error.errors()]
-        ) from None
+        problems = [_problem_of(item, model, document, at) for item in error.errors()]
+        raise BadInputError(list(dict.fromkeys(problems))) from None
 
 
 def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key) -> Problem:
@@ -280,7 +302,13 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
         return document.problem(
             (*at, *inside, name), f'unknown key "{name}"', did_you_mean(name, known)
         )
-    key = (*at, *_walk(model, location)[0])
+    # Pydantic names the option of a union of literals, which is no key of the file.
+    path = [part for part in _walk(model, location)[0] if not str(part).startswith("literal[")]
+    key = (*at, *path)
+    replacement = RENAMED_VALUES.get((str(key[-1]), str(error["input"]))) if key else None
+    if replacement is not None:
+        what = f"{_shown(error['input'])} does not fit"
+        return document.problem(key, what, f'it was renamed or removed: write "{replacement}"')
     message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
     return document.problem(key, f"{_shown(error['input'])} does not fit", message)
 

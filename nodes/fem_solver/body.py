@@ -191,4 +191,4 @@ def faded(response: Response, lost_s: float, *, hold_s: float, relax_s: float) -
 
 def position_at(fingertip: Fingertip, lead_s: float) -> Floats:
     """Where the fingertip is expected `lead_s` after its exposure, m, world."""
-    return path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, lead_s)[0]
+    return path_at(fingertip.predicted_path_world_m, fingertip.prediction_step_s, lead_s)[0]

@@ -93,10 +93,14 @@ class Planner(Node):
         else:
             if self.parameters.lead_s is None:
                 before_s = self._lead_s
-                furthest_s = (len(fingertip.ahead_world_m) - 1) * fingertip.ahead_step_s
+                furthest_s = (
+                    len(fingertip.predicted_path_world_m) - 1
+                ) * fingertip.prediction_step_s
                 self._lead_s = next_lead_s(before_s, age_s + self.parameters.arrival_s, furthest_s)
                 step_s += self._lead_s - before_s
-            point, velocity = path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, self._lead_s)
+            point, velocity = path_at(
+                fingertip.predicted_path_world_m, fingertip.prediction_step_s, self._lead_s
+            )
             planned = plan.follow_finger(point, velocity, yielding, step_s)
         self._publish(planned, source_ns)
 

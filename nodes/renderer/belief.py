@@ -74,4 +74,4 @@ def finger_tip_at(finger: Input[Fingertip], lead_s: float, *, stale_s: float) ->
     if finger.message is None or not finger.message.valid or age_s > stale_s:
         return None
     message = finger.message
-    return path_at(message.ahead_world_m, message.ahead_step_s, age_s + lead_s)[0]
+    return path_at(message.predicted_path_world_m, message.prediction_step_s, age_s + lead_s)[0]

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 Point = tuple[float, float, float]
 Views = Literal["both", "left", "right"]
 
-MARK_RADIUS_M = 0.003
+MARKER_RADIUS_M = 0.003
 FINGER_LENGTH_M = 0.06
 FINGER_DIRECTION: Point = (0.0, -0.5, 0.866)
 """World direction from the tip to the knuckle: up from below, out of the mark's sight."""
@@ -78,11 +78,11 @@ class Limb:
 
 
 @dataclass(frozen=True, slots=True)
-class SecondMark:
+class SecondMarker:
     """A bead like the mark."""
 
     path: Path
-    radius_m: float = MARK_RADIUS_M
+    radius_m: float = MARKER_RADIUS_M
     level: float = 215.0
     carried: bool = False
     views: Views = "both"
@@ -134,21 +134,21 @@ class Clutter:
 
     sheet: Sheet | None = None
     limbs: tuple[Limb, ...] = ()
-    marks: tuple[SecondMark, ...] = ()
+    markers: tuple[SecondMarker, ...] = ()
     highlights: tuple[Highlight, ...] = ()
     occluders: tuple[Occluder, ...] = ()
 
 
-def second_mark(offset_m: Point, *, level: float = 215.0, views: Views = "both") -> Clutter:
+def second_marker(offset_m: Point, *, level: float = 215.0, views: Views = "both") -> Clutter:
     """A second mark at a fixed offset from the first."""
-    return Clutter(marks=(SecondMark(Still(offset_m), level=level, carried=True, views=views),))
+    return Clutter(markers=(SecondMarker(Still(offset_m), level=level, carried=True, views=views),))
 
 
 def touching_highlight(
     overlap: float, *, radius_m: float = 0.0015, level: float = 300.0, views: Views = "both"
 ) -> Clutter:
     """A highlight beside the mark along x that covers `overlap` (0..1) of its diameter."""
-    aside_m = MARK_RADIUS_M + radius_m - overlap * 2.0 * MARK_RADIUS_M
+    aside_m = MARKER_RADIUS_M + radius_m - overlap * 2.0 * MARKER_RADIUS_M
     spot = Highlight(Still((aside_m, 0.0, 0.0)), radius_m, level, carried=True, views=views)
     return Clutter(highlights=(spot,))
 
@@ -166,7 +166,7 @@ def covered(share: float, *, level: float = 60.0, views: Views = "both") -> Clut
         edge = brentq(
             lambda x: (np.arccos(x) - x * np.sqrt(1.0 - x * x)) / np.pi - share, -1.0, 1.0
         )
-    middle_m = edge * MARK_RADIUS_M + radius_m
+    middle_m = edge * MARKER_RADIUS_M + radius_m
     ends = [Still((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
     return Clutter(
         occluders=(Occluder(ends[0], ends[1], radius_m, level, carried=True, views=views),)
@@ -181,7 +181,7 @@ def together(*parts: Clutter) -> Clutter:
     return Clutter(
         sheet=sheets[0] if sheets else None,
         limbs=tuple(limb for part in parts for limb in part.limbs),
-        marks=tuple(mark for part in parts for mark in part.marks),
+        markers=tuple(marker for part in parts for marker in part.markers),
         highlights=tuple(spot for part in parts for spot in part.highlights),
         occluders=tuple(occluder for part in parts for occluder in part.occluders),
     )
@@ -223,7 +223,7 @@ CLAMPS = Clutter(
 """Glints on what clamps the sheet's edges."""
 
 PASSING = Clutter(
-    marks=(SecondMark(Swinging((0.0, 0.05, 0.02), (0.14, 0.02, 0.0), 7.3)),),
+    markers=(SecondMarker(Swinging((0.0, 0.05, 0.02), (0.14, 0.02, 0.0), 7.3)),),
     highlights=(
         Highlight(Swinging((0.03, 0.0, 0.005), (0.05, 0.06, 0.0), 3.1), 0.0015, 300.0),
         Highlight(

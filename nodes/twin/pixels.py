@@ -27,10 +27,10 @@ from nodes.twin.clutter import (
     CLUTTER,
     FINGER_DIRECTION,
     FINGER_LENGTH_M,
-    MARK_RADIUS_M,
+    MARKER_RADIUS_M,
     Clutter,
     Highlight,
-    SecondMark,
+    SecondMarker,
     Sheet,
     Still,
 )
@@ -84,7 +84,7 @@ class Sensor:
     exposure: factor on all light; above 1 the mark saturates.
     """
 
-    mark_level: float = 215.0
+    marker_level: float = 215.0
     finger_level: float = 85.0
     background_level: float = 32.0
     texture_level: float = 9.0
@@ -174,8 +174,8 @@ class TwinCamera:
     ) -> None:
         self.camera = camera
         self.finger_radius_m = finger_radius_m
-        self.mark_radius_m = MARK_RADIUS_M
-        self.mark_offset_m = np.zeros(3)
+        self.marker_radius_m = MARKER_RADIUS_M
+        self.marker_offset_m = np.zeros(3)
         self.sensor = Sensor() if sensor is None else sensor
         self.clutter = CLUTTER["none"] if clutter is None else clutter
         self._random = np.random.default_rng(seed)
@@ -194,21 +194,21 @@ class TwinCamera:
         self,
         *,
         sensor: Sensor | None = None,
-        mark_radius_m: float | None = None,
-        mark_offset_m: Floats | None = None,
+        marker_radius_m: float | None = None,
+        marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
         """The same camera before the same background, with another mark or sensor for the rest.
 
-        mark_offset_m: where the mark sits, from the fingertip, in the world's directions.
+        marker_offset_m: where the mark sits, from the fingertip, in the world's directions.
         """
         other = copy.copy(self)
         other.sensor = self.sensor if sensor is None else sensor
-        other.mark_radius_m = self.mark_radius_m if mark_radius_m is None else mark_radius_m
-        other.mark_offset_m = self.mark_offset_m if mark_offset_m is None else mark_offset_m
+        other.marker_radius_m = self.marker_radius_m if marker_radius_m is None else marker_radius_m
+        other.marker_offset_m = self.marker_offset_m if marker_offset_m is None else marker_offset_m
         return other
 
     def picture(
-        self, position: Position, *, exposure_s: float, mark: bool = True, time_s: float = 0.0
+        self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Image, Image]:
         """The left and right pictures of a fingertip at `position(seconds from mid-exposure)`.
 
@@ -217,19 +217,19 @@ class TwinCamera:
         """
         instants_s, tips = self._instants(position, exposure_s)
         left, right = (
-            self._exposed(eye, self._draw(eye, tips, time_s + instants_s, mark=mark))
+            self._exposed(eye, self._draw(eye, tips, time_s + instants_s, marker=marker))
             for eye in self.eyes
         )
         return left, right
 
     def levels(
-        self, position: Position, *, exposure_s: float, mark: bool = True, time_s: float = 0.0
+        self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Singles, Singles]:
         """Both pictures (height, width) as light: before noise, saturation and rounding."""
         instants_s, tips = self._instants(position, exposure_s)
         pictures = []
         for eye in self.eyes:
-            windows = self._draw(eye, tips, time_s + instants_s, mark=mark)
+            windows = self._draw(eye, tips, time_s + instants_s, marker=marker)
             pictures.append(eye.canvas.copy())
             _wipe(eye, windows)
         return pictures[0], pictures[1]
@@ -259,7 +259,7 @@ class TwinCamera:
         noise = self._grain[start : start + levels.size].reshape(levels.shape)
         return quantized(levels + self.sensor.noise(levels) * noise)
 
-    def _draw(self, eye: Eye, tips: Floats, times_s: Floats, *, mark: bool) -> list[Window]:
+    def _draw(self, eye: Eye, tips: Floats, times_s: Floats, *, marker: bool) -> list[Window]:
         """Draw all that is not background on the eye's canvas; gives the windows it touches.
 
         tips: (n, 3) over the exposure, times_s: (n,).
@@ -278,9 +278,9 @@ class TwinCamera:
         ends = np.stack([tip, tip + FINGER_LENGTH_M * np.array(FINGER_DIRECTION)])
         radii_m = (self.finger_radius_m, 1.2 * self.finger_radius_m)
         windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, way, lit=True))
-        if mark:
-            at = tips + self.mark_offset_m
-            windows.append(self._disc(eye, at, self.mark_radius_m, sensor.mark_level))
+        if marker:
+            at = tips + self.marker_offset_m
+            windows.append(self._disc(eye, at, self.marker_radius_m, sensor.marker_level))
         for thing in _spots(clutter, eye.side):
             if not _is_static(thing):
                 places = np.stack([thing.path.at(float(instant)) for instant in times_s])
@@ -295,7 +295,7 @@ class TwinCamera:
                 windows.append(self._limb(eye, ends, radii_m, occluder.level, moved, lit=False))
         return [window for window in windows if window is not None]
 
-    def _spot(self, eye: Eye, thing: SecondMark | Highlight, places: Floats) -> Window | None:
+    def _spot(self, eye: Eye, thing: SecondMarker | Highlight, places: Floats) -> Window | None:
         adds = isinstance(thing, Highlight)
         return self._disc(eye, places, thing.radius_m, thing.level, adds=adds)
 
@@ -409,7 +409,7 @@ class TwinCamera:
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
             texture += share * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
         level = self.sensor.background_level + self.sensor.texture_level * texture
-        return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.mark_level), dtype=np.float32)
+        return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.marker_level), dtype=np.float32)
 
     def _grained(self, sheet: Sheet) -> Singles:
         """The sheet's levels, one per half grain: fine grain, blotches, one side lit more."""
@@ -483,13 +483,13 @@ def quantized(levels: Singles) -> Image:
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
 
-def _spots(clutter: Clutter, side: Side) -> list[SecondMark | Highlight]:
+def _spots(clutter: Clutter, side: Side) -> list[SecondMarker | Highlight]:
     """The marks and highlights that one camera sees."""
-    spots: list[SecondMark | Highlight] = [*clutter.marks, *clutter.highlights]
+    spots: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     return [spot for spot in spots if spot.views in ("both", side)]
 
 
-def _is_static(thing: SecondMark | Highlight) -> bool:
+def _is_static(thing: SecondMarker | Highlight) -> bool:
     return isinstance(thing.path, Still) and not thing.carried
 
 
