@@ -20,7 +20,7 @@ TrackingMethod = Literal[
 ]
 KinematicsMethod = Literal["closed_form_continuous"]
 """The one by which an arm's way is checked beforehand: its steps have to stay on that branch."""
-SheetForceMethod = Literal["linear", "cubic", "scaled", "table"]
+SheetForceMethod = Literal["linear", "scaled", "table"]
 SheetShapeMethod = Literal["flat", "four_triangles", "dents"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 SoftBodyMethod = Literal["linear", "nonlinear_table"]

@@ -41,6 +41,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     },
     ("Methods", "triangulation"): {"midpoint": "dlt", "optimal": "dlt"},
     ("Methods", "tracking"): {"hand": "singer_tremor", "exponential": "one_euro"},
+    ("Methods", "sheet_force"): {"cubic": "scaled"},
     ("Methods", "kinematics"): {"closed_form": "closed_form_continuous"},
 }
 """By model and today's field name: recorded literal values and those of today."""

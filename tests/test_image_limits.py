@@ -21,7 +21,7 @@ from nodes.renderer.sheet_mesh import SheetMesh
 from nodes.renderer.stage import Stage
 from nodes.twin.eye import seen
 from nodes.twin.places import error_map
-from tests.dent_shapes import DEEPEST_M, few_dents
+from tests.indentation_bases import DEEPEST_M, few_dents
 
 Floats = NDArray[np.float64]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")

@@ -25,7 +25,7 @@ from nodes.renderer.stage import NO_DENTS, Stage
 from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen
 from nodes.twin.membrane import DeformedSheet, Rubber, solve
 from nodes.twin.true_object import TrueBody
-from tests.dent_shapes import few_dents
+from tests.indentation_bases import few_dents
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -180,7 +180,7 @@ def test_dent_shapes_are_kept_and_found_again(
         solves.append(rubber)
         return few_dents()
 
-    monkeypatch.setattr(dent_cache, "solve_dents", solve_few)
+    monkeypatch.setattr(dent_cache, "solve_indentation_basis", solve_few)
     assert dent_cache.load(SCENE, tmp_path) is None
     dent_cache.load_or_solve(SCENE, tmp_path)
     kept = dent_cache.load_or_solve(SCENE, tmp_path)

@@ -12,7 +12,7 @@ from nodes.methods import Point, measure, pareto_front
 from nodes.renderer import dent_cache, families
 from nodes.renderer.families import correction_family, covers, with_projector_of
 from nodes.renderer.stage import projector_homography
-from tests.dent_shapes import few_dents
+from tests.indentation_bases import few_dents
 
 SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
 

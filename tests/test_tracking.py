@@ -356,11 +356,11 @@ def test_a_late_point_mends_the_track(name: str) -> None:
     order = [*range(30), 31, 32, 30, 34, 33, 35, 36, 37, 38, 39]
     in_order, shuffled = new_tracker(name), new_tracker(name)
     for frame in range(40):
-        in_order.take(frame * FRAME_NS, points[frame], NOISE)
+        in_order.update(frame * FRAME_NS, points[frame], NOISE)
     late = 0
     for frame in order:
         late += shuffled.is_late(frame * FRAME_NS)
-        shuffled.take(frame * FRAME_NS, points[frame], NOISE)
+        shuffled.update(frame * FRAME_NS, points[frame], NOISE)
     assert late == 2
     horizons_s = np.array([0.0, 0.05])
     assert shuffled.predict_at(39 * FRAME_NS, horizons_s).ahead == pytest.approx(
@@ -390,7 +390,7 @@ def test_a_late_point_is_judged_as_one_in_time(off_m: float) -> None:
     astray = still(0.0) + np.array([off_m, 0.0, 0.0])
     in_time = new_tracker()
     feed(in_time, still, range(58))
-    if in_time.take(58 * FRAME_NS, astray, NOISE) == "too_fast":
+    if in_time.update(58 * FRAME_NS, astray, NOISE) == "too_fast":
         tracker.update(58 * FRAME_NS, astray, NOISE)
         assert tracker.estimate is before
     else:

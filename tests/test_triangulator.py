@@ -223,7 +223,12 @@ async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCa
     header = Header(1, 1, 1, "virtual", "camera", 1)
     full, wide = np.zeros((480, 640), np.uint8), np.zeros((480, 752), np.uint8)
     for device, left, origin, said in (
-        ("webcam", full, (0, 0), 'images of device "webcam"; the scene\'s camera is "twin-'),
+        (
+            "webcam",
+            full,
+            (0, 0),
+            'images of device "webcam"; the scene\'s camera is "twin-bumblebee"',
+        ),
         ("twin-bumblebee", wide, (0, 0), "left image of 752x480 px at column 0, row 0"),
         ("twin-bumblebee", full, (0, 8), "left image of 640x480 px at column 0, row 8"),
     ):

@@ -101,7 +101,7 @@ TUNABLES = (
         "sheet-force",
         "sheet_force",
         ("launch.methods.families:SHEET_LAWS", "launch.methods.families:SHEET_FORCE"),
-        _by_name("linear", "cubic", "scaled", "table"),
+        _by_name("linear", "scaled", "table"),
     ),
     Tunable(
         "sheet-shape",

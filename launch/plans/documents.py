@@ -263,6 +263,7 @@ RENAMED_KEYS = {
 RENAMED_VALUES = {
     ("tracking", "hand"): "singer_tremor",
     ("tracking", "exponential"): "one_euro",
+    ("sheet_force", "cubic"): "scaled",
     ("triangulation", "midpoint"): "dlt",
     ("triangulation", "optimal"): "dlt",
 }

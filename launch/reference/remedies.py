@@ -142,7 +142,7 @@ REMEDIES = {
     "ImageMismatchError": "let the scene name the camera that the pictures are from.",
     "PlacesError": "correct the row that is named in joints.csv, or take the place again.",
     "HandEyeError": "take more places, with the board turned about at least two axes.",
-    "FitError": "add pushes at other stretches and depths.",
+    "SheetModelFitError": "add pushes at other stretches and depths.",
     "BoardError": "choose a board that fits into the pictures: fewer or smaller squares.",
     "UnfitGeometryError": "choose an object whose shape that command can handle.",
     "UnfitCurveError": "give force over depth from zero, rising, without repeats.",

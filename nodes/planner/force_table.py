@@ -14,24 +14,23 @@ from messages.methods import SheetForceMethod
 from messages.scene import Scene
 from nodes.cache import default_cache_dir, load_arrays, save_arrays
 from nodes.methods import Progress
-from nodes.models.sheet.laws import CubicLaw, LinearLaw, ScaledLaw, SheetLaw
+from nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel, SheetForceModel
 from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.table import TableLaw
+from nodes.models.sheet.tabulated import TabulatedSheetModel
 from nodes.planner.sheet_force import membrane_table, rubber_of
 
 VERSION = 1
 """Of the table's making; another one makes it anew."""
 
 KEPT = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
-"""Fields of `TableLaw` that are in the file."""
+"""Fields of `TabulatedSheetModel` that are in the file."""
 
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
 """Places, over the sheet's width and height."""
 
-LAWS: dict[str, Callable[[Rubber], SheetLaw]] = {
-    "linear": LinearLaw,
-    "cubic": CubicLaw,
-    "scaled": ScaledLaw,
+LAWS: dict[str, Callable[[Rubber], SheetForceModel]] = {
+    "linear": LinearSheetModel,
+    "scaled": ScaledSheetModel,
 }
 
 
@@ -47,19 +46,19 @@ def file_of(scene: Scene, cache_dir: Path | None) -> Path:
     return (cache_dir or default_cache_dir()) / f"sheet-force-{digest}.npz"
 
 
-def load(scene: Scene, cache_dir: Path | None) -> TableLaw | None:
+def load(scene: Scene, cache_dir: Path | None) -> TabulatedSheetModel | None:
     """The scene's table, or None where it is not kept, or the file is damaged."""
     kept = load_arrays(file_of(scene, cache_dir))
     if kept is None or not kept.keys() >= set(KEPT):
         return None
     stretches, depths_m, xs_m, ys_m, ratios = (kept[name] for name in KEPT)
-    base = ScaledLaw(rubber_of(scene.sheet))
-    return TableLaw(base, stretches, depths_m, xs_m, ys_m, ratios)
+    base = ScaledSheetModel(rubber_of(scene.sheet))
+    return TabulatedSheetModel(base, stretches, depths_m, xs_m, ys_m, ratios)
 
 
 def load_or_make(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
-) -> TableLaw:
+) -> TabulatedSheetModel:
     """The scene's table from the cache; else made by the membrane's finite elements, and kept."""
     table = load(scene, cache_dir)
     if table is not None:
@@ -78,7 +77,9 @@ def load_or_make(
     return table
 
 
-def law_by(scene: Scene, method: SheetForceMethod, cache_dir: Path | None) -> tuple[SheetLaw, str]:
+def law_by(
+    scene: Scene, method: SheetForceMethod, cache_dir: Path | None
+) -> tuple[SheetForceModel, str]:
     """The scene's ideal sheet by a method, and what to say of it: a table that nobody made yet is
     stood in for by the scaled law."""
     rubber = rubber_of(scene.sheet)
@@ -86,5 +87,7 @@ def law_by(scene: Scene, method: SheetForceMethod, cache_dir: Path | None) -> tu
         return LAWS[method](rubber), method
     table = load(scene, cache_dir)
     if table is None:
-        return ScaledLaw(rubber), "scaled law: no table of the sheet's force (flexsheet prepare)"
+        return ScaledSheetModel(
+            rubber
+        ), "scaled; there is no table of the sheet's force: run flexsheet prepare"
     return table, method

@@ -17,7 +17,7 @@ from scipy.interpolate import LinearNDInterpolator
 from messages.scene import Scene
 from nodes.methods import Case, Family, Trial, up_to
 from nodes.models.sheet import edge_poses
-from nodes.models.sheet.dents import triangles_of
+from nodes.models.sheet.indentation import triangulate_grid
 from nodes.models.sheet.membrane import push_path
 from nodes.renderer import dent_cache
 from nodes.renderer.sheet import Sheet, sheet_between
@@ -92,7 +92,7 @@ def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
                 finger_radius_m=scene.finger.radius_m,
             )
             rows, columns = pushed.rest_m.shape[:2]
-            return SheetMesh(pushed.positions[0].reshape(-1, 3), triangles_of(rows, columns))
+            return SheetMesh(pushed.positions[0].reshape(-1, 3), triangulate_grid(rows, columns))
 
         shapes: dict[str, Callable[[Sheet], SheetMesh]] = {
             "flat": flat_mesh,
@@ -104,7 +104,7 @@ def _trials(judge: Judge, solved: bool, scene: Scene) -> Iterator[Trial]:
         }
         if dents is not None:
             shapes |= {"dents": partial(dented_mesh, dents=dents), "membrane": elements}
-            in_range |= {"dents": not dents.outside(stretch, place, depth), "membrane": True}
+            in_range |= {"dents": not dents.invalid_reason(stretch, place, depth), "membrane": True}
         truth = judge(scene, *edges, tip)
         case: Case = {"stretch": stretch, "depth_mm": 1e3 * depth, "place": where}
         for method, shape in shapes.items():

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.models.rigid import apply, inverse
-from nodes.models.sheet.dents import DentShapes, triangles_of
+from nodes.models.sheet.indentation import IndentationBasis, triangulate_grid
 from nodes.renderer.correction import GRAZING_SINE, LEAST_PUSH_M
 from nodes.renderer.sheet import Sheet
 
@@ -64,11 +64,11 @@ def finer(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
     return SheetMesh(vertices, triangles.astype(np.int32), mesh.note)
 
 
-_grid_triangles = cache(triangles_of)
+_grid_triangles = cache(triangulate_grid)
 """The same array for the same grid, so that nobody need compare it."""
 
 
-def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
+def dented_mesh(sheet: Sheet, dents: IndentationBasis) -> SheetMesh:
     """The sheet as it narrows by its stretch and dents by its fingertip.
 
     Edges that are turned to one another turn the flat sheet evenly between them; the dent is added
@@ -95,7 +95,7 @@ def dented_mesh(sheet: Sheet, dents: DentShapes) -> SheetMesh:
     return SheetMesh(
         vertices,
         _grid_triangles(rows, columns),
-        dents.outside(stretch, place, depth_m),
+        dents.invalid_reason(stretch, place, depth_m),
     )
 
 
