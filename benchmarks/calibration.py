@@ -28,7 +28,7 @@ from nodes.camera.corners import BoardPair, CornerFinder, board_points, find_pai
 from nodes.camera.selection import fit_pairs
 from nodes.models import rigid
 from nodes.twin.board import TwinBoard
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -85,7 +85,7 @@ FINDERS = {
 
 def judge_finders() -> None:
     board = Board(columns=9, rows=6, square_m=0.025)
-    twin = TwinBoard(true_camera(load_scene(SCENE).camera), board, seed=SEED)
+    twin = TwinBoard(make_true_camera(load_scene(SCENE).camera), board, seed=SEED)
     pictures = []
     for pose in twin.poses(POSES):
         pictures += list(zip(twin.pair(pose), twin.corners(pose), strict=True))

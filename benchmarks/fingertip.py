@@ -22,13 +22,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.fingertip_bound import fingertip_bound
 from launch.plans.plan import load_scene
 from messages.scene import Scene
 from nodes.triangulator.fingertip import DetectorConfig, detect
 from nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from nodes.triangulator.tracking import Gate
 from nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
-from nodes.twin.bound import fingertip_bound
 from nodes.twin.clutter import CLUTTER
 from nodes.twin.pixels import TwinCamera
 

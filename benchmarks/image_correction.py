@@ -40,9 +40,9 @@ from nodes.renderer.families import (
 from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.sheet import Sheet, sheet_between
 from nodes.renderer.stage import Stage
-from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen, tilt_sizes
+from nodes.twin.error_map import ErrorMap, error_map
+from nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen, tilt_sizes
 from nodes.twin.membrane import DeformedSheet, NotConvergedError
-from nodes.twin.places import ErrorMap, error_map
 from nodes.twin.true_object import TrueBody
 
 Floats = NDArray[np.float64]
@@ -63,7 +63,7 @@ class Bench:
         dents = dent_cache.load_or_solve(scene, None)
         self.stage = Stage(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
-        self._proper = proper(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
+        self._expected = render_expected(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
         unmoved = self.situation(np.eye(4), None)
         self._whole = len(self.errors("none", *unmoved).sizes_m)
 
@@ -98,12 +98,12 @@ class Bench:
         truth: DeformedSheet,
         sizes: Callable[[Image, float], Sequence[float]],
     ) -> Floats:
-        """Of each size (m), against the proper picture; the drawn object is not deformed."""
+        """Of each size (m), against the expected picture; the drawn object is not deformed."""
         shown = Display(correction=correction, stereo="mono", shading="flat", marks=False)
         projected = self.stage.draw(shown, believed, Look(True, "object"), read=True)
         assert projected is not None
         picture = seen(projected, truth, self.scene, eye=self._eye)
-        wanted = np.array(sizes(self._proper, METRES_PER_PX))
+        wanted = np.array(sizes(self._expected, METRES_PER_PX))
         return np.asarray(np.abs(np.array(sizes(picture, METRES_PER_PX)) - wanted))
 
     def errors(self, method: str, believed: Sheet, truth: DeformedSheet) -> ErrorMap:

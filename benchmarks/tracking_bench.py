@@ -24,7 +24,7 @@ from nodes.triangulator.parameters import TriangulatorParameters
 from nodes.twin.clutter import Clutter
 from nodes.twin.finger import FingerMotion
 from nodes.twin.pixels import Sensor, TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 TruePathCase = Callable[[float], Floats]
@@ -153,7 +153,7 @@ def twin_camera(
 ) -> TwinCamera:
     """The camera of the rig as it really stands."""
     return TwinCamera(
-        true_camera(scene.camera),
+        make_true_camera(scene.camera),
         finger_radius_m=scene.finger.radius_m,
         seed=seed,
         clutter=clutter,

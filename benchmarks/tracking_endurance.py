@@ -56,13 +56,13 @@ from nodes.twin.clutter import (
     MARKER_RADIUS_M,
     NAIL,
     Clutter,
+    FixedPoint,
     Highlight,
     Occluder,
-    Path,
+    Oscillation,
     SecondMarker,
     Sheet,
-    Still,
-    Swinging,
+    Trajectory,
     together,
 )
 from nodes.twin.gestures import GESTURES
@@ -92,18 +92,18 @@ def crowd(random: np.random.Generator) -> Clutter:
         x, y, z = random.normal(MIDDLE_M, SPREAD_M).tolist()
         return x, y, z
 
-    def swinging(least_m: float, most_m: float, fastest_s: float, slowest_s: float) -> Swinging:
+    def swinging(least_m: float, most_m: float, fastest_s: float, slowest_s: float) -> Oscillation:
         way = random.normal(0.0, 1.0, 3) * (1.0, 1.0, 0.3)
         x, y, z = (random.uniform(least_m, most_m) * way / np.linalg.norm(way)).tolist()
         period_s, phase = random.uniform(fastest_s, slowest_s), random.uniform(0.0, 2.0 * np.pi)
-        return Swinging(place(), (x, y, z), float(period_s), float(phase))
+        return Oscillation(place(), (x, y, z), float(period_s), float(phase))
 
     markers = [
         SecondMarker(swinging(0.06, 0.2, 2.0, 8.0), level=float(random.uniform(150.0, 235.0)))
         for _ in range(int(random.integers(1, 3)))
     ]
     if random.random() < 0.5:
-        markers.append(SecondMarker(Still(place()), level=float(random.uniform(150.0, 235.0))))
+        markers.append(SecondMarker(FixedPoint(place()), level=float(random.uniform(150.0, 235.0))))
     highlights = [
         Highlight(
             swinging(0.06, 0.2, 2.0, 6.0),
@@ -116,7 +116,7 @@ def crowd(random: np.random.Generator) -> Clutter:
     top_x, reach_x, period_s = random.normal(0.0, 0.05), random.uniform(0.2, 0.4), 6.0
     phase = float(random.uniform(0.0, 2.0 * np.pi))
     ends = [
-        Swinging((float(top_x), y, z), (float(reach_x), 0.0, 0.0), period_s, phase)
+        Oscillation((float(top_x), y, z), (float(reach_x), 0.0, 0.0), period_s, phase)
         for y, z in ((0.35, -0.05), (-0.35, 0.35))
     ]
     cable = Occluder(
@@ -164,7 +164,7 @@ def in_full_view(camera: TwinCamera, frame: Frame, tip: Floats) -> bool:
     """Whether nothing comes between the mark and either camera, nor runs into it."""
     clutter = camera.clutter
     blobs: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
-    things: list[tuple[str, Path, Path, float]] = [
+    things: list[tuple[str, Trajectory, Trajectory, float]] = [
         (blob.views, blob.path, blob.path, blob.radius_m) for blob in blobs if not blob.carried
     ]
     things += [(one.views, one.start, one.end, one.radius_m) for one in clutter.occluders]

@@ -46,8 +46,8 @@ from nodes.twin.clutter import (
     CLUTTER,
     MARKER_RADIUS_M,
     Clutter,
+    FixedPoint,
     Occluder,
-    Still,
     second_marker,
     together,
     touching_highlight,
@@ -172,7 +172,7 @@ def before(camera: TwinCamera) -> Callable[[Frame], Frame]:
 def hidden_in_one_view(scene: Scene, edge: float, repetition: int) -> Stage:
     """Something dark with a straight edge, so many radii from the mark's centre, hides the rest."""
     middle_m = edge * MARKER_RADIUS_M + SCREEN_M
-    ends = [Still((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
+    ends = [FixedPoint((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
     screen = Occluder(ends[0], ends[1], SCREEN_M, level=30.0, carried=True, views="right")
     camera = _camera(Clutter(occluders=(screen,)))
     return passing(scene, drawing(scene, repetition), before(camera))

@@ -30,6 +30,7 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
         "ahead_step_s": "prediction_step_s",
     },
     "Methods": {"mark": "marker"},
+    "TwinEye": {"proper": "expected"},
 }
 """By model, messages and their parts alike: recorded field names and those of today."""
 

@@ -434,4 +434,4 @@ class TwinEye(Message):
     correction: Correction
     metres_per_px: Positive = Field(description="of the picture, on the imaginary screen")
     seen: ColorImage
-    proper: ColorImage
+    expected: ColorImage

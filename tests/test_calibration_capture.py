@@ -35,7 +35,7 @@ from nodes.camera.corners import (
 from nodes.camera.printing import raster, svg, write_board
 from nodes.models import rigid
 from nodes.twin.board import TwinBoard
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -127,7 +127,7 @@ def test_charuco_boards_that_cannot_be_are_refused(change: dict[str, Any], said:
 def shown(
     board: Board, camera: StereoCamera, count: int, *, seed: int
 ) -> list[tuple[Image, Image]]:
-    twin = TwinBoard(true_camera(camera), board, seed=seed)
+    twin = TwinBoard(make_true_camera(camera), board, seed=seed)
     return [twin.pair(pose) for pose in twin.poses(count)]
 
 
@@ -145,7 +145,7 @@ def test_charuco_boards_seen_in_part_calibrate_a_rig(camera: StereoCamera, tmp_p
     calibrated = calibrate_stereo(left[:9], right[:9], board=CHARUCO, device="made")
     seen = [len(pair.left.ids) for pair in calibrated.pairs.values()]
     assert min(seen) < 24
-    true = true_camera(camera)
+    true = make_true_camera(camera)
     calibration = calibrated.calibration
     assert calibration.left.fx_px == pytest.approx(true.left.fx_px, rel=4e-3)
     assert calibration.right_from_left[:3, 3] == pytest.approx(
@@ -158,7 +158,7 @@ def test_charuco_boards_seen_in_part_calibrate_a_rig(camera: StereoCamera, tmp_p
 
 
 def test_the_same_corner_has_the_same_number_in_both_views(camera: StereoCamera) -> None:
-    twin = TwinBoard(true_camera(camera), CHARUCO, seed=2)
+    twin = TwinBoard(make_true_camera(camera), CHARUCO, seed=2)
     finder = CornerFinder(CHARUCO)
     compared = 0
     for pose in twin.poses(4):
@@ -332,7 +332,7 @@ def test_the_twin_is_calibrated_by_the_command(
     assert calibration.device == camera.device
     assert calibration.opencv_version == cv2.__version__
     assert "# flexsheet calibrate stereo --twin" in output.read_text()
-    assert calibration.left.fx_px == pytest.approx(true_camera(camera).left.fx_px, rel=5e-3)
+    assert calibration.left.fx_px == pytest.approx(make_true_camera(camera).left.fx_px, rel=5e-3)
 
     page = (report / "index.html").read_text()
     for word in ("Calibration of twin-bumblebee", "right_from_left.tx_m", "mm in depth"):

@@ -28,7 +28,7 @@ from nodes.camera.uncertainty import (
 )
 from nodes.models import rigid
 from nodes.twin.board import TwinBoard
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,7 +59,7 @@ def half(lens: Lens) -> Lens:
 @cache
 def small_camera() -> StereoCamera:
     """The true rig with half as many pixels each way: four times as quick to draw."""
-    camera = true_camera(scene_camera())
+    camera = make_true_camera(scene_camera())
     return camera.model_copy(
         update={
             "width_px": 320,
@@ -100,7 +100,7 @@ def calibrated(
 @cache
 def exact_corners(count: int) -> tuple[tuple[Floats, Floats], ...]:
     """Corners of the board in many poses, without any noise."""
-    board = TwinBoard(true_camera(scene_camera()), BOARD, seed=5)
+    board = TwinBoard(make_true_camera(scene_camera()), BOARD, seed=5)
     return tuple(board.corners(pose) for pose in board.poses(count))
 
 
@@ -117,7 +117,7 @@ def noisy(*, seed: int, sigma_px: float, count: int = 12) -> list[BoardPair]:
 
 
 def test_slopes_of_corners_are_those_of_differences() -> None:
-    rig = numbers_of(true_camera(scene_camera()))
+    rig = numbers_of(make_true_camera(scene_camera()))
     pose = np.array([0.3, -0.4, 0.1, -0.05, -0.04, 0.45])
     (pair,) = noisy(seed=1, sigma_px=0.1, count=1)
     pair = BoardPair(
@@ -154,7 +154,7 @@ def best_points(rig: Floats, start: Floats, left: Floats, right: Floats) -> Floa
 
 
 def test_slopes_of_positions_are_those_of_differences() -> None:
-    rig = numbers_of(true_camera(scene_camera()))
+    rig = numbers_of(make_true_camera(scene_camera()))
     grid = view_of_work(rig, (640, 480), 0.5)
     assert grid[:, 2] == pytest.approx(0.5)
     points = grid[[0, 12]]
@@ -179,7 +179,7 @@ def drawn(rig: Floats, points: Floats) -> tuple[Floats, Floats]:
 
 def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
     """Corners with independent noise: the errors of 40 fits scatter as each of them states."""
-    true = numbers_of(true_camera(scene_camera()))
+    true = numbers_of(make_true_camera(scene_camera()))
     slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
     scores, shifts, stated = [], [], []
     for seed in range(40):
@@ -198,7 +198,7 @@ def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
 
 
 def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
-    true = numbers_of(true_camera(scene_camera()))
+    true = numbers_of(make_true_camera(scene_camera()))
     slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
     pairs = noisy(seed=3, sigma_px=0.05, count=20)
     fit = fit_pairs(pairs, POINTS, (640, 480))
@@ -215,7 +215,7 @@ def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
 
 def test_boards_that_bend_are_told_by_the_jackknife_alone() -> None:
     """Corners that err together: the fit believes in many small errors, refits tell better."""
-    camera = true_camera(scene_camera())
+    camera = make_true_camera(scene_camera())
     true = numbers_of(camera)
     random = np.random.default_rng(8)
     board = TwinBoard(camera, BOARD, seed=5)
@@ -259,7 +259,7 @@ def test_fingertips_err_as_the_calibrations_state() -> None:
 def test_the_shipped_calibration_is_true_within_what_it_states() -> None:
     shipped = load_calibration(SHIPPED)
     assert shipped.uncertainty is not None
-    true, measured = numbers_of(true_camera(scene_camera())), numbers_of(shipped)
+    true, measured = numbers_of(make_true_camera(scene_camera())), numbers_of(shipped)
     off = measured - true
     score = off @ np.linalg.solve(shipped.uncertainty.covariance, off)
     assert score < 22 + 3 * np.sqrt(2 * 22)
@@ -276,7 +276,7 @@ def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
     assert shipped.uncertainty is not None
     distance_m = shipped.uncertainty.working_distance_m
     fit, anew = calibrated(
-        true_camera(scene_camera()), BOARD, seed=77, count=10, distance_m=distance_m
+        make_true_camera(scene_camera()), BOARD, seed=77, count=10, distance_m=distance_m
     )
     slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), distance_m))
     shifts = slopes @ (fit.rig - numbers_of(shipped))

@@ -260,7 +260,8 @@ async def run_session(folder: Path) -> Session:
         "scene: scenes/cylinder.yaml\n"
         "nodes:\n"
         "  twin_finger: {type: twin_finger, nice: 10}\n"
-        f"  recorder: {{type: recorder, parameters: {{bag: {folder}/bags/a.mcap, waits: true}}}}\n"
+        "  recorder:\n    type: recorder\n"
+        f"    parameters: {{bag: {folder}/bags/a.mcap, start_paused: true}}\n"
     )
     port = free_port()
     settings = [f"console.page_port={port}", f"console.bags={folder}/bags"]

@@ -26,8 +26,8 @@ from nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint, 
 from nodes.twin.clutter import (
     CLUTTER,
     Clutter,
+    FixedPoint,
     Highlight,
-    Still,
     covered,
     second_marker,
     together,
@@ -246,7 +246,7 @@ def test_two_marks_are_one_too_many_unless_one_is_expected() -> None:
 )
 def test_a_light_that_is_no_mark_does_not_count(radius_m: float, views: str) -> None:
     """Too small or too large for its depth, or in one view only."""
-    blob = Highlight(Still((0.05, 0.04, 0.02)), radius_m, 200.0, views=views)  # type: ignore[arg-type]  # a parameter of pytest is any str
+    blob = Highlight(FixedPoint((0.05, 0.04, 0.02)), radius_m, 200.0, views=views)  # type: ignore[arg-type]  # a parameter of pytest is any str
     for expected in (None, HERE):
         reason, measured = detect_in(
             pictures(twin(together(LAB, Clutter(highlights=(blob,))))), expected=expected

@@ -19,8 +19,8 @@ from nodes.renderer.gl import Look, headless_context
 from nodes.renderer.sheet import Sheet, sheet_between
 from nodes.renderer.sheet_mesh import SheetMesh
 from nodes.renderer.stage import Stage
+from nodes.twin.error_map import error_map
 from nodes.twin.eye import seen
-from nodes.twin.places import error_map
 from tests.indentation_bases import DEEPEST_M, few_dents
 
 Floats = NDArray[np.float64]

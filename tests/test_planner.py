@@ -19,7 +19,7 @@ from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
 from messages.types import FingertipReason, SheetTarget, SoftBody
-from nodes.models.rigid import inverse, moved, transform, transform_from_rpy, twist_between
+from nodes.models.rigid import inverse, moved, transform, transform_from_rpy
 from nodes.models.shapes import CylinderShape
 from nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
 from nodes.planner.compliance import RESERVE, compliance_for, stretch_range
@@ -27,6 +27,7 @@ from nodes.planner.encounter import Encounter, Presentation, Reach
 from nodes.planner.node import Planner
 from nodes.planner.parameters import PlannerParameters
 from tests.fingertips import fingertip
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"

@@ -20,7 +20,8 @@ from nodes.models.motion import (
     follow,
     follow_sheet,
 )
-from nodes.models.rigid import is_rigid, transform_from_rpy, twist_between
+from nodes.models.rigid import is_rigid, transform_from_rpy
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 STEP_S = 1.0 / 60.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from launch.bench.twin_sheet import twin_push
 from messages.types import SheetTarget, SoftBody
 from nodes.models.motion import SheetMotion
-from nodes.models.rigid import moved, twist_between
+from nodes.models.rigid import moved
 from nodes.models.sheet.fit import make_model
 from nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel, SheetForceModel
 from nodes.models.sheet.rubber import Rubber
@@ -22,6 +22,7 @@ from nodes.planner.motion import withdrawn
 from nodes.planner.sheet_force import law_for, rubber_of
 from nodes.planner.yielding import Yielding
 from tests.test_planner import FRAME_NS, SCENE, Table, in_world, on_cylinder, table
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 STEP_S = FRAME_NS * 1e-9

@@ -22,7 +22,7 @@ from nodes.renderer.shape_families import sheet_shape_family
 from nodes.renderer.sheet import Sheet, sheet_between
 from nodes.renderer.sheet_mesh import dented_mesh, flat_mesh, pyramid_mesh
 from nodes.renderer.stage import NO_DENTS, Stage
-from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen
+from nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen
 from nodes.twin.membrane import DeformedSheet, Rubber, solve
 from nodes.twin.true_object import TrueBody
 from tests.indentation_bases import few_dents
@@ -91,7 +91,7 @@ def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: Stage, depth_mm: i
     eye = SCENE.eyes.centre_world_m
     truth, sheet = true_sheet(tip), sheet_at(np.eye(4), tip)
     wanted = np.array(
-        push_sizes(proper(TrueBody(SCENE).at_rest(), eye=eye, flat=True), METRES_PER_PX)
+        push_sizes(render_expected(TrueBody(SCENE).at_rest(), eye=eye, flat=True), METRES_PER_PX)
     )
 
     def errors_mm(correction: Correction) -> Floats:

@@ -23,7 +23,7 @@ from nodes.triangulator.parameters import TriangulatorParameters
 from nodes.twin.clutter import touching_highlight
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from nodes.twin.pixels import Sensor, TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -335,7 +335,7 @@ async def test_from_the_twins_pixels_to_the_true_fingertip(
             truths.append(message)
 
     twin = TwinFingerNode(TwinFingerParameters(), name="finger", clock=clock, send=keep)
-    save_calibration(calibration_of(true_camera(scene.camera)), tmp_path / "rig.yaml")
+    save_calibration(calibration_of(make_true_camera(scene.camera)), tmp_path / "rig.yaml")
     perfect = TriangulatorParameters(calibration=tmp_path / "rig.yaml")
     eye = Triangulator(perfect, name="eye", clock=clock, send=keep)
     await eye.setup()

@@ -24,7 +24,7 @@ from nodes.twin.finger import FingerMotion, FingerPathError
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from nodes.twin.paths import recorded_path
 from nodes.twin.pixels import TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDING = ROOT.parent / "shared" / "data" / "finger" / "reach_and_grip.csv"
@@ -347,7 +347,7 @@ async def test_truth_and_pixels_are_of_the_same_instant(scene: Scene) -> None:
     assert np.array_equal(truth.position_world_m, node.truth(at_ns).position)
     assert node.camera is not None
     # The rig as it stands, not as its data sheet says.
-    assert node.camera.camera.left == true_camera(scene.camera).left
+    assert node.camera.camera.left == make_true_camera(scene.camera).left
     place = node.camera.eyes[0].see(truth.position_world_m)[0]
     assert np.abs(light_centre(pair.left, place) - place).max() < 0.3
 

@@ -71,10 +71,10 @@ def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
 def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
     """What the twin's true rig sees of a board, in one pose after the other."""
     from nodes.twin.board import BoardError, TwinBoard
-    from nodes.twin.rig import true_camera
+    from nodes.twin.rig import make_true_camera
 
     try:
-        shown = TwinBoard(true_camera(scene.camera), board, seed=seed)
+        shown = TwinBoard(make_true_camera(scene.camera), board, seed=seed)
         for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
             yield shown.pair(left_from_board)
     except BoardError as error:

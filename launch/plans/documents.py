@@ -249,6 +249,7 @@ def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:
 
 
 RENAMED_KEYS = {
+    "again_after_s": "min_interval_s",
     "ahead_s": "prediction_horizon_s",
     "forget_after_s": "track_timeout_s",
     "mark": "marker",
@@ -257,6 +258,8 @@ RENAMED_KEYS = {
     "mark_min_contrast": "marker_min_contrast",
     "mark_noise_px": "marker_noise_px",
     "mark_radius_m": "marker_radius_m",
+    "most_waiting": "max_queue",
+    "waits": "start_paused",
 }
 """Keys of launch files, scenes and parameters that were renamed, and their names of today."""
 

@@ -205,7 +205,9 @@ def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> Shee
     """Return the sheet `step_s` later while it stops as fast as the bounds allow."""
     linear = _decelerate(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
     angular = _decelerate(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)
-    rate = _decelerate(np.array([now.stretch_rate_per_s]), bounds.stretch_acceleration_per_s2 * step_s)
+    rate = _decelerate(
+        np.array([now.stretch_rate_per_s]), bounds.stretch_acceleration_per_s2 * step_s
+    )
     twist = np.concatenate([linear, angular])
     return SheetMotion(
         _orthonormal(moved(now.world_from_sheet, twist, step_s)),

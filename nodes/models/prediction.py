@@ -11,11 +11,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def even_path(position: Floats, velocity: Floats, *, count: int, step_s: float) -> Floats:
-    """Return the path (count, 3) from `position` (3,) m at a constant `velocity` (3,) m/s."""
-    return position + np.arange(count)[:, None] * step_s * velocity
-
-
 def path_at(path: Floats, step_s: float, lead_s: float) -> tuple[Floats, Floats]:
     """Return position (3,) m and velocity (3,) m/s on a path (n >= 2, 3) `lead_s` after its start.
 

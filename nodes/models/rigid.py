@@ -157,13 +157,6 @@ def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Fl
     return transform(rotation, world_from_body[:3, 3] + twist_world[:3] * duration_s)
 
 
-def twist_between(world_from_before: Floats, world_from_after: Floats, duration_s: float) -> Floats:
-    """Return the constant twist that moves one pose to the other in `duration_s` (> 0)."""
-    linear = (world_from_after[:3, 3] - world_from_before[:3, 3]) / duration_s
-    turn = world_from_after[:3, :3] @ world_from_before[:3, :3].T
-    return np.concatenate([linear, vector_from_rotation(turn) / duration_s])
-
-
 def angle_between(a: Floats, b: Floats) -> float:
     """Return the angle (rad, 0..pi) between two vectors; accurate for small angles, unlike
     arccos."""

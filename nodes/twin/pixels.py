@@ -29,10 +29,10 @@ from nodes.twin.clutter import (
     FINGER_LENGTH_M,
     MARKER_RADIUS_M,
     Clutter,
+    FixedPoint,
     Highlight,
     SecondMarker,
     Sheet,
-    Still,
 )
 from nodes.twin.rig import pixel_of, pixels_per_slope, slopes_of
 
@@ -60,13 +60,13 @@ SHADE = 0.35
 SIDE_LIGHT = 0.2
 """How much brighter than the ridge the flank towards the lamp is, and darker the other."""
 
-NEAREST_M = 0.02
+MIN_DEPTH_M = 0.02
 """What comes nearer to a camera than this is not drawn."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
 """Where along a limb its place in the picture is looked up to find the window that holds it."""
 
-EMPTY_SHARE = 1.2
+EMPTY_FRACTION = 1.2
 """Overlapping windows are joined if that takes no more than so many times their pixels."""
 
 GRAIN = 1 << 21
@@ -190,7 +190,7 @@ class TwinCamera:
             self._eye("right", camera.right, right_from_world, sheet),
         )
 
-    def altered(
+    def with_changes(
         self,
         *,
         sensor: Sensor | None = None,
@@ -240,7 +240,7 @@ class TwinCamera:
         travel_px = 0.0
         for eye in self.eyes:
             (first, first_depth), (last, last_depth) = (eye.see(end) for end in ends)
-            if min(first_depth, last_depth) > NEAREST_M:
+            if min(first_depth, last_depth) > MIN_DEPTH_M:
                 travel_px = max(travel_px, float(np.linalg.norm(last - first)))
         steps = max(1, math.ceil(travel_px / MOTION_STEP_PX))
         instants_s = exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
@@ -257,7 +257,7 @@ class TwinCamera:
     def _read_out(self, levels: Singles) -> Image:
         start = int(self._random.integers(GRAIN - levels.size))
         noise = self._grain[start : start + levels.size].reshape(levels.shape)
-        return quantized(levels + self.sensor.noise(levels) * noise)
+        return quantize(levels + self.sensor.noise(levels) * noise)
 
     def _draw(self, eye: Eye, tips: Floats, times_s: Floats, *, marker: bool) -> list[Window]:
         """Draw all that is not background on the eye's canvas; gives the windows it touches.
@@ -316,7 +316,7 @@ class TwinCamera:
         what is thinner than its own edges.
         """
         (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
-        if min(z0, z1) <= NEAREST_M:
+        if min(z0, z1) <= MIN_DEPTH_M:
             return None
         u0, v0, u1, v1 = x0 / z0, y0 / z0, x1 / z1, y1 / z1
         width0, width1 = radii_m[0] / z0, radii_m[1] / z1
@@ -361,7 +361,7 @@ class TwinCamera:
         adds: its light adds to what is there, instead of hiding it.
         """
         in_camera = apply(eye.camera_from_world, places)
-        if in_camera[:, 2].min() <= NEAREST_M:
+        if in_camera[:, 2].min() <= MIN_DEPTH_M:
             return None
         x, y, z = in_camera.mean(axis=0).tolist()
         spread_px = self.sensor.spread_px(z, eye.lens.fx_px)
@@ -370,7 +370,7 @@ class TwinCamera:
         window = eye.window(pixels, reach_px)
         if window is None:
             return None
-        cover = ball_cover(eye, in_camera, radius_m, spread_px, window)
+        cover = rasterize_ball(eye, in_camera, radius_m, spread_px, window)
         canvas = eye.canvas[window]
         light = np.float32(level * self.sensor.exposure)
         canvas += cover * (light if adds else light - canvas)
@@ -452,7 +452,7 @@ def _slopes(lens: Lens, width: int, height: int) -> Floats:
     return slopes
 
 
-def ball_cover(
+def rasterize_ball(
     eye: Eye, centres: Floats, radius_m: float, spread_px: float, window: Window
 ) -> Singles:
     """Share of each pixel's light that comes from a ball, the mean over its centres (n, 3).
@@ -478,7 +478,7 @@ def ball_cover(
     return np.asarray(cover / single(len(centres)), dtype=np.float32)
 
 
-def quantized(levels: Singles) -> Image:
+def quantize(levels: Singles) -> Image:
     """Digital numbers as the converter gives them: rounded, clipped at 0 and 255."""
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
@@ -490,7 +490,7 @@ def _spots(clutter: Clutter, side: Side) -> list[SecondMarker | Highlight]:
 
 
 def _is_static(thing: SecondMarker | Highlight) -> bool:
-    return isinstance(thing.path, Still) and not thing.carried
+    return isinstance(thing.path, FixedPoint) and not thing.carried
 
 
 def _wipe(eye: Eye, windows: list[Window]) -> None:
@@ -515,7 +515,7 @@ def disjoint(windows: list[Window]) -> list[Window]:
             slice(min(one[0].start, other[0].start), max(one[0].stop, other[0].stop)),
             slice(min(one[1].start, other[1].start), max(one[1].stop, other[1].stop)),
         )
-        if _area(both) <= EMPTY_SHARE * (_area(one) + _area(other)):
+        if _area(both) <= EMPTY_FRACTION * (_area(one) + _area(other)):
             apart.remove(other)
             pending.append(both)
         else:

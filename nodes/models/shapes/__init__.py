@@ -17,8 +17,8 @@ from nodes.models.shapes.surface import (
     Convex,
     Nearest,
     Shape,
-    foot_jacobian,
     principal_curvatures,
+    projection_jacobian,
     tightest_curvature,
 )
 from nodes.models.shapes.triangles import MeshError
@@ -55,8 +55,8 @@ __all__ = [
     "Shape",
     "SmoothMeshShape",
     "SphereShape",
-    "foot_jacobian",
     "make_shape",
     "principal_curvatures",
+    "projection_jacobian",
     "tightest_curvature",
 ]

@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nodes.models.shapes.surface import (
+    EQUAL_DISTANCE_M,
     FRONT,
-    SAME_M,
     Bools,
     Convex,
     Floats,
     Nearest,
     Triple,
-    checked,
-    checked_previous,
+    check_points,
+    check_positive,
+    check_previous,
     descend,
     descend_one,
-    positive,
 )
 
 _IDENTITY = np.eye(3)
@@ -37,11 +37,11 @@ class CylinderShape(Convex):
     length_m: float
 
     def __post_init__(self) -> None:
-        positive(radius_m=self.radius_m, length_m=self.length_m)
+        check_positive(radius_m=self.radius_m, length_m=self.length_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided on the axis."""
-        queries = checked(points)
+        queries = check_points(points)
         radial = queries * np.array([0.0, 1.0, 1.0])
         normal, radius, undecided = _directions(radial, previous, queries, across=(1, 2))
         half = 0.5 * self.length_m
@@ -55,7 +55,7 @@ class CylinderShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`; of the solid with its end caps."""
-        queries = checked(points)
+        queries = check_points(points)
         aside = np.hypot(queries[..., 1], queries[..., 2]) - self.radius_m
         beyond = np.abs(queries[..., 0]) - 0.5 * self.length_m
         outside = np.hypot(np.maximum(aside, 0.0), np.maximum(beyond, 0.0))
@@ -73,11 +73,11 @@ class SphereShape(Convex):
     radius_m: float
 
     def __post_init__(self) -> None:
-        positive(radius_m=self.radius_m)
+        check_positive(radius_m=self.radius_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided at the centre."""
-        queries = checked(points)
+        queries = check_points(points)
         normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
         operator = (_IDENTITY - _outer(normal)) / self.radius_m
         nowhere = np.zeros(radius.shape, dtype=bool)
@@ -86,7 +86,7 @@ class SphereShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`."""
-        return np.asarray(np.linalg.norm(checked(points), axis=-1) - self.radius_m)
+        return np.asarray(np.linalg.norm(check_points(points), axis=-1) - self.radius_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +97,12 @@ class PlaneShape(Convex):
     height_m: float
 
     def __post_init__(self) -> None:
-        positive(width_m=self.width_m, height_m=self.height_m)
+        check_positive(width_m=self.width_m, height_m=self.height_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; past the rectangle (x along the width, y along the height) `on_edge`."""
-        queries = checked(points)
-        checked_previous(previous, queries)
+        queries = check_points(points)
+        check_previous(previous, queries)
         half = 0.5 * np.array([self.width_m, self.height_m, np.inf])
         point = np.clip(queries, -half, half)
         point[..., 2] = 0.0
@@ -115,7 +115,7 @@ class PlaneShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`; of the whole half-space."""
-        return checked(points)[..., 2].copy()
+        return check_points(points)[..., 2].copy()
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,12 +126,12 @@ class EllipsoidShape(Convex):
 
     def __post_init__(self) -> None:
         for axis, length in zip("xyz", self.semi_axes_m, strict=True):
-            positive(**{f"semi_axes_m ({axis})": length})
+            check_positive(**{f"semi_axes_m ({axis})": length})
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided on the medial disc, across the shortest axis."""
-        queries = checked(points)
-        before = checked_previous(previous, queries)
+        queries = check_points(points)
+        before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
         undecided = self._undecided(flat)
         if before is None:
@@ -139,7 +139,7 @@ class EllipsoidShape(Convex):
         else:
             starts = before.reshape(-1, 3)
             # The centre, where the level set has no slope, tells no side.
-            blind = np.linalg.norm(starts, axis=-1, keepdims=True) < SAME_M
+            blind = np.linalg.norm(starts, axis=-1, keepdims=True) < EQUAL_DISTANCE_M
             starts = np.where(blind, FRONT * self.semi_axes_m, starts)
             least = min(self.semi_axes_m)
             stride_m, rest_m = 0.5 * least, 1e-7 * least
@@ -199,7 +199,7 @@ class EllipsoidShape(Convex):
         others = np.setdiff1d(np.arange(3), shortest)
         focal = (axes[others] ** 2 - axes.min() ** 2) / axes[others]
         inside = (np.square(queries[:, others] / focal).sum(-1)) < 1.0
-        on_plane = np.linalg.norm(queries[:, shortest], axis=-1) < SAME_M
+        on_plane = np.linalg.norm(queries[:, shortest], axis=-1) < EQUAL_DISTANCE_M
         return np.asarray(on_plane & inside)
 
     def _nearest(self, queries: Floats, sides: Floats) -> Floats:
@@ -246,8 +246,8 @@ class RoundedBoxShape(Convex):
 
     def __post_init__(self) -> None:
         for axis, length in zip("xyz", self.size_m, strict=True):
-            positive(**{f"size_m ({axis})": length})
-        positive(edge_radius_m=self.edge_radius_m)
+            check_positive(**{f"size_m ({axis})": length})
+        check_positive(edge_radius_m=self.edge_radius_m)
         if 2.0 * self.edge_radius_m > min(self.size_m):
             raise ValueError(
                 f"edge_radius_m is {self.edge_radius_m}, more than half the least size "
@@ -256,8 +256,8 @@ class RoundedBoxShape(Convex):
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided inside where two faces are as near."""
-        queries = checked(points)
-        before = checked_previous(previous, queries)
+        queries = check_points(points)
+        before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
         core = self._core()
         nearest_core = np.clip(flat, -core, core)
@@ -293,7 +293,7 @@ class RoundedBoxShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`."""
-        away = np.abs(checked(points)) - self._core()
+        away = np.abs(check_points(points)) - self._core()
         outside = np.linalg.norm(np.maximum(away, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
@@ -319,7 +319,7 @@ class RoundedBoxShape(Convex):
             # A point that is not of the surface decides nothing.
             allowed |= ~allowed.any(axis=1, keepdims=True)
         first = margins.min(axis=1)
-        tied = (margins < first[:, None] + SAME_M).sum(axis=1) > 1
+        tied = (margins < first[:, None] + EQUAL_DISTANCE_M).sum(axis=1) > 1
         chosen = np.where(allowed, margins, np.inf)
         # Rounding must not choose between equals.
         face = (chosen <= chosen.min(axis=1, keepdims=True) + 1e-12).argmax(axis=1)
@@ -339,15 +339,15 @@ def _directions(
     across: the coordinates that offsets have.  Undecided ones follow the points found before, or
     `FRONT`.
     """
-    before = checked_previous(previous, queries)
+    before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)
-    undecided = length < SAME_M
+    undecided = length < EQUAL_DISTANCE_M
     direction = offsets
     if undecided.any():
         kept = np.zeros(3)
         kept[list(across)] = 1.0
         sides = np.broadcast_to(FRONT, offsets.shape) if before is None else before * kept
-        blind = np.linalg.norm(sides, axis=-1) < SAME_M
+        blind = np.linalg.norm(sides, axis=-1) < EQUAL_DISTANCE_M
         sides = np.where(blind[..., None], FRONT, sides)
         direction = np.where(undecided[..., None], sides, offsets)
     unit = direction / np.linalg.norm(direction, axis=-1)[..., None]

@@ -20,10 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SAME_M = 1e-6
+EQUAL_DISTANCE_M = 1e-6
 """Two ways to the surface that differ by less than this are equally long."""
 
-FARTHEST_M = 1e6
+MAX_QUERY_M = 1e6
 """A query farther from the origin than this is a mistake, not a place."""
 
 FRONT = np.array([0.0, 0.0, 1.0])
@@ -62,7 +62,7 @@ class Shape(Protocol):
             nearer one has appeared elsewhere, the nearest point of the same neighbourhood is kept
             as long as there is one.  Leave it out when a finger comes anew.
 
-        ValueError for NaN, infinity, another shape than (3,) or (n, 3), or beyond `FARTHEST_M`.
+        ValueError for NaN, infinity, another shape than (3,) or (n, 3), or beyond `MAX_QUERY_M`.
         """
         ...
 
@@ -112,7 +112,7 @@ def tightest_curvature(shape_operator: Floats) -> float:
     return 0.5 * (total + sqrt(max(2.0 * squares - total * total, 0.0)))
 
 
-def foot_jacobian(found: Nearest) -> Floats:
+def projection_jacobian(found: Nearest) -> Floats:
     """d point / d query, (..., 3, 3): how the nearest point moves as the query does.
 
     On a parallel surface at height h, W becomes W (I + h W)^-1; hence the foot moves by
@@ -125,28 +125,28 @@ def foot_jacobian(found: Nearest) -> Floats:
     return np.asarray(np.linalg.solve(np.eye(3) + height * operator, tangent))
 
 
-def checked(points: ArrayLike, name: str = "points") -> Floats:
+def check_points(points: ArrayLike, name: str = "points") -> Floats:
     """`points` as floats (3,) or (n, 3); ValueError says what is wrong with them."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
         raise ValueError(f"{name} of shape {array.shape}, wanted (3,) or (n, 3)")
     # A comparison with NaN is false, hence the double negation.
-    if array.size and not (np.abs(array) <= FARTHEST_M).all():
-        raise ValueError(f"{name} hold NaN, infinity or places beyond {FARTHEST_M:g} m")
+    if array.size and not (np.abs(array) <= MAX_QUERY_M).all():
+        raise ValueError(f"{name} hold NaN, infinity or places beyond {MAX_QUERY_M:g} m")
     return array
 
 
-def checked_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
+def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
     """`previous` as floats, shaped as `points`; ValueError otherwise."""
     if previous is None:
         return None
-    array = checked(previous, "previous")
+    array = check_points(previous, "previous")
     if array.shape != points.shape:
         raise ValueError(f"previous of shape {array.shape}, points of shape {points.shape}")
     return array
 
 
-def positive(**lengths_m: float) -> None:
+def check_positive(**lengths_m: float) -> None:
     """ValueError unless every length is a positive number."""
     for name, length in lengths_m.items():
         if not (np.isfinite(length) and length > 0.0):
@@ -159,7 +159,7 @@ well it is supported there (n,), in its own measure.  It is zero on the surface,
 
 
 @dataclass(frozen=True, slots=True)
-class Feet:
+class SurfaceProjections:
     """Where descents to the surface ended: points, normals (n, 3), shape operators (n, 3, 3).
 
     steepness, support: (n,) length of the level set's gradient, and its support.
@@ -175,14 +175,14 @@ class Feet:
 
 
 MOST_STEPS = 25
-LEAST_BEND = 0.02
+MIN_EIGENVALUE = 0.02
 """Floor of the size of the reduced Hessian's eigenvalues (1 on a flat surface): close to a centre
 of curvature the full Newton step would be too long; past it, downhill is the other way."""
 
 
 def descend(
     level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float, rest_m: float
-) -> Feet:
+) -> SurfaceProjections:
     """From `starts` (n, 3) along the surface to the points nearest to `queries` (n, 3).
 
     Newton's method for min |x - q|^2 on f(x) = 0 (Nocedal and Wright, Numerical Optimization,
@@ -211,7 +211,7 @@ def descend(
         fall = (-value / square)[:, None] * gradient
         slope = tangent @ (offset[:, :, None] - bend @ fall[:, :, None])
         values, vectors = np.linalg.eigh(tangent @ bend @ tangent + outward)
-        bounded = np.maximum(np.abs(values), LEAST_BEND)
+        bounded = np.maximum(np.abs(values), MIN_EIGENVALUE)
         along = np.swapaxes(vectors, 1, 2) @ slope / bounded[:, :, None]
         step = (vectors @ along)[:, :, 0] + fall
         size = np.sqrt((step * step).sum(-1))
@@ -222,14 +222,14 @@ def descend(
         normal[moving] = turned / np.sqrt((turned * turned).sum(-1))[:, None]
         operator[moving] = weingarten
         # Where eigenvalues are bounded the steps shrink slowly: the last must be far shorter.
-        slow = values[:, 0] < LEAST_BEND
+        slow = values[:, 0] < MIN_EIGENVALUE
         resting = size <= np.where(slow, 1e-3 * rest_m, rest_m)
         steepness[moving], support[moving] = length, known
         is_nearest[moving] = resting & (values[:, 0] > 0.0)
         if resting.all():
             break
         moving = moving[~resting]
-    return Feet(point, normal, operator, steepness, support, is_nearest)
+    return SurfaceProjections(point, normal, operator, steepness, support, is_nearest)
 
 
 _IDENTITY = np.eye(3)
@@ -241,7 +241,7 @@ LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[flo
 
 def descend_one(
     level: LevelAt, query: Floats, start: Floats, *, stride_m: float, rest_m: float
-) -> Feet:
+) -> SurfaceProjections:
     """`descend` for one query (3,), at a fraction of its cost; the feet are of length one.
 
     Written out in the tangent plane's two directions, since arrays of three numbers cost more than
@@ -276,14 +276,14 @@ def descend_one(
         x += t1 * e[0] + t2 * f[0] + fall * ux
         y += t1 * e[1] + t2 * f[1] + fall * uy
         z += t1 * e[2] + t2 * f[2] + fall * uz
-        if size <= (rest_m if low >= LEAST_BEND else 1e-3 * rest_m):
+        if size <= (rest_m if low >= MIN_EIGENVALUE else 1e-3 * rest_m):
             is_nearest = low > 0.0
             break
     basis = np.array([e, f])
     inner = np.array([[h11, h12], [h12, h22]]) / length
     # By the last step's part within the first's tangent plane, as the operator is.
     turned = np.array([ux, uy, uz]) + np.array([t1, t2]) @ inner @ basis
-    return Feet(
+    return SurfaceProjections(
         np.array([[x, y, z]]),
         (turned / sqrt(turned @ turned))[None],
         (basis.T @ inner @ basis)[None],
@@ -310,8 +310,8 @@ def _downhill(
     middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
     turn = 0.5 * atan2(2.0 * b12, b11 - b22)
     c, s = cos(turn), sin(turn)
-    along_high = (c * slope[0] + s * slope[1]) / max(abs(middle + spread), LEAST_BEND)
-    along_low = (c * slope[1] - s * slope[0]) / max(abs(middle - spread), LEAST_BEND)
+    along_high = (c * slope[0] + s * slope[1]) / max(abs(middle + spread), MIN_EIGENVALUE)
+    along_low = (c * slope[1] - s * slope[0]) / max(abs(middle - spread), MIN_EIGENVALUE)
     return c * along_high - s * along_low, s * along_high + c * along_low, middle - spread
 
 

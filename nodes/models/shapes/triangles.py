@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-MOST_TRIANGLES = 100_000
-FLATTEST = 1e-6
+MAX_TRIANGLES = 100_000
+MIN_HEIGHT_RATIO = 1e-6
 """A triangle whose height is less than this share of its longest edge has no direction."""
-FOLDED_RAD = np.radians(175.0)
+MAX_DIHEDRAL_RAD = np.radians(175.0)
 """Two neighbours that meet at a sharper angle than this lie on one another."""
 
 
@@ -27,42 +27,42 @@ class MeshError(ValueError):
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
     """Raise MeshError unless the mesh is the closed, consistently wound surface of a solid.
 
-    Refused: not finite, empty, larger than `MOST_TRIANGLES`, indices out of range, degenerate or
+    Refused: not finite, empty, larger than `MAX_TRIANGLES`, indices out of range, degenerate or
     repeated triangles, holes, edges of more than two triangles, inconsistent winding, parts that
     touch in one vertex only, triangles folded onto their neighbours, inside out.  Intersections of
-    triangles that are no neighbours are dearer to find: see `intersecting`.
+    triangles that are no neighbours are dearer to find: see `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(f"arrays of shapes {vertices.shape} and {triangles.shape} are no mesh")
     if len(triangles) < 4:
         raise MeshError(f"a mesh of {len(triangles)} triangles bounds no solid")
-    if len(triangles) > MOST_TRIANGLES:
+    if len(triangles) > MAX_TRIANGLES:
         raise MeshError(
-            f"{len(triangles)} triangles, at most {MOST_TRIANGLES} are taken; decimate the mesh"
+            f"{len(triangles)} triangles, at most {MAX_TRIANGLES} are taken; decimate the mesh"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise MeshError(f"a triangle names a vertex that is not among the {len(vertices)}")
     if not np.isfinite(vertices).all():
         raise MeshError("a vertex is NaN or infinite")
-    flat = int(degenerate(vertices, triangles).sum())
+    flat = int(find_degenerate(vertices, triangles).sum())
     if flat:
         raise MeshError(f"{flat} triangles are degenerate (no area); remove them")
     _check_edges(triangles)
     _check_fans(triangles)
-    folded = int((dihedrals_rad(vertices, triangles)[1] > FOLDED_RAD).sum())
+    folded = int((dihedrals_rad(vertices, triangles)[1] > MAX_DIHEDRAL_RAD).sum())
     if folded:
         raise MeshError(f"{folded} pairs of neighbouring triangles lie on one another; untangle it")
     if volume_m3(vertices, triangles) <= 0.0:
         raise MeshError("the mesh is inside out; reverse its triangles")
 
 
-def degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
+def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
     """Which triangles (t,) have no direction: repeated vertices, or all three in a line."""
     corners = vertices[triangles]
     sides = np.roll(corners, -1, axis=1) - corners
     longest = np.square(sides).sum(-1).max(-1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1)
-    return np.asarray(doubled <= FLATTEST * longest)
+    return np.asarray(doubled <= MIN_HEIGHT_RATIO * longest)
 
 
 def half_edges(triangles: Indices) -> Indices:
@@ -102,7 +102,7 @@ def _check_fans(triangles: Indices) -> None:
         raise MeshError(f"parts of the surface touch in {pinched} single vertices; separate them")
 
 
-def wound_alike(triangles: Indices) -> Indices:
+def unify_winding(triangles: Indices) -> Indices:
     """The triangles (t, 3), some turned over, so that neighbours across edges of two triangles run
     alike; in each connected part those are turned that are fewer.  Where that cannot be, as on a
     Möbius strip, `check_mesh` will find the seam."""
@@ -185,11 +185,11 @@ def volume_m3(vertices: Floats, triangles: Indices) -> float:
     return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
 
-def refined(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
+def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
     """The same facets in smaller triangles, no edge longer than `longest_m`.
 
     Each long edge is halved in all triangles that have it, until none is left, so that a closed
-    mesh stays closed.  MeshError where that would take more than `MOST_TRIANGLES`.
+    mesh stays closed.  MeshError where that would take more than `MAX_TRIANGLES`.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
@@ -206,10 +206,10 @@ def refined(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Flo
         middle[halved] = len(vertices) + np.arange(int(halved.sum()))
         vertices = np.concatenate([vertices, vertices[edges[halved]].mean(axis=1)])
         triangles = np.concatenate(list(_split(triangles, middle[which])))
-        if len(triangles) > MOST_TRIANGLES:
+        if len(triangles) > MAX_TRIANGLES:
             raise MeshError(
                 f"edges up to {length.max():.3g} m cannot be cut down to {longest_m:.3g} m within "
-                f"{MOST_TRIANGLES} triangles; smooth over a longer distance"
+                f"{MAX_TRIANGLES} triangles; smooth over a longer distance"
             )
 
 
@@ -235,7 +235,7 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
         yield np.stack(one, axis=1)
 
 
-def intersecting(vertices: Floats, triangles: Indices) -> int:
+def count_intersections(vertices: Floats, triangles: Indices) -> int:
     """How many pairs of triangles cut through one another.
 
     Found: an edge of one passing through the inside of another with which it shares no vertex.  Not

@@ -28,7 +28,7 @@ STEP_PX = 0.02
 ROUNDING_VARIANCE = 1.0 / 12.0
 FULL_LEVEL = 255.0
 NUISANCES = 4
-WORST_CONDITION = 1e10
+MAX_CONDITION = 1e10
 """Of the information with its diagonal scaled to one; beyond it, something cannot be told."""
 
 
@@ -77,23 +77,25 @@ def fingertip_bound(
         raise BoundError("the fingertip is behind the camera")
     by_place = [
         slope(
-            camera.altered(marker_offset_m=offset_m - step_m * axis),
-            camera.altered(marker_offset_m=offset_m + step_m * axis),
+            camera.with_changes(marker_offset_m=offset_m - step_m * axis),
+            camera.with_changes(marker_offset_m=offset_m + step_m * axis),
             2.0 * step_m,
         )
         for axis in np.eye(3)
     ]
     by_level = slope(
-        camera, camera.altered(sensor=replace(sensor, marker_level=sensor.marker_level + 1.0)), 1.0
+        camera,
+        camera.with_changes(sensor=replace(sensor, marker_level=sensor.marker_level + 1.0)),
+        1.0,
     )
     by_radius = slope(
-        camera.altered(marker_radius_m=radius_m - step_m),
-        camera.altered(marker_radius_m=radius_m + step_m),
+        camera.with_changes(marker_radius_m=radius_m - step_m),
+        camera.with_changes(marker_radius_m=radius_m + step_m),
         2.0 * step_m,
     )
     by_blur = slope(
-        camera.altered(sensor=replace(sensor, blur_px=sensor.blur_px - STEP_PX)),
-        camera.altered(sensor=replace(sensor, blur_px=sensor.blur_px + STEP_PX)),
+        camera.with_changes(sensor=replace(sensor, blur_px=sensor.blur_px - STEP_PX)),
+        camera.with_changes(sensor=replace(sensor, blur_px=sensor.blur_px + STEP_PX)),
         2.0 * STEP_PX,
     )
     seen = drawn(camera)
@@ -174,6 +176,6 @@ def _covariance(information: Floats, views: str) -> Floats:
     if not (scale > 0).all():
         raise BoundError(f"{views} view: no pixel tells the mark's place, size or level")
     scaled = information / np.outer(scale, scale)
-    if np.linalg.cond(scaled) > WORST_CONDITION:
+    if np.linalg.cond(scaled) > MAX_CONDITION:
         raise BoundError(f"{views} view: the pixels do not tell the mark's place from its looks")
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))
