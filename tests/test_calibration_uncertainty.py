@@ -18,7 +18,7 @@ from messages.scene import Lens, Scene, StereoCamera
 from nodes.camera import bundle
 from nodes.camera.calibration import state_uncertainty
 from nodes.camera.check import Rig, triangulated
-from nodes.camera.corners import BoardPair, CornerFinder, View, board_points, pair_of
+from nodes.camera.corners import BoardPair, CornerFinder, View, board_points, match_views
 from nodes.camera.selection import Selection, fit_pairs, fit_selection
 from nodes.camera.uncertainty import (
     jackknife_covariance,
@@ -80,13 +80,13 @@ def numbers_of(camera: StereoCamera | StereoCalibration) -> Floats:
 
 def calibrated(
     camera: StereoCamera, board: Board, *, seed: int, count: int, distance_m: float
-) -> tuple[bundle.Fit, Uncertainty]:
+) -> tuple[bundle.RigFit, Uncertainty]:
     """A calibration from the twin's pictures of a board."""
     twin, finder = TwinBoard(camera, board, seed=seed), CornerFinder(board)
     pairs = []
     for left_from_board in twin.poses(count):
         left, right = twin.pair(left_from_board)
-        pairs.append(pair_of(finder.find(left), finder.find(right), board, ("left", "right")))
+        pairs.append(match_views(finder.find(left), finder.find(right), board, ("left", "right")))
     selection = Selection(pairs, [str(number) for number in range(count)])
     size, points = (camera.width_px, camera.height_px), board_points(board)
     fit = fit_selection(selection, points, size)
@@ -124,10 +124,10 @@ def test_slopes_of_corners_are_those_of_differences() -> None:
         View(pair.left.ids[:40], pair.left.pixels[:40]),
         View(pair.right.ids[9:], pair.right.pixels[9:]),
     )
-    here = bundle.linearized(pair, POINTS, rig, pose)
+    here = bundle.linearize(pair, POINTS, rig, pose)
     for slopes, base, of in (
-        (here.by_rig, rig, lambda rig: bundle.linearized(pair, POINTS, rig, pose)),
-        (here.by_pose, pose, lambda pose: bundle.linearized(pair, POINTS, rig, pose)),
+        (here.by_rig, rig, lambda rig: bundle.linearize(pair, POINTS, rig, pose)),
+        (here.by_pose, pose, lambda pose: bundle.linearize(pair, POINTS, rig, pose)),
     ):
         for index in range(len(base)):
             step = np.zeros(len(base))

@@ -30,7 +30,7 @@ from nodes.camera.corners import (
     Progress,
     board_points,
     find_pairs,
-    pair_of,
+    match_views,
 )
 from nodes.models.camera import camera_matrix, project
 from nodes.models.rigid import (
@@ -237,7 +237,7 @@ class PlaceTaker:
             return "no word from the arm yet"
         if exposed_s - self._still_since_s < STILL_S:
             return "the arm moves"
-        pair = pair_of(
+        pair = match_views(
             self._finder.find(left), self._finder.find(right), self._board, ("left", "right")
         )
         if isinstance(pair, str):

@@ -55,7 +55,7 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
 
 def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
     from nodes.camera.devices import open_reader
-    from nodes.camera.pictures import DeviceError, check_size
+    from nodes.camera.image_pair import DeviceError, check_size
 
     try:
         with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:

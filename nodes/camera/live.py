@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import cv2
 
 from messages.scene import StereoCamera
-from nodes.camera.pictures import (
+from nodes.camera.image_pair import (
     DeviceError,
     Image,
+    ImagePair,
     Now,
-    Pictures,
     Region,
     Regions,
     gray,
@@ -31,7 +31,7 @@ RELEASE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
+class CapturedFrame:
     """One camera's picture and the middle of its exposure, ns.
 
     The middle is reckoned from the picture's arrival and, where it is believed, from the driver's
@@ -78,7 +78,7 @@ class Stream(threading.Thread):
         """
         super().__init__(name=f"camera {device}", daemon=True)
         self.device = device
-        self.frames: deque[Frame] = deque(maxlen=WAITING)
+        self.frames: deque[CapturedFrame] = deque(maxlen=WAITING)
         self.count = 0
         self.failure: Exception | None = None
         self._now, self._changed = now, changed
@@ -127,7 +127,7 @@ class Stream(threading.Thread):
         finally:
             self._capture.release()
 
-    def _next(self) -> Frame | None:
+    def _next(self) -> CapturedFrame | None:
         """The next frame; None for one whose stamp is a lapse.  Raises DeviceError."""
         grabbed = self._capture.grab()
         arrival_ns = self._now()
@@ -142,7 +142,7 @@ class Stream(threading.Thread):
         if image is None:
             raise DeviceError(f"{self.device!r}: gives no more pictures: unplugged, or at its end")
         by_stamp_ns = None if stamp_ns is None else stamp_ns - self._to_stamp_ns
-        return Frame(gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
+        return CapturedFrame(gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
 
 
 class CameraReader:
@@ -193,7 +193,7 @@ class CameraReader:
         for stream in self._streams:
             stream.start()
 
-    def read(self) -> Pictures | None:
+    def read(self) -> ImagePair | None:
         """See `Reader`."""
         with self._changed:
             counts = [stream.count for stream in self._streams]
@@ -218,12 +218,12 @@ class CameraReader:
         """Whether the drivers' stamps count: two cameras are compared by one kind of stamp only."""
         return all(stream.believed for stream in self._streams)
 
-    def _moment_ns(self, frame: Frame) -> int:
+    def _moment_ns(self, frame: CapturedFrame) -> int:
         if frame.by_stamp_ns is not None and self._by_stamp():
             return frame.by_stamp_ns
         return frame.by_arrival_ns
 
-    def _take(self) -> tuple[Frame, ...] | None:
+    def _take(self) -> tuple[CapturedFrame, ...] | None:
         """The next pair, or the next picture with both views; None until there is one."""
         if len(self._streams) == 1:
             frames = self._streams[0].frames
@@ -231,7 +231,7 @@ class CameraReader:
         left, right = self._streams
         return self._pairing.take(left.frames, right.frames, self._moment_ns)
 
-    def _pictures(self, frames: tuple[Frame, ...]) -> Pictures:
+    def _pictures(self, frames: tuple[CapturedFrame, ...]) -> ImagePair:
         moments_ns = [self._moment_ns(frame) for frame in frames]
         notes = ["stamped by the driver" if self._by_stamp() else "stamped on arrival"]
         if len(frames) == 1:
@@ -239,7 +239,7 @@ class CameraReader:
         else:
             left, right = frames[0].image, frames[1].image
             notes.append(f"{self._pairing.unpaired} frames without a partner")
-        return Pictures(
+        return ImagePair(
             left,
             right,
             sum(moments_ns) // len(moments_ns),

@@ -25,7 +25,7 @@ RULER_MM = 100.0
 PNG_DOTS_PER_INCH = 300
 
 
-def black_rectangles(board: Board) -> Floats:
+def find_black_rectangles(board: Board) -> Floats:
     """Black parts (n, 4): x, y, width, height in m from the outer corner of the first square.
 
     Raises CalibrationError for markers that do not fit the board.
@@ -80,7 +80,7 @@ def svg(board: Board) -> str:
     parts = [
         f'<rect x="{border + 1e3 * x:.6g}" y="{border + 1e3 * y:.6g}" width="{1e3 * w:.6g}" '
         f'height="{1e3 * h:.6g}"/>'
-        for x, y, w, h in black_rectangles(board)
+        for x, y, w, h in find_black_rectangles(board)
     ]
     whole = height + 2 * CAPTION_MM
     ruler_y = height + 1.4 * CAPTION_MM
@@ -105,7 +105,7 @@ def raster(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
     across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
     width, height = np.ceil(across * dots_per_m).astype(int)
     picture = np.full((height, width), 255, np.uint8)
-    for x, y, w, h in black_rectangles(board):
+    for x, y, w, h in find_black_rectangles(board):
         low = np.ceil((border + np.array([x, y])) * dots_per_m - 0.5).astype(int)
         high = np.ceil((border + np.array([x + w, y + h])) * dots_per_m - 0.5).astype(int)
         picture[low[1] : high[1], low[0] : high[0]] = 0

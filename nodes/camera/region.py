@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from messages.scene import Lens, Scene
-from nodes.camera.pictures import DeviceError, Region, Regions
+from nodes.camera.image_pair import DeviceError, Region, Regions
 from nodes.models import camera, rigid
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,9 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 
-def seen_region(points_camera: Floats, lens: Lens, width_px: int, height_px: int) -> Region | None:
+def find_visible_region(
+    points_camera: Floats, lens: Lens, width_px: int, height_px: int
+) -> Region | None:
     """The part of a sensor that shows points (n, 3) of the camera's frame, m; None where none do.
 
     Beyond the picture's corners a lens's polynomial means nothing and may fold back: points out
@@ -67,7 +69,7 @@ def seen_region(points_camera: Floats, lens: Lens, width_px: int, height_px: int
     return Region(int(begin[0]), int(begin[1]), int(end[0] - begin[0]), int(end[1] - begin[1]))
 
 
-def finger_regions(scene: Scene) -> Regions:
+def find_finger_regions(scene: Scene) -> Regions:
     """Where each view can show a fingertip: the finger's volume, wider by its radius, and a margin.
 
     Raises DeviceError for a view that sees none of it.
@@ -81,7 +83,7 @@ def finger_regions(scene: Scene) -> Regions:
     in_right = rigid.apply(np.asarray(rig.right_from_left), in_left)
     found = []
     for side, points, lens in (("left", in_left, rig.left), ("right", in_right, rig.right)):
-        region = seen_region(points, lens, rig.width_px, rig.height_px)
+        region = find_visible_region(points, lens, rig.width_px, rig.height_px)
         if region is None:
             raise DeviceError(
                 f"the {side} view shows nothing of finger.volume: correct it or "
@@ -91,7 +93,7 @@ def finger_regions(scene: Scene) -> Regions:
     return found[0], found[1]
 
 
-def wanted_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None:
+def resolve_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None:
     """The regions to publish; None: all of both sensors.  Raises DeviceError.
 
     asked: "full", "finger", or regions, which must lie on the sensor.
@@ -99,7 +101,7 @@ def wanted_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None
     if asked == "full":
         return None
     if not isinstance(asked, ExplicitRegions):
-        return finger_regions(scene)
+        return find_finger_regions(scene)
     whole = Region(0, 0, scene.camera.width_px, scene.camera.height_px)
     for side, region in (("left", asked.left), ("right", asked.right)):
         if not whole.holds(region):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.camera.bundle import PARAMETERS, pose_transform
-from nodes.camera.calibration import Calibrated
+from nodes.camera.calibration import CalibrationResult
 from nodes.camera.check import Rig
 from nodes.camera.corners import board_points, describe
 from nodes.models import rigid
@@ -39,7 +39,7 @@ img { max-width: 100%; } figcaption { color: #444; }
 """
 
 
-def epipolar_distances(calibrated: Calibrated) -> tuple[Floats, Floats]:
+def epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
     """Right pixels (n, 2) of all common corners, and their signed distances (n,) px from the
 
     epipolar lines of the left ones, both undistorted and in the right camera's pixels.
@@ -63,7 +63,7 @@ def epipolar_distances(calibrated: Calibrated) -> tuple[Floats, Floats]:
     return np.concatenate(places), np.concatenate(distances)
 
 
-def _residuals(calibrated: Calibrated) -> Figure:
+def _residuals(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 2, (13.0, 5.0))
     lengths = np.concatenate(
         [np.linalg.norm(view, axis=1) for views in calibrated.fit.residuals for view in views]
@@ -89,7 +89,7 @@ def _residuals(calibrated: Calibrated) -> Figure:
     return figure
 
 
-def _pairs(calibrated: Calibrated) -> Figure:
+def _pairs(calibrated: CalibrationResult) -> Figure:
     figure, (axis,) = _figure(1, 1, (13.0, 3.6))
     pairs = calibrated.calibration.pairs
     x = np.arange(len(pairs))
@@ -106,7 +106,7 @@ def _pairs(calibrated: Calibrated) -> Figure:
     return figure
 
 
-def _coverage(calibrated: Calibrated) -> Figure:
+def _coverage(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 3, (15.0, 4.2))
     for axis, side in zip(axes[:2], ("left", "right"), strict=True):
         for pair in calibrated.pairs.values():
@@ -127,7 +127,7 @@ def _coverage(calibrated: Calibrated) -> Figure:
     return figure
 
 
-def _epipolar(calibrated: Calibrated) -> Figure:
+def _epipolar(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 2, (13.0, 4.6))
     places, off = epipolar_distances(calibrated)
     largest = float(np.percentile(np.abs(off), 98.0))
@@ -155,7 +155,7 @@ def _as_picture(axis: Axes, size: tuple[int, int], title: str) -> None:
     axis.set_aspect("equal")
 
 
-def parameter_rows(calibrated: Calibrated) -> list[tuple[str, float, float]]:
+def parameter_rows(calibrated: CalibrationResult) -> list[tuple[str, float, float]]:
     """(name, value, standard deviation) of the rig's 22 numbers."""
     uncertainty = calibrated.calibration.uncertainty
     assert uncertainty is not None
@@ -166,7 +166,7 @@ def parameter_rows(calibrated: Calibrated) -> list[tuple[str, float, float]]:
     ]
 
 
-def write_report(calibrated: Calibrated, folder: Path) -> Path:
+def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
     """Write `index.html` and the pictures into a folder, which is made; returns the page."""
     folder.mkdir(parents=True, exist_ok=True)
     calibration = calibrated.calibration

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.camera.bundle import (
-    Fit,
     NotDeterminedError,
+    RigFit,
     board_pose,
     fit_rig,
     lens_arrays,
@@ -86,7 +86,7 @@ def misfits(
     return np.asarray(errors[judge]), pose_vector(stands[judge])
 
 
-def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> Fit:
+def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> RigFit:
     """Both cameras together, from nothing but the pairs; points: the board's corners (n, 3) m."""
     left = single_lens([pair.left for pair in pairs], points, size)
     right = single_lens([pair.right for pair in pairs], points, size)
@@ -100,7 +100,7 @@ def corner_count(pair: BoardPair) -> int:
     return len(pair.left.ids) + len(pair.right.ids)
 
 
-def without_stray_corners(fit: Fit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
+def without_stray_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
     """The pairs without the corners that lie further off than noise can put them.
 
     The standard deviation is taken from the median of the distances, which strays do not move (of
@@ -210,7 +210,7 @@ class Selection:
         return corner_count(whole) - corner_count(self.good[number])
 
 
-def fit_selection(selection: Selection, points: Floats, size: tuple[int, int]) -> Fit:
+def fit_selection(selection: Selection, points: Floats, size: tuple[int, int]) -> RigFit:
     """The rig from what is sound of the pairs; the selection then tells what was left out.
 
     Pairs that contradict the others grossly (`misfits`); single corners six standard deviations

@@ -13,7 +13,7 @@ from typing import Protocol
 import cv2
 
 from messages.scene import StereoCamera
-from nodes.camera.pictures import Region
+from nodes.camera.image_pair import Region
 
 EXPOSURE_TOLERANCE = 0.05
 RATE_TOLERANCE = 0.02

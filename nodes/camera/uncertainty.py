@@ -18,7 +18,7 @@ from nodes.camera.bundle import (
     PARAMETERS,
     RIGHT,
     STAND,
-    Fit,
+    RigFit,
     fit_rig,
     floats,
     lens_arrays,
@@ -85,7 +85,7 @@ def position_spread(slopes: Floats, covariance: Floats) -> tuple[float, float]:
 
 
 def jackknife_covariance(
-    fit: Fit,
+    fit: RigFit,
     pairs: Sequence[BoardPair],
     board: Floats,
     progress: Progress = ignore_progress,

@@ -52,7 +52,7 @@ Regions = tuple[Region, Region]
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
+class ImagePair:
     """A pair and when it was taken: the middle between the middles of both exposures.
 
     exposure_ns: by the clock that the reader was given; of a paced reader (files), by the file's
@@ -82,7 +82,7 @@ class Reader(Protocol):
     rate_hz: float | None
     warnings: tuple[str, ...]
 
-    def read(self) -> Pictures | None:
+    def read(self) -> ImagePair | None:
         """The next pair, waiting for it; None when there are no more.  Raises DeviceError."""
         ...
 
@@ -93,7 +93,9 @@ class Reader(Protocol):
     def close(self) -> None: ...
 
 
-def pair_of(pictures: Pictures, device: str, exposure_s: float, dropped_frames: int) -> StereoPair:
+def make_stereo_message(
+    pictures: ImagePair, device: str, exposure_s: float, dropped_frames: int
+) -> StereoPair:
     """The message that tells of the pictures; exposure_s: where the device does not tell it."""
     origins = [(region.column, region.row) for region in pictures.regions or ()] or [(0, 0)] * 2
     return StereoPair(
@@ -108,14 +110,14 @@ def pair_of(pictures: Pictures, device: str, exposure_s: float, dropped_frames: 
     )
 
 
-def pictures_of(pair: StereoPair, exposure_ns: int) -> Pictures:
+def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
     """The pictures of a published pair."""
     origins = (pair.left_origin_px, pair.right_origin_px)
     left, right = (
         Region(*origin, image.shape[1], image.shape[0])
         for origin, image in zip(origins, (pair.left, pair.right), strict=True)
     )
-    return Pictures(
+    return ImagePair(
         pair.left,
         pair.right,
         exposure_ns,
@@ -125,7 +127,7 @@ def pictures_of(pair: StereoPair, exposure_ns: int) -> Pictures:
     )
 
 
-def too_skewed(skew_s: float, limit_s: float) -> str:
+def skew_reason(skew_s: float, limit_s: float) -> str:
     """What to tell people of a pair that was refused."""
     return (
         f"skew {1e3 * skew_s:.1f} ms, at most {1e3 * limit_s:g} ms wanted; cameras that run freely "
@@ -150,7 +152,7 @@ def halves(image: Image, name: object) -> tuple[Image, Image]:
     return np.ascontiguousarray(image[:, :middle]), np.ascontiguousarray(image[:, middle:])
 
 
-def check_size(pictures: Pictures, camera: StereoCamera, name: object) -> None:
+def check_size(pictures: ImagePair, camera: StereoCamera, name: object) -> None:
     """Raises DeviceError unless each view has the size of its region, or of the scene's camera."""
     whole = Region(0, 0, camera.width_px, camera.height_px)
     regions = pictures.regions or (whole, whole)
@@ -168,7 +170,7 @@ def check_size(pictures: Pictures, camera: StereoCamera, name: object) -> None:
             )
 
 
-def cut(pictures: Pictures, wanted: Regions) -> Pictures:
+def cut(pictures: ImagePair, wanted: Regions) -> ImagePair:
     """The wanted regions of pictures that `check_size` has passed.
 
     Raises DeviceError where the pictures do not show all of them.
