@@ -87,9 +87,7 @@ class ReaderThread(threading.Thread):
                 finally:
                     self._reader = None
                     reader.close()
-            except (
-                Exception
-            ) as error:  # drivers raise anything; report it and try again
+            except Exception as error:  # drivers raise anything; report it and try again
                 if self._stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):

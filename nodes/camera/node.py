@@ -1,4 +1,4 @@
-"""The camera: pictures of the finger, from the twin, from devices or from files."""
+"""Publish images of the finger, from the simulator, from devices or from files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ JOIN_S = 3.0
 
 
 class CameraParameters(NodeParameters):
-    """Where pictures come from, and which of them are published."""
+    """Hold the source of the images, and which of them are published."""
 
     source: AnySource = TwinSource()
     retry_s: Positive = Field(default=1.0, description="first pause after a device failed")
@@ -43,7 +43,7 @@ class CameraParameters(NodeParameters):
 
 
 class Camera(Node):
-    """Publishes stereo pairs with the time of their exposure."""
+    """Publish stereo pairs with the time of their exposure."""
 
     opens_devices: ClassVar[bool] = True
 
@@ -99,7 +99,7 @@ class Camera(Node):
         self.note = f"no pictures: {error}"
 
     def _tell_warning(self, text: str) -> None:
-        """Once for each scene, however often the device is opened anew."""
+        """Report a warning once per scene, however often the device is opened."""
         if text not in self.warned:
             self.warned = (*self.warned, text)
             self.report_error("source", DeviceError(text))
@@ -120,7 +120,11 @@ class Camera(Node):
         self._publish(pictures, pair.device, pair.exposure_s, pair.dropped_frames)
 
     def _publish(self, pictures: ImagePair, device: str, exposure_s: float, lost: int) -> None:
-        """exposure_s: where the device does not tell it.  lost: frames, beside those refused."""
+        """Publish a pair.
+
+        exposure_s: used where the device does not report it.
+        lost: number of lost frames, apart from rejected ones.
+        """
         limit_s = self.parameters.max_skew_s
         if limit_s is not None and abs(pictures.skew_s) > limit_s:
             self.refused += 1

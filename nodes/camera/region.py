@@ -1,4 +1,4 @@
-"""Which part of each sensor can show the finger: its volume as the scene's optics project it."""
+"""Compute the part of each sensor that can show the finger, by projecting its volume."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from nodes.models import camera, rigid
 Floats = NDArray[np.float64]
 
 GRID = 17
-"""Points along each edge of the volume: a lens bends its image, but by little between two."""
+"""Points along each edge of the volume; between two of them a lens bends its image only little."""
 MARGIN_PX = 16.0
-"""For the blur of the mark and for a calibration that differs from the scene's optics."""
+"""Margin for the marker's blur and for a calibration that differs from the scene's optics."""
 ALIGN_PX = (16, 2)
-"""Columns and rows that sensors can begin a region at."""
+"""Multiples of columns and rows at which sensors can begin a region."""
 NEAREST_M = 1e-3
 
 
 class ExplicitRegions(BaseModel):
-    """Regions as a launch file gives them: [column, row, width, height] in pixels for each view."""
+    """Hold regions in a launch file's form: [column, row, width, height] in pixels for each
+    view."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -31,7 +32,7 @@ class ExplicitRegions(BaseModel):
 
 
 def volume_points(low_m: Floats, high_m: Floats) -> Floats:
-    """A grid of points (n, 3) that fills the box between two corners (3,)."""
+    """Return a grid of points (n, 3) that fills the box between two corners (3,)."""
     axes = [np.linspace(low, high, GRID) for low, high in zip(low_m, high_m, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
@@ -39,11 +40,11 @@ def volume_points(low_m: Floats, high_m: Floats) -> Floats:
 def find_visible_region(
     points_camera: Floats, lens: Lens, width_px: int, height_px: int
 ) -> Region | None:
-    """The part of a sensor that shows points (n, 3) of the camera's frame, m; None where none do.
+    """Return the part of a sensor that shows points (n, 3) of the camera's frame, m; None if none.
 
-    Beyond the picture's corners a lens's polynomial means nothing and may fold back: points out
-    there are drawn in to the circle through the farthest corner, which changes nothing inside.  A
-    volume that reaches behind the camera fills the picture.
+    Beyond the image's corners a lens's polynomial has no meaning and may fold back.  Points out
+    there are moved to the circle through the farthest corner, which changes nothing inside.  A
+    volume that extends behind the camera fills the image.
     """
     in_front = points_camera[points_camera[:, 2] > NEAREST_M]
     if len(in_front) == 0:
@@ -70,9 +71,10 @@ def find_visible_region(
 
 
 def find_finger_regions(scene: Scene) -> Regions:
-    """Where each view can show a fingertip: the finger's volume, wider by its radius, and a margin.
+    """Return the region of each view that can show a fingertip.
 
-    Raises DeviceError for a view that sees none of it.
+    It is the finger's volume, extended by the finger's radius and a margin.  Raises DeviceError for
+    a view that sees none of it.
     """
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m
@@ -94,7 +96,7 @@ def find_finger_regions(scene: Scene) -> Regions:
 
 
 def resolve_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None:
-    """The regions to publish; None: all of both sensors.  Raises DeviceError.
+    """Return the regions to publish; None: all of both sensors.  Raises DeviceError.
 
     asked: "full", "finger", or regions, which must lie on the sensor.
     """

@@ -1,6 +1,6 @@
-"""A calibration's report: where corners miss, which pairs fit, what was covered, how sure it is.
+"""Write a calibration's report: residuals of corners, quality of pairs, coverage, uncertainty.
 
-One page that needs no other file, and its pictures beside it as PNG.
+The report is one page that needs no other file, with its images beside it as PNG.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Floats = NDArray[np.float64]
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""Length in the picture of the 95 % longest residual."""
+"""Length in the image of the 95 % longest residual."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
@@ -143,7 +143,7 @@ def _epipolar(calibrated: CalibrationResult) -> Figure:
 
 
 def _figure(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure  # only here: it is slow to import
+    from matplotlib.figure import Figure  # imported here, since it is slow
 
     figure = Figure(figsize=size_in, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -156,7 +156,7 @@ def _as_picture(axis: Axes, size: tuple[int, int], title: str) -> None:
 
 
 def parameter_rows(calibrated: CalibrationResult) -> list[tuple[str, float, float]]:
-    """(name, value, standard deviation) of the rig's 22 numbers."""
+    """Return (name, value, standard deviation) of the rig's 22 numbers."""
     uncertainty = calibrated.calibration.uncertainty
     assert uncertainty is not None
     deviations = np.sqrt(np.diag(uncertainty.covariance))
@@ -167,7 +167,7 @@ def parameter_rows(calibrated: CalibrationResult) -> list[tuple[str, float, floa
 
 
 def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
-    """Write `index.html` and the pictures into a folder, which is made; returns the page."""
+    """Write `index.html` and the images into a folder, which is made; returns the page."""
     folder.mkdir(parents=True, exist_ok=True)
     calibration = calibrated.calibration
     board, uncertainty = calibration.board, calibration.uncertainty

@@ -1,4 +1,4 @@
-"""The parameter `source`: which device or files a camera node reads."""
+"""Define the parameter `source`: which device or files a camera node reads."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from messages.scene import Finite, NonNegative, Positive
 
 
 class Source(BaseModel):
-    """A kind of device, as the parameter `source` names it."""
+    """Base of the kinds of source."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class TwinSource(Source):
-    """The twin's pixels, from the topic twin/stereo."""
+    """The simulator's pixels, from the topic twin/stereo."""
 
     kind: Literal["twin"] = "twin"
 
@@ -25,8 +25,8 @@ class TwinSource(Source):
 class OpenCvSource(Source):
     """Cameras that OpenCV opens: by number, by path, or by a stream's address.
 
-    Two cameras without a common trigger see a moving finger at two times (`docs/camera.md`).  One
-    device that gives both views has no such trouble.
+    Two cameras without a common trigger see a moving finger at two times (`docs/camera.md`); one
+    device that gives both views does not.
     """
 
     kind: Literal["opencv"]
@@ -80,7 +80,7 @@ class ImagesSource(Source):
 
 
 def _kind_alone(source: object) -> object:
-    """Lets a launch file write `source: twin` for a source that needs nothing but its kind."""
+    """Accept `source: twin` in a launch file for a source that needs only its kind."""
     return {"kind": source} if isinstance(source, str) else source
 
 

@@ -1,21 +1,23 @@
-"""A closed triangle mesh as a smooth surface, for a sheet that must not rattle over facets.
+"""Represent a closed triangle mesh as a smooth surface, so that the sheet does not rattle on
+facets.
 
-Two steps, the first when the shape is built.  `rho` is the length over which is smoothed.
+The surface is built in two steps, the first when the shape is made.  `rho` is the smoothing length.
 
 1. Osculating jets (Cazals and Pouget, Estimating Differential Quantities Using Polynomial Fitting
-   of Osculating Jets, 2005): about a choice of the mesh's vertices a quadratic is fitted to the
-   vertices around, by least squares.  Position, normal and shape operator A of each give the
-   signed distance to second order: s_i(x) = n_i d + d A_i d / 2 with d = x - p_i.
-2. Partition of unity (Ohtake et al., Multi-level Partition of Unity Implicits, 2003):
-   f(x) = sum w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and
-   w_i = 0 past t_i = 1.  The surface is f = 0.  Weights are three times continuously
-   differentiable, and so is f: along a path the normal has a continuous second derivative, which
-   facets, interpolated vertex normals and patches joined with a common tangent plane do not give.
-   Supports are half as thick along the normal as across it, so that the two sides of a thin part
-   do not see one another.
+of Osculating Jets, 2005): about selected vertices a quadratic is fitted to the vertices around by
+least squares.  Position, normal and shape operator A of each give the signed distance to second
+order: s_i(x) = n_i d + d A_i d / 2 with d = x - p_i.
+2. Partition of unity (Ohtake et al., Multi-level Partition of Unity Implicits, 2003): f(x) = sum
+w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and w_i = 0 beyond t_i
+= 1.  The surface is f = 0.
 
-Edges sharper than `rho` are rounded over about that length; how far that takes the surface from the
-mesh is measured (`deviation_m`).
+The weights are three times continuously differentiable, and so is f.  Along a path the normal thus
+has a continuous second derivative, unlike with facets, interpolated vertex normals, or patches
+joined with a common tangent plane.  Supports are half as thick along the normal as across it, so
+that the two sides of a thin part do not affect one another.
+
+Edges sharper than `rho` are rounded over about that length; `deviation_m` measures the resulting
+distance of the surface from the mesh.
 """
 
 from __future__ import annotations
@@ -54,34 +56,34 @@ FIT_RATIO = 1.25
 SPACING_RATIO = 1.0 / 3.0
 """Jets of one side of the surface lie at least this many `rho` apart."""
 MIN_NORMAL_COSINE = 0.2
-"""Cosine of the steepest normal, against a jet's, of a vertex that it is fitted to."""
+"""Minimum cosine between a jet's normal and that of a vertex in its fit."""
 MAX_CURVATURE_RATIO = 2.0
-"""Curvatures are bounded by this over `rho`; what is sharper is smoothed to it."""
+"""Curvatures are bounded by this over `rho`; sharper ones are smoothed to it."""
 EDGE = 1.5
-"""A curvature so many times the tightest of a jet comes of jets that face apart: an edge."""
+"""A curvature this many times a jet's maximum comes from jets of different directions: an edge."""
 OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
-"""f is nearly a distance, its gradient's length nearly one.  Where that is off by more than the
-first, jets that face apart pull at f: an edge.  By more than the second: f = 0 beyond the rim of a
-thin part, which is no surface."""
+"""f is nearly a distance, with a gradient of nearly unit length.  A deviation above the first bound
+comes from jets of different directions: an edge.  Above the second, f = 0 beyond the rim of a thin
+part, which is no surface."""
 MIN_SUPPORT = 0.1
-"""On the mesh the weights add up to several times this; less is beyond such a rim as well."""
+"""Minimum sum of the weights; on the mesh it is several times this, and less beyond a rim."""
 MEMBERS_KNOWN = 0.1
-"""So many `rho` from where the supports around were looked up, they still are all."""
+"""Distance, in `rho`, over which a list of the supports around a point remains complete."""
 STRIDE_RATIO = 0.4
-"""A descent goes at most this many `rho` a step, so that it never leaves the supports."""
+"""Maximum step of a descent in `rho`, so that it never leaves the supports."""
 REST_RATIO = 1e-3
-"""A step under this many `rho` is a descent's last; it leaves nanometres, and some 1e-5 rad."""
+"""A descent ends at a step below this many `rho`; it leaves nanometres, and some 1e-5 rad."""
 APART_RATIO = 0.4
-"""Nearest points that far apart, in `rho`, are two."""
+"""Nearest points farther apart than this, in `rho`, are distinct."""
 MAX_DEVIATION_RATIO = 0.22
-"""The surface stays within this many `rho` of the mesh, or `rho` is too long for it."""
+"""Maximum distance of the surface from the mesh in `rho`; otherwise `rho` is too long."""
 MAX_EXTENT_FRACTION = 1.0 / 3.0
 MAX_STARTS = 6
-"""So many places besides the first are tried for the nearest of all."""
+"""Number of further starts that are tried for the global nearest point."""
 MIN_CURVATURE_FACTOR = 0.1
-"""Close to a centre of curvature, where I + h A is less than this, any foot of a jet is rough."""
+"""Near a centre of curvature, where I + h A is below this, a jet's nearest point is inaccurate."""
 RIM_FRACTION = 0.8
-"""From this share of a circle's radius on, what rises in it counts less and less."""
+"""From this fraction of a circle's radius on, the weight of what rises in it decreases."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -90,9 +92,9 @@ if TYPE_CHECKING:
 
 
 def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
-    """A length to smooth over that hides the facets and keeps the form: 1.75 usual edges.
+    """Return a smoothing length that hides the facets and preserves the form: 1.75 typical edges.
 
-    Shorter ones let facets through, longer ones flatten what is curved over a few edges; see
+    Shorter lengths show facets, longer ones flatten what is curved over a few edges; see
     docs/shapes.md for figures.
     """
     run = half_edges(triangles)
@@ -101,7 +103,7 @@ def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
 
 
 class SmoothMeshShape:
-    """A closed mesh, smoothed over `smoothing_m`; see the module's text."""
+    """Smooth a closed mesh over `smoothing_m`; see the module's text."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """MeshError for a mesh that is no solid's surface or too small to be smoothed so;
