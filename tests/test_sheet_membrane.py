@@ -156,7 +156,7 @@ def test_pushes_that_are_none_are_refused(changed: dict[str, object], words: str
 
 
 def test_an_equilibrium_that_is_not_found_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(membrane, "MOST_ITERATIONS", 1)
+    monkeypatch.setattr(membrane, "MAX_ITERATIONS", 1)
     with pytest.raises(NoEquilibriumError, match="residual"):
         push_path(RUBBER, stretch_ratio=1.05, depths_m=[0.02], finger_radius_m=RADIUS, cells=12)
 

@@ -114,7 +114,6 @@ REMEDIES = {
     "for each cause; news of a start, a reset or new keys ask for nothing.",
     "Reason": "it is a state, not a breakdown: put right what it names, or wait.",
     "Value": "follows `does not fit` of a file, or refuses a message: give a value that it allows.",
-    "BoundError": "bring the mark into both pictures, or choose another pose.",
     "BagError": "`flexsheet bag info BAG` says how much can be read, `flexsheet bag recover` "
     "makes a whole bag of it.",
     "ExportError": "install what it names, or choose another output file.",

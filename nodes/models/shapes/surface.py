@@ -177,7 +177,7 @@ class SurfaceProjections:
     is_nearest: Bools
 
 
-MOST_STEPS = 25
+MAX_STEPS = 25
 MIN_EIGENVALUE = 0.02
 """Lower bound on the eigenvalues' size in the reduced Hessian (1 on a flat surface).  Close to a
 centre of curvature the full Newton step would be too long; past it, descent has the opposite
@@ -201,7 +201,7 @@ def descend(
     steepness, support = np.empty(count), np.empty(count)
     is_nearest = np.zeros(count, dtype=bool)
     moving = np.arange(count)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         x = point[moving]
         value, gradient, hessian, known = level(x)
         square = (gradient * gradient).sum(-1)
@@ -255,7 +255,7 @@ def descend_one(
     qx, qy, qz = query.tolist()
     x, y, z = start.tolist()
     is_nearest = False
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         value, (gx, gy, gz), hessian, support = level((x, y, z))
         square = max(gx * gx + gy * gy + gz * gz, 1e-300)
         length = sqrt(square)

@@ -32,13 +32,13 @@ Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 CELLS = 32
-FINEST_RADII = 0.3
+MIN_CELL_RADII = 0.3
 """Cell size under the finger, in finger radii."""
 STEP_RADII = 0.4
 """Maximum advance of the finger between equilibria, in its radii."""
-BED_PER_MODULUS = 2e5
+PENALTY_PER_MODULUS = 2e5
 """Contact penalty stiffness: pressure per depth of penetration, in E t / width^2."""
-MOST_ITERATIONS = 120
+MAX_ITERATIONS = 120
 GAUSS = 0.5 / np.sqrt(3.0)
 """Distance of the two integration points from a cell's middle, over its side."""
 TOLERANCE = 1e-7
@@ -99,26 +99,26 @@ def push_path(
     )
     if not (0.0 < focus[0] < rubber.width_m and 0.0 < focus[1] < rubber.height_m):
         raise ValueError(f"place {place_m} is not on the sheet")
-    grid = _Grid(rubber, focus, FINEST_RADII * finger_radius_m, cells)
+    grid = _Grid(rubber, focus, MIN_CELL_RADII * finger_radius_m, cells)
     state = _flat(grid, stretch_ratio)
-    state = _settle(grid, state, None)
+    state = _solve_equilibrium(grid, state, None)
     foot: Floats = np.array([*place_m, 0.0], dtype=np.float64)
-    kept = np.zeros(len(state), dtype=bool)
+    sticking = np.zeros(len(state), dtype=bool)
     depth = 0.0
     rows: list[tuple[float, float, Floats]] = []
     for wanted in depths:
         steps = max(1, int(np.ceil((wanted - depth) / (STEP_RADII * finger_radius_m))))
         advance = float(wanted - depth) / steps
         for _ in range(steps if wanted > depth else 0):
-            state = _carried(grid, state, foot, kept, (depth, advance))
+            state = _carried(grid, state, foot, sticking, (depth, advance))
             depth += advance
             centre = foot.copy()
             centre[2] = finger_radius_m - depth
-            ball = _Ball(centre, finger_radius_m, grid.bed, kept)
-            state = _settle(grid, state, ball)
-            kept = kept | ball.touched(state)
+            ball = _Ball(centre, finger_radius_m, grid.penalty, sticking)
+            state = _solve_equilibrium(grid, state, ball)
+            sticking = sticking | ball.touched(state)
         inner = grid.gradient(state).reshape(-1, 3)
-        finger = -inner[kept, 2].sum()
+        finger = -inner[sticking, 2].sum()
         left, right = inner[grid.left, 0].sum(), inner[grid.right, 0].sum()
         rows.append((float(finger), float(0.5 * (right - left)), state))
     return PushPath(
@@ -183,7 +183,7 @@ class _Grid:
         self.volume = np.repeat(0.25 * area * rubber.thickness_m, 4)
         node_area = np.bincount(self.cells.ravel(), np.repeat(0.25 * area, 4), len(self.rest))
         pressure = rubber.young_modulus_pa * rubber.thickness_m / rubber.width_m**2
-        self.bed = np.asarray(BED_PER_MODULUS * pressure * node_area, dtype=np.float64)
+        self.penalty = np.asarray(PENALTY_PER_MODULUS * pressure * node_area, dtype=np.float64)
         self.left, self.right = number[:, 0], number[:, -1]
         clamped = np.zeros(len(self.rest), dtype=bool)
         clamped[self.left] = clamped[self.right] = True
@@ -213,15 +213,15 @@ class _Grid:
         deformed, c = self.strain(positions)
         stress, _ = stress_and_tangent(c, self.c1, self.c2, tangent=False)
         local = self.volume[:, None, None] * self.hats @ stress @ deformed.transpose(0, 2, 1)
-        return self._gathered(local)
+        return self._assemble(local)
 
-    def _gathered(self, local: Floats) -> Floats:
+    def _assemble(self, local: Floats) -> Floats:
         """Sum the forces of the points (points, 4, 3) at the nodes (3 nodes,)."""
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
-    def _summed(self, blocks: Floats) -> Floats:
+    def _scatter(self, blocks: Floats) -> Floats:
         """Sum the stiffnesses of the points (points, ...) into the entries of the pattern."""
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
@@ -249,7 +249,7 @@ class _Grid:
         geometric = volume * hats @ stress @ hats.transpose(0, 2, 1)
         for axis in range(3):
             blocks[:, :, axis, :, axis] += geometric
-        values = self._summed(blocks)
+        values = self._scatter(blocks)
         values[self._diagonal] += damping
         for node in np.flatnonzero(added.any(axis=(1, 2))):
             at = 3 * node + np.arange(3)
@@ -260,7 +260,7 @@ class _Grid:
             (values[keep], (number[self._rows[keep]], number[self._columns[keep]])),
             shape=(int(free.sum()),) * 2,
         )
-        return self._gathered(local), matrix
+        return self._assemble(local), matrix
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
@@ -335,9 +335,9 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 class _Ball:
     """Press nodes inside the fingertip outwards, and move the nodes that stick to it."""
 
-    def __init__(self, centre: Floats, radius_m: float, bed: Floats, kept: Bools) -> None:
-        self.centre, self.radius, self.kept = centre, radius_m, kept
-        self._bed = np.where(kept, 0.0, bed)
+    def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
+        self.centre, self.radius, self.sticking = centre, radius_m, sticking
+        self._bed = np.where(sticking, 0.0, penalty)
 
     def _reach(self, positions: Floats) -> tuple[Floats, Floats]:
         offset = positions - self.centre
@@ -367,7 +367,7 @@ def _flat(grid: _Grid, stretch_ratio: float) -> Floats:
 
 
 def _carried(
-    grid: _Grid, state: Floats, foot: Floats, kept: Bools, push: tuple[float, float]
+    grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
     """Guess the next equilibrium: the indentation grows in proportion; the first one is a cone.
 
@@ -381,13 +381,13 @@ def _carried(
         away = np.hypot(state[:, 0] - foot[0], state[:, 1] - foot[1])
         grown[:, 2] = -advance * np.maximum(1.0 - away / np.abs(grid.centre).max(), 0.0)
         grown[grid.clamped, 2] = 0.0
-    grown[kept] = state[kept] - [0.0, 0.0, advance]
+    grown[sticking] = state[sticking] - [0.0, 0.0, advance]
     return grown
 
 
-def _settle(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
+def _solve_equilibrium(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
     """Solve the equilibrium near `start` with clamped and sticking nodes fixed."""
-    held = grid.clamped if ball is None else grid.clamped | ball.kept
+    held = grid.clamped if ball is None else grid.clamped | ball.sticking
     free = np.repeat(~held, 3)
     positions, damping = start, 1e-7
     stiffness_scale = grid.force_scale / grid.centre[0]
@@ -397,7 +397,7 @@ def _settle(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
         return grid.energy(at) + (0.0 if ball is None else ball.energy(at))
 
     current, residual = energy(positions), np.inf
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         push = np.zeros_like(start)
         if ball is not None:
             push, added = ball.gradient(positions)
