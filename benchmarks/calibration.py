@@ -22,13 +22,19 @@ from scipy.optimize import least_squares
 
 from launch.plans.plan import load_scene
 from messages.calibration import Board
-from nodes.camera.bundle import fit_rig, linearized, pose_transform
-from nodes.camera.check import Rig, measure_board, plain_corners, plain_opencv, triangulated
+from nodes.camera.bundle import fit_rig, linearize, pose_transform
+from nodes.camera.check import (
+    Rig,
+    calibrate_plain_opencv,
+    find_plain_corners,
+    measure_board,
+    triangulated,
+)
 from nodes.camera.corners import BoardPair, CornerFinder, board_points, find_pairs
 from nodes.camera.selection import fit_pairs
 from nodes.models import rigid
 from nodes.twin.board import TwinBoard
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -85,7 +91,7 @@ FINDERS = {
 
 def judge_finders() -> None:
     board = Board(columns=9, rows=6, square_m=0.025)
-    twin = TwinBoard(true_camera(load_scene(SCENE).camera), board, seed=SEED)
+    twin = TwinBoard(make_true_camera(load_scene(SCENE).camera), board, seed=SEED)
     pictures = []
     for pose in twin.poses(POSES):
         pictures += list(zip(twin.pair(pose), twin.corners(pose), strict=True))
@@ -131,12 +137,12 @@ def robust(loss: str, scale_px: float) -> Fitter:
             return [(i, p, x[22 + 6 * i : 28 + 6 * i]) for i, p in enumerate(pairs)]
 
         def shifts(x: Floats) -> Floats:
-            return np.concatenate([linearized(p, points, x[:22], q).shifts for _, p, q in parts(x)])
+            return np.concatenate([linearize(p, points, x[:22], q).shifts for _, p, q in parts(x)])
 
         def slopes(x: Floats) -> Floats:
             rows = []
             for i, pair, pose in parts(x):
-                here = linearized(pair, points, x[:22], pose)
+                here = linearize(pair, points, x[:22], pose)
                 row = np.zeros((len(here.shifts), len(x)))
                 row[:, :22], row[:, 22 + 6 * i : 28 + 6 * i] = -here.by_rig, -here.by_pose
                 rows.append(row)
@@ -173,17 +179,17 @@ FITTERS: dict[str, Fitter] = {
     "joint, soft L1 at 0.2 px": robust("soft_l1", 0.2),
     "joint, Cauchy at 0.2 px": robust("cauchy", 0.2),
     "joint, with the board's shape": with_board_shape,
-    "each camera alone, then fixed": plain_opencv,
+    "each camera alone, then fixed": calibrate_plain_opencv,
 }
 
 
 def judge_fitters(left: list[Path], right: list[Path], board: Board) -> None:
     found, size = find_pairs(left, right, board)
     pairs = [pair for pair in found if isinstance(pair, BoardPair)]
-    tutorial = [plain_corners(*paths, board) for paths in zip(left, right, strict=True)]
+    tutorial = [find_plain_corners(*paths, board) for paths in zip(left, right, strict=True)]
     plain = [pair for pair in tutorial if pair is not None]
     ways = [(name, fitter, pairs) for name, fitter in FITTERS.items()]
-    ways.append(("each camera alone, then fixed, window of 11 px", plain_opencv, plain))
+    ways.append(("each camera alone, then fixed, window of 11 px", calibrate_plain_opencv, plain))
     ways.append(("joint, window of 11 px", joint, plain))
     points = board_points(board)
     for name, fitter, given in ways:

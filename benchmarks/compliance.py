@@ -25,7 +25,7 @@ from launch.bench.twin_sheet import twin_force
 from launch.health.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
 from launch.plans.plan import load_scene
 from messages.scene import Scene
-from nodes.models.sheet.laws import CENTRE, Place, SheetLaw
+from nodes.models.sheet.force_models import CENTRE, Place, SheetForceModel
 from nodes.planner.compliance import (
     FELT_N,
     GOOD_RATIO,
@@ -75,7 +75,7 @@ def verdict(error: Floats) -> str:
     return f"noticeable ({100 * worst:.0f} %; {100 * WEBER_RATIO:.0f}-{100 * WEBER_RATIO_BARE:.0f})"
 
 
-def materials(scene: Scene, law: SheetLaw, depths: Floats) -> None:
+def materials(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
     curve_of = object_curve(scene)
     print(f"{'error, % of wanted, at':<28}" + "".join(f"{1e3 * d:>5.0f} mm" for d in depths))
     for modulus in MODULI_PA:
@@ -100,7 +100,7 @@ def materials(scene: Scene, law: SheetLaw, depths: Floats) -> None:
             print(f"  {shown.note}")
 
 
-def places(scene: Scene, law: SheetLaw, depths: Floats) -> None:
+def places(scene: Scene, law: SheetForceModel, depths: Floats) -> None:
     curve = object_curve(scene)(PLACES_MODULUS_PA)
     shown = scene_compliance(scene, law, curve, deepest_m=float(depths[-1]))
     print(f"\n{1e-3 * PLACES_MODULUS_PA:g} kPa at places of the sheet, error %")
@@ -111,7 +111,7 @@ def places(scene: Scene, law: SheetLaw, depths: Floats) -> None:
         print(row(where, error) + f"   {verdict(error)}")
 
 
-def limits(scene: Scene, law: SheetLaw, deepest_m: float) -> None:
+def limits(scene: Scene, law: SheetForceModel, deepest_m: float) -> None:
     """The softest and the stiffest modulus, by the law itself."""
     curve_of = object_curve(scene)
 

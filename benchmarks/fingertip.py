@@ -22,13 +22,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.fingertip_bound import fingertip_bound
 from launch.plans.plan import load_scene
 from messages.scene import Scene
-from nodes.triangulator.fingertip import Eyesight, locate
-from nodes.triangulator.mark import MARK_METHODS, MarkLooks
-from nodes.triangulator.tracking import Expected
+from nodes.triangulator.fingertip import DetectorConfig, detect
+from nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from nodes.triangulator.tracking import Gate
 from nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
-from nodes.twin.bound import fingertip_bound
 from nodes.twin.clutter import CLUTTER
 from nodes.twin.pixels import TwinCamera
 
@@ -88,9 +88,9 @@ def shots(camera: TwinCamera, speed_m_per_s: float, exposure_s: float) -> list[S
 def measure(scene: Scene, method: str, taken: list[Shot]) -> tuple[Run, Run]:
     """The region of interest and the whole picture, in turn on every shot."""
     geometry = StereoGeometry.of(scene.camera)
-    eyesight = Eyesight(
-        looks=MarkLooks(),
-        refine=MARK_METHODS[method],
+    config = DetectorConfig(
+        blob_filter=BlobFilter(),
+        refine=MARKER_METHODS[method],
         triangulate=TRIANGULATION_METHODS["dlt"],
         max_reprojection_px=1.5,
     )
@@ -101,15 +101,15 @@ def measure(scene: Scene, method: str, taken: list[Shot]) -> tuple[Run, Run]:
     gc.disable()
     for turn in range(ROUNDS):
         for i, shot in enumerate(taken):
-            for way, expected in enumerate((Expected(shot.expected, REACH_M), None)):
+            for way, gate in enumerate((Gate(shot.expected, REACH_M), None)):
                 start = time.thread_time()
-                reason, measured = locate(
+                reason, measured = detect(
                     shot.left,
                     shot.right,
                     geometry=geometry,
-                    eyesight=eyesight,
+                    config=config,
                     volume=volume,
-                    expected=expected,
+                    gate=gate,
                 )
                 times[way, turn, i] = time.thread_time() - start
                 if reason == "ok" and measured is not None:
@@ -156,7 +156,7 @@ def main() -> None:
         ]
         bound_m = float(np.sqrt(np.mean([np.trace(bound.position_m2) for bound in bounds])))
         print(f"\n{speed_m_per_s:g} m/s, bound {1e3 * bound_m:.3f} mm rms; p50, p99 a pair:")
-        for method in MARK_METHODS:
+        for method in MARKER_METHODS:
             near, whole = measure(scene, method, taken)
             report(method, "region", near, bound_m)
             report(method, "whole", whole, bound_m)

@@ -8,7 +8,7 @@ single pictures (before tracking) and tracked:
 
 - with the shipped calibration: all of the error;
 - with the rig's true optics: what pixels leave, beside the Cramer-Rao bound of the same pixels
-  (`nodes.twin.bound`), each per axis as root mean square over all places.
+  (`benchmarks.fingertip_bound`), each per axis as root mean square over all places.
 
 Some two minutes.
 """
@@ -27,23 +27,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.fingertip_bound import fingertip_bound
 from benchmarks.tracking_bench import (
     CALIBRATION_FILE,
     MACHINE,
+    DiscCutouts,
     Frame,
-    Motion,
     Observer,
-    Seen,
+    TruePathCase,
     bench_scene,
     twin_camera,
 )
 from messages.calibration import load_calibration, save_calibration
 from messages.scene import Scene
-from nodes.twin.bound import fingertip_bound
 from nodes.twin.clutter import CLUTTER
-from nodes.twin.finger import TREMOR_BAND_HZ, Sines
+from nodes.twin.finger import TREMOR_BAND_HZ, SineSum
 from nodes.twin.gestures import TREMOR_HAND_M
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class Walk:
 
     places: Floats
     ways: Floats
-    tremor: Sines
+    tremor: SineSum
 
     @staticmethod
     def drawn(count: int, seed: int) -> Walk:
@@ -71,7 +71,7 @@ class Walk:
         ways = random.standard_normal((count, 3))
         ways /= np.linalg.norm(ways, axis=1, keepdims=True)
         return Walk(
-            random.uniform(LOW_M, HIGH_M, (count, 3)), ways, Sines.drawn(TREMOR_BAND_HZ, random)
+            random.uniform(LOW_M, HIGH_M, (count, 3)), ways, SineSum.drawn(TREMOR_BAND_HZ, random)
         )
 
     def at(self, time_s: float) -> Floats:
@@ -89,7 +89,7 @@ class Walk:
 
 def exact_calibration(scene: Scene, folder: Path) -> Path:
     """A calibration file of the rig as it really stands."""
-    rig = true_camera(scene.camera)
+    rig = make_true_camera(scene.camera)
     true = load_calibration(CALIBRATION_FILE).model_copy(
         update={"left": rig.left, "right": rig.right, "right_from_left": rig.right_from_left}
     )
@@ -97,7 +97,7 @@ def exact_calibration(scene: Scene, folder: Path) -> Path:
     return folder / "true.yaml"
 
 
-async def follow(scene: Scene, walk: Walk, calibration: Path) -> list[Seen]:
+async def follow(scene: Scene, walk: Walk, calibration: Path) -> list[DiscCutouts]:
     camera = twin_camera(scene, CLUTTER["lab"])
     frames = [Frame(t, camera) for t in walk.moments(1.0 / scene.camera.rate_hz)]
     observer = await Observer(scene, calibration=calibration).start()
@@ -108,7 +108,7 @@ def bound_m2(scene: Scene, walk: Walk) -> Floats:
     """(3,) mean over the places of the least variance per axis."""
     camera = twin_camera(scene, CLUTTER["lab"])
 
-    def around(place: int) -> Motion:
+    def around(place: int) -> TruePathCase:
         return lambda offset_s: walk.at(place * APART_S + offset_s)
 
     bounds = [
@@ -118,7 +118,7 @@ def bound_m2(scene: Scene, walk: Walk) -> Floats:
     return np.asarray(np.mean([np.diag(bound.position_m2) for bound in bounds], axis=0))
 
 
-def single_errors(seen: Sequence[Seen]) -> Floats:
+def single_errors(seen: Sequence[DiscCutouts]) -> Floats:
     """(n, 3) m of single pictures that have a measured point."""
     return np.array(
         [
@@ -129,7 +129,7 @@ def single_errors(seen: Sequence[Seen]) -> Floats:
     )
 
 
-def tracked_errors(seen: Sequence[Seen]) -> Floats:
+def tracked_errors(seen: Sequence[DiscCutouts]) -> Floats:
     """(n, 3) m of valid fingertips of settled tracks."""
     settled = [one for place, one in enumerate(seen) if place % FRAMES >= SETTLED_FRAMES]
     return np.array([one.error_m for one in settled if one.valid])

@@ -40,9 +40,9 @@ from nodes.renderer.benchmarks import (
 from nodes.renderer.gl import DrawStyle, headless_context
 from nodes.renderer.scene_renderer import SceneRenderer
 from nodes.renderer.sheet import SheetPose, estimate_sheet
-from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen, tilt_sizes
+from nodes.twin.error_map import ErrorMap, error_map
+from nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen, tilt_sizes
 from nodes.twin.membrane import DeformedSheet, NotConvergedError
-from nodes.twin.places import ErrorMap, error_map
 from nodes.twin.true_object import TrueBody
 
 Floats = NDArray[np.float64]
@@ -63,7 +63,7 @@ class Bench:
         dents = deflection_cache.load_or_compute(scene, None)
         self.stage = SceneRenderer(scene, headless_context(), spacing_m=0.0025, dents=dents)
         self._eye = scene.eyes.centre_world_m
-        self._proper = proper(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
+        self._expected = render_expected(TrueBody(scene).at_rest(), eye=self._eye, flat=True)
         unmoved = self.situation(np.eye(4), None)
         self._whole = len(self.errors("none", *unmoved).sizes_m)
 
@@ -105,7 +105,7 @@ class Bench:
         projected = self.stage.draw(shown, predicted, DrawStyle(True, "object"), read=True)
         assert projected is not None
         picture = seen(projected, truth, self.scene, eye=self._eye)
-        wanted = np.array(sizes(self._proper, METRES_PER_PX))
+        wanted = np.array(sizes(self._expected, METRES_PER_PX))
         return np.asarray(np.abs(np.array(sizes(picture, METRES_PER_PX)) - wanted))
 
     def errors(self, method: str, predicted: SheetPose, truth: DeformedSheet) -> ErrorMap:

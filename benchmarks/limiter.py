@@ -50,8 +50,8 @@ from nodes.twin.arms import (
     RANGE_RAD,
     SPEED_RAD_PER_S,
     Servo,
+    decelerate,
     forward,
-    slowed,
 )
 
 Floats = NDArray[np.float64]
@@ -202,7 +202,7 @@ class Judged:
         """Undo the step of frozen arms; let stopping ones brake instead."""
         servo, still, braking = self.servo, moving < 0, moving == 0
         servo.joints_rad[still], servo.velocity_rad_per_s[still] = joints[still], 0.0
-        slower = slowed(velocity, step_s)
+        slower = decelerate(velocity, step_s)
         servo.velocity_rad_per_s[braking] = slower[braking]
         servo.joints_rad[braking] = (joints + slower * step_s)[braking]
 

@@ -213,8 +213,8 @@ def fingertip(number: int) -> Fingertip:
         position_world_m=POINT,
         velocity_world_m_per_s=POINT,
         covariance=COVARIANCE,
-        ahead_world_m=AHEAD,
-        ahead_step_s=0.01,
+        predicted_path_world_m=AHEAD,
+        prediction_step_s=0.01,
         measured_world_m=POINT,
         reprojection_px=0.1,
     )

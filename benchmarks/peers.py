@@ -185,8 +185,8 @@ def dds_types() -> dict[type, type]:
         "position_world_m": three,
         "velocity_world_m_per_s": three,
         "covariance": array[float64, 36],
-        "ahead_world_m": sequence[float64],
-        "ahead_step_s": float64,
+        "predicted_path_world_m": sequence[float64],
+        "prediction_step_s": float64,
         "measured_world_m": three,
         "reprojection_px": float64,
     }
@@ -343,8 +343,8 @@ class LcmFingertip:
     velocity_world_m_per_s: Any
     covariance: Any
     points: int
-    ahead_world_m: Any
-    ahead_step_s: float
+    predicted_path_world_m: Any
+    prediction_step_s: float
     measured_world_m: Any
     reprojection_px: float
 
@@ -359,9 +359,9 @@ class LcmFingertip:
         for row in self.covariance:
             out.write(struct.pack(">6d", *row[:6]))
         out.write(struct.pack(">i", self.points))
-        for row in self.ahead_world_m:
+        for row in self.predicted_path_world_m:
             out.write(struct.pack(">3d", *row[:3]))
-        out.write(struct.pack(">d", self.ahead_step_s))
+        out.write(struct.pack(">d", self.prediction_step_s))
         out.write(struct.pack(">3d", *self.measured_world_m[:3]))
         out.write(struct.pack(">d", self.reprojection_px))
         return out.getvalue()
@@ -432,7 +432,7 @@ class LcmStereoPair:
 def lcm_message(message: Fingertip | StereoPair, header: LcmHeader) -> LcmFingertip | LcmStereoPair:
     values = dict(message.__dict__)
     if isinstance(message, Fingertip):
-        return LcmFingertip(header=header, points=len(message.ahead_world_m), **values)
+        return LcmFingertip(header=header, points=len(message.predicted_path_world_m), **values)
     rows, columns = message.left.shape
     return LcmStereoPair(header=header, rows=rows, columns=columns, **values)
 

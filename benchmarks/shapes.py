@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from launch.objects.meshes import read_mesh
 from nodes.models.shapes import Shape, SmoothMeshShape, make_shape
-from nodes.models.shapes.smooth_mesh import usual_smoothing_m
+from nodes.models.shapes.smooth_mesh import default_smoothing_m
 from nodes.models.shapes.triangles import Facets, triangle_normals, vertex_normals
 from nodes.planner.families import ellipsoid_mesh
 
@@ -89,7 +89,7 @@ def second_derivative(normals: Floats, edges: Bools, step_m: float) -> float:
 
 
 def judge_mesh(vertices: Floats, triangles: Indices) -> None:
-    edge_m = usual_smoothing_m(vertices, triangles) / 1.75
+    edge_m = default_smoothing_m(vertices, triangles) / 1.75
     facets = Facets(vertices, triangles)
     flat, rough = triangle_normals(vertices, triangles), vertex_normals(vertices, triangles)
     corners = vertices[triangles]

@@ -277,7 +277,9 @@ class Soak:
         self.log_lines: dict[str, int] = {}
         self.began_s = self.lasted_s = 0.0
         bag = folder / "soak-%Y%m%d-%H%M%S.mcap"
-        self.plan = load_plan(DEMO_FILE, record=bag, settings=["recorder.waits=true", *settings])
+        self.plan = load_plan(
+            DEMO_FILE, record=bag, settings=["recorder.start_paused=true", *settings]
+        )
         self.graph = RunningGraph(self.plan)
         self._processes: dict[int, psutil.Process] = {}
         self._cpu_s: dict[int, float] = {}

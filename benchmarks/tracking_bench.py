@@ -24,10 +24,10 @@ from nodes.triangulator.parameters import TriangulatorParameters
 from nodes.twin.clutter import Clutter
 from nodes.twin.finger import FingerMotion
 from nodes.twin.pixels import Sensor, TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
-Motion = Callable[[float], Floats]
+TruePathCase = Callable[[float], Floats]
 """The true fingertip (3,) at a time in seconds."""
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -51,7 +51,7 @@ class Frame:
     time_s: float
     camera: TwinCamera
     stamp_s: float | None = None
-    mark: bool = True
+    marker: bool = True
     right_from_column: int = 0
 
     @property
@@ -60,7 +60,7 @@ class Frame:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class DiscCutouts:
     """A frame's truth (3,) and what the triangulator said of it; None: it came too late."""
 
     frame: Frame
@@ -108,13 +108,13 @@ class Observer:
         await self.node.step("scene", self.scene, Header(1, 0, 0, "virtual", "bench", 1))
         return self
 
-    async def show(self, frame: Frame, motion: Motion) -> Seen:
+    async def show(self, frame: Frame, motion: TruePathCase) -> DiscCutouts:
         """Take the picture and hand it over; a handler's error is raised here."""
         exposure_s = self.scene.camera.exposure_s
         left, right = frame.camera.picture(
             lambda offset_s: motion(frame.time_s + offset_s),
             exposure_s=exposure_s,
-            mark=frame.mark,
+            marker=frame.marker,
             time_s=frame.time_s,
         )
         column = frame.right_from_column
@@ -126,7 +126,7 @@ class Observer:
             right=np.ascontiguousarray(right[:, column:]),
             right_origin_px=(column, 0),
         )
-        return Seen(frame, motion(frame.time_s), await self.hand_over(pair, frame.stamp_ns))
+        return DiscCutouts(frame, motion(frame.time_s), await self.hand_over(pair, frame.stamp_ns))
 
     async def hand_over(self, pair: StereoPair, stamp_ns: int) -> Fingertip | None:
         """What is said of a pair; None: nothing, it came too late.  Raises a handler's error."""
@@ -136,7 +136,7 @@ class Observer:
             raise RuntimeError(f"triangulator: {self.node.last_error}")
         return self._said[0] if self._said else None
 
-    async def follow(self, frames: Iterable[Frame], motion: Motion) -> list[Seen]:
+    async def follow(self, frames: Iterable[Frame], motion: TruePathCase) -> list[DiscCutouts]:
         return [await self.show(frame, motion) for frame in frames]
 
     def _keep(self, topic: Topic, message: Message, header: Header) -> None:
@@ -153,7 +153,7 @@ def twin_camera(
 ) -> TwinCamera:
     """The camera of the rig as it really stands."""
     return TwinCamera(
-        true_camera(scene.camera),
+        make_true_camera(scene.camera),
         finger_radius_m=scene.finger.radius_m,
         seed=seed,
         clutter=clutter,
@@ -172,7 +172,7 @@ def calibration_covariance(scene: Scene, file: Path = CALIBRATION_FILE) -> Float
     return world_from_left @ in_left @ world_from_left.T
 
 
-def path_motion(path: FingerPath, scene: Scene, *, seed: int) -> Motion:
+def path_motion(path: FingerPath, scene: Scene, *, seed: int) -> TruePathCase:
     """A finger on a path, its time counted from the path's start, with its unsteadiness."""
     motion = FingerMotion.resting(path.positions_world_m[0], seed=seed).followed_by(
         0.0,
@@ -186,7 +186,9 @@ def path_motion(path: FingerPath, scene: Scene, *, seed: int) -> Motion:
     return lambda time_s: motion.at(motion.ease_s + time_s).position
 
 
-def paths_motion(paths: Sequence[FingerPath], scene: Scene, *, seed: int) -> tuple[Motion, float]:
+def paths_motion(
+    paths: Sequence[FingerPath], scene: Scene, *, seed: int
+) -> tuple[TruePathCase, float]:
     """A finger that goes over from each path to the next at its end, and how long it takes."""
     motion = FingerMotion.resting(paths[0].positions_world_m[0], seed=seed)
     starts_s, motions = [0.0], [motion]
@@ -214,7 +216,7 @@ def paths_motion(paths: Sequence[FingerPath], scene: Scene, *, seed: int) -> tup
     return at, end_s
 
 
-def sigmas(seen: Seen, added: Floats) -> float:
+def sigmas(seen: DiscCutouts, added: Floats) -> float:
     """How many of its stated standard deviations a fingertip is off (Mahalanobis).
 
     added: (3, 3) m^2 of what the track's own covariance leaves out, the calibration's.

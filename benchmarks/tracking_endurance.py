@@ -38,10 +38,10 @@ from numpy.typing import NDArray
 from benchmarks.tracking_bench import (
     MACHINE,
     WRONG_FOOTED_M,
+    DiscCutouts,
     Frame,
-    Motion,
     Observer,
-    Seen,
+    TruePathCase,
     bench_scene,
     paths_motion,
     twin_camera,
@@ -53,16 +53,16 @@ from nodes.twin.clutter import (
     CLAMPS,
     CLUTTER,
     HAND,
-    MARK_RADIUS_M,
+    MARKER_RADIUS_M,
     NAIL,
     Clutter,
+    FixedPoint,
     Highlight,
     Occluder,
-    Path,
-    SecondMark,
+    Oscillation,
+    SecondMarker,
     Sheet,
-    Still,
-    Swinging,
+    Trajectory,
     together,
 )
 from nodes.twin.gestures import GESTURES
@@ -74,7 +74,7 @@ SEQUENCE_FRAMES = 2000
 MIDDLE_M, SPREAD_M = (0.0, 0.01, 0.02), (0.05, 0.04, 0.03)
 """Where the distractors' middles are drawn, one standard deviation: where the gestures go on."""
 
-ALONE_S = 0.5
+SOLE_CANDIDATE_TIME_S = 0.5
 BLINKS_PER_S = 0.4
 LONGEST_BLINK_FRAMES = 60
 LOST_FRAMES_SHARE = 0.01
@@ -92,18 +92,18 @@ def crowd(random: np.random.Generator) -> Clutter:
         x, y, z = random.normal(MIDDLE_M, SPREAD_M).tolist()
         return x, y, z
 
-    def swinging(least_m: float, most_m: float, fastest_s: float, slowest_s: float) -> Swinging:
+    def swinging(least_m: float, most_m: float, fastest_s: float, slowest_s: float) -> Oscillation:
         way = random.normal(0.0, 1.0, 3) * (1.0, 1.0, 0.3)
         x, y, z = (random.uniform(least_m, most_m) * way / np.linalg.norm(way)).tolist()
         period_s, phase = random.uniform(fastest_s, slowest_s), random.uniform(0.0, 2.0 * np.pi)
-        return Swinging(place(), (x, y, z), float(period_s), float(phase))
+        return Oscillation(place(), (x, y, z), float(period_s), float(phase))
 
-    marks = [
-        SecondMark(swinging(0.06, 0.2, 2.0, 8.0), level=float(random.uniform(150.0, 235.0)))
+    markers = [
+        SecondMarker(swinging(0.06, 0.2, 2.0, 8.0), level=float(random.uniform(150.0, 235.0)))
         for _ in range(int(random.integers(1, 3)))
     ]
     if random.random() < 0.5:
-        marks.append(SecondMark(Still(place()), level=float(random.uniform(150.0, 235.0))))
+        markers.append(SecondMarker(FixedPoint(place()), level=float(random.uniform(150.0, 235.0))))
     highlights = [
         Highlight(
             swinging(0.06, 0.2, 2.0, 6.0),
@@ -116,7 +116,7 @@ def crowd(random: np.random.Generator) -> Clutter:
     top_x, reach_x, period_s = random.normal(0.0, 0.05), random.uniform(0.2, 0.4), 6.0
     phase = float(random.uniform(0.0, 2.0 * np.pi))
     ends = [
-        Swinging((float(top_x), y, z), (float(reach_x), 0.0, 0.0), period_s, phase)
+        Oscillation((float(top_x), y, z), (float(reach_x), 0.0, 0.0), period_s, phase)
         for y, z in ((0.35, -0.05), (-0.35, 0.35))
     ]
     cable = Occluder(
@@ -130,7 +130,7 @@ def crowd(random: np.random.Generator) -> Clutter:
         HAND,
         NAIL,
         CLAMPS,
-        Clutter(marks=tuple(marks), highlights=tuple(highlights), occluders=(cable,)),
+        Clutter(markers=tuple(markers), highlights=tuple(highlights), occluders=(cable,)),
     )
 
 
@@ -151,24 +151,24 @@ def exposures(
     tick = taken = 0
     while taken < count:
         tick += 1
-        camera = alone if tick * period_s < ALONE_S else crowded
+        camera = alone if tick * period_s < SOLE_CANDIDATE_TIME_S else crowded
         if camera is crowded and tick > hidden_until and random.random() < BLINKS_PER_S * period_s:
             length = LONGEST_BLINK_FRAMES ** random.random()
             hidden_until = tick + int(length)
         if random.random() >= LOST_FRAMES_SHARE:
             taken += 1
-            yield Frame(tick * period_s, camera, mark=tick > hidden_until)
+            yield Frame(tick * period_s, camera, marker=tick > hidden_until)
 
 
 def in_full_view(camera: TwinCamera, frame: Frame, tip: Floats) -> bool:
     """Whether nothing comes between the mark and either camera, nor runs into it."""
     clutter = camera.clutter
-    spots: list[SecondMark | Highlight] = [*clutter.marks, *clutter.highlights]
-    things: list[tuple[str, Path, Path, float]] = [
-        (spot.views, spot.path, spot.path, spot.radius_m) for spot in spots if not spot.carried
+    blobs: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
+    things: list[tuple[str, Trajectory, Trajectory, float]] = [
+        (blob.views, blob.path, blob.path, blob.radius_m) for blob in blobs if not blob.carried
     ]
     things += [(one.views, one.start, one.end, one.radius_m) for one in clutter.occluders]
-    return frame.mark and all(
+    return frame.marker and all(
         _gap_px(eye, tip, start.at(frame.time_s), end.at(frame.time_s), radius_m) > CLEAR_PX
         for views, start, end, radius_m in things
         for eye in camera.eyes
@@ -185,7 +185,7 @@ def _gap_px(eye: Eye, tip: Floats, start: Floats, end: Floats, radius_m: float) 
     share = min(max(share, 0.0), 1.0)
     depth_m = in_camera[1, 2] + share * (in_camera[2, 2] - in_camera[1, 2])
     gap = float(np.linalg.norm(slopes[1] + share * way - slopes[0]))
-    return float(eye.lens.fx_px * (gap - radius_m / depth_m - MARK_RADIUS_M / in_camera[0, 2]))
+    return float(eye.lens.fx_px * (gap - radius_m / depth_m - MARKER_RADIUS_M / in_camera[0, 2]))
 
 
 @dataclass
@@ -257,10 +257,10 @@ class Tally:
         }
 
 
-def tallied(seen: list[Seen], scene: Scene, seed: int) -> Tally:
+def tallied(seen: list[DiscCutouts], scene: Scene, seed: int) -> Tally:
     """Judge one sequence; what comes before its first valid fingertip is no outage."""
     tally = Tally(frames=len(seen))
-    before: Seen | None = None
+    before: DiscCutouts | None = None
     clear_since_s: float | None = None
     out = False
     for one in seen:
@@ -309,7 +309,7 @@ def tallied(seen: list[Seen], scene: Scene, seed: int) -> Tally:
     return tally
 
 
-def _jump(before: Seen, after: Seen) -> tuple[float, float, float]:
+def _jump(before: DiscCutouts, after: DiscCutouts) -> tuple[float, float, float]:
     """How much further the fingertip went than the finger did, m, and its standard deviation.
 
     Two of them: of the difference of the two positions as a whole (root of the trace of the sum of
@@ -325,7 +325,7 @@ def _jump(before: Seen, after: Seen) -> tuple[float, float, float]:
     return beyond_m, float(np.sqrt(np.trace(both))), float(np.sqrt(along @ both @ along))
 
 
-async def follow(seed: int, count: int) -> tuple[list[Seen], Motion]:
+async def follow(seed: int, count: int) -> tuple[list[DiscCutouts], TruePathCase]:
     """One sequence of frames, all of it drawn from its seed."""
     scene, random = bench_scene(), np.random.default_rng(seed)
     alone = twin_camera(scene, CLUTTER["lab"], seed=seed)

@@ -31,10 +31,10 @@ from benchmarks.tracking_bench import (
     MACHINE,
     ROOT,
     WRONG_FOOTED_M,
+    DiscCutouts,
     Frame,
-    Motion,
     Observer,
-    Seen,
+    TruePathCase,
     bench_scene,
     calibration_covariance,
     path_motion,
@@ -44,11 +44,11 @@ from benchmarks.tracking_bench import (
 from messages.scene import Scene
 from nodes.twin.clutter import (
     CLUTTER,
-    MARK_RADIUS_M,
+    MARKER_RADIUS_M,
     Clutter,
+    FixedPoint,
     Occluder,
-    Still,
-    second_mark,
+    second_marker,
     together,
     touching_highlight,
 )
@@ -79,7 +79,7 @@ class Stage:
     calibration: None where the scene's optics are exact.
     """
 
-    motion: Motion
+    motion: TruePathCase
     frames: list[Frame]
     begins_s: float
     ends_s: float
@@ -142,20 +142,20 @@ def times(
     return [float(t) for t in np.arange(since_s, until_s - 1e-9, period_s)]
 
 
-def drawing(scene: Scene, repetition: int) -> Motion:
+def drawing(scene: Scene, repetition: int) -> TruePathCase:
     """A finger that draws circles before the sheet at 86 mm/s."""
     motion = path_motion(circle(scene), scene, seed=repetition)
     start_s = 1.5 + 0.7 * repetition
     return lambda time_s: motion(start_s + time_s)
 
 
-def reaching(scene: Scene, repetition: int) -> Motion:
+def reaching(scene: Scene, repetition: int) -> TruePathCase:
     """A finger that reaches to and fro, at up to 0.35 m/s."""
     motion = path_motion(reach(scene, seed=repetition + 1), scene, seed=repetition)
     return lambda time_s: motion(0.1 + time_s)
 
 
-def passing(scene: Scene, motion: Motion, change: Callable[[Frame], Frame]) -> Stage:
+def passing(scene: Scene, motion: TruePathCase, change: Callable[[Frame], Frame]) -> Stage:
     """An undisturbed finger, a change of the frames for some time, and the finger again."""
     ends_s = BEFORE_S + DURING_S
     frames = [
@@ -171,8 +171,8 @@ def before(camera: TwinCamera) -> Callable[[Frame], Frame]:
 
 def hidden_in_one_view(scene: Scene, edge: float, repetition: int) -> Stage:
     """Something dark with a straight edge, so many radii from the mark's centre, hides the rest."""
-    middle_m = edge * MARK_RADIUS_M + SCREEN_M
-    ends = [Still((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
+    middle_m = edge * MARKER_RADIUS_M + SCREEN_M
+    ends = [FixedPoint((middle_m, y, 0.0)) for y in (-0.02, 0.02)]
     screen = Occluder(ends[0], ends[1], SCREEN_M, level=30.0, carried=True, views="right")
     camera = _camera(Clutter(occluders=(screen,)))
     return passing(scene, drawing(scene, repetition), before(camera))
@@ -191,15 +191,15 @@ def off_the_edge(scene: Scene, distance_px: float, repetition: int) -> Stage:
 
 
 def with_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Stage:
-    camera = _camera(second_mark((1e-3 * distance_mm, 0.0, 0.0)))
+    camera = _camera(second_marker((1e-3 * distance_mm, 0.0, 0.0)))
     return passing(scene, drawing(scene, repetition), before(camera))
 
 
 def hidden_beside_a_second_mark(scene: Scene, distance_mm: float, repetition: int) -> Stage:
     """The second mark is there all the time, and alone while the finger's is hidden."""
-    camera = _camera(second_mark((1e-3 * distance_mm, 0.0, 0.0)))
+    camera = _camera(second_marker((1e-3 * distance_mm, 0.0, 0.0)))
     stage = passing(
-        scene, drawing(scene, repetition), lambda frame: replace(frame, camera=camera, mark=False)
+        scene, drawing(scene, repetition), lambda frame: replace(frame, camera=camera, marker=False)
     )
     frames = [
         replace(frame, camera=camera) if frame.time_s > 0.5 * BEFORE_S else frame
@@ -264,7 +264,7 @@ def out_of_focus(scene: Scene, defocus_px: float, repetition: int) -> Stage:
     return passing(scene, motion, before(_camera(Clutter(), sensor)))
 
 
-def overexposed(scene: Scene, exposure: float, repetition: int) -> Stage:
+def is_overexposed(scene: Scene, exposure: float, repetition: int) -> Stage:
     camera = _camera(Clutter(), Sensor(exposure=exposure))
     return passing(scene, drawing(scene, repetition), before(camera))
 
@@ -349,7 +349,7 @@ FAILURES: dict[str, Failure] = {
         "The picture saturates",
         "exposure, as a multiple of the right one",
         (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 8.0),
-        overexposed,
+        is_overexposed,
     ),
     "rate": Failure(
         "The frame rate falls",
@@ -372,7 +372,7 @@ FAILURES: dict[str, Failure] = {
 }
 
 
-async def perform(stage: Stage) -> list[Seen]:
+async def perform(stage: Stage) -> list[DiscCutouts]:
     observer = await Observer(stage.scene, calibration=stage.calibration).start()
     return await observer.follow(stage.frames, stage.motion)
 
@@ -380,7 +380,7 @@ async def perform(stage: Stage) -> list[Seen]:
 def measure(name: str, severity: float, *, repetitions: int = REPETITIONS) -> Row:
     """One severity of one failure."""
     scene = bench_scene()
-    shown: list[Seen] = []
+    shown: list[DiscCutouts] = []
     recoveries_ms: list[float] = []
     added = np.zeros((3, 3))
     for repetition in range(repetitions):
@@ -397,14 +397,14 @@ def measure(name: str, severity: float, *, repetitions: int = REPETITIONS) -> Ro
     return judged(severity, shown, recoveries_ms, added)
 
 
-def recovery_ms(after: Sequence[Seen]) -> float:
+def recovery_ms(after: Sequence[DiscCutouts]) -> float:
     """To the first valid fingertip; infinite if none comes."""
     back_s = next((one.frame.time_s for one in after if one.valid), np.inf)
     return 1e3 * (back_s - after[0].frame.time_s)
 
 
 def judged(
-    severity: float, shown: Sequence[Seen], recoveries_ms: Sequence[float], added: Floats
+    severity: float, shown: Sequence[DiscCutouts], recoveries_ms: Sequence[float], added: Floats
 ) -> Row:
     valid = [one for one in shown if one.valid]
     errors_mm = 1e3 * np.array([float(np.linalg.norm(one.error_m)) for one in valid])
@@ -481,14 +481,14 @@ def draw(name: str, rows: Sequence[Row]) -> Path:
             axes.patch.set_alpha(0.0)
             for side in ("top", "right"):
                 axes.spines[side].set_visible(False)
-        for key, colour, mark, label in (
+        for key, colour, marker, label in (
             ("max_mm", "#d97706", "v", "most"),
             ("p99_mm", "#0891b2", "s", "99 %"),
             ("rms_mm", "#4f7df0", "o", "rms"),
         ):
             values = [getattr(row, key) for row in rows]
             heights = [np.nan if value is None else value for value in values]
-            above.plot(places, heights, mark, color=colour, label=label, linestyle="-")
+            above.plot(places, heights, marker, color=colour, label=label, linestyle="-")
         above.axhline(0.3, color=grey, linestyle=":", linewidth=1)
         above.set_yscale("log")
         above.set_ylim(0.01, 10.0)

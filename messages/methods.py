@@ -13,14 +13,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 T = TypeVar("T", bound=str | float)
 
-MarkMethod = Literal["moments", "weighted_centroid", "subpixel_fit"]
-TriangulationMethod = Literal["midpoint", "dlt", "optimal"]
+MarkerMethod = Literal["moments", "weighted_centroid", "subpixel_fit"]
+TriangulationMethod = Literal["dlt"]
 TrackingMethod = Literal[
-    "none", "exponential", "one_euro", "constant_velocity", "constant_acceleration", "hand"
+    "none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"
 ]
 KinematicsMethod = Literal["closed_form_continuous"]
 """The one by which an arm's way is checked beforehand: its steps have to stay on that branch."""
-SheetForceMethod = Literal["linear", "cubic", "scaled", "table"]
+SheetForceMethod = Literal["linear", "scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
 SoftBodyMethod = Literal["linear", "nonlinear_table"]
@@ -40,7 +40,7 @@ class Methods(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    mark: MarkMethod | None = None
+    marker: MarkerMethod | None = None
     triangulation: TriangulationMethod | None = None
     tracking: TrackingMethod | None = None
     kinematics: KinematicsMethod | None = None

@@ -1,18 +1,21 @@
-"""Bags from before a message changed, read by the code of today.
+"""Reads bags that were written before a message changed.
 
 Every bag holds the JSON Schema of its messages.  Where a type has since only gained (fields with
 defaults, further values of a literal, further members of a union), the recorded fields are valid
-as they are, and `fits` finds that out by comparing the two schemas.  Any other change needs a line
-in `MIGRATIONS`: the type, the fingerprint it had (`flexsheet bag info --json` names it), and a
-function from the recorded fields to those of the type that came after.
+as they are, and `fits` finds that out by comparing the two schemas.
+
+A renamed field or literal value needs a line in `RENAMED_FIELDS` or `RENAMED_VALUES`.  These hold
+for every recorded version of the type.  Any other change needs a line in `MIGRATIONS`: the type,
+the fingerprint it had (`flexsheet bag info --json` names it), and a function from the recorded
+fields to those of the type that came after.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
-from functools import partial
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, get_args
+
+from pydantic import BaseModel
 
 from messages.base import Message, schema_fingerprint
 
@@ -21,29 +24,34 @@ Migration = Callable[[Fields], Fields]
 Schema = Mapping[str, Any]
 
 
-def _one_way_of_stepping(scene: Fields) -> Fields:
-    """The arms' `closed_form` is no longer a choice."""
-    methods = scene.get("methods", {})
-    if methods.get("kinematics") != "closed_form":
-        return scene
-    return scene | {"methods": methods | {"kinematics": "closed_form_continuous"}}
-
-
-MIGRATIONS: dict[tuple[str, str], Migration] = {
-    ("Scene", "d7307561a5180666"): _one_way_of_stepping,
-}
-
-RENAMED_FIELDS: dict[str, Mapping[str, str]] = {
+RENAMED_FIELDS: dict[str, dict[str, str]] = {
+    "Fingertip": {
+        "ahead_world_m": "predicted_path_world_m",
+        "ahead_step_s": "prediction_step_s",
+    },
     "Frame": {"lost_share": "occluded_fraction"},
+    "Methods": {"mark": "marker"},
     "SoftBody": {"lead_s": "prediction_horizon_s"},
+    "TwinEye": {"proper": "expected"},
 }
-"""Old to new names of fields, by message type."""
+"""By model, messages and their parts alike: recorded field names and those of today."""
 
-RENAMED_VALUES: dict[tuple[str, ...], Mapping[str, str]] = {
+RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
+    ("Fingertip", "reason"): {
+        "no_mark": "no_marker",
+        "mark_in_one_view": "marker_in_one_view",
+        "two_marks": "two_markers",
+    },
     ("Display", "pattern"): {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
-    ("Scene", "methods", "sheet_shape"): {"dents": "reduced_order", "flat": "four_triangles"},
+    ("Methods", "sheet_shape"): {"dents": "reduced_order", "flat": "four_triangles"},
+    ("Methods", "triangulation"): {"midpoint": "dlt", "optimal": "dlt"},
+    ("Methods", "tracking"): {"hand": "singer_tremor", "exponential": "one_euro"},
+    ("Methods", "sheet_force"): {"cubic": "scaled"},
+    ("Methods", "kinematics"): {"closed_form": "closed_form_continuous"},
 }
-"""Old to new values of a literal field, by message type and the path to the field."""
+"""By model and today's field name: recorded literal values and those of today."""
+
+MIGRATIONS: dict[tuple[str, str], Migration] = {}
 
 _IGNORED = frozenset({"title", "description", "default", "discriminator", "$defs"})
 _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf", "oneOf",
@@ -53,62 +61,81 @@ _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf
 def migration_for(
     message_type: type[Message], fingerprint: str, recorded_schema: Schema
 ) -> Migration | None:
-    """From recorded fields to those of today's type; None where nobody knows how.
+    """Return the function from recorded fields to those of today's type; None without one.
 
-    fingerprint: hexadecimal, of the type as it was recorded; recorded_schema: the bag's own.
+    fingerprint: hexadecimal, of the type as it was recorded.
+    recorded_schema: the bag's own.
     """
     if fingerprint == schema_fingerprint(message_type).hex():
-        return _as_it_is
-    name = message_type.__name__
-    if (name, fingerprint) in MIGRATIONS:
-        migration = MIGRATIONS[name, fingerprint]
-        return lambda fields: rename(name, migration(fields))
-    if fits(recorded_schema, message_type.model_json_schema()):
-        return _as_it_is
-    try:
-        renamed_schema = _rename_in_schema(name, recorded_schema)
-    except (KeyError, TypeError, AttributeError):
+        return _unchanged
+    if (message_type.__name__, fingerprint) in MIGRATIONS:
+        return MIGRATIONS[message_type.__name__, fingerprint]
+    renamed_schema = _rename_in_schema(message_type, recorded_schema)
+    if not fits(renamed_schema, message_type.model_json_schema()):
         return None
-    return partial(rename, name) if fits(renamed_schema, message_type.model_json_schema()) else None
+    return lambda fields: _rename_in_fields(message_type, fields)
 
 
-def rename(type_name: str, fields: Fields) -> Fields:
-    """Return recorded fields with the names and values of today."""
-    names = RENAMED_FIELDS.get(type_name, {})
-    result = {names.get(name, name): value for name, value in fields.items()}
-    for (holder, *path), values in RENAMED_VALUES.items():
-        if holder == type_name:
-            result = _rename_value(result, path, values)
-    return result
+def _rename_in_schema(message_type: type[Message], recorded: Schema) -> Schema:
+    """Return the recorded schema with the names of today."""
+    parts = recorded.get("$defs", {})
+    if not isinstance(parts, Mapping):
+        return recorded
+    renamed = {name: _rename_part(name, part) for name, part in parts.items()}
+    return {**_rename_part(message_type.__name__, recorded), "$defs": renamed}
 
 
-def _rename_value(fields: Fields, path: Sequence[str], values: Mapping[str, str]) -> Fields:
-    if not isinstance(fields, dict) or path[0] not in fields:
-        return fields
-    value: Any = fields[path[0]]
-    if len(path) > 1:
-        value = _rename_value(value, path[1:], values)
-    elif isinstance(value, str):
-        value = values.get(value, value)
-    return fields | {path[0]: value}
+def _rename_part(model: str, schema: Any) -> Any:
+    """Return one model's schema with its renamed properties and literal values."""
+    if not isinstance(schema, Mapping) or not isinstance(schema.get("properties"), Mapping):
+        return schema
+    names = RENAMED_FIELDS.get(model, {})
+    properties = {
+        names.get(name, name): _rename_values(
+            field, RENAMED_VALUES.get((model, names.get(name, name)), {})
+        )
+        for name, field in schema["properties"].items()
+    }
+    required = [names.get(name, name) for name in schema.get("required", ())]
+    return {**schema, "properties": properties, "required": required}
 
 
-def _rename_in_schema(type_name: str, schema: Schema) -> Schema:
-    """Return a recorded schema with the names and values of today."""
-    result = deepcopy(dict(schema))
-    names = RENAMED_FIELDS.get(type_name, {})
-    properties = result["properties"]
-    result["properties"] = {names.get(name, name): one for name, one in properties.items()}
-    result["required"] = [names.get(name, name) for name in result.get("required", [])]
-    for (holder, *path), values in RENAMED_VALUES.items():
-        if holder == type_name:
-            part: Any = result
-            for name in path:
-                part = _resolved(part, result.get("$defs", {}))["properties"][name]
-            for option in (part, *_options(part)):
-                if "enum" in option:
-                    option["enum"] = [values.get(one, one) for one in option["enum"]]
-    return result
+def _rename_values(schema: Any, values: Mapping[str, str]) -> Any:
+    """Return a field's schema with the literal values of today, in it and in its options."""
+    if not values or not isinstance(schema, Mapping):
+        return schema
+    renamed = dict(schema)
+    if "const" in schema:
+        renamed["const"] = values.get(schema["const"], schema["const"])
+    if "enum" in schema:
+        renamed["enum"] = [values.get(value, value) for value in schema["enum"]]
+    if "anyOf" in schema:
+        renamed["anyOf"] = [_rename_values(option, values) for option in schema["anyOf"]]
+    return renamed
+
+
+def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
+    """Return the recorded fields of a model, and of the models within it, with today's names."""
+    names = RENAMED_FIELDS.get(model.__name__, {})
+    renamed: Fields = {}
+    for name, value in fields.items():
+        key = names.get(name, name)
+        values = RENAMED_VALUES.get((model.__name__, key), {})
+        if isinstance(value, str):
+            renamed[key] = values.get(value, value)
+        elif isinstance(value, dict) and key in model.model_fields:
+            inner = _model_in(model.model_fields[key].annotation)
+            renamed[key] = value if inner is None else _rename_in_fields(inner, value)
+        else:
+            renamed[key] = value
+    return renamed
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """Return the one model that an annotation allows; None for none or several."""
+    options = [annotation, *get_args(annotation)]
+    models = [one for one in options if isinstance(one, type) and issubclass(one, BaseModel)]
+    return models[0] if len(models) == 1 else None
 
 
 def fits(recorded: Schema, today: Schema) -> bool:
@@ -119,7 +146,7 @@ def fits(recorded: Schema, today: Schema) -> bool:
         return False  # damaged: no JSON Schema at all, or one without an end
 
 
-def _as_it_is(fields: Fields) -> Fields:
+def _unchanged(fields: Fields) -> Fields:
     return fields
 
 

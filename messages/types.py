@@ -60,9 +60,9 @@ class StereoPair(Message):
 
 FingertipReason = Literal[
     "ok",
-    "no_mark",
-    "mark_in_one_view",
-    "two_marks",
+    "no_marker",
+    "marker_in_one_view",
+    "two_markers",
     "merged",
     "blurred",
     "saturated",
@@ -71,22 +71,21 @@ FingertipReason = Literal[
     "too_fast",
     "unconfirmed",
 ]
-"""Why a picture gave no fingertip: nothing like a mark in it; in one view only; several that could
-be it; a mark that runs into another light; too far out of focus; too bright to tell; beyond where a
-finger can be; two views that are not of one point; faster than a finger; not yet seen often enough
-to begin a track with."""
+"""Why an image pair gave no fingertip: no marker; a marker in one view only; several candidates; a
+marker merged with another light; blurred; overexposed; outside the finger's volume; views that are
+not of one point; faster than a finger; too few detections to begin a track."""
 
 FingertipState = Literal["lost", "acquiring", "tracking", "coasting"]
-"""Of the track: there is none; it is too young to be trusted; this picture confirmed it; this one
-did not, and it is carried on for a while."""
+"""State of the track: none; too new to be used; confirmed by this image pair; predicted for a while
+without a detection."""
 
 
 class Fingertip(Message):
-    """Where the fingertip is at the exposure, and where it will be.
+    """Report the fingertip at the exposure, and its predicted path.
 
-    When `valid` is false, `reason` says why and the tracked state is the last good one, carried on
-    while `state` is "coasting".  `measured_world_m` is this picture's triangulated point, without
-    any filter.
+    When `valid` is false, `reason` says why, and the tracked state is predicted from the last
+    valid one while `state` is "coasting".  `measured_world_m` is the triangulated point of this
+    image pair, without any filter.
     """
 
     valid: bool
@@ -94,11 +93,11 @@ class Fingertip(Message):
     reason: FingertipReason
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
-    covariance: Matrix6 = Field(description="of (position, velocity), m and m/s")
-    ahead_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
-        description="where the finger is predicted to be at the exposure and every step after it"
+    covariance: Matrix6 = Field(description="covariance of (position, velocity), m and m/s")
+    predicted_path_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(
+        description="predicted fingertip at the exposure and every prediction_step_s after it"
     )
-    ahead_step_s: Positive
+    prediction_step_s: Positive
     measured_world_m: Vector3
     reprojection_px: NonNegative
 
@@ -475,4 +474,4 @@ class TwinEye(Message):
     correction: Correction
     metres_per_px: Positive = Field(description="of the picture, on the imaginary screen")
     seen: ColorImage
-    proper: ColorImage
+    expected: ColorImage

@@ -1,4 +1,4 @@
-"""Fingertip messages for tests: a finger that goes evenly."""
+"""Make fingertip messages for tests: a finger at constant velocity."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.types import Fingertip, FingertipReason
-from nodes.models.prediction import even_path
 
 Floats = NDArray[np.float64]
 STEP_S = 0.01
@@ -23,8 +22,8 @@ def fingertip(
         position_world_m=position,
         velocity_world_m_per_s=moving,
         covariance=np.eye(6) * 1e-8,
-        ahead_world_m=even_path(position, moving, count=13, step_s=STEP_S),
-        ahead_step_s=STEP_S,
+        predicted_path_world_m=position + np.arange(13)[:, None] * STEP_S * moving,
+        prediction_step_s=STEP_S,
         measured_world_m=position,
         reprojection_px=0.1,
     )

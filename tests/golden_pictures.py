@@ -25,8 +25,8 @@ from nodes.models.rigid import rotation_from_vector, transform
 from nodes.renderer.gl import DrawStyle, headless_context
 from nodes.renderer.scene_renderer import SceneRenderer
 from nodes.renderer.sheet import SheetPose
-from tests.dent_shapes import few_dents
 from tests.drawing import dent, follow, sheet_at
+from tests.indentation_bases import few_dents
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from messages.scene import Scene
-from nodes.models.rigid import apply, inverse, transform_from_rpy, twist_between
+from nodes.models.rigid import apply, inverse, transform_from_rpy
 from nodes.planner.motion import Plan, Planned
 from nodes.planner.parameters import PlannerParameters
 from nodes.planner.sheet_force import law_for
 from nodes.planner.yielding import Yielding
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent

@@ -161,7 +161,7 @@ def _write_step(desk: Desk, i: int, seconds: float, begin_s: float, finish_s: fl
         desk.write("stereo", stereo, recorded_s, age_s=LATENCY_S)
         colour = np.zeros((24, 32, 3), np.uint8)
         eye = TwinEye(label="look", correction="two_pass", metres_per_px=1e-3, seen=colour,
-                      proper=colour)  # fmt: skip
+                      expected=colour)  # fmt: skip
         desk.write("twin/eye", eye, recorded_s)
         desk.write("frame", _frame(pose, colour), recorded_s + 0.02, age_s=0.028)
     body = SoftBody(mesh_id="a", method="linear", in_range=i % 10 > 0, push_depth_m=0.002,

@@ -26,8 +26,9 @@ from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.arm_bridge.standstill import STANDSTILL_COUNT
 from nodes.methods import measure
 from nodes.models.motion import SheetMotion
-from nodes.models.rigid import transform_from_rpy, twist_between, vector_from_rotation
+from nodes.models.rigid import transform_from_rpy, vector_from_rotation
 from nodes.models.sheet import edge_poses
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"

@@ -41,7 +41,7 @@ def paper_scene() -> Scene:
 
 
 def finger_at(position: Floats, velocity: Floats, *, valid: bool = True) -> Fingertip:
-    return fingertip(position, velocity, reason="ok" if valid else "no_mark")
+    return fingertip(position, velocity, reason="ok" if valid else "no_marker")
 
 
 @dataclass

@@ -354,7 +354,7 @@ def test_pictures_that_made_the_calibration_are_named_when_checked(
 
 def test_every_pair_is_left_out_once(rendered: Pictures) -> None:
     result = cross_check(rendered.left[:9], rendered.right[:9], board=BOARD, leave_out=2)
-    rows, plain = result["rows"], result["plain_opencv"]
+    rows, plain = result["rows"], result["calibrate_plain_opencv"]
     assert isinstance(rows, list)
     assert isinstance(plain, dict)
     assert [row["left"] for row in rows] == [path.name for path in rendered.left[:9]]
@@ -377,7 +377,7 @@ def test_real_pairs_beat_plain_opencv_on_held_out_pairs() -> None:
     assert isinstance(result["rigid_fit_rms_mm"], float)
     assert result["rigid_fit_rms_mm"] <= 0.5
     in_turn = cross_check(left, right, board=board, leave_out=4)
-    plain = in_turn["plain_opencv"]
+    plain = in_turn["calibrate_plain_opencv"]
     assert isinstance(plain, dict)
     assert isinstance(in_turn["rigid_fit_rms_mm"], float)
     assert in_turn["rigid_fit_rms_mm"] <= min(0.56, plain["rigid_fit_rms_mm"])

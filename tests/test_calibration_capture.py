@@ -23,19 +23,19 @@ from messages.calibration import Board, load_calibration
 from messages.scene import Scene, StereoCamera
 from nodes.camera.bundle import pose_vector
 from nodes.camera.calibration import calibrate_stereo
-from nodes.camera.capture import TILTS, Bin, Capture, needed, place, tilt_of
+from nodes.camera.capture import TILTS, Bin, Capture, classify_tilt, needed, place
 from nodes.camera.check import check_stereo
 from nodes.camera.corners import (
     BoardPair,
     CalibrationError,
     CornerFinder,
     board_points,
-    pair_of,
+    match_views,
 )
 from nodes.camera.printing import raster, svg, write_board
 from nodes.models import rigid
 from nodes.twin.board import TwinBoard
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -127,7 +127,7 @@ def test_charuco_boards_that_cannot_be_are_refused(change: dict[str, Any], said:
 def shown(
     board: Board, camera: StereoCamera, count: int, *, seed: int
 ) -> list[tuple[Image, Image]]:
-    twin = TwinBoard(true_camera(camera), board, seed=seed)
+    twin = TwinBoard(make_true_camera(camera), board, seed=seed)
     return [twin.pair(pose) for pose in twin.poses(count)]
 
 
@@ -145,7 +145,7 @@ def test_charuco_boards_seen_in_part_calibrate_a_rig(camera: StereoCamera, tmp_p
     calibrated = calibrate_stereo(left[:9], right[:9], board=CHARUCO, device="made")
     seen = [len(pair.left.ids) for pair in calibrated.pairs.values()]
     assert min(seen) < 24
-    true = true_camera(camera)
+    true = make_true_camera(camera)
     calibration = calibrated.calibration
     assert calibration.left.fx_px == pytest.approx(true.left.fx_px, rel=4e-3)
     assert calibration.right_from_left[:3, 3] == pytest.approx(
@@ -158,12 +158,12 @@ def test_charuco_boards_seen_in_part_calibrate_a_rig(camera: StereoCamera, tmp_p
 
 
 def test_the_same_corner_has_the_same_number_in_both_views(camera: StereoCamera) -> None:
-    twin = TwinBoard(true_camera(camera), CHARUCO, seed=2)
+    twin = TwinBoard(make_true_camera(camera), CHARUCO, seed=2)
     finder = CornerFinder(CHARUCO)
     compared = 0
     for pose in twin.poses(4):
         left, right = twin.pair(pose)
-        pair = pair_of(finder.find(left), finder.find(right), CHARUCO, ("l", "r"))
+        pair = match_views(finder.find(left), finder.find(right), CHARUCO, ("l", "r"))
         if not isinstance(pair, BoardPair):
             continue  # too little of it is seen
         compared += 1
@@ -195,11 +195,11 @@ def posed(turn: list[float]) -> Floats:
 def test_tilts_have_the_names_that_people_would_give_them(turn: list[float], tilt: str) -> None:
     pose = posed(turn)
     middle = board_points(CHESSBOARD).mean(axis=0)
-    assert tilt_of(pose, middle) == tilt
+    assert classify_tilt(pose, middle) == tilt
     # A board held upside down leans as it did.
     about = rigid.transform(rigid.rotation_from_vector([0.0, 0.0, np.pi]), 2 * middle)
     flipped = rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:]) @ about
-    assert tilt_of(pose_vector(flipped), middle) == tilt
+    assert classify_tilt(pose_vector(flipped), middle) == tilt
     depths = rigid.apply(
         rigid.transform(rigid.rotation_from_vector(pose[:3]), pose[3:]), board_points(CHESSBOARD)
     )
@@ -332,7 +332,7 @@ def test_the_twin_is_calibrated_by_the_command(
     assert calibration.device == camera.device
     assert calibration.opencv_version == cv2.__version__
     assert "# flexsheet calibrate stereo --twin" in output.read_text()
-    assert calibration.left.fx_px == pytest.approx(true_camera(camera).left.fx_px, rel=5e-3)
+    assert calibration.left.fx_px == pytest.approx(make_true_camera(camera).left.fx_px, rel=5e-3)
 
     page = (report / "index.html").read_text()
     for word in ("Calibration of twin-bumblebee", "right_from_left.tx_m", "mm in depth"):
@@ -364,7 +364,7 @@ def test_the_twin_is_calibrated_by_the_command(
     assert code == 0, err
     crossed = json.loads(out)
     assert crossed["rigid_fit_rms_mm"] < 1.0
-    assert crossed["plain_opencv"]["pairs"] == crossed["pairs"] == len(crossed["rows"])
+    assert crossed["calibrate_plain_opencv"]["pairs"] == crossed["pairs"] == len(crossed["rows"])
     code, out, err = flexsheet("calibrate", "cross-check", *given, "--leave-out", 2)
     assert code == 0, err
     assert "rigid_fit_rms_mm" in out

@@ -18,7 +18,7 @@ from messages.scene import Lens, Scene, StereoCamera
 from nodes.camera import bundle
 from nodes.camera.calibration import state_uncertainty
 from nodes.camera.check import Rig, triangulated
-from nodes.camera.corners import BoardPair, CornerFinder, View, board_points, pair_of
+from nodes.camera.corners import BoardPair, CornerFinder, View, board_points, match_views
 from nodes.camera.selection import Selection, fit_pairs, fit_selection
 from nodes.camera.uncertainty import (
     jackknife_covariance,
@@ -28,7 +28,7 @@ from nodes.camera.uncertainty import (
 )
 from nodes.models import rigid
 from nodes.twin.board import TwinBoard
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,7 +59,7 @@ def half(lens: Lens) -> Lens:
 @cache
 def small_camera() -> StereoCamera:
     """The true rig with half as many pixels each way: four times as quick to draw."""
-    camera = true_camera(scene_camera())
+    camera = make_true_camera(scene_camera())
     return camera.model_copy(
         update={
             "width_px": 320,
@@ -80,13 +80,13 @@ def numbers_of(camera: StereoCamera | StereoCalibration) -> Floats:
 
 def calibrated(
     camera: StereoCamera, board: Board, *, seed: int, count: int, distance_m: float
-) -> tuple[bundle.Fit, Uncertainty]:
+) -> tuple[bundle.RigFit, Uncertainty]:
     """A calibration from the twin's pictures of a board."""
     twin, finder = TwinBoard(camera, board, seed=seed), CornerFinder(board)
     pairs = []
     for left_from_board in twin.poses(count):
         left, right = twin.pair(left_from_board)
-        pairs.append(pair_of(finder.find(left), finder.find(right), board, ("left", "right")))
+        pairs.append(match_views(finder.find(left), finder.find(right), board, ("left", "right")))
     selection = Selection(pairs, [str(number) for number in range(count)])
     size, points = (camera.width_px, camera.height_px), board_points(board)
     fit = fit_selection(selection, points, size)
@@ -100,7 +100,7 @@ def calibrated(
 @cache
 def exact_corners(count: int) -> tuple[tuple[Floats, Floats], ...]:
     """Corners of the board in many poses, without any noise."""
-    board = TwinBoard(true_camera(scene_camera()), BOARD, seed=5)
+    board = TwinBoard(make_true_camera(scene_camera()), BOARD, seed=5)
     return tuple(board.corners(pose) for pose in board.poses(count))
 
 
@@ -117,17 +117,17 @@ def noisy(*, seed: int, sigma_px: float, count: int = 12) -> list[BoardPair]:
 
 
 def test_slopes_of_corners_are_those_of_differences() -> None:
-    rig = numbers_of(true_camera(scene_camera()))
+    rig = numbers_of(make_true_camera(scene_camera()))
     pose = np.array([0.3, -0.4, 0.1, -0.05, -0.04, 0.45])
     (pair,) = noisy(seed=1, sigma_px=0.1, count=1)
     pair = BoardPair(
         View(pair.left.ids[:40], pair.left.pixels[:40]),
         View(pair.right.ids[9:], pair.right.pixels[9:]),
     )
-    here = bundle.linearized(pair, POINTS, rig, pose)
+    here = bundle.linearize(pair, POINTS, rig, pose)
     for slopes, base, of in (
-        (here.by_rig, rig, lambda rig: bundle.linearized(pair, POINTS, rig, pose)),
-        (here.by_pose, pose, lambda pose: bundle.linearized(pair, POINTS, rig, pose)),
+        (here.by_rig, rig, lambda rig: bundle.linearize(pair, POINTS, rig, pose)),
+        (here.by_pose, pose, lambda pose: bundle.linearize(pair, POINTS, rig, pose)),
     ):
         for index in range(len(base)):
             step = np.zeros(len(base))
@@ -154,7 +154,7 @@ def best_points(rig: Floats, start: Floats, left: Floats, right: Floats) -> Floa
 
 
 def test_slopes_of_positions_are_those_of_differences() -> None:
-    rig = numbers_of(true_camera(scene_camera()))
+    rig = numbers_of(make_true_camera(scene_camera()))
     grid = view_of_work(rig, (640, 480), 0.5)
     assert grid[:, 2] == pytest.approx(0.5)
     points = grid[[0, 12]]
@@ -179,7 +179,7 @@ def drawn(rig: Floats, points: Floats) -> tuple[Floats, Floats]:
 
 def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
     """Corners with independent noise: the errors of 40 fits scatter as each of them states."""
-    true = numbers_of(true_camera(scene_camera()))
+    true = numbers_of(make_true_camera(scene_camera()))
     slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
     scores, shifts, stated = [], [], []
     for seed in range(40):
@@ -198,7 +198,7 @@ def test_the_covariance_of_a_fit_is_that_of_many_fits() -> None:
 
 
 def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
-    true = numbers_of(true_camera(scene_camera()))
+    true = numbers_of(make_true_camera(scene_camera()))
     slopes = position_slopes(true, view_of_work(true, (640, 480), 0.5))
     pairs = noisy(seed=3, sigma_px=0.05, count=20)
     fit = fit_pairs(pairs, POINTS, (640, 480))
@@ -215,7 +215,7 @@ def test_the_jackknife_agrees_where_the_noise_is_independent() -> None:
 
 def test_boards_that_bend_are_told_by_the_jackknife_alone() -> None:
     """Corners that err together: the fit believes in many small errors, refits tell better."""
-    camera = true_camera(scene_camera())
+    camera = make_true_camera(scene_camera())
     true = numbers_of(camera)
     random = np.random.default_rng(8)
     board = TwinBoard(camera, BOARD, seed=5)
@@ -259,7 +259,7 @@ def test_fingertips_err_as_the_calibrations_state() -> None:
 def test_the_shipped_calibration_is_true_within_what_it_states() -> None:
     shipped = load_calibration(SHIPPED)
     assert shipped.uncertainty is not None
-    true, measured = numbers_of(true_camera(scene_camera())), numbers_of(shipped)
+    true, measured = numbers_of(make_true_camera(scene_camera())), numbers_of(shipped)
     off = measured - true
     score = off @ np.linalg.solve(shipped.uncertainty.covariance, off)
     assert score < 22 + 3 * np.sqrt(2 * 22)
@@ -276,7 +276,7 @@ def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
     assert shipped.uncertainty is not None
     distance_m = shipped.uncertainty.working_distance_m
     fit, anew = calibrated(
-        true_camera(scene_camera()), BOARD, seed=77, count=10, distance_m=distance_m
+        make_true_camera(scene_camera()), BOARD, seed=77, count=10, distance_m=distance_m
     )
     slopes = position_slopes(fit.rig, view_of_work(fit.rig, (640, 480), distance_m))
     shifts = slopes @ (fit.rig - numbers_of(shipped))

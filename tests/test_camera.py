@@ -26,8 +26,8 @@ from messages.base import Header
 from messages.scene import Scene
 from messages.types import StereoPair
 from nodes.camera.devices import ReaderThread, open_reader
+from nodes.camera.image_pair import DeviceError, ImagePair, halves
 from nodes.camera.node import CameraParameters
-from nodes.camera.pictures import DeviceError, Pictures, halves
 from nodes.camera.sources import ImagesSource, OpenCvSource, VideoSource
 
 
@@ -229,11 +229,11 @@ class StutteringReader:
     def __init__(self) -> None:
         self.frames = iter([1, 2, 3, 7, 8])
 
-    def read(self) -> Pictures | None:
+    def read(self) -> ImagePair | None:
         frame = next(self.frames, None)
         if frame is None:
             return None
-        return Pictures(picture(0, 0), picture(0, 1), round(frame * 1e9 / 60))
+        return ImagePair(picture(0, 0), picture(0, 1), round(frame * 1e9 / 60))
 
     def interrupt(self) -> None:
         """It does not wait."""
@@ -265,7 +265,7 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
 class BrokenReader(StutteringReader):
     """OpenCV itself fails on what the device sends."""
 
-    def read(self) -> Pictures | None:
+    def read(self) -> ImagePair | None:
         raise cv2.error("no such colour")
 
 

@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from messages.scene import Scene
 from nodes.camera.devices import ReaderThread, open_reader
 from nodes.camera.files import read_times
-from nodes.camera.pictures import DeviceError, Pictures, Reader
+from nodes.camera.image_pair import DeviceError, ImagePair, Reader
 from nodes.camera.sources import AnySource, ImagesSource, VideoSource
 
 MS = 1_000_000
@@ -63,7 +63,7 @@ def opened(source: AnySource, scene: Scene) -> Reader:
     return open_reader(source, scene.camera, lambda: 0)
 
 
-def read_all(source: AnySource, scene: Scene, at_most: int = 1000) -> list[Pictures]:
+def read_all(source: AnySource, scene: Scene, at_most: int = 1000) -> list[ImagePair]:
     reader = opened(source, scene)
     pictures = []
     while len(pictures) < at_most and (pair := reader.read()) is not None:
@@ -72,11 +72,11 @@ def read_all(source: AnySource, scene: Scene, at_most: int = 1000) -> list[Pictu
     return pictures
 
 
-def times_ms(pictures: list[Pictures]) -> list[float]:
+def times_ms(pictures: list[ImagePair]) -> list[float]:
     return [pair.exposure_ns / MS for pair in pictures]
 
 
-def numbers(pictures: list[Pictures]) -> list[tuple[int, int]]:
+def numbers(pictures: list[ImagePair]) -> list[tuple[int, int]]:
     return [(told(pair.left), told(pair.right) - 5) for pair in pictures]
 
 

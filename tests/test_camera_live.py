@@ -29,8 +29,8 @@ from hypothesis import strategies as st
 
 from messages.scene import Scene
 from nodes.camera import live
+from nodes.camera.image_pair import DeviceError, ImagePair, Region, Regions
 from nodes.camera.live import CameraReader
-from nodes.camera.pictures import DeviceError, Pictures, Region, Regions
 from nodes.camera.sources import OpenCvSource
 from nodes.camera.stamps import LAPSES, SLACK, Pairing, StampJudge
 
@@ -73,7 +73,7 @@ def reading(
         reader.close()
 
 
-def read(reader: CameraReader) -> Pictures:
+def read(reader: CameraReader) -> ImagePair:
     pictures = reader.read()
     assert pictures is not None
     return pictures
@@ -445,7 +445,7 @@ def test_a_reader_that_waits_is_interrupted(
     bag: CameraBag, cameras: tuple[FakeCamera, FakeCamera], scene: Scene
 ) -> None:
     with reading(bag, scene, silence_s=60.0) as reader:
-        results: list[Pictures | None] = []
+        results: list[ImagePair | None] = []
         waiting = threading.Thread(target=lambda: results.append(reader.read()))
         waiting.start()
         reader.interrupt()

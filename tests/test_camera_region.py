@@ -13,9 +13,14 @@ from pydantic import ValidationError
 from messages.base import Header
 from messages.scene import Lens, Pose, Scene
 from messages.types import StereoPair
+from nodes.camera.image_pair import DeviceError, ImagePair, Region, check_size, cut
 from nodes.camera.node import CameraParameters
-from nodes.camera.pictures import DeviceError, Pictures, Region, check_size, cut
-from nodes.camera.region import ExplicitRegions, finger_regions, seen_region, wanted_regions
+from nodes.camera.region import (
+    ExplicitRegions,
+    find_finger_regions,
+    find_visible_region,
+    resolve_regions,
+)
 from nodes.models import rigid
 
 WIDE, HIGH = 640, 480
@@ -63,7 +68,7 @@ def test_every_finger_that_a_view_can_see_lies_in_its_region(
     low, high = np.array(scene.finger.volume_min_m), np.array(scene.finger.volume_max_m)
     points = np.random.default_rng(seed).uniform(low, high, (200, 3))
     try:
-        regions = finger_regions(scene)
+        regions = find_finger_regions(scene)
     except DeviceError:
         return
     for side, region in enumerate(regions):
@@ -79,7 +84,7 @@ def test_a_region_is_no_larger_than_it_need_be() -> None:
     finger = SCENE.finger.model_copy(
         update={"volume_min_m": (-0.02, -0.02, -0.02), "volume_max_m": (0.02, 0.02, 0.02)}
     )
-    for region in finger_regions(SCENE.model_copy(update={"finger": finger})):
+    for region in find_finger_regions(SCENE.model_copy(update={"finger": finger})):
         image_px = 2 * 540 * (0.02 + 0.007) * np.sqrt(2) / 0.48
         assert region.width <= image_px + 2 * (16 + 16)
         assert region.height <= image_px + 2 * (16 + 2)
@@ -91,7 +96,7 @@ def test_a_lens_that_folds_back_outside_the_picture_loses_nothing() -> None:
     """k1 = -0.5 turns the image round at 0.8 of the focal length; the volume reaches far beyond."""
     lens = Lens(fx_px=540, fy_px=540, cx_px=319.5, cy_px=239.5, distortion=(-0.5, 0, 0, 0, 0))
     line = np.stack([np.linspace(0.0, 3.0, 4000), np.zeros(4000), np.ones(4000)], axis=-1)
-    region = seen_region(line, lens, WIDE, HIGH)
+    region = find_visible_region(line, lens, WIDE, HIGH)
     assert region is not None
     assert region.column <= 319 - 16
     # The farthest column that this lens can reach on that row, by its own polynomial.
@@ -103,20 +108,20 @@ def test_a_lens_that_folds_back_outside_the_picture_loses_nothing() -> None:
 def test_a_volume_round_the_camera_fills_the_picture() -> None:
     scene = moved(SCENE, (0.0, 0.0, 0.0), 0.0)
     whole = Region(0, 0, WIDE, HIGH)
-    assert finger_regions(scene) == (whole, whole)
+    assert find_finger_regions(scene) == (whole, whole)
 
 
 @pytest.mark.parametrize("tilt_rad", [np.pi, 1.2], ids=["behind", "beside"])
 def test_a_camera_that_looks_elsewhere_is_told_of(tilt_rad: float) -> None:
     scene = moved(SCENE, (0.0, 0.5, 0.9), tilt_rad)
     with pytest.raises(DeviceError, match=r"the left view shows nothing of finger\.volume"):
-        finger_regions(scene)
+        find_finger_regions(scene)
 
 
 def test_regions_beyond_the_sensor_are_refused() -> None:
     asked = ExplicitRegions(left=Region(0, 0, 64, 48), right=Region(600, 0, 64, 48))
     with pytest.raises(DeviceError, match=r"region\.right: 64x48 px at \(600, 0\) is not on"):
-        wanted_regions(asked, SCENE)
+        resolve_regions(asked, SCENE)
 
 
 @pytest.mark.parametrize(
@@ -151,7 +156,7 @@ def test_a_cut_shows_the_same_pixels_of_the_sensor(data: st.DataObject) -> None:
     whole = Region(0, 0, WIDTH, HEIGHT)
     reads = inside(whole), inside(whole)
     wanted = inside(reads[0]), inside(reads[1])
-    result = cut(Pictures(part(reads[0]), part(reads[1]), 7, regions=reads), wanted)
+    result = cut(ImagePair(part(reads[0]), part(reads[1]), 7, regions=reads), wanted)
     np.testing.assert_array_equal(result.left, part(wanted[0]))
     np.testing.assert_array_equal(result.right, part(wanted[1]))
     assert result.regions == wanted
@@ -160,7 +165,7 @@ def test_a_cut_shows_the_same_pixels_of_the_sensor(data: st.DataObject) -> None:
 
 def test_a_cut_of_what_is_not_there_is_refused() -> None:
     reads = Region(0, 0, 64, 40), Region(10, 0, 64, 40)
-    pictures = Pictures(RAMP[:40, :64], RAMP[:40, 10:74], 0, regions=reads)
+    pictures = ImagePair(RAMP[:40, :64], RAMP[:40, 10:74], 0, regions=reads)
     with pytest.raises(DeviceError, match="the right region is 20x20 px at"):
         cut(pictures, (Region(0, 0, 20, 20), Region(0, 0, 20, 20)))
 
@@ -168,8 +173,8 @@ def test_a_cut_of_what_is_not_there_is_refused() -> None:
 def test_pictures_must_have_their_regions_size() -> None:
     camera = load_scene().camera
     reads = Region(0, 0, 64, 40), Region(10, 0, 64, 40)
-    check_size(Pictures(RAMP[:40, :64], RAMP[:40, :64], 0, regions=reads), camera, "camera")
-    wrong = Pictures(RAMP[:40, :64], RAMP, 0, regions=reads)
+    check_size(ImagePair(RAMP[:40, :64], RAMP[:40, :64], 0, regions=reads), camera, "camera")
+    wrong = ImagePair(RAMP[:40, :64], RAMP, 0, regions=reads)
     with pytest.raises(DeviceError, match=r"right view of 160x120 px, its region is 64x40 px"):
         check_size(wrong, camera, "camera")
 
@@ -177,7 +182,7 @@ def test_pictures_must_have_their_regions_size() -> None:
 async def test_the_twins_pairs_are_cut_to_the_fingers_regions() -> None:
     scene = load_scene()
     async with running(scene, source="twin", region="finger") as bench:
-        left, right = finger_regions(scene)
+        left, right = find_finger_regions(scene)
         pair = StereoPair(device="t", exposure_s=0.0, dropped_frames=0, left=RAMP, right=RAMP)
         header = Header(1, 5, 6, bench.node.clock.id, "twin", 1)
         await bench.node.step("twin__stereo", pair, header)

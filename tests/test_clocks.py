@@ -22,7 +22,7 @@ from messages.topics import Topic
 from messages.types import ClockOffset, ClockPing, Clocks, EStop, Fingertip
 from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from nodes.clock.node import ClockNode, ClockParameters
-from nodes.clock.offset import OtherClock, Sample, bounds, sample_of
+from nodes.clock.offset import OtherClock, Sample, bounds, make_sample
 from nodes.node import Input, Node, NodeParameters, Output
 from tests.test_launch_supervisor import LISTENER, beacon, write
 from tests.test_messages_wire import HEADER as SOME_HEADER
@@ -52,7 +52,7 @@ def measured(
         now += every_ns
         answered = now + there + every_ns // 3
         stamps = ours.at(now), theirs.at(now + there), theirs.at(answered), ours.at(answered + back)
-        sample = sample_of(*stamps, max_drift_ratio=max_drift)
+        sample = make_sample(*stamps, max_drift_ratio=max_drift)
         if sample is not None:
             clock.take(sample)
         now = answered + back
@@ -122,7 +122,7 @@ def test_a_clock_that_was_stepped_is_measured_anew() -> None:
 
 @given(*[st.integers(-(2**50), 2**50)] * 4)
 def test_impossible_stamps_are_no_sample(t1: int, t2: int, t3: int, t4: int) -> None:
-    sample = sample_of(t1, t2, t3, t4, max_drift_ratio=5e-4)
+    sample = make_sample(t1, t2, t3, t4, max_drift_ratio=5e-4)
     if sample is None:
         assert t4 < t1 or t3 < t2 or (t4 - t1) - (t3 - t2) < 0
     else:
@@ -287,8 +287,8 @@ async def test_a_stamp_that_is_passed_on_is_of_the_clock_that_the_header_names()
     zeros = np.zeros(3)
     fingertip = Fingertip(
         valid=True, state="tracking", reason="ok", position_world_m=zeros,
-        velocity_world_m_per_s=zeros, covariance=np.eye(6), ahead_world_m=np.zeros((1, 3)),
-        ahead_step_s=0.01, measured_world_m=zeros, reprojection_px=0.0,
+        velocity_world_m_per_s=zeros, covariance=np.eye(6), predicted_path_world_m=np.zeros((1, 3)),
+        prediction_step_s=0.01, measured_world_m=zeros, reprojection_px=0.0,
     )  # fmt: skip
     stamped = replace(SOME_HEADER, clock_id="there", source_ns=50_099 * S, publish_ns=50_100 * S)
     await node.step("fingertip", fingertip, stamped)

@@ -18,8 +18,8 @@ from launch.cli import app
 from launch.commands.output import CommandError
 from launch.plans.plan import load_scene
 from messages.types import SoftBody
-from nodes.models.sheet.laws import CENTRE, ScaledLaw
-from nodes.models.sheet.table import TableLaw
+from nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
+from nodes.models.sheet.tabulated import TabulatedSheetModel
 from nodes.planner import sheet_force
 from nodes.planner.compliance import (
     ADVANCE_PER_DEPTH,
@@ -103,7 +103,7 @@ def test_the_retreat_is_smooth_and_bounded_whatever_the_object(
     inner = slopes[(depths[1:] > 0.02 * deepest) & (depths[1:] < 0.99 * deepest)]
     assert np.abs(np.diff(inner)).max() < 0.25
     held = (min(abs(place[0]), 0.06), min(abs(place[1]), 0.09))
-    pressed = LAW.press(shown.stretch_ratio, pushed, place_m=held, finger_radius_m=RADIUS)
+    pressed = LAW.evaluate(shown.stretch_ratio, pushed, place_m=held, finger_radius_m=RADIUS)
     assert pressed.edge_force_n.max() < SHEET.max_edge_force_n
     assert PULL.least_stretch <= shown.stretch_ratio <= PULL.largest_stretch
 
@@ -164,7 +164,7 @@ def test_the_arms_never_pull_harder_than_the_reserve_however_deep_the_push() -> 
     weak = SHEET.model_copy(update={"max_edge_force_n": 9.0})
     pull = pull_of(weak, LAW)
     assert pull.edge_force_n == pytest.approx(RESERVE * 9.0)
-    flat = LAW.press(pull.largest_stretch, np.zeros(1), place_m=CENTRE, finger_radius_m=RADIUS)
+    flat = LAW.evaluate(pull.largest_stretch, np.zeros(1), place_m=CENTRE, finger_radius_m=RADIUS)
     assert flat.edge_force_n[0] == pytest.approx(RESERVE * 9.0, rel=1e-6)
     for scale in (0.2, 1.0, 10.0):
         shown = compliance(soft_curve(scale), pull=pull)
@@ -249,7 +249,7 @@ def test_a_curve_comes_from_the_soft_bodys_message_and_goes_on_straight() -> Non
 
 
 def test_a_calibrated_law_serves_as_well() -> None:
-    stiffer = ScaledLaw(LAW.rubber, cubic_ratio=1.4, stretch_scale=1.004)
+    stiffer = ScaledSheetModel(LAW.rubber, cubic_ratio=1.4, stretch_scale=1.004)
     curve = soft_curve(0.8)
     shown = fit_compliance(
         curve,
@@ -299,8 +299,11 @@ def test_the_doctor_names_what_it_cannot_use(tmp_path: Path) -> None:
 
 def test_every_law_is_charted_within_the_scenes_range() -> None:
     axes = np.array([1.02, 1.08]), np.array([0.002, 0.05]), np.array([0.0, 0.06])
-    table = TableLaw(
-        ScaledLaw(sheet_force.rubber_of(SHEET)), *axes, np.array([0.0, 0.09]), np.ones((2, 2, 2, 2))
+    table = TabulatedSheetModel(
+        ScaledSheetModel(sheet_force.rubber_of(SHEET)),
+        *axes,
+        np.array([0.0, 0.09]),
+        np.ones((2, 2, 2, 2)),
     )
     family = sheet_force.sheet_force_family(lambda *asked: 2.0, lambda scene: table)
     trials = list(family.trials(SCENE))

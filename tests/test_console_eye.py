@@ -48,7 +48,7 @@ def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
     assert (asked.stereo, asked.pixels_every > 0) == ("mono", True)
     look.heed(asked)
     pixel = np.zeros((2, 2, 3), np.uint8)
-    eye = TwinEye(label="x", correction="none", metres_per_px=1e-3, seen=pixel, proper=pixel)
+    eye = TwinEye(label="x", correction="none", metres_per_px=1e-3, seen=pixel, expected=pixel)
     assert not look.got(eye, 2.5)
     assert look.got(eye.model_copy(update={"label": asked.label}), 3.0)
     assert sent[-1] is anothers

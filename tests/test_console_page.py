@@ -270,7 +270,8 @@ async def run_session(folder: Path) -> Session:
         "scene: scenes/cylinder.yaml\n"
         "nodes:\n"
         "  twin_finger: {type: twin_finger, nice: 10}\n"
-        f"  recorder: {{type: recorder, parameters: {{bag: {folder}/bags/a.mcap, waits: true}}}}\n"
+        "  recorder:\n    type: recorder\n"
+        f"    parameters: {{bag: {folder}/bags/a.mcap, start_paused: true}}\n"
     )
     (folder / "bags").mkdir()
     with BagWriter(folder / "bags" / "older.mcap") as writer:

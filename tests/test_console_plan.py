@@ -34,7 +34,7 @@ def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
     assert plan.nodes["console"].parameters["page_port"] == 8123
     assert plan.ports_of_its_own(None) == [("console", 8123)]
     assert plan.nodes["console"].parameters["drives_finger"]
-    assert plan.nodes["recorder"].parameters["waits"]
+    assert plan.nodes["recorder"].parameters["start_paused"]
     # In the run's directory NAME.json is what the launcher tells the node of that name.
     assert plan.nodes["console"].parameters["kept"].removeprefix("@run/") not in {
         f"{name}.json" for name in plan.nodes
@@ -53,7 +53,7 @@ def test_what_the_file_says_of_console_and_recorder_stays(graph: Path, tmp_path:
     plan = load_plan(graph, console=True, record=tmp_path / "a.mcap")
     assert "console" not in plan.nodes
     assert plan.nodes["page"].parameters["page_port"] == 9
-    assert not plan.nodes["recorder"].parameters["waits"]
+    assert not plan.nodes["recorder"].parameters["start_paused"]
     graph.write_text(text.replace("twin_finger: {type: twin_finger}", "fem_solver: {type: x:Y}"))
     with pytest.raises(BadInputError):
         load_plan(graph, console=True)

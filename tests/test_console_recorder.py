@@ -27,7 +27,7 @@ def names_in(folder: Path) -> list[Path]:
 async def test_a_recorder_that_waits_begins_a_bag_for_each_start(tmp_path: Path) -> None:
     names = ("estop", "recording", "display")
     node = Recorder(
-        RecorderParameters(bag=tmp_path / "a.mcap", attach=(), waits=True),
+        RecorderParameters(bag=tmp_path / "a.mcap", attach=(), start_paused=True),
         name="recorder",
         clock=VirtualClock(1000, clock_id="clock"),
         send=lambda topic, message, header: None,
@@ -61,7 +61,7 @@ async def test_a_recorder_that_waits_begins_a_bag_for_each_start(tmp_path: Path)
 async def test_a_recorder_that_cannot_begin_says_so_and_goes_on(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     node = Recorder(
-        RecorderParameters(bag=tmp_path / "file" / "a.mcap", attach=(), waits=True),
+        RecorderParameters(bag=tmp_path / "file" / "a.mcap", attach=(), start_paused=True),
         name="recorder",
         clock=VirtualClock(),
         send=lambda topic, message, header: None,

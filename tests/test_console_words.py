@@ -187,7 +187,7 @@ def test_names_with_markup_are_shown_as_text() -> None:
 
 def test_words_of_the_tabs() -> None:
     assert "No fingertip" in panels.finger(None)
-    lost = fingertip(np.zeros(3)).model_copy(update={"valid": False, "reason": "no_mark"})
+    lost = fingertip(np.zeros(3)).model_copy(update={"valid": False, "reason": "no_marker"})
     assert "not tracked: no mark" in panels.finger(lost)
     told = panels.finger(fingertip(np.array([-0.012, 0.003, -0.0041])))
     assert "12 mm left and 3 mm above the screen" in told

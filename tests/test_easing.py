@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
-from nodes.models.rigid import is_rigid, transform, transform_from_rpy, twist_between
+from nodes.models.rigid import is_rigid, transform, transform_from_rpy
 from nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 STEP_S = 1.0 / 60.0

@@ -30,7 +30,7 @@ from launch.methods.svg import INK
 from messages.methods import (
     Correction,
     KinematicsMethod,
-    MarkMethod,
+    MarkerMethod,
     SheetForceMethod,
     SheetShapeMethod,
     SoftBodyMethod,
@@ -225,7 +225,7 @@ def test_what_numpy_answers_can_be_written(tmp_path: Path) -> None:
 
 
 CHOICES = {
-    "mark": MarkMethod,
+    "marker": MarkerMethod,
     "triangulation": TriangulationMethod,
     "tracking": TrackingMethod,
     "kinematics": KinematicsMethod,

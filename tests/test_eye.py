@@ -26,8 +26,8 @@ from nodes.twin.eye import (
     Rays,
     TrueProjector,
     first_hits,
-    proper,
     push_sizes,
+    render_expected,
     seen,
     tilt_sizes,
 )
@@ -99,12 +99,14 @@ def test_projector_lands_and_is_found_again(scene: Scene) -> None:
     sheet = flat_sheet(transform(rotation_from_vector([0.5, 0.1, 0.0]), [0.0, 0.0, 0.01]))
     projector = TrueProjector(scene.projector, sheet.positions.reshape(-1, 3), sheet.triangles())
     pixels = np.random.default_rng(1).uniform([250, 200], [550, 400], (200, 2))
-    points, lands = projector.lands_at(pixels)
+    points, lands = projector.intersect_surface(pixels)
     assert lands.all()
     again, lit = projector.pixels_of(points)
     assert lit.all()
     assert np.allclose(again, pixels, atol=1e-6)
-    outside, lands = projector.lands_at(np.array([[-5.0, 10.0], [900.0, 10.0], [2.0, 2.0]]))
+    outside, lands = projector.intersect_surface(
+        np.array([[-5.0, 10.0], [900.0, 10.0], [2.0, 2.0]])
+    )
     assert not lands.any()
     assert np.isfinite(outside).all()
 
@@ -143,13 +145,13 @@ def test_flat_sheet_on_the_imaginary_screen_shows_the_picture_mirrored_back(
     assert picture[:, :20].max() == 0
 
 
-def test_proper_picture_has_the_cylinders_own_size(scene: Scene) -> None:
-    picture = proper(TrueBody(scene).at_rest(), eye=EYE, flat=True)
+def test_expected_image_has_the_cylinders_own_size(scene: Scene) -> None:
+    picture = render_expected(TrueBody(scene).at_rest(), eye=EYE, flat=True)
     radius, length = scene.object.geometry.radius_m, scene.object.geometry.length_m
     height, width = push_sizes(picture, METRES_PER_PX)
     assert np.isclose(height, 0.8 * np.tan(np.arcsin(radius / (0.4 + radius))), atol=3e-5)
     assert np.isclose(width, length, atol=6e-5)
-    soft = proper(TrueBody(scene).at_rest(), eye=EYE, flat=False)
+    soft = render_expected(TrueBody(scene).at_rest(), eye=EYE, flat=False)
     assert len(np.unique(soft[..., 0])) > 20
     assert ((soft.max(axis=2) > 0) == (picture[..., 0] > 0)).mean() > 0.998
 
@@ -198,11 +200,11 @@ def test_what_cannot_be_measured_is_said(what: str) -> None:
         tilt_sizes(picture, 1.0)
 
 
-Situation = tuple[SheetPose, DeformedSheet]
+EyeSituation = tuple[SheetPose, DeformedSheet]
 Sizes = Callable[[Image, float], Sequence[float]]
 
 
-def mean_mm(bench: Bench, correction: Correction, situation: Situation, sizes: Sizes) -> float:
+def mean_mm(bench: Bench, correction: Correction, situation: EyeSituation, sizes: Sizes) -> float:
     return float(1e3 * bench.size_errors(correction, *situation, sizes).mean())
 
 
@@ -308,7 +310,7 @@ async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
     assert header.source_ns == 123
     assert picture.seen.shape == (120, 120, 3)
     assert picture.seen[60, 60].tolist() == [200, 200, 200]
-    assert picture.proper[60, 60].tolist() == [255, 255, 255]
+    assert picture.expected[60, 60].tolist() == [255, 255, 255]
     # The label just taken is passed over, but not for ever.
     await bench.show(frame("a", correction="one_plane"))
     await bench.finish()
@@ -324,7 +326,7 @@ async def test_eye_node_pictures_each_label_once(scene: Scene) -> None:
 async def test_eye_node_reports_what_has_no_picture_and_goes_on(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    bench = EyeBench(scene, most_waiting=2)
+    bench = EyeBench(scene, max_queue=2)
     await bench.ready()
     real = bench.node._camera.take
 

@@ -49,7 +49,7 @@ def fingertip(
     return even_fingertip(
         np.array(position, dtype=np.float64),
         np.array(velocity, dtype=np.float64),
-        reason="ok" if valid else "no_mark",
+        reason="ok" if valid else "no_marker",
     )
 
 

@@ -95,8 +95,8 @@ class Tracked:
                 "position_world_m": ahead[0] + self.error(i),
                 "velocity_world_m_per_s": self.motion.at(at_s).velocity,
                 "covariance": np.diag([SIGMA_M**2] * 3 + [1e-4] * 3),
-                "ahead_world_m": np.array(ahead) + self.error(i),
-                "ahead_step_s": 0.01,
+                "predicted_path_world_m": np.array(ahead) + self.error(i),
+                "prediction_step_s": 0.01,
                 "measured_world_m": ahead[0],
                 "reprojection_px": 0.1,
             }
@@ -163,7 +163,7 @@ def test_a_late_tracker_is_found_late_at_every_lead(tmp_path: Path, name: str) -
 
 def test_what_is_not_valid_is_counted_by_its_reason_and_left_out(tmp_path: Path) -> None:
     def reason(i: int) -> str:
-        return {7: "two_marks", 9: "no_mark"}.get(i % 10, "ok")
+        return {7: "two_markers", 9: "no_marker"}.get(i % 10, "ok")
 
     def error(i: int) -> Floats:
         return np.full(3, 0.0 if reason(i) == "ok" else 1.0)
@@ -174,8 +174,8 @@ def test_what_is_not_valid_is_counted_by_its_reason_and_left_out(tmp_path: Path)
     assert result["valid_ratio"] == pytest.approx(0.8, abs=0.01)
     tenth = result["fingertips"] / 10
     assert result["reasons"] == {
-        "two_marks": pytest.approx(tenth, abs=1),
-        "no_mark": pytest.approx(tenth, abs=1),
+        "two_markers": pytest.approx(tenth, abs=1),
+        "no_marker": pytest.approx(tenth, abs=1),
     }
     assert result["error_mm"]["max"] < 1e-9
 
@@ -196,10 +196,10 @@ def test_a_prediction_is_not_judged_where_the_truth_was_not_seen(tmp_path: Path)
 
 
 def test_a_gesture_that_is_never_tracked_is_a_result(tmp_path: Path) -> None:
-    bag = write(tmp_path / "a.mcap", Tracked("hold", reason=lambda _: "no_mark"))
+    bag = write(tmp_path / "a.mcap", Tracked("hold", reason=lambda _: "no_marker"))
     result = result_of(bag, "hold")
     assert result["valid_ratio"] == 0.0
-    assert set(result["reasons"]) == {"no_mark"}
+    assert set(result["reasons"]) == {"no_marker"}
     assert result["error_mm"] == {"rms": None, "p99": None, "max": None}
     assert result["jump"]["max_sigmas"] is None
     assert [each["lag_ms"] for each in result["prediction"]] == [None] * 3

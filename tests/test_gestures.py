@@ -15,19 +15,19 @@ from ruamel.yaml import YAML
 
 from messages.scene import Scene
 from messages.types import FingerPath, PathJoin
-from nodes.twin.finger import FingerMotion, FingerPathError, checked_path, smoothstep
+from nodes.twin.finger import FingerMotion, FingerPathError, smoothstep, validate_path
 from nodes.twin.gestures import (
     GESTURES,
     SAMPLE_S,
     TREMOR_ARM_M,
     WANDER_M,
     Gesture,
+    integrate_speed_profile,
     minimum_jerk,
     tap,
     tap_fast,
-    way_of_speeds,
 )
-from nodes.twin.paths import over_surface, recorded_path
+from nodes.twin.paths import map_to_surface, recorded_path
 
 ROOT = Path(__file__).resolve().parent.parent
 Floats = NDArray[np.float64]
@@ -103,7 +103,7 @@ def test_a_gesture_keeps_to_the_scenes_speed_and_volume(
     positions = np.array([state.position for state in states])
     assert (positions >= scene.finger.volume_min_m).all()
     assert (positions <= scene.finger.volume_max_m).all()
-    steady = checked_path(path.times_s, path.positions_world_m, path.joined_by)
+    steady = validate_path(path.times_s, path.positions_world_m, path.joined_by)
     assert steady.speeds().max() <= 0.8 * scene.finger.max_speed_m_per_s * (1.0 + 1e-9)
 
 
@@ -169,7 +169,7 @@ def test_taps_touch_as_long_and_as_often_as_people_do(
     gesture: Gesture, interval_s: float, contact_s: float
 ) -> None:
     path = gesture(SCENE)
-    motion = checked_path(path.times_s, path.positions_world_m, path.joined_by)
+    motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
     times = np.arange(0.0, motion.duration_s, 2e-4)
     below = heights(np.array([motion.at(time)[0] for time in times]), SCENE) < 0.0
     touches = times[1:][below[1:] & ~below[:-1]]
@@ -181,7 +181,7 @@ def test_taps_touch_as_long_and_as_often_as_people_do(
 
 def test_a_stop_stops_in_50_ms_and_the_finger_then_rests() -> None:
     path = GESTURES["stop"](SCENE)
-    motion = checked_path(path.times_s, path.positions_world_m, path.joined_by)
+    motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
     times = np.arange(1.2, motion.duration_s - 1.2, 1e-3)
     speeds = np.array([np.linalg.norm(motion.at(time)[1]) for time in times])
     going = speeds > 0.95 * speeds.max()
@@ -192,7 +192,7 @@ def test_a_stop_stops_in_50_ms_and_the_finger_then_rests() -> None:
 
 def test_a_reverse_turns_at_full_speed_within_100_ms() -> None:
     path = GESTURES["reverse"](SCENE)
-    motion = checked_path(path.times_s, path.positions_world_m, path.joined_by)
+    motion = validate_path(path.times_s, path.positions_world_m, path.joined_by)
     times = np.arange(1.3, motion.duration_s - 1.15, 1e-3)
     around = np.array([motion.at(time)[1][1] for time in times])
     turns = np.flatnonzero(around[:-1] * around[1:] < 0)
@@ -213,7 +213,7 @@ def test_a_reach_of_least_jerk_comes_out_as_it_was_meant(way_m: float, duration_
     """Its samples, joined by the spline, are within 10 um of it, at any acceleration up to 2 g."""
     duration_s = max(duration_s, float(np.sqrt(5.77 * way_m / 20.0)))
     times, places = minimum_jerk([0.0, 0.0, 0.0], [(duration_s, [way_m, 0.0, 0.0])])
-    motion = checked_path(times, places, "spline")
+    motion = validate_path(times, places, "spline")
     between = np.linspace(0.0, duration_s, 500)
     share, rate = smoothstep(between / duration_s)
     found = [motion.at(time) for time in between]
@@ -231,7 +231,7 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
     missed = []
     for joined_by in ("rounded_lines", "spline"):
         join: PathJoin = joined_by
-        motion = checked_path(times, places, join)
+        motion = validate_path(times, places, join)
         errors = [motion.at(time)[0][0] - 0.05 * smoothstep(time / 0.5)[0] for time in times]
         missed.append(np.abs(errors).max())
     assert missed[0] > 2.5e-4
@@ -242,9 +242,9 @@ def test_lines_with_rounded_corners_would_miss_that_reach() -> None:
 def test_halving_the_samples_changes_no_gesture(gesture: Gesture) -> None:
     """So the samples hold the whole motion."""
     path = gesture(SCENE)
-    whole = checked_path(path.times_s, path.positions_world_m, "spline")
+    whole = validate_path(path.times_s, path.positions_world_m, "spline")
     keep = np.unique(np.append(np.arange(0, len(path.times_s), 2), len(path.times_s) - 1))
-    half = checked_path(path.times_s[keep], path.positions_world_m[keep], "spline")
+    half = validate_path(path.times_s[keep], path.positions_world_m[keep], "spline")
     times = np.arange(0.0, whole.duration_s, 0.5 * SAMPLE_S)
     apart = [np.linalg.norm(whole.at(time)[0] - half.at(time)[0]) for time in times]
     # A spline's error falls with the fourth power of the step, with the third where jerk steps.
@@ -260,7 +260,7 @@ def test_no_smooth_path_is_faster_than_its_bound(
     points: list[tuple[float, float, float]], step_s: float
 ) -> None:
     times = np.linspace(0.0, step_s * (len(points) - 1), len(points))
-    path = checked_path(times, np.array(points), "spline")
+    path = validate_path(times, np.array(points), "spline")
     bounds = path.speeds()
     for piece, bound in enumerate(bounds):
         inside = np.linspace(times[piece], times[piece + 1], 40)
@@ -282,12 +282,14 @@ def test_a_smooth_path_that_is_too_fast_between_its_samples_is_refused() -> None
 
 
 def test_one_point_is_a_place_to_rest_however_it_is_joined() -> None:
-    path = checked_path(np.zeros(1), np.array([[0.1, 0.0, 0.0]]), "spline")
+    path = validate_path(np.zeros(1), np.array([[0.1, 0.0, 0.0]]), "spline")
     assert path.at(3.0)[0][0] == pytest.approx(0.1)
 
 
 def test_speeds_add_up_to_the_way() -> None:
-    times, way = way_of_speeds([(0.2, 0.1), (0.5, 0.1), (0.05, 0.0), (0.3, 0.0), (0.1, -0.2)])
+    times, way = integrate_speed_profile(
+        [(0.2, 0.1), (0.5, 0.1), (0.05, 0.0), (0.3, 0.0), (0.1, -0.2)]
+    )
     assert way[-1] == pytest.approx(0.1 * (0.1 + 0.5 + 0.025) - 0.2 * 0.05)
     assert np.abs(np.diff(way) / np.diff(times)).max() <= 0.2
 
@@ -304,8 +306,10 @@ def test_a_turned_object_is_touched_from_the_users_side() -> None:
     changed["object"]["world_from_object"]["rpy_rad"] = [2.0, 0.0, 0.0]
     turned = Scene.model_validate(changed)
     places = np.array([[0.01, 0.0, 0.02], [0.0, 0.02, 0.0]])
-    np.testing.assert_allclose(over_surface(turned, places), over_surface(SCENE, places), atol=1e-9)
-    np.testing.assert_allclose(over_surface(SCENE, places)[0], [0.01, 0.0, 0.02], atol=1e-9)
+    np.testing.assert_allclose(
+        map_to_surface(turned, places), map_to_surface(SCENE, places), atol=1e-9
+    )
+    np.testing.assert_allclose(map_to_surface(SCENE, places)[0], [0.01, 0.0, 0.02], atol=1e-9)
 
 
 def test_a_recorded_hand_keeps_what_it_did_between_its_samples(tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ from nodes.models.rigid import (
     vector_from_rotation,
 )
 from nodes.twin.arms import forward as twin_forward
-from nodes.twin.arms import joints_for
+from nodes.twin.arms import solve_inverse_kinematics
 from nodes.twin.board import TwinBoard
 from nodes.twin.rig import pixels_of
 
@@ -97,7 +97,9 @@ class Workplace:
         """Joints that turn the board (rotation vector, in the camera's axes) and shift it."""
         rotation = RIG.world_from_left[:3, :3] @ rotation_from_vector(turn_rad)
         board = transform(rotation, self.held + shift_m - rotation @ CORNERS.mean(axis=0))
-        return joints_for(inverse(self.base) @ board @ inverse(self.flange_from_board), READY)
+        return solve_inverse_kinematics(
+            inverse(self.base) @ board @ inverse(self.flange_from_board), READY
+        )
 
     def sighting(
         self, name: str, joints: Floats, *, noise_px: float = 0.0, joint_noise_rad: float = 0.0

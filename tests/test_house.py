@@ -80,12 +80,6 @@ def test_the_twin_shares_nothing_with_what_it_judges() -> None:
         assert not shared, f"{path.relative_to(ROOT)} imports {shared}"
 
 
-def test_node_files_stay_short() -> None:
-    for path in (ROOT / "nodes").glob("*/*node.py"):
-        lines = path.read_text().splitlines()
-        assert len(lines) <= 160, f"{path.relative_to(ROOT)} has {len(lines)} lines"
-
-
 def test_no_unfinished_marks() -> None:
     marks = ("TO" + "DO", "FIX" + "ME", "XX" + "X", "HA" + "CK")
     for floor in (*FLOORS, "tests", "benchmarks"):

@@ -24,9 +24,9 @@ from nodes.renderer.gl import DrawStyle, headless_context
 from nodes.renderer.scene_renderer import SceneRenderer
 from nodes.renderer.sheet import SheetPose, estimate_sheet
 from nodes.renderer.sheet_mesh import SheetMesh
+from nodes.twin.error_map import error_map
 from nodes.twin.eye import seen
-from nodes.twin.places import error_map
-from tests.dent_shapes import DEEPEST_M, few_dents
+from tests.indentation_bases import DEEPEST_M, few_dents
 
 Floats = NDArray[np.float64]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")

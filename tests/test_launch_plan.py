@@ -126,6 +126,14 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
             GRAPH.replace("rate_hz: 20", "rate_hz: fast"),
             "graph.yaml:6: nodes.beacon.parameters.rate_hz: 'fast' does not fit",
         ),
+        (
+            GRAPH + "  triangulator: {type: triangulator, parameters: {ahead_s: 0.1}}\n",
+            'unknown key "ahead_s"; it was renamed: write "prediction_horizon_s"',
+        ),
+        (
+            GRAPH + "  triangulator: {type: triangulator, parameters: {tracking: hand}}\n",
+            "'hand' does not fit; it was renamed or removed: write \"singer_tremor\"",
+        ),
         (GRAPH + "    host: left\n", 'unknown host "left"; there are: main'),
         (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),
         (GRAPH + "hosts: {main: {}}\n", 'graph.yaml:9: hosts.main: "address" is missing'),

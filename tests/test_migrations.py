@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from messages import migrations
 from messages.bag import BagError, BagReader, BagWriter, info
@@ -37,17 +39,50 @@ def test_a_bag_from_before_any_migration_is_read_whole() -> None:
     assert np.isfinite(finger.position_world_m).all()
 
 
+def recorded_schema(name: str) -> dict[str, Any]:
+    with OLD_BAG.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    (schema,) = (one for one in summary.schemas.values() if one.name == name)
+    return dict(json.loads(schema.data))
+
+
 @pytest.mark.parametrize("kinematics", ["closed_form", "closed_form_continuous", None])
-def test_a_scene_that_stepped_to_the_nearest_of_all_branches_is_still_read(
-    kinematics: str | None,
-) -> None:
+def test_a_recorded_scene_is_read_with_the_method_names_of_today(kinematics: str | None) -> None:
     recorded = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "scene")
     fields = recorded.model_dump()
-    fields["methods"]["kinematics"] = kinematics
-    migration = migration_for(Scene, "d7307561a5180666", {})
+    fields["methods"] = {"kinematics": kinematics, "mark": "moments", "tracking": "hand"}
+    migration = migration_for(Scene, "d7307561a5180666", recorded_schema("Scene"))
     assert migration is not None
-    taken = Scene.model_validate(migration(fields)).methods.kinematics
-    assert taken == (None if kinematics is None else "closed_form_continuous")
+    methods = Scene.model_validate(migration(fields)).methods
+    assert methods.kinematics == (None if kinematics is None else "closed_form_continuous")
+    assert (methods.marker, methods.tracking) == ("moments", "singer_tremor")
+
+
+def test_renamed_fields_of_a_recorded_fingertip_are_read() -> None:
+    finger = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "fingertip")
+    assert isinstance(finger, Fingertip)
+    assert len(finger.predicted_path_world_m) > 1
+    assert finger.prediction_step_s > 0.0
+
+
+@pytest.mark.parametrize(
+    ("model", "renamed"),
+    [*migrations.RENAMED_FIELDS.items(), *migrations.RENAMED_VALUES.items()],
+    ids=str,
+)
+def test_every_renaming_leads_to_a_name_of_today(
+    model: str | tuple[str, str], renamed: dict[str, str]
+) -> None:
+    name, field = (model, None) if isinstance(model, str) else model
+    schemas = [topic.message.model_json_schema() for topic in TOPICS.values()]
+    parts = [part for schema in schemas for part in (schema, *schema.get("$defs", {}).values())]
+    models = [part["properties"] for part in parts if part.get("title") == name]
+    assert models
+    for properties in models:
+        text = json.dumps(properties if field is None else properties[field])
+        assert all(f'"{new}"' in text for new in renamed.values())
+        assert not any(f'"{old}"' in text for old in renamed)
 
 
 class Before(Message):

@@ -19,7 +19,7 @@ from messages.clock import VirtualClock
 from messages.scene import Scene
 from messages.topics import Topic
 from messages.types import FingertipReason, SheetTarget, SoftBody
-from nodes.models.rigid import inverse, moved, transform, transform_from_rpy, twist_between
+from nodes.models.rigid import inverse, moved, transform, transform_from_rpy
 from nodes.models.shapes import CylinderShape
 from nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
 from nodes.planner.compliance import RESERVE, compliance_for, stretch_range
@@ -27,6 +27,7 @@ from nodes.planner.encounter import Encounter, Presentation, Reach
 from nodes.planner.node import Planner
 from nodes.planner.parameters import PlannerParameters
 from tests.fingertips import fingertip
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -121,9 +122,9 @@ async def test_nothing_is_sent_before_the_scene() -> None:
 
 async def test_without_a_finger_the_sheet_waits_in_the_imaginary_screen() -> None:
     desk = await table()
-    target = await desk.see(np.zeros(3), reason="no_mark")
+    target = await desk.see(np.zeros(3), reason="no_marker")
     assert target.phase == "wait"
-    assert target.reason == "fingertip: no_mark"
+    assert target.reason == "fingertip: no_marker"
     assert target.world_from_sheet == pytest.approx(np.eye(4), abs=1e-12)
     assert target.stretch_ratio == SCENE.sheet.min_stretch_ratio
 
@@ -381,9 +382,9 @@ async def test_a_lost_finger_brings_the_sheet_to_rest_smoothly() -> None:
     desk = await table(lead_s=0.0)
     await desk.rest_at(in_world(on_cylinder(0.0, -0.001)))
     await stroke(desk, 0.0, 40.0, 120)
-    lost = [await desk.see(np.zeros(3), reason="two_marks") for _ in range(30)]
+    lost = [await desk.see(np.zeros(3), reason="two_markers") for _ in range(30)]
     assert {target.phase for target in lost} == {"hold"}
-    assert lost[0].reason == "fingertip: two_marks"
+    assert lost[0].reason == "fingertip: two_markers"
     assert lost[-1].twist_world == pytest.approx(np.zeros(6), abs=0.0)
     assert lost[-1].world_from_sheet == pytest.approx(lost[-2].world_from_sheet, abs=1e-15)
     found = await desk.rest_at(in_world(on_cylinder(40.0, -0.001)), 60)
@@ -412,7 +413,7 @@ async def test_motion_is_bounded_whatever_the_finger_does(seed: int) -> None:
     sent = []
     for _ in range(40):
         spot = random.uniform([-0.1, -0.1, -0.1], [0.1, 0.1, 0.1])
-        reason: FingertipReason = "no_mark" if random.random() < 0.2 else "ok"
+        reason: FingertipReason = "no_marker" if random.random() < 0.2 else "ok"
         velocity = random.uniform(-1.0, 1.0, 3)
         for _ in range(random.integers(1, 8)):
             sent.append(await desk.see(spot, velocity, reason=reason))

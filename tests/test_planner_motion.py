@@ -16,11 +16,12 @@ from nodes.models.motion import (
     SheetBounds,
     SheetMotion,
     coast_sheet,
-    extrapolated,
+    extrapolate,
     follow,
     follow_sheet,
 )
-from nodes.models.rigid import is_rigid, transform_from_rpy, twist_between
+from nodes.models.rigid import is_rigid, transform_from_rpy
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 STEP_S = 1.0 / 60.0
@@ -123,7 +124,7 @@ def test_coasting_ends_at_rest() -> None:
 
 def test_extrapolation_goes_both_ways() -> None:
     motion = replace(AT_REST, twist_world=np.array([0.1, 0, 0.05, 0.5, 0, 0]))
-    there = extrapolated(motion, 0.04)
+    there = extrapolate(motion, 0.04)
     assert there.world_from_sheet[:3, 3] == pytest.approx([0.004, 0.0, 0.002])
-    back = extrapolated(there, -0.04)
+    back = extrapolate(there, -0.04)
     assert back.world_from_sheet == pytest.approx(np.eye(4), abs=1e-12)

@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 from launch.bench.twin_sheet import twin_push
 from messages.types import SheetTarget, SoftBody
 from nodes.models.motion import SheetMotion
-from nodes.models.rigid import moved, twist_between
-from nodes.models.sheet.fit import law_of
-from nodes.models.sheet.laws import CubicLaw, LinearLaw, ScaledLaw, SheetLaw
+from nodes.models.rigid import moved
+from nodes.models.sheet.fit import make_model
+from nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel, SheetForceModel
 from nodes.models.sheet.rubber import Rubber
 from nodes.planner.compliance import GOOD_RATIO, UnfitCurveError
 from nodes.planner.motion import withdrawn
 from nodes.planner.sheet_force import law_for, rubber_of
 from nodes.planner.yielding import Yielding
 from tests.test_planner import FRAME_NS, SCENE, Table, in_world, on_cylinder, table
+from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
 STEP_S = FRAME_NS * 1e-9
@@ -136,9 +137,9 @@ async def test_the_same_curve_again_changes_nothing_and_another_does() -> None:
     assert yielding.retreat(0.03, (0.0, 0.0))[0] > first[0]
 
 
-@pytest.mark.parametrize("law", [LinearLaw, CubicLaw, ScaledLaw])
+@pytest.mark.parametrize("law", [LinearSheetModel, ScaledSheetModel])
 def test_a_law_that_is_asked_beyond_its_range_is_named_with_the_reason(
-    law: Callable[[Rubber], SheetLaw],
+    law: Callable[[Rubber], SheetForceModel],
 ) -> None:
     for depth_m in (0.002, 0.05):
         working_range = SCENE.working_range.model_copy(update={"push_depth_m": depth_m})
@@ -147,13 +148,13 @@ def test_a_law_that_is_asked_beyond_its_range_is_named_with_the_reason(
         yielding = Yielding(scene, asked, "curve")
         yielding.take(soft_body(), touching=False)
         indentation_m = depth_m - yielding.retreat(depth_m, (0.0, 0.0))[0]
-        why = asked.outside(
+        why = asked.invalid_reason(
             yielding.stretch_ratio, indentation_m, place_m=(0.0, 0.0), finger_radius_m=RADIUS
         )
         assert bool(why) == ("law of the sheet's force" in yielding.note)
         assert yielding.note.endswith(why)
         # All three are wrong about a push of a millimetre or two; deep, the line is.
-        assert bool(why) == (depth_m < 0.01 or law is LinearLaw)
+        assert bool(why) == (depth_m < 0.01 or law is LinearSheetModel)
 
 
 async def test_in_touch_the_stretch_stays_and_the_retreat_makes_up_for_it() -> None:
@@ -193,7 +194,7 @@ async def test_what_the_sheet_cannot_present_is_said(scale: float, words: str) -
 
 
 async def test_a_calibrated_sheet_is_planned_with() -> None:
-    thin = law_of(
+    thin = make_model(
         rubber_of(SCENE.sheet),
         modulus_thickness_n_per_m=700.0,
         slack_width_m=SCENE.sheet.width_m,

@@ -23,10 +23,10 @@ from nodes.renderer.scene_renderer import NO_SHAPES_NOTE, SceneRenderer
 from nodes.renderer.sheet import SheetPose, estimate_sheet
 from nodes.renderer.sheet_mesh import deflected_mesh, flat_mesh, pyramid_mesh
 from nodes.renderer.sheet_shape_benchmark import sheet_shape_family
-from nodes.twin.eye import METRES_PER_PX, proper, push_sizes, seen
+from nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen
 from nodes.twin.membrane import DeformedSheet, Rubber, solve
 from nodes.twin.true_object import TrueBody
-from tests.dent_shapes import few_dents
+from tests.indentation_bases import few_dents
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -96,7 +96,7 @@ def test_on_a_dented_sheet_the_eye_sees_what_it_should(stage: SceneRenderer, dep
     eye = SCENE.eyes.centre_world_m
     truth, sheet = true_sheet(tip), sheet_at(np.eye(4), tip)
     wanted = np.array(
-        push_sizes(proper(TrueBody(SCENE).at_rest(), eye=eye, flat=True), METRES_PER_PX)
+        push_sizes(render_expected(TrueBody(SCENE).at_rest(), eye=eye, flat=True), METRES_PER_PX)
     )
 
     def errors_mm(correction: Correction) -> Floats:

@@ -32,11 +32,11 @@ from nodes.twin.eye import TrueProjector
 from nodes.twin.projector import (
     LitSheet,
     errors_at_eye,
+    make_true_projector,
     pixels_lighting,
     sheet_poses,
-    true_projector,
 )
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 
@@ -76,12 +76,12 @@ def scene() -> Scene:
 
 @pytest.fixture(scope="module")
 def true_rig(scene: Scene) -> StereoCamera:
-    return true_camera(scene.camera)
+    return make_true_camera(scene.camera)
 
 
 @pytest.fixture(scope="module")
 def true(scene: Scene) -> Projector:
-    return true_projector(scene.projector, seed=3)
+    return make_true_projector(scene.projector, seed=3)
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +200,7 @@ def test_corners_in_no_order_are_refused() -> None:
 
 def test_the_scene_keeps_its_comments_and_takes_the_projector(tmp_path: Path) -> None:
     scene = load_scene(SCENE_FILE)
-    found = true_projector(scene.projector, seed=5)
+    found = make_true_projector(scene.projector, seed=5)
     copy = tmp_path / "scene.yaml"
     write_scene(SCENE_FILE, found, copy)
     before, after = (path.read_text().splitlines() for path in (SCENE_FILE, copy))
@@ -235,7 +235,7 @@ def test_the_twins_eye_bends_light_as_the_true_lens(scene: Scene, true: Projecto
     vertices = np.array([[-0.12, -0.12, 0], [0.12, -0.12, 0], [0.12, 0.12, 0], [-0.12, 0.12, 0]])
     projector = TrueProjector(true, vertices, np.array([[0, 1, 2], [0, 2, 3]]))
     pixels = np.array([[200.0, 150.0], [20.5, 30.25], [380.0, 280.0]])
-    landed, lands = projector.lands_at(pixels)
+    landed, lands = projector.intersect_surface(pixels)
     assert lands[0]
     assert np.allclose(pixels_lighting(true, landed[lands]), pixels[lands], atol=1e-6)
     again, lit = projector.pixels_of(landed[lands])

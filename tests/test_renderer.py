@@ -329,7 +329,7 @@ class Bench:
             await self.step(f"arm_{side}", state, age_ms=age_ms)
 
     async def finger(self, *tip: float, age_ms: float = 4.0, valid: bool = True) -> None:
-        message = fingertip(np.array(tip), reason="ok" if valid else "no_mark")
+        message = fingertip(np.array(tip), reason="ok" if valid else "no_marker")
         await self.step("fingertip", message, age_ms=age_ms)
 
 

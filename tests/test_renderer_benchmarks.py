@@ -12,7 +12,7 @@ from nodes.methods import Point, measure, pareto_front
 from nodes.renderer import benchmarks, deflection_cache
 from nodes.renderer.benchmarks import correction_family, is_in_range, scale_projector
 from nodes.renderer.scene_renderer import projector_homography
-from tests.dent_shapes import few_dents
+from tests.indentation_bases import few_dents
 
 SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")
 

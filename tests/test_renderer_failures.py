@@ -18,7 +18,7 @@ from nodes.renderer.gl import DrawStyle, headless_context
 from nodes.renderer.scene_renderer import SceneRenderer
 from nodes.renderer.sheet import SheetPose
 from nodes.renderer.sheet_mesh import SheetMesh, occluded_fraction, pyramid_mesh
-from nodes.twin.eye import proper, seen
+from nodes.twin.eye import render_expected, seen
 from nodes.twin.membrane import Rubber, solve
 from nodes.twin.true_object import TrueBody
 from tests.drawing import body_of, dent, follow, sheet_at
@@ -76,7 +76,9 @@ def test_what_is_before_the_sheet_is_seen_at_its_place(stage: SceneRenderer) -> 
     rubber = Rubber(spec.width_m, spec.height_m, spec.thickness_m, spec.young_modulus_pa)
     edges = edge_poses(pose, 1.05 * spec.width_m)
     truth = solve(rubber, *edges, finger_tip=None, finger_radius_m=SCENE.finger.radius_m)
-    wanted = proper(TrueBody(SCENE).at_rest(), eye=EYE, flat=True, metres_per_px=0.001) / 255.0
+    wanted = (
+        render_expected(TrueBody(SCENE).at_rest(), eye=EYE, flat=True, metres_per_px=0.001) / 255.0
+    )
     for correction in ("one_plane", "two_pass"):
         picture = drawn(stage, correction, sheet_at(SCENE, pose))
         off = seen(picture, truth, SCENE, eye=EYE, metres_per_px=0.001) / 255.0 - wanted

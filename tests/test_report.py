@@ -174,10 +174,10 @@ def test_latencies_speeds_and_forces(numbers: dict[str, Any]) -> None:
 
 def test_a_nodes_methods_are_those_of_its_parameters_else_of_its_scene() -> None:
     chosen = Methods.model_validate(
-        {"mark": "moments", "soft_body": {"method": "linear", "skin_spacing_m": 0.006}}
+        {"marker": "moments", "soft_body": {"method": "linear", "skin_spacing_m": 0.006}}
     )
     tuned = sessions.SCENE.model_copy(update={"methods": chosen})
-    eye = {"mark": "auto", "triangulation": "dlt", "tracking": "auto", "rate_hz": 60.0}
+    eye = {"marker": "auto", "triangulation": "dlt", "tracking": "auto", "rate_hz": 60.0}
     assert methods_of(eye, tuned) == "mark moments, triangulation dlt, tracking default"
     assert methods_of(eye, None) == "mark default, triangulation dlt, tracking default"
     assert methods_of({"method": "auto"}, tuned) == "linear"

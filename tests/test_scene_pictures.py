@@ -238,12 +238,12 @@ async def chain(case: Case) -> AsyncIterator[Chain]:
 
 async def test_the_eye_sees_what_it_ought_to(chain: Chain) -> None:
     picture = await chain.picture("flat")
-    seen, proper = picture.seen[..., 0] / 255.0, picture.proper[..., 0] / 255.0
-    assert proper.sum() > 3000  # mm^2
-    assert seen.sum() == pytest.approx(proper.sum(), rel=3e-3)
-    assert np.abs(seen - proper).sum() < 0.015 * proper.sum()
+    seen, expected = picture.seen[..., 0] / 255.0, picture.expected[..., 0] / 255.0
+    assert expected.sum() > 3000  # mm^2
+    assert seen.sum() == pytest.approx(expected.sum(), rel=3e-3)
+    assert np.abs(seen - expected).sum() < 0.015 * expected.sum()
     for axis in (0, 1):
-        width, wanted = (each.max(axis=axis).sum() for each in (seen, proper))
+        width, wanted = (each.max(axis=axis).sum() for each in (seen, expected))
         assert width == pytest.approx(wanted, abs=0.5)
 
 
@@ -252,6 +252,6 @@ async def test_a_dented_object_is_seen_as_dented(chain: Chain, case: Case) -> No
     rest = await chain.picture("soft")
     body = case.body(case.dent(0.02) + SHIFT_M)
     moved = await chain.picture("soft", ("skin", case.skin), ("soft_body", body))
-    off = np.abs(moved.seen.astype(float) - moved.proper)
-    assert off.mean() < 0.03 * moved.proper.mean()
-    assert (np.abs(moved.proper.astype(float) - rest.proper) > 40).mean() > 0.005
+    off = np.abs(moved.seen.astype(float) - moved.expected)
+    assert off.mean() < 0.03 * moved.expected.mean()
+    assert (np.abs(moved.expected.astype(float) - rest.expected) > 40).mean() > 0.005

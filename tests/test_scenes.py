@@ -21,7 +21,7 @@ from nodes.planner.encounter import BEYOND_SPIN
 from nodes.planner.node import Planner
 from nodes.twin.finger import FingerPathError, SmoothPath
 from nodes.twin.gestures import GESTURES
-from nodes.twin.paths import over_surface, touchable
+from nodes.twin.paths import map_to_surface, touchable
 from tests import test_arm_loop as arm_loop
 from tests.plans import STEP_S, Desk, scene_with
 
@@ -61,14 +61,14 @@ def test_the_arms_reach_the_whole_working_range(name: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_the_front_touches_the_imaginary_screen_and_places_are_straightest_ways(name: str) -> None:
     here = scene(name)
-    front = over_surface(here, np.zeros((1, 3)))[0]
+    front = map_to_surface(here, np.zeros((1, 3)))[0]
     assert front == pytest.approx(np.zeros(3), abs=1.5e-3)
     along_m, arc_m = touchable(here)
     assert 0.02 < along_m < 0.2
     assert 0.02 < arc_m <= 2.0 * here.sheet.usable_half_height_m
     # Around the surface a millimetre is a millimetre, and at the ends the tilt is not exceeded.
     arcs = np.linspace(-0.5 * arc_m, 0.5 * arc_m, 400)
-    points = over_surface(here, np.column_stack([0 * arcs, arcs, 0 * arcs]))
+    points = map_to_surface(here, np.column_stack([0 * arcs, arcs, 0 * arcs]))
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     assert steps == pytest.approx(np.diff(arcs), rel=2e-3)
     shape, world_from_object = make_shape(dict(here.object.geometry)), object_pose(here)
@@ -85,7 +85,7 @@ def test_on_a_cylinder_and_a_sphere_places_are_known_in_closed_form() -> None:
     radius = 0.0353553
     angle, reach = arc / radius, radius + height
     wanted = np.column_stack([along, reach * np.sin(angle), reach * np.cos(angle) - radius])
-    assert over_surface(scene("cylinder"), places) == pytest.approx(wanted, abs=1e-7)
+    assert map_to_surface(scene("cylinder"), places) == pytest.approx(wanted, abs=1e-7)
     radius = 0.05
     out = np.column_stack(
         [
@@ -95,7 +95,7 @@ def test_on_a_cylinder_and_a_sphere_places_are_known_in_closed_form() -> None:
         ]
     )
     wanted = (radius + height)[:, None] * out - [0.0, 0.0, radius]
-    assert over_surface(scene("sphere"), places) == pytest.approx(wanted, abs=1e-7)
+    assert map_to_surface(scene("sphere"), places) == pytest.approx(wanted, abs=1e-7)
 
 
 def test_an_object_that_turns_no_side_to_the_user_has_no_path() -> None:
@@ -108,7 +108,7 @@ def test_an_object_that_is_turned_is_met_at_its_middle() -> None:
     """Where the point nearest to the user is an end, what he sees through the middle counts."""
     plane = {"shape": "plane", "width_m": 0.1, "height_m": 0.1}
     turned = scene_with(plane, (0.0, 0.0, -0.01), (0.4, 0.0, 0.0))
-    assert over_surface(turned, np.zeros((1, 3)))[0] == pytest.approx([0.0, 0.0, -0.01], abs=1e-6)
+    assert map_to_surface(turned, np.zeros((1, 3)))[0] == pytest.approx([0.0, 0.0, -0.01], abs=1e-6)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -186,7 +186,7 @@ async def test_both_arms_carry_the_sheet_over_the_object(
     def path(at_s: float) -> Floats:
         share = min(max(at_s / seconds, 0.0), 1.0)
         arc = 0.35 * arc_m * share * share * (3.0 - 2.0 * share)
-        point: Floats = over_surface(here, np.array([[0.0, arc, -0.001]]))[0]
+        point: Floats = map_to_surface(here, np.array([[0.0, arc, -0.001]]))[0]
         return point
 
     async with arm_loop.running_rig() as (rig, nodes):

@@ -18,9 +18,9 @@ from nodes.models.shapes import (
     RoundedBoxShape,
     Shape,
     SphereShape,
-    foot_jacobian,
     make_shape,
     principal_curvatures,
+    projection_jacobian,
     tightest_curvature,
 )
 
@@ -130,7 +130,7 @@ def test_the_foot_moves_as_its_jacobian_says(shape: Shape) -> None:
         found.on_edge[keep],
         found.undecided[keep],
     )
-    wrong = np.linalg.norm(0.5 * after[keep] - foot_jacobian(kept) @ moved, axis=1) > 1e-11
+    wrong = np.linalg.norm(0.5 * after[keep] - projection_jacobian(kept) @ moved, axis=1) > 1e-11
     assert wrong.mean() < 0.01
 
 

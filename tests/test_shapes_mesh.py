@@ -22,15 +22,15 @@ from nodes.models.shapes import (
     make_shape,
     principal_curvatures,
 )
-from nodes.models.shapes.smooth_mesh import EDGE, TIGHTEST, usual_smoothing_m
+from nodes.models.shapes.smooth_mesh import EDGE, MAX_CURVATURE_RATIO, default_smoothing_m
 from nodes.models.shapes.triangles import (
     Facets,
     check_mesh,
+    count_intersections,
     dihedrals_rad,
     half_edges,
-    intersecting,
     nearest_in_triangles,
-    refined,
+    refine_facets,
     triangle_normals,
     vertex_normals,
     volume_m3,
@@ -58,7 +58,7 @@ def cube(side_m: float = 0.04) -> tuple[Floats, Indices]:
 @cache
 def smooth_ellipsoid(axes: tuple[float, float, float], subdivisions: int) -> SmoothMeshShape:
     vertices, triangles = meshed_ellipsoid(axes, subdivisions)
-    return SmoothMeshShape(vertices, triangles, usual_smoothing_m(vertices, triangles))
+    return SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
 
 
 @cache
@@ -200,7 +200,7 @@ def test_the_normals_acceleration_is_bounded_on_a_real_mesh(step_m: float) -> No
         assert edges.mean() < 0.3
         turned = np.linalg.norm(np.diff(normals, axis=0), axis=1) / step_m
         off = ~(edges[1:] | edges[:-1])
-        assert turned[off].max() < 1.1 * EDGE * TIGHTEST / shape.smoothing_m
+        assert turned[off].max() < 1.1 * EDGE * MAX_CURVATURE_RATIO / shape.smoothing_m
 
 
 def test_the_real_mesh_is_followed_closely() -> None:
@@ -385,16 +385,16 @@ def test_a_fold_is_refused() -> None:
 
 def test_triangles_that_cut_through_one_another_are_counted() -> None:
     vertices, triangles = cube()
-    assert intersecting(vertices, triangles) == 0
+    assert count_intersections(vertices, triangles) == 0
     both = np.concatenate([vertices, vertices + np.array([0.011, 0.012, 0.013])])
-    assert intersecting(both, np.concatenate([triangles, triangles + 8])) > 4
+    assert count_intersections(both, np.concatenate([triangles, triangles + 8])) > 4
     ball = meshed_ellipsoid(AXES, 3)
-    assert intersecting(*ball) == 0
+    assert count_intersections(*ball) == 0
 
 
 def test_refinement_keeps_the_surface() -> None:
     vertices, triangles = cube()
-    fine_vertices, fine = refined(vertices, triangles, 0.007)
+    fine_vertices, fine = refine_facets(vertices, triangles, 0.007)
     check_mesh(fine_vertices, fine)
     run = half_edges(fine)
     assert (
@@ -404,7 +404,7 @@ def test_refinement_keeps_the_surface() -> None:
     assert np.isclose(np.abs(fine_vertices).max(axis=1), 0.02).all()
     assert np.isclose(np.degrees(dihedrals_rad(vertices, triangles)[1]).max(), 90.0)
     with pytest.raises(MeshError, match="smooth over a longer"):
-        refined(vertices, triangles, 1e-5)
+        refine_facets(vertices, triangles, 1e-5)
 
 
 @settings(max_examples=60, deadline=None)

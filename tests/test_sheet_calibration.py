@@ -25,9 +25,15 @@ from messages.sheet_calibration import (
     load_sheet_calibration,
     save_sheet_calibration,
 )
-from nodes.models.sheet.fit import FitError, Push, fit_law, law_of, table_from
-from nodes.models.sheet.laws import CENTRE, ScaledLaw
-from nodes.models.sheet.table import TableLaw
+from nodes.models.sheet.fit import (
+    MeasuredPush,
+    SheetModelFitError,
+    fit_sheet_model,
+    make_model,
+    tabulate_pushes,
+)
+from nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
+from nodes.models.sheet.tabulated import TabulatedSheetModel
 from nodes.planner.sheet_force import law_for, rubber_of
 
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
@@ -37,22 +43,22 @@ RADIUS = 0.007
 
 
 def pushes_of(
-    law: ScaledLaw,
+    law: ScaledSheetModel,
     *,
     stretches: tuple[float, ...] = (1.02, 1.04, 1.06, 1.09),
     depths: tuple[float, ...] = (0.004, 0.008, 0.015, 0.025, 0.04),
     noise_n: float = 0.0,
     edges: bool = False,
     seed: int = 1,
-) -> list[Push]:
+) -> list[MeasuredPush]:
     """What a gauge would say of a sheet that has this law."""
     rng = np.random.default_rng(seed)
     pushes = []
     for stretch in stretches:
-        pressed = law.press(stretch, np.array(depths), place_m=CENTRE, finger_radius_m=RADIUS)
+        pressed = law.evaluate(stretch, np.array(depths), place_m=CENTRE, finger_radius_m=RADIUS)
         for depth, force, pull in zip(depths, pressed.force_n, pressed.edge_force_n, strict=True):
             pushes.append(
-                Push(
+                MeasuredPush(
                     edge_distance_m=stretch * NOMINAL.width_m,
                     depth_m=depth,
                     force_n=float(force) + float(rng.normal(0.0, noise_n)),
@@ -66,21 +72,21 @@ def pushes_of(
 @settings(max_examples=12, deadline=None)
 @given(st.floats(200.0, 4000.0), st.floats(0.237, 0.243), st.floats(0.5, 2.0))
 def test_a_sheets_numbers_are_found_again(modulus: float, width: float, cubic: float) -> None:
-    law = law_of(
+    law = make_model(
         NOMINAL,
         modulus_thickness_n_per_m=modulus,
         slack_width_m=width,
         cubic_ratio=cubic,
         mooney_share=0.0,
     )
-    fit = fit_law(pushes_of(law), NOMINAL)
+    fit = fit_sheet_model(pushes_of(law), NOMINAL)
     assert fit.values == pytest.approx((modulus, width, cubic), rel=1e-3)
     assert fit.worst_ratio < 1e-3
     assert fit.used.all()
 
 
 def test_noise_is_within_the_stated_deviations_and_strays_are_left_out() -> None:
-    law = law_of(
+    law = make_model(
         NOMINAL,
         modulus_thickness_n_per_m=1500.0,
         slack_width_m=0.2385,
@@ -90,8 +96,10 @@ def test_noise_is_within_the_stated_deviations_and_strays_are_left_out() -> None
     rows = pushes_of(law, noise_n=0.01)
     for number, factor in ((3, 3.0), (12, 0.2)):
         push = rows[number]
-        rows[number] = Push(push.edge_distance_m, push.depth_m, factor * push.force_n, RADIUS)
-    fit = fit_law(rows, NOMINAL)
+        rows[number] = MeasuredPush(
+            push.edge_distance_m, push.depth_m, factor * push.force_n, RADIUS
+        )
+    fit = fit_sheet_model(rows, NOMINAL)
     assert list(np.flatnonzero(~fit.used)) == [3, 12]
     for value, true, deviation in zip(
         fit.values, (1500.0, 0.2385, 1.3), fit.standard_deviations, strict=True
@@ -101,7 +109,7 @@ def test_noise_is_within_the_stated_deviations_and_strays_are_left_out() -> None
 
 
 def test_mooneys_share_is_found_where_the_sheet_is_stretched_far() -> None:
-    law = law_of(
+    law = make_model(
         NOMINAL,
         modulus_thickness_n_per_m=900.0,
         slack_width_m=0.24,
@@ -109,63 +117,65 @@ def test_mooneys_share_is_found_where_the_sheet_is_stretched_far() -> None:
         mooney_share=0.4,
     )
     rows = pushes_of(law, stretches=(1.02, 1.05, 1.12, 1.2, 1.3), edges=True)
-    fit = fit_law(rows, NOMINAL, with_mooney=True)
+    fit = fit_sheet_model(rows, NOMINAL, with_mooney=True)
     assert fit.names[3] == "mooney_share"
     assert fit.values == pytest.approx((900.0, 0.24, 1.0, 0.4), rel=0.02)
     assert 0.0 < fit.standard_deviations[3] < 0.2
 
 
 def test_edge_forces_tell_more() -> None:
-    law = ScaledLaw(NOMINAL)
-    without = fit_law(pushes_of(law), NOMINAL)
-    along = fit_law(pushes_of(law, edges=True), NOMINAL)
+    law = ScaledSheetModel(NOMINAL)
+    without = fit_sheet_model(pushes_of(law), NOMINAL)
+    along = fit_sheet_model(pushes_of(law, edges=True), NOMINAL)
     assert along.standard_deviations[1] < without.standard_deviations[1]
 
 
 @pytest.mark.parametrize(
     ("rows", "words"),
     [
-        (pushes_of(ScaledLaw(NOMINAL))[:5], "6 or more"),
+        (pushes_of(ScaledSheetModel(NOMINAL))[:5], "6 or more"),
         (
-            pushes_of(ScaledLaw(NOMINAL), stretches=(1.05,), depths=(0.005,) * 8),
+            pushes_of(ScaledSheetModel(NOMINAL), stretches=(1.05,), depths=(0.005,) * 8),
             r"open|known to",
         ),
     ],
 )
-def test_rows_that_leave_it_open_are_refused(rows: list[Push], words: str) -> None:
-    with pytest.raises(FitError, match=words):
-        fit_law(rows, NOMINAL)
+def test_rows_that_leave_it_open_are_refused(rows: list[MeasuredPush], words: str) -> None:
+    with pytest.raises(SheetModelFitError, match=words):
+        fit_sheet_model(rows, NOMINAL)
 
 
 def test_a_table_keeps_what_the_law_leaves() -> None:
     rows = [
-        Push(
+        MeasuredPush(
             push.edge_distance_m,
             push.depth_m,
             push.force_n * (1.0 + 4.0 * (push.depth_m - 0.02)),
             RADIUS,
         )
-        for push in pushes_of(ScaledLaw(NOMINAL))
+        for push in pushes_of(ScaledSheetModel(NOMINAL))
     ]
-    fit = fit_law(rows, NOMINAL)
-    table = table_from(fit.law, rows, fit.used, NOMINAL.width_m)
+    fit = fit_sheet_model(rows, NOMINAL)
+    table = tabulate_pushes(fit.law, rows, fit.used, NOMINAL.width_m)
     for push in rows:
         stretch = push.edge_distance_m / NOMINAL.width_m
-        pressed = table.press(
+        pressed = table.evaluate(
             stretch, np.array([push.depth_m]), place_m=CENTRE, finger_radius_m=RADIUS
         )
         assert pressed.force_n[0] == pytest.approx(push.force_n, rel=0.02)
 
 
 def test_a_table_needs_all_combinations() -> None:
-    rows = pushes_of(ScaledLaw(NOMINAL))
-    moved = Push(rows[0].edge_distance_m, 0.01, rows[1].force_n, RADIUS, place_m=(0.03, 0.0))
+    rows = pushes_of(ScaledSheetModel(NOMINAL))
+    moved = MeasuredPush(
+        rows[0].edge_distance_m, 0.01, rows[1].force_n, RADIUS, place_m=(0.03, 0.0)
+    )
     used = np.ones(len(rows) + 1, dtype=bool)
-    with pytest.raises(FitError, match="every combination"):
-        table_from(ScaledLaw(NOMINAL), [*rows, moved], used, NOMINAL.width_m)
+    with pytest.raises(SheetModelFitError, match="every combination"):
+        tabulate_pushes(ScaledSheetModel(NOMINAL), [*rows, moved], used, NOMINAL.width_m)
     apart = [push for push in rows if (push.depth_m < 0.01) == (push.edge_distance_m < 0.25)]
-    with pytest.raises(FitError, match="in common"):
-        table_from(ScaledLaw(NOMINAL), apart, used[: len(apart)], NOMINAL.width_m)
+    with pytest.raises(SheetModelFitError, match="in common"):
+        tabulate_pushes(ScaledSheetModel(NOMINAL), apart, used[: len(apart)], NOMINAL.width_m)
 
 
 CSV = """# measured on a bench
@@ -182,7 +192,7 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
     file.write_text(CSV)
     rows, lines = read_rows(file, SCENE.sheet, RADIUS)
     assert lines == [3, 4, 6]
-    assert rows[0] == Push(pytest.approx(0.2448), 0.005, 0.09, 0.007, edge_force_n=5.1)  # type: ignore[arg-type]  # compares as a float
+    assert rows[0] == MeasuredPush(pytest.approx(0.2448), 0.005, 0.09, 0.007, edge_force_n=5.1)  # type: ignore[arg-type]  # compares as a float
     assert rows[1].place_m == pytest.approx((0.0, -0.012))
     assert rows[1].edge_force_n is None
     assert rows[2].finger_radius_m == pytest.approx(0.008)
@@ -242,10 +252,10 @@ def test_the_twin_is_known_by_its_pushes(twin_calibration: SheetCalibration) -> 
     assert found.cubic_ratio.value == pytest.approx(1.0, abs=0.2)
     assert found.residual_rms_ratio < 0.07
     law = law_for(SCENE.sheet, found)
-    assert isinstance(law, TableLaw)
+    assert isinstance(law, TabulatedSheetModel)
     for stretch, depth in ((1.03, 0.009), (1.05, 0.016)):
         true = twin_force(SCENE.sheet, stretch, depth, CENTRE, RADIUS)
-        pressed = law.press(stretch, np.array([depth]), place_m=CENTRE, finger_radius_m=RADIUS)
+        pressed = law.evaluate(stretch, np.array([depth]), place_m=CENTRE, finger_radius_m=RADIUS)
         assert pressed.force_n[0] == pytest.approx(true, rel=0.04)
 
 
@@ -257,7 +267,7 @@ def test_the_file_gives_back_the_law(twin_calibration: SheetCalibration, tmp_pat
     one, two = law_for(SCENE.sheet, twin_calibration), law_for(SCENE.sheet, again)
     depths = np.linspace(0.001, 0.04, 9)
     answers = [
-        law.press(1.037, depths, place_m=(0.02, 0.01), finger_radius_m=RADIUS).force_n
+        law.evaluate(1.037, depths, place_m=(0.02, 0.01), finger_radius_m=RADIUS).force_n
         for law in (one, two)
     ]
     assert np.array_equal(answers[0], answers[1])
@@ -301,7 +311,7 @@ def test_another_sheets_calibration_is_refused(twin_calibration: SheetCalibratio
 def test_the_command_fits_rows_and_tells(tmp_path: Path) -> None:
     rows = tmp_path / "rows.csv"
     lines = ["stretch_ratio,depth_mm,force_n"]
-    for push in pushes_of(ScaledLaw(NOMINAL), noise_n=0.002):
+    for push in pushes_of(ScaledSheetModel(NOMINAL), noise_n=0.002):
         stretch = push.edge_distance_m / NOMINAL.width_m
         lines.append(f"{stretch:.5f},{1e3 * push.depth_m:.3f},{push.force_n:.5f}")
     lines[7] = lines[7].rsplit(",", 1)[0] + ",9.0"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from launch.bench.twin_sheet import twin_push
 from messages.scene import SheetSpec
 from nodes.models.sheet import membrane
-from nodes.models.sheet.laws import MembraneLaw
+from nodes.models.sheet.force_models import MembraneSheetModel
 from nodes.models.sheet.membrane import (
     NoEquilibriumError,
     graded,
@@ -110,10 +110,10 @@ def test_near_the_free_edge_and_the_clamp_there_is_an_answer() -> None:
             cells=20,
         )
         assert 0.0 < path.forces_n[0] < path.forces_n[1]
-    law = MembraneLaw(RUBBER)
-    assert law.outside(1.05, 0.02, place_m=(0.0, 0.112), finger_radius_m=RADIUS)
-    assert law.outside(1.05, 0.001, place_m=(0.0, 0.0), finger_radius_m=RADIUS)
-    assert not law.outside(1.05, 0.02, place_m=(0.05, 0.05), finger_radius_m=RADIUS)
+    law = MembraneSheetModel(RUBBER)
+    assert law.invalid_reason(1.05, 0.02, place_m=(0.0, 0.112), finger_radius_m=RADIUS)
+    assert law.invalid_reason(1.05, 0.001, place_m=(0.0, 0.0), finger_radius_m=RADIUS)
+    assert not law.invalid_reason(1.05, 0.02, place_m=(0.05, 0.05), finger_radius_m=RADIUS)
 
 
 def test_mooneys_rubber_softens_when_stretched() -> None:
@@ -156,7 +156,7 @@ def test_pushes_that_are_none_are_refused(changed: dict[str, object], words: str
 
 
 def test_an_equilibrium_that_is_not_found_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(membrane, "MOST_ITERATIONS", 1)
+    monkeypatch.setattr(membrane, "MAX_ITERATIONS", 1)
     with pytest.raises(NoEquilibriumError, match="residual"):
         push_path(RUBBER, stretch_ratio=1.05, depths_m=[0.02], finger_radius_m=RADIUS, cells=12)
 

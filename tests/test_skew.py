@@ -14,8 +14,8 @@ from ruamel.yaml import YAML
 from benchmarks.tracking_bench import Observer, bench_scene, twin_camera
 from messages.scene import Scene
 from messages.types import StereoPair
-from nodes.triangulator.skew import unskewed
-from nodes.triangulator.triangulation import Measured, StereoGeometry, dlt, measure
+from nodes.triangulator.skew import compensate_skew
+from nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint, dlt, measure
 from nodes.twin.clutter import CLUTTER
 
 Floats = NDArray[np.float64]
@@ -25,7 +25,7 @@ GEOMETRY = StereoGeometry.of(SCENE.camera)
 NOISE_PX2 = 1e-4 * np.eye(2)
 
 
-def seen(point: Floats, velocity: Floats, skew_s: float) -> Measured:
+def seen(point: Floats, velocity: Floats, skew_s: float) -> TriangulatedPoint:
     left = GEOMETRY.project(point - 0.5 * skew_s * velocity)[0]
     right = GEOMETRY.project(point + 0.5 * skew_s * velocity)[1]
     found = measure(
@@ -46,12 +46,12 @@ def test_a_known_velocity_undoes_the_skew(
 ) -> None:
     point, moving = np.array(place), np.array(velocity)
     found = seen(point, moving, skew_s)
-    mended = unskewed(found, GEOMETRY, skew_s, moving, np.zeros((3, 3)))
+    corrected = compensate_skew(found, GEOMETRY, skew_s, moving, np.zeros((3, 3)))
     # What is left is of second order in the way between the exposures, a few times over the
     # baseline.
     way_m = float(np.linalg.norm(moving)) * abs(skew_s)
-    assert np.linalg.norm(mended.point_world - point) <= 6.0 * way_m**2 / 0.1205 + 1e-6
-    assert mended.covariance == pytest.approx(found.covariance)
+    assert np.linalg.norm(corrected.point_world - point) <= 6.0 * way_m**2 / 0.1205 + 1e-6
+    assert corrected.covariance == pytest.approx(found.covariance)
 
 
 def test_an_unknown_velocity_is_in_the_covariance() -> None:
@@ -59,7 +59,7 @@ def test_an_unknown_velocity_is_in_the_covariance() -> None:
     found = seen(np.zeros(3), velocity, 0.008)
     error = found.point_world
     assert np.linalg.norm(error) > 0.005, "a skew of half a frame is centimetres of depth"
-    careful = unskewed(found, GEOMETRY, 0.008, np.zeros(3), 0.3**2 * np.eye(3))
+    careful = compensate_skew(found, GEOMETRY, 0.008, np.zeros(3), 0.3**2 * np.eye(3))
     assert error @ np.linalg.solve(careful.covariance, error) < 9.0
     assert error @ np.linalg.solve(found.covariance, error) > 1000.0
 

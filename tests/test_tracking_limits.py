@@ -33,14 +33,14 @@ CONFIRMED_MS = 2.0 * FRAME_MS
 
 SEVERE = {
     "one-view": (0.5, {"merged", "inconsistent"}, CONFIRMED_MS),
-    "edge": (-5.0, {"mark_in_one_view"}, CONFIRMED_MS),
-    "two-marks": (6.0, {"merged", "two_marks"}, CONFIRMED_MS),
-    "hidden": (30.0, {"no_mark", "two_marks", "too_fast"}, CONFIRMED_MS),
+    "edge": (-5.0, {"marker_in_one_view"}, CONFIRMED_MS),
+    "two-marks": (6.0, {"merged", "two_markers"}, CONFIRMED_MS),
+    "hidden": (30.0, {"no_marker", "two_markers", "too_fast"}, CONFIRMED_MS),
     "highlight": (0.25, {"merged", "blurred"}, CONFIRMED_MS),
     # What comes after begins beyond the volume, and the way back takes a while.
     "volume": (10.0, {"outside_volume"}, 150.0),
     "baseline": (2.0, {"inconsistent"}, None),
-    "defocus": (3.0, {"blurred", "no_mark", "mark_in_one_view"}, CONFIRMED_MS),
+    "defocus": (3.0, {"blurred", "no_marker", "marker_in_one_view"}, CONFIRMED_MS),
     "saturated": (8.0, {"saturated"}, CONFIRMED_MS),
 }
 

@@ -23,7 +23,7 @@ from nodes.triangulator.parameters import TriangulatorParameters
 from nodes.twin.clutter import touching_highlight
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from nodes.twin.pixels import Sensor, TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -121,7 +121,7 @@ async def test_each_reason_and_back_again(scene: Scene, camera: TwinCamera) -> N
 
     assert await reason(bench.pictures((0.0, 0.0, -0.16))) == "outside_volume"
     before_any = await bench.show(*empty)
-    assert (before_any.valid, before_any.reason, before_any.state) == (False, "no_mark", "lost")
+    assert (before_any.valid, before_any.reason, before_any.state) == (False, "no_marker", "lost")
     assert np.linalg.eigvalsh(before_any.covariance).min() >= 1.0
 
     assert [await reason(here) for _ in range(3)] == ["unconfirmed", "unconfirmed", "ok"]
@@ -130,9 +130,9 @@ async def test_each_reason_and_back_again(scene: Scene, camera: TwinCamera) -> N
     assert np.linalg.norm(first.position_world_m - HERE) < 3e-4
 
     cases = {
-        "no_mark": [empty, (black, black), bench.pictures(FAR)],
+        "no_marker": [empty, (black, black), bench.pictures(FAR)],
         "saturated": [(white, white), (here[0], white)],
-        "mark_in_one_view": [(here[0], empty[1]), (empty[0], here[1])],
+        "marker_in_one_view": [(here[0], empty[1]), (empty[0], here[1])],
         "merged": [Bench(touched).pictures(HERE)],
         "blurred": [Bench(soft).pictures(HERE)],
         "inconsistent": [crossed],
@@ -154,7 +154,7 @@ async def test_a_second_mark_far_from_a_followed_one_does_not_disturb(
     assert (await bench.show(*bench.pictures(HERE, FAR))).valid
     # Lost for longer than a track is kept, there is no telling which of the two is the finger.
     lost = await bench.show(*bench.pictures(HERE, FAR), frames=60)
-    assert lost.reason == "two_marks"
+    assert lost.reason == "two_markers"
 
 
 async def test_a_mark_where_no_finger_can_be_is_followed_only_when_it_stays_alone(
@@ -165,7 +165,7 @@ async def test_a_mark_where_no_finger_can_be_is_followed_only_when_it_stays_alon
         await bench.show(*bench.pictures(HERE))
     far = bench.pictures(FAR)
     shown = [await bench.show(*far) for _ in range(75)]
-    assert {one.reason for one in shown[:55]} <= {"no_mark", "too_fast", "two_marks"}
+    assert {one.reason for one in shown[:55]} <= {"no_marker", "too_fast", "two_markers"}
     assert shown[-1].reason == "ok"
     assert np.linalg.norm(shown[-1].position_world_m - FAR) < 3e-4
 
@@ -223,9 +223,14 @@ async def test_foreign_pictures_are_refused_by_name(scene: Scene, camera: TwinCa
     header = Header(1, 1, 1, "virtual", "camera", 1)
     full, wide = np.zeros((480, 640), np.uint8), np.zeros((480, 752), np.uint8)
     for device, left, origin, said in (
-        ("webcam", full, (0, 0), 'pictures of device "webcam", the scene\'s is "twin-bumblebee"'),
-        ("twin-bumblebee", wide, (0, 0), "left picture of 752x480 px from column 0, row 0"),
-        ("twin-bumblebee", full, (0, 8), "left picture of 640x480 px from column 0, row 8"),
+        (
+            "webcam",
+            full,
+            (0, 0),
+            'images of device "webcam"; the scene\'s camera is "twin-bumblebee"',
+        ),
+        ("twin-bumblebee", wide, (0, 0), "left image of 752x480 px at column 0, row 0"),
+        ("twin-bumblebee", full, (0, 8), "left image of 640x480 px at column 0, row 8"),
     ):
         pair = StereoPair(
             device=device,
@@ -330,7 +335,7 @@ async def test_from_the_twins_pixels_to_the_true_fingertip(
             truths.append(message)
 
     twin = TwinFingerNode(TwinFingerParameters(), name="finger", clock=clock, send=keep)
-    save_calibration(calibration_of(true_camera(scene.camera)), tmp_path / "rig.yaml")
+    save_calibration(calibration_of(make_true_camera(scene.camera)), tmp_path / "rig.yaml")
     perfect = TriangulatorParameters(calibration=tmp_path / "rig.yaml")
     eye = Triangulator(perfect, name="eye", clock=clock, send=keep)
     await eye.setup()

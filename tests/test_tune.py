@@ -126,7 +126,9 @@ def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return []
 
 
-STAGED = Tunable("made-up", "mark", ("quick", "slow"), {"cheap": "moments", "dear": "subpixel_fit"})
+STAGED = Tunable(
+    "made-up", "marker", ("quick", "slow"), {"cheap": "moments", "dear": "subpixel_fit"}
+)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +151,7 @@ def test_what_takes_minutes_is_asked_only_where_nothing_else_does(
     assert choice.met
 
 
-def choice_of(points: Sequence[Point], key: str = "mark") -> tune.Choice:
+def choice_of(points: Sequence[Point], key: str = "marker") -> tune.Choice:
     judged = verdicts(points, SETTINGS, tolerance=1.0)
     return tune.Choice("made-up", key, "mm", 1.0, choose(judged), tuple(judged))
 
@@ -213,16 +215,16 @@ def test_choices_are_added_to_a_file_and_all_else_is_left_as_it_was() -> None:
     text = put(FILE, GOOD, BAD)
     assert text.startswith(FILE)
     assert "# Chosen by `flexsheet tune` on 2026-01-02; a machine; code 0000000000.\n" in text
-    assert "  mark: cheap  # 10 µs, leaves 0.1 of 1 mm\n" in text
+    assert "  marker: cheap  # 10 µs, leaves 0.1 of 1 mm\n" in text
     assert "  tracking: cheap  # NOT GOOD ENOUGH, the nearest miss: 10 µs" in text
-    assert YAML(typ="safe").load(text)["methods"] == {"mark": "cheap", "tracking": "cheap"}
+    assert YAML(typ="safe").load(text)["methods"] == {"marker": "cheap", "tracking": "cheap"}
 
 
 def test_choices_are_written_over_and_other_families_stay() -> None:
     text = put(FILE, GOOD, BAD) + "# behind\nlast: 2\n"
     again = put(text, choice_of([point("dear", 0.2)]))
     assert again.count("methods:") == again.count("Chosen by") == 1
-    assert YAML(typ="safe").load(again)["methods"] == {"mark": "dear", "tracking": "cheap"}
+    assert YAML(typ="safe").load(again)["methods"] == {"marker": "dear", "tracking": "cheap"}
     assert "NOT GOOD ENOUGH" in again  # of the one that was not tuned again
     assert again.startswith(FILE)
     assert again.endswith("# behind\nlast: 2\n")
@@ -231,10 +233,10 @@ def test_choices_are_written_over_and_other_families_stay() -> None:
 
 def test_choices_on_one_line_are_unfolded() -> None:
     text = put(
-        "a: 1\nmethods: {mark: x, soft_body: {method: linear, skin_spacing_m: 0.003}}\n", GOOD
+        "a: 1\nmethods: {marker: x, soft_body: {method: linear, skin_spacing_m: 0.003}}\n", GOOD
     )
     assert YAML(typ="safe").load(text)["methods"] == {
-        "mark": "cheap",
+        "marker": "cheap",
         "soft_body": {"method": "linear", "skin_spacing_m": 0.003},
     }
 
@@ -254,9 +256,9 @@ def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert load_scene(tmp_path / "copy.yaml").methods == Methods(soft_body=wanted)
     with pytest.raises(BadInputError, match="a folder that is there"):
         write_choices(source, tmp_path / "no folder" / "copy.yaml", [scene_choice()])
-    with pytest.raises(BadInputError, match="mark") as refused:  # no method's name
+    with pytest.raises(BadInputError, match="marker") as refused:  # no method's name
         write_choices(source, source, [GOOD])
-    assert str(refused.value).startswith(f"{source}: methods.mark: with the choices put in, ")
+    assert str(refused.value).startswith(f"{source}: methods.marker: with the choices put in, ")
     assert source.read_text() == (SCENES / "sphere.yaml").read_text()
     write_choices(source, source, [scene_choice()])
     assert load_scene(source).methods.soft_body == wanted
@@ -266,22 +268,23 @@ def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after"),
     [
-        ("a: 1\r\nb: 2\r\n", "a: 1\r\nb: 2\r\n\r\n# C\r\nmethods:\r\n  mark: cheap\r\n"),
-        ("a: 1", "a: 1\n\n# C\nmethods:\n  mark: cheap\n"),
-        ("a: 1\n\n\n", "a: 1\n\n\n# C\nmethods:\n  mark: cheap\n"),
+        ("a: 1\r\nb: 2\r\n", "a: 1\r\nb: 2\r\n\r\n# C\r\nmethods:\r\n  marker: cheap\r\n"),
+        ("a: 1", "a: 1\n\n# C\nmethods:\n  marker: cheap\n"),
+        ("a: 1\n\n\n", "a: 1\n\n\n# C\nmethods:\n  marker: cheap\n"),
         (
-            "methods:  # mine\n    # why\n    mark: moments\n    # of tracking\n    tracking: none"
+            "methods:  # mine\n    # why\n    marker: moments\n"
+            "    # of tracking\n    tracking: none"
             "\n\n# behind\nlast: 2",
-            "# C\nmethods:  # mine\n    # why\n    mark: cheap\n    # of tracking\n"
+            "# C\nmethods:  # mine\n    # why\n    marker: cheap\n    # of tracking\n"
             "    tracking: none\n\n# behind\nlast: 2",
         ),
         (
             "methods:\n  soft_body:\n    method: linear\n    skin_spacing_m: 0.003\n",
             "# C\nmethods:\n  soft_body:\n    method: linear\n    skin_spacing_m: 0.003\n"
-            "  mark: cheap\n",
+            "  marker: cheap\n",
         ),
-        ("methods: {tracking: null}\n", "# C\nmethods:\n  tracking: null\n  mark: cheap\n"),
-        ("methods:\nlast: 2\n", "# C\nmethods:\n  mark: cheap\nlast: 2\n"),
+        ("methods: {tracking: null}\n", "# C\nmethods:\n  tracking: null\n  marker: cheap\n"),
+        ("methods:\nlast: 2\n", "# C\nmethods:\n  marker: cheap\nlast: 2\n"),
     ],
 )
 def test_all_else_stays_to_the_byte(before: str, after: str) -> None:
@@ -435,16 +438,16 @@ async def test_a_node_follows_the_scene_where_it_is_told_auto() -> None:
         given = TriangulatorParameters(**parameters)
         return Triangulator(given, name="eye", clock=VirtualClock(), send=lambda *_: None)
 
-    follows, set_by_hand = node(), node(mark="weighted_centroid")
+    follows, set_by_hand = node(), node(marker="weighted_centroid")
     for each in (follows, set_by_hand):
         await each.setup()
         await each.step("scene", SCENE, header_at(0))
-    assert follows.methods == "subpixel_fit, dlt, hand"
+    assert follows.methods == "subpixel_fit, dlt, singer_tremor"
     for each in (follows, set_by_hand):  # another scene, at run time
-        changed = with_methods(mark="moments", triangulation="midpoint", tracking="one_euro")
+        changed = with_methods(marker="moments", triangulation="dlt", tracking="one_euro")
         await each.step("scene", changed, header_at(1))
-    assert follows.methods == "moments, midpoint, one_euro"
-    assert set_by_hand.methods == "weighted_centroid, midpoint, one_euro"
+    assert follows.methods == "moments, dlt, one_euro"
+    assert set_by_hand.methods == "weighted_centroid, dlt, one_euro"
 
 
 def test_the_soft_body_follows_the_scene_but_begins_no_minutes_of_work(tmp_path: Path) -> None:

@@ -36,7 +36,7 @@ from nodes.twin.arms import (
     Controller,
     Servo,
     forward,
-    joints_for,
+    solve_inverse_kinematics,
 )
 from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from nodes.twin.mxt_controller import MxtServer
@@ -55,14 +55,14 @@ def test_home_pose_by_hand() -> None:
 @given(arrays(np.float64, 6, elements=st.floats(-0.2, 0.2)))
 def test_inverse_finds_the_pose(change: Floats) -> None:
     pose = forward(JOINTS + change)
-    assert forward(joints_for(pose, JOINTS)) == pytest.approx(pose, abs=1e-6)
+    assert forward(solve_inverse_kinematics(pose, JOINTS)) == pytest.approx(pose, abs=1e-6)
 
 
 def test_a_pose_out_of_reach_is_an_error() -> None:
     pose = forward(JOINTS)
     pose[0, 3] += 1.0
     with pytest.raises(ValueError, match="cannot reach"):
-        joints_for(pose, JOINTS)
+        solve_inverse_kinematics(pose, JOINTS)
 
 
 def test_the_servo_trails_an_even_command_by_its_lag() -> None:

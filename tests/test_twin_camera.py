@@ -14,28 +14,28 @@ from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 from scipy.special import erf, ndtr
 
+from benchmarks.fingertip_bound import BoundError, fingertip_bound, pixel_information
 from messages.calibration import Board
 from messages.scene import Lens, Scene, StereoCamera
 from nodes.models.rigid import transform, vector_from_rotation
 from nodes.twin.board import BoardError, TwinBoard
-from nodes.twin.bound import BoundError, fingertip_bound, pixel_information
 from nodes.twin.clutter import (
     CLUTTER,
     Clutter,
+    FixedPoint,
     Highlight,
     Moving,
     Occluder,
-    SecondMark,
+    Oscillation,
+    SecondMarker,
     Sheet,
-    Still,
-    Swinging,
     covered,
-    second_mark,
+    second_marker,
     together,
     touching_highlight,
 )
 from nodes.twin.pixels import Image, Sensor, TwinCamera, Window, disjoint
-from nodes.twin.rig import pixels_of, slopes_of, true_camera
+from nodes.twin.rig import make_true_camera, pixels_of, slopes_of
 
 ROOT = Path(__file__).resolve().parent.parent
 Floats = NDArray[np.float64]
@@ -62,13 +62,13 @@ def sheet(scene: Scene) -> StereoCamera:
 
 @pytest.fixture(scope="module")
 def rig(sheet: StereoCamera) -> StereoCamera:
-    return true_camera(sheet)
+    return make_true_camera(sheet)
 
 
 def test_a_device_name_is_one_rig_and_another_name_another(sheet: StereoCamera) -> None:
-    rig, again = true_camera(sheet), true_camera(sheet)
+    rig, again = make_true_camera(sheet), make_true_camera(sheet)
     assert rig.model_dump_json() == again.model_dump_json()
-    other = true_camera(sheet.model_copy(update={"device": "twin-bumblebee-2"}))
+    other = make_true_camera(sheet.model_copy(update={"device": "twin-bumblebee-2"}))
     assert other.left != rig.left
     assert not np.allclose(other.right_from_left, rig.right_from_left, atol=1e-5)
 
@@ -76,7 +76,7 @@ def test_a_device_name_is_one_rig_and_another_name_another(sheet: StereoCamera) 
 @given(device=st.text(min_size=1, max_size=20))
 @settings(max_examples=60, deadline=None)
 def test_a_rig_differs_from_its_data_sheet_as_devices_do(sheet: StereoCamera, device: str) -> None:
-    rig = true_camera(sheet.model_copy(update={"device": device}))
+    rig = make_true_camera(sheet.model_copy(update={"device": device}))
     for lens in (rig.left, rig.right):
         assert abs(lens.fx_px / 540.0 - 1.0) < 0.0101
         assert abs(lens.fy_px / lens.fx_px - 1.0) < 0.0011
@@ -236,7 +236,8 @@ def plain(rig: StereoCamera) -> TwinCamera:
 def of_the_mark(camera: TwinCamera, time_s: float = 0.0) -> tuple[Floats, Floats]:
     """The light (height, width) that the mark adds to each view."""
     lit, unlit = (
-        camera.levels(still, exposure_s=0.004, mark=mark, time_s=time_s) for mark in (True, False)
+        camera.levels(still, exposure_s=0.004, marker=marker, time_s=time_s)
+        for marker in (True, False)
     )
     left, right = (np.asarray(a, float) - b for a, b in zip(lit, unlit, strict=True))
     return left, right
@@ -269,12 +270,14 @@ def test_a_second_mark_is_where_it_was_asked_for(
 ) -> None:
     if np.hypot(*offset) < 0.015:
         offset = (offset[0] + 0.03, offset[1])
-    camera = looking(rig, Clutter(marks=(SecondMark(Still((*offset, 0.0)), carried=True),)))
+    camera = looking(
+        rig, Clutter(markers=(SecondMarker(FixedPoint((*offset, 0.0)), carried=True),))
+    )
     ground = plain.levels(still, exposure_s=0.004)
     changes = of_the_clutter(camera, plain)
     for eye, change, under in zip(camera.eyes, changes, ground, strict=True):
         # Where it lies over the first mark's fringe it changes nothing.
-        share = change / np.maximum(camera.sensor.mark_level - under, 5.0)
+        share = change / np.maximum(camera.sensor.marker_level - under, 5.0)
         place = eye.see(TIP + np.array([*offset, 0.0]))[0]
         assert np.abs(centre_and_spread(share)[0] - place).max() < 0.1
 
@@ -367,7 +370,7 @@ def test_the_sheets_grain_lies_in_the_plane_of_the_world(rig: StereoCamera) -> N
 
 def test_a_lamps_image_may_stand_in_one_view_only(rig: StereoCamera, plain: TwinCamera) -> None:
     place = (-0.09, 0.05, 0.0)
-    spot = Highlight(Still(place), 0.0015, 300.0, views="left")
+    spot = Highlight(FixedPoint(place), 0.0015, 300.0, views="left")
     camera = looking(rig, Clutter(highlights=(spot,)))
     left, right = of_the_clutter(camera, plain)
     assert np.abs(centre_and_spread(left)[0] - camera.eyes[0].see(np.array(place))[0]).max() < 0.02
@@ -375,7 +378,7 @@ def test_a_lamps_image_may_stand_in_one_view_only(rig: StereoCamera, plain: Twin
 
 
 def test_what_moves_is_where_its_path_is_at_that_time(rig: StereoCamera, plain: TwinCamera) -> None:
-    swinging = Swinging((0.0, 0.06, 0.0), (0.08, 0.0, 0.0), period_s=2.0)
+    swinging = Oscillation((0.0, 0.06, 0.0), (0.08, 0.0, 0.0), period_s=2.0)
     moving = Moving((-0.1, -0.06, 0.0), (0.1, 0.0, 0.0))
     assert np.allclose(swinging.at(0.5), [0.08, 0.06, 0.0])
     for path in (swinging, moving):
@@ -397,7 +400,7 @@ def test_an_occluder_passes_before_the_mark_and_away_again(rig: StereoCamera) ->
 
 def test_a_long_thing_that_the_lens_bends_is_drawn_whole(rig: StereoCamera) -> None:
     """Across its middle it is as wide as it is, with the ground on both sides of it."""
-    ends = Still((-0.22, 0.35, -0.05)), Still((-0.22, -0.35, 0.35))
+    ends = FixedPoint((-0.22, 0.35, -0.05)), FixedPoint((-0.22, -0.35, 0.35))
     camera = looking(rig, Clutter(occluders=(Occluder(*ends, radius_m=0.012, level=200.0),)))
     seen = camera.levels(still, exposure_s=0.004)
     for eye, levels in zip(camera.eyes, seen, strict=True):
@@ -444,7 +447,7 @@ def test_pictures_come_from_the_seed_and_leave_nothing_behind(rig: StereoCamera)
 def test_nothing_in_the_lab_looks_like_a_mark(rig: StereoCamera) -> None:
     """Neither as bright over six pixels as half of the mark's height, nor as large."""
     camera = looking(rig, CLUTTER["lab"])
-    for image in camera.picture(still, exposure_s=0.004, mark=False):
+    for image in camera.picture(still, exposure_s=0.004, marker=False):
         bright = (image > 140).astype(np.uint8)
         sizes = cv2.connectedComponentsWithStats(bright)[2][1:, cv2.CC_STAT_AREA]
         assert max(sizes.tolist(), default=0) < 6
@@ -465,7 +468,7 @@ BESIDE = np.array([0.05, 0.0, 0.0])
 @pytest.fixture(scope="module")
 def disc(rig: StereoCamera) -> TwinCamera:
     """A mark on even ground, beside the finger."""
-    return looking(rig, sensor=EVEN).altered(mark_offset_m=BESIDE)
+    return looking(rig, sensor=EVEN).with_changes(marker_offset_m=BESIDE)
 
 
 def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera) -> None:
@@ -477,7 +480,7 @@ def test_the_bound_of_a_disc_on_even_ground_is_that_of_its_rim(rig: StereoCamera
         background_level=40.0, texture_level=0.0, photons_per_level=1e9, read_noise=3.0,
         noisy_backgrounds=1, aperture_m=1e-6,
     )  # fmt: skip
-    camera = looking(rig, sensor=sensor).altered(mark_radius_m=0.006, mark_offset_m=BESIDE)
+    camera = looking(rig, sensor=sensor).with_changes(marker_radius_m=0.006, marker_offset_m=BESIDE)
     bound = fingertip_bound(camera, still, exposure_s=0.0)
     for eye, covariance in zip(camera.eyes, bound.views_px2, strict=True):
         _, depth_m = eye.see(TIP + BESIDE)
@@ -528,10 +531,10 @@ def test_the_bound_widens_with_defocus_speed_and_saturation(disc: TwinCamera) ->
 
     plain = size(disc)
     blurred = Sensor(background_level=40.0, texture_level=0.0, blur_px=2.5)
-    assert size(disc.altered(sensor=blurred)) > 1.5 * plain
+    assert size(disc.with_changes(sensor=blurred)) > 1.5 * plain
     assert size(disc, 1.5) > 1.2 * plain
-    dim = Sensor(background_level=40.0, texture_level=0.0, mark_level=100.0)
-    assert size(disc.altered(sensor=dim)) > 2.0 * plain
+    dim = Sensor(background_level=40.0, texture_level=0.0, marker_level=100.0)
+    assert size(disc.with_changes(sensor=dim)) > 2.0 * plain
 
 
 def test_a_full_pixel_tells_nothing_and_a_dark_one_all_that_its_noise_allows() -> None:
@@ -550,4 +553,4 @@ def test_there_is_no_bound_where_the_mark_cannot_be_seen(rig: StereoCamera) -> N
             fingertip_bound(looking(rig), lambda _, p=place: np.array(p), exposure_s=0.004)
     with pytest.raises(BoundError, match="right view"):
         fingertip_bound(looking(rig, covered(1.0, views="right")), still, exposure_s=0.004)
-    assert fingertip_bound(looking(rig, second_mark((0.03, 0.0, 0.0))), still, exposure_s=0.004)
+    assert fingertip_bound(looking(rig, second_marker((0.03, 0.0, 0.0))), still, exposure_s=0.004)

@@ -24,7 +24,7 @@ from nodes.twin.finger import FingerMotion, FingerPathError
 from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
 from nodes.twin.paths import recorded_path
 from nodes.twin.pixels import TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDING = ROOT.parent / "shared" / "data" / "finger" / "reach_and_grip.csv"
@@ -268,9 +268,11 @@ def test_the_marks_light_is_centred_on_the_fingertip(
         def moving(offset_s: float, tip: Floats = tip) -> Floats:
             return tip + offset_s * velocity
 
-        lit, unlit = (camera.levels(moving, exposure_s=0.004, mark=mark) for mark in (True, False))
+        lit, unlit = (
+            camera.levels(moving, exposure_s=0.004, marker=marker) for marker in (True, False)
+        )
         for eye, with_mark, without in zip(camera.eyes, lit, unlit, strict=True):
-            share = (with_mark - without) / (camera.sensor.mark_level - without)
+            share = (with_mark - without) / (camera.sensor.marker_level - without)
             y, x = np.mgrid[: share.shape[0], : share.shape[1]]
             centre = np.array([(share * x).sum(), (share * y).sum()]) / share.sum()
             assert np.abs(centre - eye.see(tip)[0]).max() < 0.02
@@ -293,14 +295,14 @@ def test_the_background_is_textured_and_darker_than_any_mark(camera: TwinCamera)
     for image in (left, right):
         assert image.shape == (480, 640)
         assert image.dtype == np.uint8
-        assert image.max() < 0.5 * camera.sensor.mark_level
+        assert image.max() < 0.5 * camera.sensor.marker_level
         assert image.std() > 4
 
 
 @pytest.mark.parametrize("place", [[0.0, 0.0, 2.0], [5.0, 0.0, 0.0], [0.0, 0.25, 0.4330127]])
 def test_a_finger_out_of_sight_is_not_drawn(camera: TwinCamera, place: list[float]) -> None:
     for image in camera.picture(lambda _: np.array(place), exposure_s=0.004):
-        assert image.max() < 0.5 * camera.sensor.mark_level
+        assert image.max() < 0.5 * camera.sensor.marker_level
 
 
 class Sent:
@@ -345,7 +347,7 @@ async def test_truth_and_pixels_are_of_the_same_instant(scene: Scene) -> None:
     assert np.array_equal(truth.position_world_m, node.truth(at_ns).position)
     assert node.camera is not None
     # The rig as it stands, not as its data sheet says.
-    assert node.camera.camera.left == true_camera(scene.camera).left
+    assert node.camera.camera.left == make_true_camera(scene.camera).left
     place = node.camera.eyes[0].see(truth.position_world_m)[0]
     assert np.abs(light_centre(pair.left, place) - place).max() < 0.3
 

@@ -22,7 +22,7 @@ from nodes import node_class
 from nodes.node import Node, parameters_of, timers_of
 from nodes.runner import status_of
 from nodes.twin.pixels import TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 ROOT = Path(__file__).resolve().parent.parent
 START_NS = 10**13
@@ -89,7 +89,7 @@ async def live(folder: Path) -> Path:
     bag, plan = folder / "live.mcap", plan_of(folder)
     scene = plan.scene_message()
     assert scene is not None
-    eyes = TwinCamera(true_camera(scene.camera), finger_radius_m=scene.finger.radius_m, seed=4)
+    eyes = TwinCamera(make_true_camera(scene.camera), finger_radius_m=scene.finger.radius_m, seed=4)
     with BagWriter(bag, {"recording": {"clock_id": "lab"}}) as writer:
         writer.add_attachment("plan.json", plan.model_dump_json().encode(), "application/json")
         graph = Live(plan, writer)

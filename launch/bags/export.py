@@ -3,7 +3,7 @@
 Each topic becomes a JSON channel of the same name with its numbers (arrays beyond `PLOTTED` values
 are left out: plots have no use for them), and what can be looked at becomes a channel of its own:
 
-    stereo/left, stereo/right, frame/picture, twin/eye/seen, twin/eye/proper     foxglove.RawImage
+    stereo/left, stereo/right, frame/picture, twin/eye/seen, twin/eye/expected     foxglove.RawImage
     tf          the sheet and both flanges                                foxglove.FrameTransforms
     finger      the fingertip, with the path that is foreseen             foxglove.SceneUpdate
     sheet       the sheet between the flanges                             foxglove.SceneUpdate
@@ -198,7 +198,7 @@ class Seen:
         ahead = fg.LinePrimitive(
             type=fg.LinePrimitiveLineType.LineStrip,
             thickness=0.001,
-            points=[_point(one) for one in message.ahead_world_m],
+            points=[_point(one) for one in message.predicted_path_world_m],
             color=colour,
         )
         entity = fg.SceneEntity(
@@ -232,7 +232,7 @@ def pictures_of(topic: str, message: Message) -> Iterator[Picture]:
                 yield f"{topic}/picture", picture
         case TwinEye():
             yield f"{topic}/seen", message.seen
-            yield f"{topic}/proper", message.proper
+            yield f"{topic}/expected", message.expected
 
 
 def _foxglove() -> Any:

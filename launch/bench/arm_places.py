@@ -31,9 +31,9 @@ from nodes.camera.corners import (
     Progress,
     board_points,
     find_pairs,
-    pair_of,
+    match_views,
 )
-from nodes.camera.pictures import encode_png
+from nodes.camera.image_pair import encode_png
 from nodes.models.camera import camera_matrix, project
 from nodes.models.rigid import (
     apply,
@@ -43,10 +43,10 @@ from nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from nodes.twin.arms import RANGE_RAD, joints_for
+from nodes.twin.arms import RANGE_RAD, solve_inverse_kinematics
 from nodes.twin.arms import forward as twin_forward
 from nodes.twin.board import TwinBoard
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -239,7 +239,7 @@ class PlaceTaker:
             return "no word from the arm yet"
         if exposed_s - self._still_since_s < STILL_S:
             return "the arm moves"
-        pair = pair_of(
+        pair = match_views(
             self._finder.find(left), self._finder.find(right), self._board, ("left", "right")
         )
         if isinstance(pair, str):
@@ -303,7 +303,7 @@ def twin_places(
     BoardError for a board that cannot be drawn.
     """
     random = np.random.default_rng([seed, side == "left", 1])
-    camera = true_camera(scene.camera)
+    camera = make_true_camera(scene.camera)
     shown = TwinBoard(camera, board, seed=seed)
     base = true_base(scene, side, seed=seed)
     place = scene.camera.world_from_left
@@ -321,7 +321,9 @@ def twin_places(
         centre = held + random.uniform(-0.06, 0.06, 3)
         board_pose = transform(turn, centre - turn @ middle)
         try:
-            joints = joints_for(inverse(base) @ board_pose @ inverse(flange_from_board), ready)
+            joints = solve_inverse_kinematics(
+                inverse(base) @ board_pose @ inverse(flange_from_board), ready
+            )
         except ValueError:
             continue  # out of the arm's reach; another place is tried
         true_joints = np.clip(

@@ -12,7 +12,7 @@ import numpy as np
 from launch.bench.twin_sheet import twin_push
 from launch.plans.documents import BadInputError, Problem, did_you_mean
 from messages.scene import Scene, SheetSpec
-from nodes.models.sheet.fit import Push
+from nodes.models.sheet.fit import MeasuredPush
 
 NEEDED = ("depth_mm", "force_n")
 STRETCH = ("edge_distance_mm", "stretch_ratio")
@@ -26,7 +26,9 @@ MOST_SHARE = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
 """Largest plausible lengths over the sheet's width: beyond, the unit is probably another."""
 
 
-def read_rows(path: Path, sheet: SheetSpec, finger_radius_m: float) -> tuple[list[Push], list[int]]:
+def read_rows(
+    path: Path, sheet: SheetSpec, finger_radius_m: float
+) -> tuple[list[MeasuredPush], list[int]]:
     """Pushes and their lines in the file; BadInputError names file, line and column.
 
     The first line names the columns: `depth_mm`, `force_n`, one of `edge_distance_mm` and
@@ -58,7 +60,7 @@ def read_rows(path: Path, sheet: SheetSpec, finger_radius_m: float) -> tuple[lis
     names = [name.strip() for name in next(csv.reader([header]))]
     _check_header(f"{path}:{first}", names)
     problems: list[Problem] = []
-    pushes: list[Push] = []
+    pushes: list[MeasuredPush] = []
     numbers: list[int] = []
     for number, line in lines[1:]:
         cells = next(csv.reader([line]))
@@ -144,9 +146,9 @@ def _values(
     return values
 
 
-def _push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: float) -> Push:
+def _push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: float) -> MeasuredPush:
     distance = values.get("edge_distance_mm")
-    return Push(
+    return MeasuredPush(
         edge_distance_m=(
             1e-3 * distance if distance is not None else values["stretch_ratio"] * sheet.width_m
         ),
@@ -171,18 +173,18 @@ def twin_rows(
     noise_n: float,
     seed: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Push]:
+) -> list[MeasuredPush]:
     """Pushes of the twin's sheet over the scene's stretches and depths, with a gauge's noise.
 
     places: over the sheet, not in its middle only.
     """
     rng = np.random.default_rng(seed)
-    pushes: list[Push] = []
+    pushes: list[MeasuredPush] = []
     asked = list(_twin_questions(scene, places))
     for done, (stretch, depth, place) in enumerate(asked, start=1):
         force, pull = twin_push(scene.sheet, stretch, depth, place, scene.finger.radius_m)
         pushes.append(
-            Push(
+            MeasuredPush(
                 edge_distance_m=stretch * scene.sheet.width_m,
                 depth_m=depth,
                 force_n=force + float(rng.normal(0.0, noise_n)),

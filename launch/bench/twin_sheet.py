@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene, SheetSpec
 from nodes.models.rigid import transform
+from nodes.twin.error_map import error_map
 from nodes.twin.eye import METRES_PER_PX, seen
 from nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, Rubber, solve
-from nodes.twin.places import error_map
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

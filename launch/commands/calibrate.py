@@ -297,7 +297,7 @@ def cross_check(
         print_json(result)
         return
     rows: Any = result.pop("rows")
-    plain: Any = result.pop("plain_opencv")
+    plain: Any = result.pop("calibrate_plain_opencv")
     print_table(
         ("pair", "distance, m", "rigid fit, mm", "plain OpenCV, mm"),
         [[row["left"], *(_figure(value) for value in list(row.values())[1:])] for row in rows],

@@ -115,9 +115,9 @@ def projector(
             fit = _by_corners(scene, corners, rectangle_mm)
         else:
             if twin:
-                from nodes.twin.projector import true_projector
+                from nodes.twin.projector import make_true_projector
 
-                true = true_projector(scene.projector, seed=seed)
+                true = make_true_projector(scene.projector, seed=seed)
                 views = list(_twin_views(scene, true, poses, seed))
             else:
                 assert pictures is not None
@@ -134,7 +134,7 @@ def projector(
 
 
 def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
-    from nodes.camera.pictures import encode_png
+    from nodes.camera.image_pair import encode_png
 
     folder.mkdir(parents=True, exist_ok=True)
     for number, pattern in enumerate(patterns):
@@ -174,10 +174,10 @@ def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterato
 
     from nodes.renderer.gray_code import patterns
     from nodes.twin.projector import LitSheet, sheet_poses
-    from nodes.twin.rig import true_camera
+    from nodes.twin.rig import make_true_camera
 
     shown = patterns(scene.projector.width_px, scene.projector.height_px)
-    lit = LitSheet(scene, true_camera(scene.camera), true, seed=seed)
+    lit = LitSheet(scene, make_true_camera(scene.camera), true, seed=seed)
     held = track(sheet_poses(poses), "taking pictures", console=words.console, transient=True)
     for world_from_sheet in held:
         yield lit.pair(shown, world_from_sheet)
@@ -283,7 +283,7 @@ def _tell(
     }
     if true is not None:
         result["eye_error_mm"] = _eye_errors_mm(scene, fit.projector, true)
-        result["true_projector"] = {
+        result["make_true_projector"] = {
             "width_px": true.width_px,
             "height_px": true.height_px,
             "lens": true.lens.model_dump(),

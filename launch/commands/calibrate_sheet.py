@@ -22,7 +22,7 @@ from launch.commands.output import (
 if TYPE_CHECKING:
     from messages.scene import Scene
     from messages.sheet_calibration import SheetCalibration
-    from nodes.models.sheet.fit import Push
+    from nodes.models.sheet.fit import MeasuredPush
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
@@ -71,7 +71,7 @@ def sheet(
     from launch.bench.sheet_rows import read_rows
     from launch.plans.plan import load_scene
     from messages.sheet_calibration import save_sheet_calibration
-    from nodes.models.sheet.fit import FitError
+    from nodes.models.sheet.fit import SheetModelFitError
 
     if not output.parent.is_dir():
         raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
@@ -97,7 +97,7 @@ def sheet(
         calibration = fitted(
             scene, pushes, lines, source=source, with_mooney=mooney, with_table=table
         )
-    except FitError as error:
+    except SheetModelFitError as error:
         raise CommandError(f"{source}: {error}", BAD_INPUT) from error
     save_sheet_calibration(calibration, output, comment=shlex.join([*made, "-o", str(output)]))
     _tell(calibration, output, as_json)
@@ -105,21 +105,21 @@ def sheet(
 
 def fitted(
     scene: Scene,
-    pushes: list[Push],
+    pushes: list[MeasuredPush],
     lines: list[int],
     *,
     source: str,
     with_mooney: bool,
     with_table: bool,
 ) -> SheetCalibration:
-    """The calibration that pushes give; FitError where they do not determine one."""
+    """The calibration that pushes give; SheetModelFitError where they do not determine one."""
     from importlib.metadata import version
 
     from messages.sheet_calibration import Fitted, LeftOutRow, SheetCalibration, SheetTable
-    from nodes.models.sheet.fit import fit_law, table_from
+    from nodes.models.sheet.fit import fit_sheet_model, tabulate_pushes
     from nodes.planner.sheet_force import rubber_of
 
-    fit = fit_law(pushes, rubber_of(scene.sheet), with_mooney=with_mooney)
+    fit = fit_sheet_model(pushes, rubber_of(scene.sheet), with_mooney=with_mooney)
     numbers = {
         name: Fitted(value=value, standard_deviation=deviation)
         for name, value, deviation in zip(
@@ -128,7 +128,7 @@ def fitted(
     }
     kept = None
     if with_table:
-        entries = table_from(fit.law, pushes, fit.used, scene.sheet.width_m)
+        entries = tabulate_pushes(fit.law, pushes, fit.used, scene.sheet.width_m)
         kept = SheetTable(
             stretch_ratios=entries.stretches,
             depths_m=entries.depths_m,
@@ -164,7 +164,7 @@ def fitted(
     )
 
 
-def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[Push]:
+def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[MeasuredPush]:
     from rich.progress import Progress
 
     from launch.bench.sheet_rows import twin_rows

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from launch.commands.output import BAD_INPUT, CommandError, words
 from messages.files import write_file
-from nodes.camera.pictures import encode_png
+from nodes.camera.image_pair import encode_png
 
 if TYPE_CHECKING:
     import numpy as np
@@ -57,7 +57,7 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
 
 def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
     from nodes.camera.devices import open_reader
-    from nodes.camera.pictures import DeviceError, check_size
+    from nodes.camera.image_pair import DeviceError, check_size
 
     try:
         with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
@@ -73,10 +73,10 @@ def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
 def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
     """What the twin's true rig sees of a board, in one pose after the other."""
     from nodes.twin.board import BoardError, TwinBoard
-    from nodes.twin.rig import true_camera
+    from nodes.twin.rig import make_true_camera
 
     try:
-        shown = TwinBoard(true_camera(scene.camera), board, seed=seed)
+        shown = TwinBoard(make_true_camera(scene.camera), board, seed=seed)
         for left_from_board in shown.poses(POSES_PER_PAIR * pairs):
             yield shown.pair(left_from_board)
     except BoardError as error:

@@ -28,7 +28,7 @@ from messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
 from nodes.models.rigid import transform_from_rpy
 from nodes.planner.compliance import FELT_N, GOOD_RATIO, WEBER_RATIO, WEBER_RATIO_BARE
 from nodes.twin.membrane import Rubber, solve
-from nodes.twin.paths import over_surface
+from nodes.twin.paths import map_to_surface
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -103,7 +103,7 @@ def _press(
     scene: Scene, label: str, place_m: tuple[float, float], way: Floats, holds: tuple[Hold, ...]
 ) -> Press:
     """way: times (s) and heights over the surface (m), (n, 2)."""
-    surface, above = over_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
+    surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
     path = FingerPath(
         label=label,

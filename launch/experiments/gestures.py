@@ -207,7 +207,9 @@ def predicted(tips: Sequence[Fingertip], lead_s: float) -> Floats:
     """Where fingertips (n,) say that the finger is `lead_s` after their exposures (n, 3)."""
     if lead_s == 0.0:
         return _rows([tip.position_world_m for tip in tips])
-    return _rows([path_at(tip.ahead_world_m, tip.ahead_step_s, lead_s)[0] for tip in tips])
+    return _rows(
+        [path_at(tip.predicted_path_world_m, tip.prediction_step_s, lead_s)[0] for tip in tips]
+    )
 
 
 def _rows(points: Sequence[Floats]) -> Floats:

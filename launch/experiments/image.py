@@ -21,8 +21,8 @@ from messages.bag import BagReader
 from messages.scene import Scene, cylinder_of
 from messages.types import Correction, FingerPath, Pattern, TwinEye
 from nodes.models.rigid import apply
+from nodes.twin.error_map import ErrorMap, error_map
 from nodes.twin.eye import push_sizes, tilt_sizes
-from nodes.twin.places import ErrorMap, error_map
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 HOVER_M = 0.03
@@ -133,7 +133,7 @@ class Picture:
     correction: Correction
     metres_per_px: float
     seen: NDArray[np.uint8]
-    proper: NDArray[np.uint8]
+    expected: NDArray[np.uint8]
 
 
 def read_pictures(bag: Path) -> dict[str, Picture]:
@@ -146,7 +146,7 @@ def read_pictures(bag: Path) -> dict[str, Picture]:
                 message.correction,
                 message.metres_per_px,
                 message.seen,
-                message.proper,
+                message.expected,
             )
     return pictures
 
@@ -154,10 +154,10 @@ def read_pictures(bag: Path) -> dict[str, Picture]:
 def size_errors_mm(
     picture: Picture, sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
 ) -> list[float]:
-    """Absolute differences (mm) of the sizes seen and the proper ones, as in the paper."""
+    """Absolute differences (mm) of the sizes seen and the expected ones, as in the paper."""
     seen = np.array(sizes(picture.seen, picture.metres_per_px))
-    proper = np.array(sizes(picture.proper, picture.metres_per_px))
-    return [float(error) for error in np.abs(seen - proper) * 1e3]
+    expected = np.array(sizes(picture.expected, picture.metres_per_px))
+    return [float(error) for error in np.abs(seen - expected) * 1e3]
 
 
 def picture_of(pictures: dict[str, Picture], label: str) -> Picture:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from launch.experiments.image import CORRECTIONS, Picture, Series, error_map_of, map_figures
 from launch.experiments.pictures import CORRECTION_NAMES
-from nodes.twin.places import ErrorMap
+from nodes.twin.error_map import ErrorMap
 
 LEAST_MM, MOST_MM = 0.01, 10.0
 """Of the colours, which are logarithmic."""

@@ -44,12 +44,12 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) ->
         shown: list[tuple[str, np.ndarray, Picture]] = [
             (CORRECTION_NAMES[picture.correction], picture.seen, picture) for picture in pictures
         ]
-        shown.append(("as it should be", pictures[0].proper, pictures[0]))
+        shown.append(("as it should be", pictures[0].expected, pictures[0]))
         for axis in row:
             axis.set_axis_off()
         for axis, (name, pixels, picture) in zip(row, shown, strict=False):
             axis.imshow(pixels)
-            outline = outline_box(picture.proper)
+            outline = outline_box(picture.expected)
             if outline is not None:
                 left, top, width, height = outline
                 axis.add_patch(
@@ -59,7 +59,7 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) ->
             rows_px, columns_px, _ = pixels.shape
             axis.set_xlim(SHOWN[0] * columns_px, SHOWN[1] * columns_px)
             axis.set_ylim(SHOWN[1] * rows_px, SHOWN[0] * rows_px)
-    figure.suptitle("What the user's eye sees (orange: the box around the proper image)")
+    figure.suptitle("What the user's eye sees (orange: the box around the expected image)")
     figure.savefig(path, dpi=110)
 
 

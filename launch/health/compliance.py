@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from messages.scene import Scene
 from nodes import cache
 from nodes.fem_solver.soft_body_factory import SoftBodyFactory
-from nodes.models.sheet.laws import SheetLaw
+from nodes.models.sheet.force_models import SheetForceModel
 from nodes.planner.compliance import (
     GOOD_RATIO,
     WEBER_RATIO,
@@ -48,7 +48,7 @@ def front_curve(scene: Scene, cache_dir: Path | None = None) -> Floats:
 
 
 def scene_compliance(
-    scene: Scene, law: SheetLaw, curve: ObjectCurve, *, deepest_m: float | None = None
+    scene: Scene, law: SheetForceModel, curve: ObjectCurve, *, deepest_m: float | None = None
 ) -> Compliance:
     """What the planner presents; deepest_m: of the push, else the scene's."""
     return fit_compliance(
@@ -62,7 +62,7 @@ def scene_compliance(
     )
 
 
-def compliance_result(scene: Scene, law: SheetLaw, curve: ObjectCurve) -> dict[str, Any]:
+def compliance_result(scene: Scene, law: SheetForceModel, curve: ObjectCurve) -> dict[str, Any]:
     """What `flexsheet doctor compliance --json` prints."""
     shown = scene_compliance(scene, law, curve)
     depths = shown.deepest_m * np.array(SHOWN_SHARES)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FAMILIES: dict[str, str] = {
-    "mark": "nodes.triangulator.families:MARK",
+    "marker": "nodes.triangulator.families:MARKER",
     "triangulation": "nodes.triangulator.families:TRIANGULATION",
     "tracking": "launch.methods.families:TRACKING",
     "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",

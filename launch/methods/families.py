@@ -15,7 +15,7 @@ from nodes.planner import force_table
 from nodes.planner.sheet_force import sheet_force_family
 from nodes.renderer.benchmarks import correction_family
 from nodes.renderer.sheet_shape_benchmark import sheet_shape_family
-from nodes.triangulator.tracking_family import Motion, tracking_family
+from nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
 from nodes.twin.finger import FingerMotion
 from nodes.twin.gestures import GESTURES
 
@@ -26,7 +26,7 @@ TRACKED_GESTURES = ("hold", "reach", "tap", "stop", "stroke-push")
 RESTING = ("hold",)
 
 
-def finger_motions(scene: Scene) -> Mapping[str, Motion]:
+def finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
     """The paper's stroke, where the object is its cylinder, and some gestures, as the twin's finger
     makes them."""
     paths: dict[str, FingerPath] = {}
@@ -36,7 +36,7 @@ def finger_motions(scene: Scene) -> Mapping[str, Motion]:
     return {name: _motion(scene, path, resting=name in RESTING) for name, path in paths.items()}
 
 
-def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
+def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
     """The path with its unsteadiness, once the reach to its start is over."""
     start = np.asarray(path.positions_world_m[0])
     motion = FingerMotion.resting(start, seed=1).followed_by(
@@ -49,10 +49,12 @@ def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> Motion:
         joined_by=path.joined_by,
     )
     duration_s = float(path.times_s[-1] - path.times_s[0])
-    return Motion(lambda time_s: motion.at(motion.ease_s + time_s).position, duration_s, resting)
+    return TruePathCase(
+        lambda time_s: motion.at(motion.ease_s + time_s).position, duration_s, resting
+    )
 
 
-TRACKING = tracking_family(finger_motions)
+TRACKING = make_tracking_family(finger_motions)
 true_force = lru_cache(maxsize=1024)(twin_force)
 SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_compute(scene, None))
 SHEET_LAWS = sheet_force_family(true_force, None)

@@ -75,24 +75,22 @@ def _soft_body(method: str, skin_spacing_m: float) -> Setting:
 
 TUNABLES = (
     Tunable(
-        "mark",
-        "mark",
-        ("nodes.triangulator.families:MARK",),
+        "marker",
+        "marker",
+        ("nodes.triangulator.families:MARKER",),
         _by_name("moments", "weighted_centroid", "subpixel_fit"),
     ),
     Tunable(
         "triangulation",
         "triangulation",
         ("nodes.triangulator.families:TRIANGULATION",),
-        _by_name("midpoint", "dlt", "optimal"),
+        _by_name("dlt"),
     ),
     Tunable(
         "tracking",
         "tracking",
         ("launch.methods.families:TRACKING",),
-        _by_name(
-            "none", "exponential", "one_euro", "constant_velocity", "constant_acceleration", "hand"
-        ),
+        _by_name("none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"),
     ),
     Tunable(
         "kinematics",
@@ -104,7 +102,7 @@ TUNABLES = (
         "sheet-force",
         "sheet_force",
         ("launch.methods.families:SHEET_LAWS", "launch.methods.families:SHEET_FORCE"),
-        _by_name("linear", "cubic", "scaled", "table"),
+        _by_name("linear", "scaled", "table"),
     ),
     Tunable(
         "sheet-shape",

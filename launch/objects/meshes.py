@@ -21,14 +21,14 @@ from launch.plans.documents import BadInputError, Document, Key, did_you_mean, v
 from messages.limits import LimitedModel
 from messages.scene import Mesh, Positive, Scene
 from nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape
-from nodes.models.shapes.smooth_mesh import usual_smoothing_m
+from nodes.models.shapes.smooth_mesh import default_smoothing_m
 from nodes.models.shapes.triangles import (
-    MOST_TRIANGLES,
+    MAX_TRIANGLES,
     check_mesh,
-    degenerate,
-    intersecting,
+    count_intersections,
+    find_degenerate,
+    unify_winding,
     volume_m3,
-    wound_alike,
 )
 
 GEOMETRY: Key = ("object", "geometry")
@@ -106,7 +106,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
             "right? (0.001 for millimetres, 0.01 for centimetres)"
         )
     check_mesh(vertices, triangles)
-    cutting = intersecting(vertices, triangles)
+    cutting = count_intersections(vertices, triangles)
     if cutting > MOST_CUTTING * len(triangles):
         raise MeshError(
             f"the surface cuts through itself: {cutting} pairs of triangles; untangle it"
@@ -114,7 +114,7 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     if cutting:
         repairs.append(f"{cutting} pairs of triangles that cut through one another are bridged")
     if smoothing_m is None:
-        smoothing_m = usual_smoothing_m(vertices, triangles)
+        smoothing_m = default_smoothing_m(vertices, triangles)
     deviation_m = SmoothMeshShape(vertices, triangles, smoothing_m).deviation_m()
     told = [
         f"{path.name} by {metres_per_unit:g}",
@@ -170,13 +170,13 @@ def _repaired(
     repairs = []
     if not len(getattr(mesh, "faces", ())):
         raise MeshError("holds no triangles")
-    if len(mesh.faces) > 2 * MOST_TRIANGLES:
+    if len(mesh.faces) > 2 * MAX_TRIANGLES:
         raise MeshError(
-            f"{len(mesh.faces)} triangles, at most {MOST_TRIANGLES} are taken; decimate the mesh"
+            f"{len(mesh.faces)} triangles, at most {MAX_TRIANGLES} are taken; decimate the mesh"
         )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     for what, keep in (
-        ("degenerate", ~degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces))),
+        ("degenerate", ~find_degenerate(np.asarray(mesh.vertices), np.asarray(mesh.faces))),
         ("repeated", None),
     ):
         kept = mesh.unique_faces() if keep is None else keep
@@ -189,7 +189,7 @@ def _repaired(
     mesh.remove_unreferenced_vertices()
     vertices = np.array(mesh.vertices, dtype=np.float64) * metres_per_unit
     before = np.array(mesh.faces, dtype=np.int64)
-    triangles = wound_alike(before)
+    triangles = unify_winding(before)
     if volume_m3(vertices, triangles) < 0.0:
         triangles = triangles[:, ::-1]
     turned = int((before != triangles).any(axis=1).sum())

@@ -298,7 +298,7 @@ def _kind_name(value: Any) -> str:
 
 
 def did_you_mean(name: object, known: Sequence[str]) -> str:
-    """The remedy for a name that does not exist: the nearest one, or all there are."""
+    """Return the remedy for an unknown name: its new name, the nearest one, or all there are."""
     near = get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
@@ -313,9 +313,8 @@ def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise BadInputError(
-            [_problem_of(item, model, document, at) for item in error.errors()]
-        ) from None
+        problems = [_problem_of(item, model, document, at) for item in error.errors()]
+        raise BadInputError(list(dict.fromkeys(problems))) from None
 
 
 def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key) -> Problem:
@@ -330,7 +329,9 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
         renamed = _renamed_keys(model, document, key).get(str(name))
         remedy = f'it is now "{renamed}"' if renamed else did_you_mean(name, known)
         return document.problem(key, f'unknown key "{name}"', remedy)
-    key = (*at, *_walk(model, location)[0])
+    # Pydantic names the option of a union of literals, which is no key of the file.
+    path = [part for part in _walk(model, location)[0] if not str(part).startswith("literal[")]
+    key = (*at, *path)
     if error["type"] in MAPPING_WANTED:
         return document.problem(
             key, f"is {_kind_name(error['input'])}", "it must hold keys and values"

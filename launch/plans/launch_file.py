@@ -139,6 +139,6 @@ def apply_console(document: Document) -> None:
             added["parameters"] = {"drives_finger": False}
         document.set(("nodes", "console"), added, origin)
     if "recorder" not in types and "record" not in document.values:
-        parameters = {"bag": str(RECORDINGS.absolute()), "waits": True}
+        parameters = {"bag": str(RECORDINGS.absolute()), "start_paused": True}
         recorder = {"type": "recorder", "nice": RECORDER_NICE, "parameters": parameters}
         document.set(("nodes", "recorder"), recorder, origin)

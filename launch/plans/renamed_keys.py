@@ -9,23 +9,41 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
         "largest_depth_m": "max_depth_m",
         "lead_s": "prediction_horizon_s",
     },
+    "recorder": {"waits": "start_paused"},
     "renderer": {
         "lead_s": "prediction_horizon_s",
         "light_s": "display_latency_s",
         "stale_s": "max_age_s",
         "still_rate_hz": "idle_rate_hz",
     },
+    "triangulator": {
+        "ahead_s": "prediction_horizon_s",
+        "forget_after_s": "track_timeout_s",
+        "mark": "marker",
+        "mark_max_area_px": "marker_max_area_px",
+        "mark_min_area_px": "marker_min_area_px",
+        "mark_min_contrast": "marker_min_contrast",
+        "mark_noise_px": "marker_noise_px",
+        "mark_radius_m": "marker_radius_m",
+    },
+    "twin_eye": {
+        "again_after_s": "min_interval_s",
+        "most_waiting": "max_queue",
+    },
 }
 """Old to new parameter names, by node type."""
 
-SCENE_KEYS: Mapping[str, str] = {}
+SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """Old to new keys of scene files."""
 
-LAUNCH_KEYS: Mapping[str, str] = {}
-"""Old to new keys of launch files."""
+LAUNCH_KEYS: Mapping[str, str] = {"waits": "start_paused"}
+"""Old to new keys of launch files, those of `record` among them."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
     "sheet_shape": {"dents": "reduced_order", "flat": "four_triangles"},
+    "sheet_force": {"cubic": "scaled"},
+    "tracking": {"exponential": "one_euro", "hand": "singer_tremor"},
+    "triangulation": {"midpoint": "dlt", "optimal": "dlt"},
     "pattern": {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
 }
 """Old to new values, by the key that holds them: names of methods and patterns."""

@@ -55,8 +55,8 @@ AREAS = (
         "Camera and calibration",
         "Devices, files, boards: [camera.md](camera.md), [calibration.md](calibration.md).",
         ("nodes/camera/", "messages/calibration", "messages/sheet_calibration.py",
-         "messages/arms_calibration.py", "launch/bench/", "nodes/triangulator/pairs.py",
-         "nodes/twin/board.py", "nodes/models/sheet/"),
+         "messages/arms_calibration.py", "launch/bench/", "nodes/twin/board.py",
+         "nodes/models/sheet/"),
     ),
     Area(
         "Fingertip",
@@ -114,7 +114,6 @@ REMEDIES = {
     "for each cause; news of a start, a reset or new keys ask for nothing.",
     "Reason": "it is a state, not a breakdown: put right what it names, or wait.",
     "Value": "follows `does not fit` of a file, or refuses a message: give a value that it allows.",
-    "BoundError": "bring the mark into both pictures, or choose another pose.",
     "BagError": "`flexsheet bag info BAG` says how much can be read, `flexsheet bag recover` "
     "makes a whole bag of it.",
     "ExportError": "install what it names, or choose another output file.",
@@ -139,10 +138,10 @@ REMEDIES = {
     "NotDeterminedError": "add pairs that differ in tilt and distance.",
     "DeviceError": "check the plug, the device's name and `flexsheet calibrate`'s file; another "
     "program may hold the camera.",
-    "ForeignPicturesError": "let the scene name the camera that the pictures are from.",
+    "ImageMismatchError": "let the scene name the camera that the pictures are from.",
     "PlacesError": "correct the row that is named in joints.csv, or take the place again.",
     "HandEyeError": "take more places, with the board turned about at least two axes.",
-    "FitError": "add pushes at other stretches and depths.",
+    "SheetModelFitError": "add pushes at other stretches and depths.",
     "BoardError": "choose a board that fits into the pictures: fewer or smaller squares.",
     "UnfitGeometryError": "choose an object whose shape that command can handle.",
     "UnfitCurveError": "give force over depth from zero, rising, without repeats.",
@@ -219,15 +218,15 @@ PARTICULAR = {
 """By words of a message that says no remedy itself and needs more than its kind's."""
 
 FINGERTIP = {
-    "no_mark": "no mark in either picture: finger out of view, mark lost, exposure too dark.",
-    "mark_in_one_view": "one camera is blocked or does not see as far: move the finger or camera.",
-    "two_marks": "a second bright spot: cover reflections, one marked finger only.",
-    "merged": "the mark touches another bright spot: remove it from behind the finger.",
+    "no_marker": "no marker in either image: finger out of view, marker lost, exposure too dark.",
+    "marker_in_one_view": "one camera is occluded or sees less far: move the finger or the camera.",
+    "two_markers": "a second bright spot: cover reflections, and show one marked finger only.",
+    "merged": "the marker touches another bright spot: remove it from behind the finger.",
     "blurred": "the finger is too fast for the exposure: shorten it, with more light.",
-    "saturated": "the mark is overexposed: shorten the exposure.",
+    "saturated": "the marker is overexposed: shorten the exposure.",
     "outside_volume": "the finger is outside the working range of the scene.",
-    "inconsistent": "both views do not meet in a point: calibrate the camera anew.",
-    "too_fast": "a jump beyond a finger's speed: usually a reflection.",
-    "unconfirmed": "a new mark is believed after a few pictures; nothing to do.",
+    "inconsistent": "the rays of both views do not meet: calibrate the camera again.",
+    "too_fast": "a jump faster than a finger, usually a reflection: cover it.",
+    "unconfirmed": "a new marker is accepted after a few images; no action is needed.",
 }
 """By `reason` of the topic `fingertip`."""

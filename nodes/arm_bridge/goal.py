@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.types import SheetTarget
-from nodes.models.motion import SheetBounds, SheetMotion, extrapolated
+from nodes.models.motion import SheetBounds, SheetMotion, extrapolate
 from nodes.models.rigid import transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
@@ -47,7 +47,7 @@ def goal_ahead(motion: SheetMotion, ahead_s: float, overdue_s: float, *, furthes
     """
     carried_s = min(max(ahead_s, -furthest_s), furthest_s)
     late_s = max(overdue_s, ahead_s - furthest_s, -ahead_s - FURTHEST_FUTURE_S)
-    return Goal(extrapolated(motion, carried_s), late_s)
+    return Goal(extrapolate(motion, carried_s), late_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.motion import BRAKE_SHARE, closing_speed
+from nodes.models.motion import BRAKE_FRACTION, closing_speed
 from nodes.models.rigid import angle_between
 from nodes.models.sheet import edge_force_n
 
@@ -132,7 +132,7 @@ def towards(
     goal = _between(goal_rad, limits.lowest_rad, limits.highest_rad)
     along = _between(goal_velocity, -fastest, fastest)
     offset = goal - along * step_s - joints_rad
-    brake = BRAKE_SHARE * limits.acceleration_rad_per_s2
+    brake = BRAKE_FRACTION * limits.acceleration_rad_per_s2
     closing = np.sign(offset) * closing_speed(np.abs(offset), brake, step_s)
     return _between(along + closing, -fastest, fastest)
 

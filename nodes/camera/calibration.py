@@ -1,7 +1,7 @@
-"""Calibrates a stereo rig from pictures of a board.
+"""Calibrate a stereo rig from images of a board.
 
-Lens model: pinhole with k1, k2, p1, p2; k3 stays 0, since boards that fill less than the picture
-cannot tell it from k2.
+Lens model: pinhole with k1, k2, p1, p2.  k3 stays 0, since boards that fill less than the image
+    cannot separate it from k2.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from nodes.camera.bundle import (
     LEFT,
     PARAMETERS,
     RIGHT,
-    Fit,
     NotDeterminedError,
+    RigFit,
     pose_transform,
 )
 from nodes.camera.corners import (
@@ -45,16 +45,16 @@ from nodes.camera.uncertainty import (
 
 Floats = NDArray[np.float64]
 
-LARGEST_DEPTH_SHARE = 0.05
-"""Of the working distance: a rig that tells depth no better is not determined."""
+MAX_DEPTH_ERROR_FRACTION = 0.05
+"""Maximum depth error as a fraction of the working distance; above, the rig is undetermined."""
 
 
 @dataclass(frozen=True, slots=True)
-class Calibrated:
-    """A calibration with what it was made from, for a report: pairs by their number among all."""
+class CalibrationResult:
+    """Hold a calibration and its input for a report; pairs are numbered among all pairs."""
 
     calibration: StereoCalibration
-    fit: Fit
+    fit: RigFit
     pairs: dict[int, BoardPair]
     size: tuple[int, int]
 
@@ -67,15 +67,17 @@ def calibrate_stereo(
     device: str,
     working_distance_m: float | None = None,
     progress: Progress = ignore_progress,
-) -> Calibrated:
-    """Calibrate a rig from pairs of pictures of a board.
+) -> CalibrationResult:
+    """Calibrate a rig from pairs of images of a board.
 
-    Left out, with the reason kept in the result: pairs without the board; pairs that repeat an
-    earlier one; pairs that contradict the others grossly (`misfits`); single corners six standard
-    deviations off; pairs whose residual then exceeds three times the median and half a pixel.
+    Some pairs and corners are left out, with the reason kept in the result: pairs without the
+    board, pairs that repeat an earlier one, and pairs that contradict the others grossly
+    (`misfits`). Also left out are single corners six standard deviations off, and pairs whose
+    residual then exceeds three times the median and half a pixel.
 
     working_distance_m: where the uncertainty is stated; None: at the median distance of the boards.
-    Raises CalibrationError when the pictures cannot be used, fewer than MIN_PAIRS pairs remain, or
+
+    Raises CalibrationError when the images cannot be used, fewer than MIN_PAIRS pairs remain, or
     they do not determine the rig.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
@@ -93,7 +95,7 @@ def calibrate_stereo(
         )
     except NotDeterminedError as error:
         raise not_determined(len(selection.good), str(error)) from error
-    if uncertainty.depth_std_m > LARGEST_DEPTH_SHARE * uncertainty.working_distance_m:
+    if uncertainty.depth_std_m > MAX_DEPTH_ERROR_FRACTION * uncertainty.working_distance_m:
         said = (
             f"depth at {1e3 * uncertainty.working_distance_m:.0f} mm is uncertain by "
             f"{1e3 * uncertainty.depth_std_m:.0f} mm"
@@ -107,8 +109,8 @@ def calibrate_stereo(
         opencv_version=cv2.__version__,
         width_px=size[0],
         height_px=size[1],
-        left=lens_of(fit.rig[LEFT]),
-        right=lens_of(fit.rig[RIGHT]),
+        left=make_lens(fit.rig[LEFT]),
+        right=make_lens(fit.rig[RIGHT]),
         right_from_left=right_from_left_of(fit.rig),
         board=board,
         reprojection_rms_px=fit.rms_px(),
@@ -127,11 +129,11 @@ def calibrate_stereo(
             for i, (left_path, right_path) in enumerate(zip(left_paths, right_paths, strict=True))
         ),
     )
-    return Calibrated(calibration, fit, selection.good, size)
+    return CalibrationResult(calibration, fit, selection.good, size)
 
 
 def state_uncertainty(
-    fit: Fit,
+    fit: RigFit,
     pairs: Sequence[BoardPair],
     points: Floats,
     *,
@@ -139,10 +141,9 @@ def state_uncertainty(
     distance_m: float | None,
     progress: Progress = ignore_progress,
 ) -> Uncertainty:
-    """The rig's covariance and what it means for a fingertip `distance_m` away.
+    """Return the rig's covariance, and the uncertainty of a fingertip at `distance_m` that follows.
 
-    Where refits without some of the pairs scatter more than the covariance says, it is raised to
-    what they say.
+    Where refits without some of the pairs scatter more than the covariance, it is raised to theirs.
     """
     if distance_m is None:
         middles = [pose_transform(pose) @ [*points.mean(axis=0), 1.0] for pose in fit.poses]
@@ -164,7 +165,7 @@ def state_uncertainty(
     )
 
 
-def lens_of(numbers: Floats) -> Lens:
-    """A lens's eight numbers as a scene's part."""
+def make_lens(numbers: Floats) -> Lens:
+    """Make a scene's lens from its eight numbers."""
     fx, fy, cx, cy, k1, k2, p1, p2 = (float(number) for number in numbers)
     return Lens(fx_px=fx, fy_px=fy, cx_px=cx, cy_px=cy, distortion=(k1, k2, p1, p2, 0.0))

@@ -1,7 +1,7 @@
-"""Live capture of board pairs: what has been covered, what is missing, and when to take one.
+"""Select board pairs during live capture: track the coverage and decide when to take a pair.
 
-A pair is taken by itself when the board holds still somewhere new and adds coverage: of the cells
-of each picture, of the ways a board can be tilted, of its distances, or of the number of pairs.
+A pair is taken when the board is still at a new pose and adds coverage: of the cells of each image,
+of tilts, of distances, or of the number of pairs.
 """
 
 from __future__ import annotations
@@ -15,31 +15,32 @@ from numpy.typing import NDArray
 from messages.calibration import Board
 from messages.scene import Lens
 from nodes.camera.bundle import board_pose, pose_transform
-from nodes.camera.corners import BoardPair, CornerFinder, board_points, pair_of
+from nodes.camera.corners import BoardPair, CornerFinder, board_points, match_views
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 COLUMNS, ROWS = 4, 3
-"""Cells of a picture."""
+"""Number of cells of an image."""
 
 MIN_CELL_CORNERS = 2
 UPRIGHT_RAD = np.radians(12.0)
 STILL_PX = 0.5
-"""The board holds still when its corners move by less than that from picture to picture."""
+"""The board is still when its corners move by less than this from image to image."""
 
-NEW_PLACE_PX = 12.0
-"""A pose of the board is new when its corners lie further off than that from any taken one's."""
+NEW_POSE_PX = 12.0
+"""A board pose is new when its corners are farther than this from those of any taken pair."""
 
 TILTS = ("upright", "left side back", "right side back", "top back", "bottom back")
 DISTANCES = ("near", "middle", "far")
 NEAR, FAR = 0.55, 0.35
-"""Share of the picture's diagonal that the board's diagonal takes, held upright."""
+"""Fractions of the image's diagonal that the upright board's diagonal covers."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """A thing to be covered: group ("left cell", "right cell", "tilt", "distance", "pairs"), name.
+    """Hold a quantity to be covered: group ("left cell", "right cell", "tilt", "distance", "pairs")
+    and name.
 
     A cell's name is its column and row.
     """
@@ -49,10 +50,10 @@ class Bin:
 
 
 def needed(pairs: int) -> dict[Bin, int]:
-    """How often each bin is to be covered when `pairs` pairs are wanted.
+    """Return how often each bin must be covered for `pairs` pairs.
 
-    Cells that one camera alone sees at most distances (the left picture's left edge, the right
-    picture's right edge) are not required, and so not among them.
+    Cells that only one camera sees at most distances (the left image's left edge, the right image's
+    right edge) are not required.
     """
     often = max(1, round(0.1 * pairs))
     wanted = {Bin("pairs", ""): pairs}
@@ -68,10 +69,10 @@ def needed(pairs: int) -> dict[Bin, int]:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """What was made of one pair of pictures.
+class PairAssessment:
+    """Hold the assessment of one image pair.
 
-    hint: what to do with the board, for the person who holds it.
+    hint: what the person should do with the board.
     """
 
     taken: bool
@@ -79,7 +80,7 @@ class Seen:
 
 
 class Capture:
-    """Watches pairs of pictures and says which to take."""
+    """Assess image pairs and select those to take."""
 
     def __init__(
         self,
@@ -90,7 +91,8 @@ class Capture:
         pairs: int = 20,
         still_pictures: int = 4,
     ) -> None:
-        """lens: of the left camera, roughly.  still_pictures: in a row before a pair is taken."""
+        """lens: of the left camera, approximately.  still_pictures: consecutive still images before
+        a pair is taken."""
         self.board = board
         self.needed = needed(pairs)
         self.counts: Counter[Bin] = Counter()
@@ -110,35 +112,35 @@ class Capture:
         return not self.missing()
 
     def missing(self) -> list[Bin]:
-        """What is not covered often enough, in the order in which it is asked for."""
+        """Return the bins that lack coverage, in the order in which they are requested."""
         return [one for one, often in self.needed.items() if self.counts[one] < often]
 
-    def see(self, left: Image, right: Image) -> Seen:
-        """Judge a pair of grey pictures (h, w); a taken one is counted."""
+    def see(self, left: Image, right: Image) -> PairAssessment:
+        """Assess a pair of grey images (h, w); a taken one is counted."""
         views = self._finder.find(left), self._finder.find(right)
-        pair = pair_of(*views, self.board, ("the left picture", "the right picture"))
+        pair = match_views(*views, self.board, ("the left picture", "the right picture"))
         if isinstance(pair, str):
             self._before, self._still = None, 0
-            return Seen(False, pair)
+            return PairAssessment(False, pair)
         moved_px = np.inf if self._before is None else _shift(pair, self._before)
         self._before = pair
         self._still = self._still + 1 if moved_px < STILL_PX else 1
-        if any(_shift(pair, one) < NEW_PLACE_PX for one in self._taken):
-            return Seen(False, self.advice("taken from here; "))
+        if any(_shift(pair, one) < NEW_POSE_PX for one in self._taken):
+            return PairAssessment(False, self.advice("taken from here; "))
         bins = self.bins_of(pair)
         adds = [one for one in bins if self.counts[one] < self.needed.get(one, 0)]
         if not adds:
-            return Seen(False, self.advice("nothing new here; "))
+            return PairAssessment(False, self.advice("nothing new here; "))
         if self._still < self._still_pictures:
-            return Seen(False, "hold still")
+            return PairAssessment(False, "hold still")
         self.counts.update(bins)
         self._taken.append(pair)
-        return Seen(True, self.advice("taken; "))
+        return PairAssessment(True, self.advice("taken; "))
 
     def bins_of(self, pair: BoardPair) -> list[Bin]:
-        """What a pair covers."""
+        """Return the bins that a pair covers."""
         pose = board_pose(pair.left, self._points, self._lens)
-        bins = [Bin("pairs", ""), Bin("tilt", tilt_of(pose, self._middle))]
+        bins = [Bin("pairs", ""), Bin("tilt", classify_tilt(pose, self._middle))]
         bins.append(Bin("distance", self._distance(pose)))
         for group, view in (("left cell", pair.left), ("right cell", pair.right)):
             cell = np.floor(view.pixels / self._size * [COLUMNS, ROWS]).astype(int)
@@ -158,7 +160,7 @@ class Capture:
         return "near" if share > NEAR else "far" if share < FAR else "middle"
 
     def advice(self, before: str) -> str:
-        """What to do with the board next, after the words `before`."""
+        """Return what to do with the board next, after the words `before`."""
         missing = self.missing()
         if not missing:
             return before + "all is covered"
@@ -180,18 +182,20 @@ def _as_order(one: Bin) -> str:
 
 
 def place(cell: Bin) -> str:
-    """Where a cell is, in words: "at the top left of"."""
+    """Describe the position of a cell: "at the top left of"."""
     column, row = (int(part) for part in cell.name.split(","))
     height = ("top", "middle", "bottom")[row]
     across = ("left", "centre left", "centre right", "right")[column]
     return f"at the {height} {across} of"
 
 
-def tilt_of(pose: Floats, middle: Floats) -> str:
-    """How the board leans, of its pose (6,) in the left camera's frame: one of TILTS.
+def classify_tilt(pose: Floats, middle: Floats) -> str:
+    """Classify the tilt of a board pose (6,) in the left camera's frame as one of TILTS.
 
-    Judged by the board's normal, turned towards the camera, so that it does not matter how the
-    board is turned within its plane.  middle: of the board (3,), in its own frame.
+    It uses the board's normal, pointing towards the camera, so that the rotation of the board
+    within its plane has no effect.
+
+    middle: centre of the board (3,), in its own frame.
     """
     transform = pose_transform(pose)
     centre = transform[:3, :3] @ middle + transform[:3, 3]
@@ -208,7 +212,7 @@ def tilt_of(pose: Floats, middle: Floats) -> str:
 
 
 def _shift(pair: BoardPair, other: BoardPair) -> float:
-    """Median distance px by which the corners that both show have moved; infinite without any."""
+    """Return the median distance px by which common corners have moved; infinite without any."""
     _, here, there = np.intersect1d(
         pair.left.ids, other.left.ids, assume_unique=True, return_indices=True
     )

@@ -1,7 +1,7 @@
-"""Measures a board of known size with a calibration: what a calibration is worth.
+"""Evaluate a calibration by measuring a board of known size.
 
-The board is the ruler.  Pairs that made the calibration flatter it; `check_stereo` is for others,
-and `cross_check` leaves each pair out in turn and measures it with what the rest gave.
+Pairs that made the calibration give too small errors.  `check_stereo` is therefore for other pairs,
+and `cross_check` leaves each pair out in turn and measures it with the calibration of the rest.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Rig:
-    """A rig as OpenCV takes it: matrices (3, 3), distortions (5,), a transform (4, 4)."""
+    """Hold a rig in OpenCV's form: matrices (3, 3), distortions (5,), a transform (4, 4)."""
 
     matrices: tuple[Floats, Floats]
     distortions: tuple[Floats, Floats]
@@ -50,13 +50,13 @@ class Rig:
 
     @staticmethod
     def of(numbers: Floats) -> Rig:
-        """From the 22 numbers of a fit."""
+        """Make it from the 22 numbers of a fit."""
         left, right = lens_arrays(numbers[LEFT]), lens_arrays(numbers[RIGHT])
         return Rig((left[0], right[0]), (left[1], right[1]), pose_transform(numbers[STAND]))
 
     @staticmethod
     def calibrated(calibration: StereoCalibration) -> Rig:
-        """From a file."""
+        """Make it from a calibration file."""
         left, right = (
             np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
             for lens in (calibration.left, calibration.right)
@@ -66,8 +66,8 @@ class Rig:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
-    """A board as a rig measures it: errors in m and px, each array of any length."""
+class BoardMeasurement:
+    """Hold a board as measured by a rig: errors in m and px, each array of any length."""
 
     squares_m: Floats
     diagonals_m: Floats
@@ -77,7 +77,8 @@ class Measured:
 
 
 def triangulated(rig: Rig, left: Floats, right: Floats) -> Floats:
-    """Points (n, 3) in the left camera's frame, m, of pixels (n, 2): undistorted, linear."""
+    """Triangulate pixels (n, 2) into points (n, 3) in the left camera's frame, m: undistorted,
+    linear."""
     normalized = [
         cv2.undistortPoints(pixels[:, None], matrix, distortion)[:, 0].T
         for pixels, matrix, distortion in zip(
@@ -89,9 +90,10 @@ def triangulated(rig: Rig, left: Floats, right: Floats) -> Floats:
 
 
 def rigid_fit_residuals(points: Floats, model: Floats) -> Floats:
-    """Distances (n,) left after the best rigid motion of `model` (n, 3) onto `points` (n, 3).
+    """Return distances (n,) left after the best rigid motion of `model` (n, 3) onto `points` (n,
+    3).
 
-    Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
+    Source: Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
     """
     centred, reference = points - points.mean(axis=0), model - model.mean(axis=0)
     u, _, vt = np.linalg.svd(reference.T @ centred)
@@ -99,8 +101,8 @@ def rigid_fit_residuals(points: Floats, model: Floats) -> Floats:
     return np.asarray(np.linalg.norm(reference @ (u @ handed @ vt) - centred, axis=1))
 
 
-def measure_board(rig: Rig, pair: BoardPair, board: Board) -> Measured:
-    """What a rig makes of the corners that both views of a pair show."""
+def measure_board(rig: Rig, pair: BoardPair, board: Board) -> BoardMeasurement:
+    """Measure the corners that both views of a pair show."""
     ids, left, right = pair.common()
     points = triangulated(rig, left, right)
     place = {int(corner): number for number, corner in enumerate(ids)}
@@ -117,7 +119,7 @@ def measure_board(rig: Rig, pair: BoardPair, board: Board) -> Measured:
         if ends[0] in place and ends[1] in place:
             span = points[place[ends[1]]] - points[place[ends[0]]]
             diagonals.append(np.linalg.norm(span) - length_m)
-    return Measured(
+    return BoardMeasurement(
         squares_m=np.array(squares),
         diagonals_m=np.array(diagonals),
         rigid_fit_m=rigid_fit_residuals(points, board_points(board)[ids]),
@@ -127,7 +129,7 @@ def measure_board(rig: Rig, pair: BoardPair, board: Board) -> Measured:
 
 
 def _reprojection(rig: Rig, left: Floats, right: Floats, points: Floats) -> Floats:
-    """Distances (2n,) px between what was seen and the projected points, left and right."""
+    """Return distances (2n,) px between detected corners and projected points, left and right."""
     distances = []
     stands = (np.eye(4), rig.right_from_left)
     for seen, matrix, distortion, stand in zip(
@@ -140,7 +142,8 @@ def _reprojection(rig: Rig, left: Floats, right: Floats, points: Floats) -> Floa
 
 
 def _rms(values: Floats) -> float | None:
-    """None for no values: a ChArUco board that is seen in part has no diagonals."""
+    """Return the root mean square; None for no values: a partly visible ChArUco board has no
+    diagonals."""
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else None
 
 
@@ -149,12 +152,13 @@ def _in_mm(values: Floats) -> float | None:
     return None if rms is None else 1e3 * rms
 
 
-def summary(boards: Sequence[Measured]) -> dict[str, float | int | None]:
-    """Root mean squares over all boards.
+def summary(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | None]:
+    """Return root mean squares over all boards.
 
-    square_rms_mm: error of the distances of neighbouring corners.  diagonal_rms_mm: of both
-    diagonals of the board.  rigid_fit_rms_mm: of the corners, after the board was laid on them as a
-    rigid body.  reprojection_rms_px: of the triangulated corners.
+    square_rms_mm: error of the distances of neighbouring corners.
+    diagonal_rms_mm: error of both diagonals of the board.
+    rigid_fit_rms_mm: error of the corners after a rigid fit of the board.
+    reprojection_rms_px: error of the triangulated corners.
     """
     return {
         "pairs": len(boards),
@@ -174,11 +178,12 @@ def check_stereo(
     board: Board,
     progress: Progress = ignore_progress,
 ) -> dict[str, float | int | list[str] | None]:
-    """Measure a board of known size with a calibration, on pictures not used to calibrate.
+    """Measure a board of known size with a calibration, on images that did not make it.
 
-    `summary` of the pairs, and used_to_calibrate: names of left pictures that made the calibration
-    and thus flatter it.  Raises CalibrationError for pictures of another size, or no board in any
-    pair.
+    The result holds the `summary` of the pairs, and used_to_calibrate: names of left images that
+    made the calibration and thus give too small errors.
+
+    Raises CalibrationError for images of another size, or without a board in any pair.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     if size != (calibration.width_px, calibration.height_px):
@@ -202,8 +207,10 @@ def check_stereo(
     }
 
 
-def plain_opencv(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> Rig:
-    """OpenCV's functions as its tutorials use them, the yardstick: intrinsics first, then fixed.
+def calibrate_plain_opencv(
+    pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
+) -> Rig:
+    """Calibrate with OpenCV as in its tutorials, for comparison: intrinsics first, then fixed.
 
     points: the board's corners (n, 3) m.
     """
@@ -233,8 +240,9 @@ def plain_opencv(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, in
 PLAIN_HALF_WINDOW_PX = 5
 
 
-def plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
-    """A chessboard's corners as OpenCV's tutorials refine them: a window of 11 px everywhere."""
+def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | None:
+    """Find a chessboard's corners as in OpenCV's tutorials: refined in a window of 11 px
+    everywhere."""
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
     window = (PLAIN_HALF_WINDOW_PX, PLAIN_HALF_WINDOW_PX)
     views = []
@@ -257,11 +265,13 @@ def cross_check(
     leave_out: int = 1,
     progress: Progress = ignore_progress,
 ) -> dict[str, object]:
-    """Leave pairs out in turn, `leave_out` at a time, and measure them with what the rest gives.
+    """Leave pairs out in turn, `leave_out` at a time, and measure them with the calibration of the
+    rest.
 
-    The i-th, i+G-th, ... pair are left out together, so that neighbouring pictures, which are
-    alike, are not.  The same is done with plain OpenCV (of a ChArUco board there is no such thing).
-    Raises CalibrationError when the pictures cannot be used or too few pairs remain.
+    The i-th, i+G-th, ... pair are left out together, so that similar neighbouring images are not.
+    The same is done with plain OpenCV, except for ChArUco boards.
+
+    Raises CalibrationError when the images cannot be used or too few pairs remain.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
     whole = {i: pair for i, pair in enumerate(found) if isinstance(pair, BoardPair)}
@@ -274,13 +284,13 @@ def cross_check(
     plain: dict[int, BoardPair] = {}
     if board.kind == "chessboard":
         for i in whole:
-            pair = plain_corners(left_paths[i], right_paths[i], board)
+            pair = find_plain_corners(left_paths[i], right_paths[i], board)
             if pair is not None:
                 plain[i] = pair
     numbers = list(whole)
     groups = -(-len(numbers) // leave_out)
-    ours: dict[int, Measured] = {}
-    theirs: dict[int, Measured] = {}
+    ours: dict[int, BoardMeasurement] = {}
+    theirs: dict[int, BoardMeasurement] = {}
     for group in range(groups):
         out = numbers[group::groups]
         kept = [i for i in numbers if i not in out]
@@ -288,12 +298,12 @@ def cross_check(
         rig = Rig.of(fit_selection(selection, points, size).rig)
         ours.update({i: measure_board(rig, whole[i], board) for i in out})
         if plain:
-            yardstick = plain_opencv([plain[i] for i in kept if i in plain], points, size)
+            yardstick = calibrate_plain_opencv([plain[i] for i in kept if i in plain], points, size)
             theirs.update({i: measure_board(yardstick, plain[i], board) for i in out if i in plain})
         progress(group + 1, groups, "leaving pairs out")
     return {
         **summary(list(ours.values())),
-        "plain_opencv": summary(list(theirs.values())) if theirs else None,
+        "calibrate_plain_opencv": summary(list(theirs.values())) if theirs else None,
         "rows": [
             {
                 "left": left_paths[i].name,

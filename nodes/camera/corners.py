@@ -1,7 +1,7 @@
-"""Corners of a calibration board in pictures: chessboards seen whole, ChArUco boards seen in part.
+"""Detect corners of calibration boards: whole chessboards, and ChArUco boards seen in part.
 
 A corner's id counts along the board's columns first, so that it is the row of `board_points`.  The
-same id is the same corner in every picture.
+same id is the same corner in every image.
 """
 
 from __future__ import annotations
@@ -21,36 +21,38 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Ids = NDArray[np.int64]
 Progress = Callable[[int, int, str], None]
-"""Called with (steps done, steps in all, what was just done)."""
+"""Called with (steps done, number of steps, description of the last step)."""
 
 SCALE = 2
-"""Corners are refined in a picture so much larger.  OpenCV's refinement interpolates linearly
-between pixels, which pulls corners by 0.015 px and the board's size by 3e-5; markers are found
-sooner, too, in a larger picture."""
+"""Corners are refined in an image enlarged by this factor.  OpenCV's refinement interpolates
+linearly between pixels, which shifts corners by 0.015 px and the board's size by 3e-5.  Markers are
+also found earlier in a larger image."""
 
 MIN_CORNERS = 8
-"""Of a ChArUco board in a view; fewer say too little about the board's pose."""
+"""Minimum number of a ChArUco board's corners in a view; fewer do not determine its pose well."""
 
-SMALLEST_HALF_WINDOW, LARGEST_HALF_WINDOW = 3, 15
-"""In pixels of the larger picture."""
+MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX = 3, 15
+"""Bounds of the refinement window, in pixels of the enlarged image."""
 
-LARGEST_MOVE_PX = 1.0
-"""A ChArUco corner that refinement takes further was drawn to another edge, and is left out."""
+MAX_REFINEMENT_PX = 1.0
+"""A ChArUco corner that refinement moves farther was drawn to another edge, and is dropped."""
 
 CHESSBOARD_SMOOTHING_PX = 1.0
 CHARUCO_SMOOTHING_PX = 0.7
-"""Standard deviations; markers stand nearer to the corners than their neighbours do."""
+"""Standard deviations of the smoothing; markers are nearer to the corners than neighbouring
+corners."""
 
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
 
 class CalibrationError(ValueError):
-    """Pictures that cannot be calibrated with; the message says which and what to do."""
+    """Raised for images that cannot be used for calibration; the message says which and what to
+    do."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What one picture shows of the board: ids (n,), rising, and pixels (n, 2)."""
+    """Hold the board's corners in one image: ids (n,), ascending, and pixels (n, 2)."""
 
     ids: Ids
     pixels: Floats
@@ -58,13 +60,13 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class BoardPair:
-    """One pose of the board in both pictures; of a ChArUco board each may show other corners."""
+    """Hold one pose of the board in both images; of a ChArUco board each may show other corners."""
 
     left: View
     right: View
 
     def common(self) -> tuple[Ids, Floats, Floats]:
-        """The corners that both views show: ids (n,), left and right pixels (n, 2)."""
+        """Return the corners that both views show: ids (n,), left and right pixels (n, 2)."""
         ids, in_left, in_right = np.intersect1d(
             self.left.ids, self.right.ids, assume_unique=True, return_indices=True
         )
@@ -72,11 +74,11 @@ class BoardPair:
 
 
 def ignore_progress(done: int, total: int, what: str) -> None:
-    """For callers that do not care."""
+    """Ignore progress, for callers without a display."""
 
 
 def board_points(board: Board) -> Floats:
-    """Corners (rows*columns, 3) in the board's frame, metres: along the columns first."""
+    """Return corners (rows*columns, 3) in the board's frame, m: along the columns first."""
     points = np.zeros((board.rows * board.columns, 3))
     grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2)
     points[:, :2] = grid * board.square_m
@@ -84,13 +86,13 @@ def board_points(board: Board) -> Floats:
 
 
 def describe(board: Board) -> str:
-    """The board in words: "chessboard of 9x6 inner corners"."""
+    """Describe the board: "chessboard of 9x6 inner corners"."""
     name = {"chessboard": "chessboard", "charuco": "ChArUco board"}[board.kind]
     return f"{name} of {board.columns}x{board.rows} inner corners"
 
 
 def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
-    """OpenCV's own board; raises CalibrationError for an unknown or too small dictionary."""
+    """Make OpenCV's board; raises CalibrationError for an unknown or too small dictionary."""
     name = board.dictionary or ""
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if board.marker_m is None or number is None:
@@ -115,9 +117,10 @@ def charuco_board(board: Board) -> cv2.aruco.CharucoBoard:
 
 
 def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
-    """A corner may be found from one marker beside it; what it gets wrong is refined or left out.
+    """Make a detector that finds a corner from one marker beside it; errors are refined or dropped.
 
-    With OpenCV's two markers a quarter fewer corners are found, most at the picture's edge.
+    With OpenCV's default of two markers, a quarter fewer corners are found, most at the image's
+    edge.
     """
     parameters = cv2.aruco.CharucoParameters()
     parameters.minMarkers = 1
@@ -125,7 +128,7 @@ def _charuco_detector(board: Board) -> cv2.aruco.CharucoDetector:
 
 
 class CornerFinder:
-    """Finds one kind of board in pictures; `quick`: gives up early on pictures without one."""
+    """Find one kind of board in images; `quick` gives up early on images without one."""
 
     def __init__(self, board: Board, *, quick: bool = False) -> None:
         self.board = board
@@ -135,7 +138,7 @@ class CornerFinder:
             self._flags |= cv2.CALIB_CB_FAST_CHECK
 
     def find(self, image: Image) -> View | None:
-        """Sub-pixel corners of a grey picture (h, w), or None where too little is seen."""
+        """Return subpixel corners of a grey image (h, w), or None where too few are visible."""
         if self._detector is not None:
             return self._charuco(image)
         return self._chessboard(image)
@@ -168,37 +171,39 @@ class CornerFinder:
         pixels = _refined(larger, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)
         last = np.array([image.shape[1], image.shape[0]]) - 1.0
         clear = np.minimum(start, last - start).min(axis=1) > half_px + 2.0
-        sound = clear & (np.linalg.norm(pixels - start, axis=1) < LARGEST_MOVE_PX)
+        sound = clear & (np.linalg.norm(pixels - start, axis=1) < MAX_REFINEMENT_PX)
         ids, pixels = ids[sound], pixels[sound]
         columns, rows = np.unique(ids % self.board.columns), np.unique(ids // self.board.columns)
         if len(ids) < MIN_CORNERS or min(len(columns), len(rows)) < 2:
-            return None  # corners in one line do not fix a pose
+            return None  # corners in one line do not determine a pose
         return View(ids, pixels)
 
 
 def _nearest(pixels: Floats) -> Floats:
-    """Distance (n,) of each corner to the nearest other one."""
+    """Return the distance (n,) of each corner to the nearest other one."""
     distances = np.linalg.norm(pixels[:, None] - pixels, axis=-1)
     np.fill_diagonal(distances, np.inf)
     return np.asarray(distances.min(axis=1))
 
 
 def _larger(image: Image) -> Image:
-    """The picture SCALE times as large; pixel x lies at SCALE * (x + 1/2) - 1/2."""
+    """Enlarge the image by SCALE; pixel x moves to SCALE * (x + 1/2) - 1/2."""
     larger = cv2.resize(image, None, fx=SCALE, fy=SCALE, interpolation=cv2.INTER_CUBIC)
     return np.asarray(larger, dtype=np.uint8)
 
 
 def _refined(larger: Image, start: Floats, half_px: Floats, *, smoothing_px: float) -> Floats:
-    """Corners (n, 2) px at the saddle points of their neighbourhoods, half_px (n,) to each side.
+    """Refine corners (n, 2) px to the saddle points of their neighbourhoods, half_px (n,) to each
+    side.
 
-    larger: of `_larger`; all else in pixels of the picture itself.  A window must stay clear of the
-    next edges (those of a neighbouring corner, or of a marker): a larger one drags corners by
-    pixels.  Smoothing takes noise from the gradients that the saddle point is found by (and the
-    blocks of JPEG).
+    larger: the result of `_larger`; all other lengths are in pixels of the original image.
+
+    A window must not contain the next edges (those of a neighbouring corner, or of a marker), which
+    shift corners by pixels.  Smoothing removes noise (and JPEG blocks) from the gradients that
+    determine the saddle point.
     """
     smooth = cv2.GaussianBlur(larger, (0, 0), SCALE * smoothing_px)
-    halves = np.clip(SCALE * half_px, SMALLEST_HALF_WINDOW, LARGEST_HALF_WINDOW).astype(int)
+    halves = np.clip(SCALE * half_px, MIN_HALF_WINDOW_PX, MAX_HALF_WINDOW_PX).astype(int)
     refined = np.empty_like(start)
     for half in np.unique(halves):
         these = halves == half
@@ -210,11 +215,11 @@ def _refined(larger: Image, start: Floats, half_px: Floats, *, smoothing_px: flo
 
 
 def same_order(left: Floats, right: Floats, board: Board) -> Floats:
-    """The right picture's corners, renumbered to start at the same board corner as the left's.
+    """Renumber the right image's corners to start at the same board corner as the left's.
 
     A detector may begin at either end of the board (at any corner of a square one).  The two
-    cameras of a rig stand nearly upright to each other, so that the right numbering is the one
-    whose axes point as the left's do.
+    cameras of a rig are nearly parallel, so that the right numbering is the one whose axes have the
+    left's directions.
     """
     grid = right.reshape(board.rows, board.columns, 2)
     turns = (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
@@ -229,10 +234,10 @@ def same_order(left: Floats, right: Floats, board: Board) -> Floats:
     return max(numberings, key=lambda corners: float(np.sum(axes(corners) * wanted)))
 
 
-def pair_of(
+def match_views(
     left: View | None, right: View | None, board: Board, names: tuple[str, str]
 ) -> BoardPair | str:
-    """The board in a pair of views, or the reason why it cannot be used; names: of the pictures."""
+    """Match the board in a pair of views, or return why it cannot be used; names: of the images."""
     if left is None or right is None:
         missing = [name for name, seen in zip(names, (left, right), strict=True) if seen is None]
         return f"no {describe(board)} in {' and '.join(missing)}"
@@ -246,7 +251,7 @@ def pair_of(
 
 
 def read_gray(path: Path) -> Image:
-    """A picture in grey; raises CalibrationError for what is not a readable picture."""
+    """Read an image in grey; raises CalibrationError for an unreadable image."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) if path.is_file() else None
     if image is None:
         raise CalibrationError(f"{path}: not a picture that can be read")
@@ -254,7 +259,7 @@ def read_gray(path: Path) -> Image:
 
 
 def digest_of(left: Path, right: Path) -> str:
-    """What tells a pair of files from others of the same names."""
+    """Return a digest that distinguishes a pair of files from others of the same names."""
     return hashlib.sha256(left.read_bytes() + right.read_bytes()).hexdigest()[:16]
 
 
@@ -264,9 +269,9 @@ def find_pairs(
     board: Board,
     progress: Progress = ignore_progress,
 ) -> tuple[list[BoardPair | str], tuple[int, int]]:
-    """The board in each pair, or the reason why not, and the pictures' (width, height).
+    """Return the board in each pair, or the reason why not, and the images' (width, height).
 
-    Raises CalibrationError for unequal counts, no pictures, unreadable ones, or mixed sizes.
+    Raises CalibrationError for unequal counts, no images, unreadable ones, or mixed sizes.
     """
     if len(left_paths) != len(right_paths):
         raise CalibrationError(
@@ -290,7 +295,7 @@ def find_pairs(
             size = image_size
             views.append(finder.find(image))
         left, right = views
-        results.append(pair_of(left, right, board, (paths[0].name, paths[1].name)))
+        results.append(match_views(left, right, board, (paths[0].name, paths[1].name)))
         progress(number, len(left_paths), f"{paths[0].name}, {paths[1].name}")
     assert size is not None
     return results, size

@@ -1,4 +1,4 @@
-"""Opens what a source names and reads it in a thread of its own, to its end or over and over."""
+"""Open a source and read it in a thread of its own, to its end or in a loop."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import cv2
 
 from messages.scene import StereoCamera
 from nodes.camera.files import ImagesReader, VideoReader
+from nodes.camera.image_pair import DeviceError, ImagePair, Now, Reader, Regions, check_size, cut
 from nodes.camera.live import CameraReader
-from nodes.camera.pictures import DeviceError, Now, Pictures, Reader, Regions, check_size, cut
 from nodes.camera.sources import AnySource, ImagesSource, OpenCvSource, VideoSource
 
 MAX_RETRY_S = 30.0
@@ -20,9 +20,9 @@ MAX_RETRY_S = 30.0
 def open_reader(
     source: AnySource, camera: StereoCamera, now: Now, wanted: Regions | None = None
 ) -> Reader:
-    """Open what a source names, for a scene's camera; raises DeviceError.
+    """Open a source for a scene's camera; raises DeviceError.
 
-    wanted: the parts of the sensors that a device is asked to read; `pictures.cut` does the rest.
+    wanted: the sensor regions that a device is asked to read; `image_pair.cut` does the rest.
     """
     if isinstance(source, OpenCvSource):
         return CameraReader(source, camera, now, wanted)
@@ -34,16 +34,16 @@ def open_reader(
 
 
 class ReaderThread(threading.Thread):
-    """Opens a source and reads it to its end; what fails is told, and tried again after a while.
+    """Open a source and read it to its end; report failures, and try again after a while.
 
     deliver(pictures, lost): called for each pair, with the number of frames lost so far.
     fail(error): called for each DeviceError; waiting times double from `retry_s` to MAX_RETRY_S,
-    and start over once pictures come again.
-    warn(text): called at each opening for what the device does not do as the scene asks.
-    finish(pairs): called when the pictures ran out.
-    All are called in this thread.
+    and start over once images arrive again.
+    warn(text): called at each opening for settings that the device does not accept.
+    finish(pairs): called when the images end.
+    regions: the parts of the images to deliver; None: all.
 
-    regions: the parts of the pictures to deliver; None: all.
+    All functions are called in this thread.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class ReaderThread(threading.Thread):
         name: str,
         now: Now,
         retry_s: float,
-        deliver: Callable[[Pictures, int], None],
+        deliver: Callable[[ImagePair, int], None],
         fail: Callable[[DeviceError], None],
         warn: Callable[[str], None],
         finish: Callable[[int], None],
@@ -70,7 +70,7 @@ class ReaderThread(threading.Thread):
         self._wait_s = retry_s
 
     def stop(self) -> None:
-        """Ask the thread to end after the picture that it waits for."""
+        """Ask the thread to end after the image that it waits for."""
         self._stopping.set()
         reader = self._reader
         if reader is not None:
@@ -87,7 +87,7 @@ class ReaderThread(threading.Thread):
                 finally:
                     self._reader = None
                     reader.close()
-            except Exception as error:  # whatever a driver or a file does: it is told, tried again
+            except Exception as error:  # drivers raise anything; report it and try again
                 if self._stopping.is_set():
                     return
                 if not isinstance(error, DeviceError):
@@ -100,7 +100,7 @@ class ReaderThread(threading.Thread):
                 return
 
     def _read(self, reader: Reader) -> None:
-        """Deliver until the pictures end or the thread is to stop."""
+        """Deliver until the images end or the thread is to stop."""
         start_ns: int | None = None
         newest_ns: int | None = None
         while not self._stopping.is_set():

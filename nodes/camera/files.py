@@ -1,4 +1,4 @@
-"""Video and image files as sources, with the time that the files themselves tell."""
+"""Read video and image files as sources, with the files' own times."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from pathlib import Path
 import cv2
 
 from messages.scene import StereoCamera
+from nodes.camera.image_pair import DeviceError, Image, ImagePair, gray, halves
 from nodes.camera.live import open_capture
-from nodes.camera.pictures import DeviceError, Image, Pictures, gray, halves
 from nodes.camera.sources import ImagesSource, VideoSource
 from nodes.camera.stamps import Pairing
 
 
 @dataclass(frozen=True, slots=True)
 class FileFrame:
-    """A decoded frame and its time from the file's first frame."""
+    """Hold a decoded frame and its time from the file's first frame."""
 
     image: Image
     time_ns: int
 
 
 class VideoFile:
-    """One video file, read frame by frame."""
+    """Read one video file frame by frame."""
 
     def __init__(self, path: Path, rate_hz: float | None) -> None:
         """rate_hz: None for the file's own frame times.  Raises DeviceError."""
@@ -41,7 +41,7 @@ class VideoFile:
         self._newest_ns = -1
 
     def advance(self) -> bool:
-        """Put the next frame into `waiting`; False at the end.  Raises DeviceError."""
+        """Read the next frame into `waiting`; False at the end.  Raises DeviceError."""
         image = self._capture.read()[1]
         if image is None:
             return False
@@ -65,7 +65,7 @@ class VideoFile:
 
 
 class VideoReader:
-    """One file with both views, or two whose frames are paired by their times."""
+    """Read one file with both views, or two whose frames are paired by their times."""
 
     paced = True
     rate_hz: float | None = None
@@ -91,7 +91,7 @@ class VideoReader:
         rate_hz = self._source.rate_hz or min([*rates, self._camera_rate_hz])
         self._pairing = Pairing(1.0 / rate_hz)
 
-    def read(self) -> Pictures | None:
+    def read(self) -> ImagePair | None:
         """See `Reader`."""
         frames = self._next()
         if frames is None and self._source.loop:
@@ -112,7 +112,7 @@ class VideoReader:
             unpaired = self._unpaired + self._pairing.unpaired
             notes.append(f"{unpaired} frames without a partner")
         times_ns = [frame.time_ns for frame in frames]
-        return Pictures(
+        return ImagePair(
             left,
             right,
             self._times.running_ns(sum(times_ns) // len(times_ns)),
@@ -121,7 +121,7 @@ class VideoReader:
         )
 
     def _next(self) -> tuple[FileFrame, ...] | None:
-        """The next pair, or picture with both views; None at the end of the shorter file."""
+        """Return the next pair, or image with both views; None at the end of the shorter file."""
         if len(self._files) == 1:
             (file,) = self._files
             return (file.waiting.popleft(),) if file.advance() else None
@@ -135,7 +135,7 @@ class VideoReader:
                     return None
 
     def interrupt(self) -> None:
-        """A file does not wait."""
+        """Do nothing: a file does not wait."""
 
     def close(self) -> None:
         for file in self._files:
@@ -144,16 +144,16 @@ class VideoReader:
 
 
 class _Times:
-    """Lets time run on when a file begins again: by the spacing of its last two pictures."""
+    """Continue the time when a file is repeated, by the spacing of its last two images."""
 
     def __init__(self, rate_hz: float) -> None:
-        """rate_hz: for a file of one picture only."""
+        """rate_hz: for a file of one image only."""
         self._spacing_ns = round(1e9 / rate_hz)
         self._begin_ns = 0
         self._newest_ns: int | None = None
 
     def running_ns(self, time_ns: int) -> int:
-        """A picture's time from the beginning of the first pass."""
+        """Return an image's time from the beginning of the first pass."""
         running_ns = self._begin_ns + time_ns
         if self._newest_ns is not None:
             self._spacing_ns = running_ns - self._newest_ns
@@ -167,9 +167,9 @@ class _Times:
 
 
 def read_times(path: Path, pairs: int) -> list[int]:
-    """The times, ns, that a CSV file's column `t_s` gives for so many pairs, from the first on.
+    """Read the times, ns, of the first `pairs` pairs from a CSV file's column `t_s`.
 
-    Raises DeviceError, naming file and line, unless they are numbers that rise.
+    Raises DeviceError, with file and line, unless they are ascending numbers.
     """
     if not path.is_file():
         raise DeviceError(f"{path}: no such file")
@@ -199,7 +199,7 @@ def read_times(path: Path, pairs: int) -> list[int]:
 
 
 class ImagesReader:
-    """Image files by two patterns."""
+    """Read image files by two patterns."""
 
     paced = True
     rate_hz: float | None = None
@@ -227,7 +227,7 @@ class ImagesReader:
         self._loop, self._next = source.loop, 0
         self._times = _Times(rate_hz)
 
-    def read(self) -> Pictures | None:
+    def read(self) -> ImagePair | None:
         """See `Reader`."""
         if self._next == len(self._pairs):
             if not self._loop:
@@ -243,10 +243,10 @@ class ImagesReader:
             images.append(gray(image))
         self._next += 1
         left, right = images
-        return Pictures(left, right, self._times.running_ns(time_ns), notes=(self._note,))
+        return ImagePair(left, right, self._times.running_ns(time_ns), notes=(self._note,))
 
     def interrupt(self) -> None:
-        """A file does not wait."""
+        """Do nothing: a file does not wait."""
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Do nothing: no file stays open."""

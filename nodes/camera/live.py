@@ -1,4 +1,4 @@
-"""Live cameras: one thread each, so that each frame is stamped as it arrives."""
+"""Read live cameras, one thread each, so that each frame is stamped on arrival."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import cv2
 
 from messages.scene import StereoCamera
-from nodes.camera.pictures import (
+from nodes.camera.image_pair import (
     DeviceError,
     Image,
+    ImagePair,
     Now,
-    Pictures,
     Region,
     Regions,
     gray,
@@ -24,17 +24,17 @@ from nodes.camera.sources import OpenCvSource
 from nodes.camera.stamps import Pairing, StampJudge
 
 WAITING = 4
-"""Frames that wait for their partner; a camera further ahead loses its oldest."""
+"""Number of frames that wait for their partner; a camera further ahead loses its oldest."""
 FIRST_S = 5.0
-"""The first frame may take longer than `silence_s`: cameras start their sensors then."""
+"""The first frame may take longer than `silence_s`, since cameras then start their sensors."""
 RELEASE_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Frame:
-    """One camera's picture and the middle of its exposure, ns.
+class CapturedFrame:
+    """Hold one camera's image and the middle of its exposure, ns.
 
-    The middle is reckoned from the picture's arrival and, where it is believed, from the driver's
+    The middle is computed from the image's arrival or, where it is trusted, from the driver's
     stamp.
     """
 
@@ -44,7 +44,7 @@ class Frame:
 
 
 def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
-    """Raises DeviceError for what OpenCV cannot open."""
+    """Open a device; raises DeviceError for what OpenCV cannot open."""
     capture = cv2.VideoCapture(device, api)
     if not capture.isOpened():
         capture.release()
@@ -55,10 +55,10 @@ def open_capture(device: int | str, api: int = cv2.CAP_ANY) -> cv2.VideoCapture:
 
 
 class Stream(threading.Thread):
-    """Takes one camera's frames as they come; `changed` is notified of each, and of the end.
+    """Take one camera's frames as they arrive; notify `changed` of each, and of the end.
 
-    It owns the capture and releases it: OpenCV does not survive a release during a grab, and a grab
-    may hang.
+    The thread owns the capture and releases it: OpenCV crashes on a release during a grab, and a
+        grab may hang.
     """
 
     def __init__(
@@ -72,13 +72,14 @@ class Stream(threading.Thread):
         now: Now,
         changed: threading.Condition,
     ) -> None:
-        """Opens the device and sets it up.  Raises DeviceError.
+        """Open and configure the device.  Raises DeviceError.
 
-        views: 2 where one picture holds both views.  wanted: what to read of the sensor.
+        views: 2 where one image holds both views.
+        wanted: the region of the sensor to read.
         """
         super().__init__(name=f"camera {device}", daemon=True)
         self.device = device
-        self.frames: deque[Frame] = deque(maxlen=WAITING)
+        self.frames: deque[CapturedFrame] = deque(maxlen=WAITING)
         self.count = 0
         self.failure: Exception | None = None
         self._now, self._changed = now, changed
@@ -102,7 +103,7 @@ class Stream(threading.Thread):
 
     @property
     def believed(self) -> bool:
-        """Whether the driver's stamps are."""
+        """Whether the driver's stamps are trusted."""
         return self._judge is not None and self._judge.believed
 
     def stop(self) -> None:
@@ -127,8 +128,8 @@ class Stream(threading.Thread):
         finally:
             self._capture.release()
 
-    def _next(self) -> Frame | None:
-        """The next frame; None for one whose stamp is a lapse.  Raises DeviceError."""
+    def _next(self) -> CapturedFrame | None:
+        """Return the next frame; None for one with an implausible stamp.  Raises DeviceError."""
         grabbed = self._capture.grab()
         arrival_ns = self._now()
         stamp_ns = None
@@ -142,14 +143,14 @@ class Stream(threading.Thread):
         if image is None:
             raise DeviceError(f"{self.device!r}: gives no more pictures: unplugged, or at its end")
         by_stamp_ns = None if stamp_ns is None else stamp_ns - self._to_stamp_ns
-        return Frame(gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
+        return CapturedFrame(gray(image), arrival_ns - self._to_grab_ns, by_stamp_ns)
 
 
 class CameraReader:
-    """Two cameras that run freely, or one that gives both views side by side.
+    """Read two free-running cameras, or one that gives both views side by side.
 
-    The middle of an exposure is the driver's stamp less `exposure_to_stamp_s`, where every camera's
-    driver gives believable stamps, otherwise the arrival less `exposure_to_grab_s`.
+    The middle of an exposure is the driver's stamp minus `exposure_to_stamp_s`, if every camera's
+    driver gives trusted stamps.  Otherwise it is the arrival minus `exposure_to_grab_s`.
     """
 
     paced = False
@@ -170,7 +171,7 @@ class CameraReader:
                     source,
                     camera,
                     views=2 if alone else 1,
-                    # A picture that holds both views cannot begin at two places.
+                    # An image that holds both views cannot begin at two positions.
                     wanted=None if wanted is None or alone else wanted[index],
                     now=now,
                     changed=self._changed,
@@ -193,7 +194,7 @@ class CameraReader:
         for stream in self._streams:
             stream.start()
 
-    def read(self) -> Pictures | None:
+    def read(self) -> ImagePair | None:
         """See `Reader`."""
         with self._changed:
             counts = [stream.count for stream in self._streams]
@@ -215,23 +216,24 @@ class CameraReader:
         return self._pictures(frames)
 
     def _by_stamp(self) -> bool:
-        """Whether the drivers' stamps count: two cameras are compared by one kind of stamp only."""
+        """Whether the drivers' stamps are used: both cameras are compared by one kind of stamp
+        only."""
         return all(stream.believed for stream in self._streams)
 
-    def _moment_ns(self, frame: Frame) -> int:
+    def _moment_ns(self, frame: CapturedFrame) -> int:
         if frame.by_stamp_ns is not None and self._by_stamp():
             return frame.by_stamp_ns
         return frame.by_arrival_ns
 
-    def _take(self) -> tuple[Frame, ...] | None:
-        """The next pair, or the next picture with both views; None until there is one."""
+    def _take(self) -> tuple[CapturedFrame, ...] | None:
+        """Return the next pair, or the next image with both views; None until there is one."""
         if len(self._streams) == 1:
             frames = self._streams[0].frames
             return (frames.popleft(),) if frames else None
         left, right = self._streams
         return self._pairing.take(left.frames, right.frames, self._moment_ns)
 
-    def _pictures(self, frames: tuple[Frame, ...]) -> Pictures:
+    def _pictures(self, frames: tuple[CapturedFrame, ...]) -> ImagePair:
         moments_ns = [self._moment_ns(frame) for frame in frames]
         notes = ["stamped by the driver" if self._by_stamp() else "stamped on arrival"]
         if len(frames) == 1:
@@ -239,7 +241,7 @@ class CameraReader:
         else:
             left, right = frames[0].image, frames[1].image
             notes.append(f"{self._pairing.unpaired} frames without a partner")
-        return Pictures(
+        return ImagePair(
             left,
             right,
             sum(moments_ns) // len(moments_ns),
@@ -250,7 +252,7 @@ class CameraReader:
         )
 
     def _silence(self, counts: list[int]) -> str:
-        """What to say when no pair came; counts: each camera's frames when the wait began."""
+        """Describe why no pair arrived; counts: each camera's frames when the wait began."""
         silent = [
             repr(stream.device)
             for stream, count in zip(self._streams, counts, strict=True)
@@ -273,7 +275,8 @@ class CameraReader:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """A camera that hangs in a grab keeps its thread, which releases it when the grab ends."""
+        """Close the cameras; one that hangs in a grab keeps its thread, which releases it after the
+        grab."""
         for stream in self._streams:
             stream.stop()
         for stream in self._streams:

@@ -1,4 +1,4 @@
-"""The camera: pictures of the finger, from the twin, from devices or from files."""
+"""Publish images of the finger, from the simulator, from devices or from files."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from messages.base import Header
 from messages.scene import Positive, Scene, StereoCamera
 from messages.types import StereoPair
 from nodes.camera.devices import ReaderThread, open_reader
-from nodes.camera.pictures import (
+from nodes.camera.image_pair import (
     DeviceError,
-    Pictures,
+    ImagePair,
     Regions,
     check_size,
     cut,
-    pair_of,
-    pictures_of,
-    too_skewed,
+    make_image_pair,
+    make_stereo_message,
+    skew_reason,
 )
-from nodes.camera.region import ExplicitRegions, wanted_regions
+from nodes.camera.region import ExplicitRegions, resolve_regions
 from nodes.camera.sources import AnySource, TwinSource
 from nodes.node import Input, Node, NodeParameters, Output
 
@@ -30,7 +30,7 @@ JOIN_S = 3.0
 
 
 class CameraParameters(NodeParameters):
-    """Where pictures come from, and which of them are published."""
+    """Hold the source of the images, and which of them are published."""
 
     source: AnySource = TwinSource()
     retry_s: Positive = Field(default=1.0, description="first pause after a device failed")
@@ -43,7 +43,7 @@ class CameraParameters(NodeParameters):
 
 
 class Camera(Node):
-    """Publishes stereo pairs with the time of their exposure."""
+    """Publish stereo pairs with the time of their exposure."""
 
     opens_devices: ClassVar[bool] = True
 
@@ -55,7 +55,7 @@ class Camera(Node):
     camera: StereoCamera | None = None
     regions: Regions | None = None
     reader: ReaderThread | None = None
-    waiting: tuple[Pictures, int] | None = None
+    waiting: tuple[ImagePair, int] | None = None
     warned: tuple[str, ...] = ()
     superseded = refused = 0
 
@@ -65,7 +65,7 @@ class Camera(Node):
     async def on_scene(self, scene: Scene, header: Header) -> None:
         await self._stop_reading()
         self.camera, self.warned = None, ()
-        regions = self.regions = wanted_regions(self.parameters.region, scene)
+        regions = self.regions = resolve_regions(self.parameters.region, scene)
         camera = self.camera = scene.camera
         if self.parameters.source.kind == "twin":
             return
@@ -74,7 +74,7 @@ class Camera(Node):
         def later(call: Callable[..., None], *arguments: object) -> None:
             loop.call_soon_threadsafe(call, *arguments)
 
-        def deliver(pictures: Pictures, lost: int) -> None:
+        def deliver(pictures: ImagePair, lost: int) -> None:
             if self.waiting is not None:
                 self.superseded += 1
             self.waiting = (pictures, lost)
@@ -99,7 +99,7 @@ class Camera(Node):
         self.note = f"no pictures: {error}"
 
     def _tell_warning(self, text: str) -> None:
-        """Once for each scene, however often the device is opened anew."""
+        """Report a warning once per scene, however often the device is opened."""
         if text not in self.warned:
             self.warned = (*self.warned, text)
             self.report_error("source", DeviceError(text))
@@ -113,20 +113,24 @@ class Camera(Node):
     def on_twin__stereo(self, pair: StereoPair, header: Header) -> None:
         if self.parameters.source.kind != "twin" or self.camera is None:
             return
-        pictures = pictures_of(pair, header.source_ns)
+        pictures = make_image_pair(pair, header.source_ns)
         check_size(pictures, self.camera, "twin/stereo")
         if self.regions is not None:
             pictures = cut(pictures, self.regions)
         self._publish(pictures, pair.device, pair.exposure_s, pair.dropped_frames)
 
-    def _publish(self, pictures: Pictures, device: str, exposure_s: float, lost: int) -> None:
-        """exposure_s: where the device does not tell it.  lost: frames, beside those refused."""
+    def _publish(self, pictures: ImagePair, device: str, exposure_s: float, lost: int) -> None:
+        """Publish a pair.
+
+        exposure_s: used where the device does not report it.
+        lost: number of lost frames, apart from rejected ones.
+        """
         limit_s = self.parameters.max_skew_s
         if limit_s is not None and abs(pictures.skew_s) > limit_s:
             self.refused += 1
-            self.note = f"{self.refused} pairs refused: {too_skewed(pictures.skew_s, limit_s)}"
+            self.note = f"{self.refused} pairs refused: {skew_reason(pictures.skew_s, limit_s)}"
             return
-        pair = pair_of(pictures, device, exposure_s, lost + self.refused)
+        pair = make_stereo_message(pictures, device, exposure_s, lost + self.refused)
         self.stereo.publish(pair, source_ns=pictures.exposure_ns)
         facts = (device, f"{pair.dropped_frames} frames lost", *pictures.notes, *self.warned)
         self.note = "; ".join(facts)

@@ -1,7 +1,7 @@
-"""Boards to print, at true size: the black parts as rectangles, written as SVG or PNG.
+"""Write boards to print at true size: the black parts as rectangles, as SVG or PNG.
 
-The first square is black, and of a ChArUco board the markers stand in the white squares, numbered
-row by row, as OpenCV's detector expects them.
+The first square is black.  The markers of a ChArUco board are in the white squares, numbered by
+row, as OpenCV's detector expects.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from nodes.camera.corners import CalibrationError, charuco_board, describe
 Floats = NDArray[np.float64]
 
 BORDER_SQUARES = 1.0
-"""White around the squares: detectors need it."""
+"""Width of the white border around the squares, which detectors need."""
 
 CAPTION_MM = 8.0
 RULER_MM = 100.0
 PNG_DOTS_PER_INCH = 300
 
 
-def black_rectangles(board: Board) -> Floats:
-    """Black parts (n, 4): x, y, width, height in m from the outer corner of the first square.
+def find_black_rectangles(board: Board) -> Floats:
+    """Return black parts (n, 4): x, y, width, height in m from the outer corner of the first
+    square.
 
     Raises CalibrationError for markers that do not fit the board.
     """
@@ -57,7 +58,7 @@ def black_rectangles(board: Board) -> Floats:
 
 
 def _runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
-    """(row, first column, length) of the black stretches of a marker's rows."""
+    """Return (row, first column, length) of the black runs of a marker's rows."""
     runs = []
     for y, row in enumerate(black):
         edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(int)))
@@ -66,7 +67,7 @@ def _runs(black: NDArray[np.bool_]) -> list[tuple[int, int, int]]:
 
 
 def caption(board: Board) -> str:
-    """What the board is, printed below it so that a print tells how to use it."""
+    """Describe the board; printed below it so that a print tells how to use it."""
     text = f"{describe(board)}, squares of {1e3 * board.square_m:g} mm"
     if board.marker_m is not None:
         text += f", markers of {1e3 * board.marker_m:g} mm, {board.dictionary}"
@@ -74,14 +75,14 @@ def caption(board: Board) -> str:
 
 
 def svg(board: Board) -> str:
-    """The board as SVG in millimetres, with a caption and a line to measure the print by."""
+    """Return the board as SVG in millimetres, with a caption and a line to measure the print by."""
     border = 1e3 * BORDER_SQUARES * board.square_m
     width = 1e3 * (board.columns + 1) * board.square_m + 2 * border
     height = 1e3 * (board.rows + 1) * board.square_m + 2 * border
     parts = [
         f'<rect x="{border + 1e3 * x:.6g}" y="{border + 1e3 * y:.6g}" width="{1e3 * w:.6g}" '
         f'height="{1e3 * h:.6g}"/>'
-        for x, y, w, h in black_rectangles(board)
+        for x, y, w, h in find_black_rectangles(board)
     ]
     whole = height + 2 * CAPTION_MM
     ruler_y = height + 1.4 * CAPTION_MM
@@ -101,12 +102,12 @@ def svg(board: Board) -> str:
 
 
 def raster(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
-    """The board as a picture (h, w), white 255; a dot is black where its centre is."""
+    """Return the board as an image (h, w), white 255; a dot is black where its centre is."""
     border = BORDER_SQUARES * board.square_m
     across = np.array([board.columns + 1, board.rows + 1]) * board.square_m + 2 * border
     width, height = np.ceil(across * dots_per_m).astype(int)
     picture = np.full((height, width), 255, np.uint8)
-    for x, y, w, h in black_rectangles(board):
+    for x, y, w, h in find_black_rectangles(board):
         low = np.ceil((border + np.array([x, y])) * dots_per_m - 0.5).astype(int)
         high = np.ceil((border + np.array([x + w, y + h])) * dots_per_m - 0.5).astype(int)
         picture[low[1] : high[1], low[0] : high[0]] = 0
@@ -114,12 +115,12 @@ def raster(board: Board, dots_per_m: float) -> NDArray[np.uint8]:
 
 
 def write_board(board: Board, path: Path) -> None:
-    """Write the board by the path's suffix; raises CalibrationError for one that is neither."""
+    """Write the board by the path's suffix; raises CalibrationError for another suffix."""
     suffix = path.suffix.lower()
     if suffix == ".svg":
         write_file(path, svg(board))
     elif suffix == ".png":
-        import matplotlib.image  # only here: it is slow to import
+        import matplotlib.image  # imported here, since it is slow
 
         picture = raster(board, PNG_DOTS_PER_INCH / 0.0254)
         matplotlib.image.imsave(path, picture, cmap="gray", vmin=0, vmax=255, dpi=PNG_DOTS_PER_INCH)

@@ -1,4 +1,4 @@
-"""Which part of each sensor can show the finger: its volume as the scene's optics project it."""
+"""Compute the part of each sensor that can show the finger, by projecting its volume."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pydantic import ConfigDict
 
 from messages.limits import LimitedModel
 from messages.scene import Lens, Scene
-from nodes.camera.pictures import DeviceError, Region, Regions
+from nodes.camera.image_pair import DeviceError, Region, Regions
 from nodes.models import camera, rigid
 
 Floats = NDArray[np.float64]
 
 GRID = 17
-"""Points along each edge of the volume: a lens bends its image, but by little between two."""
+"""Points along each edge of the volume; between two of them a lens bends its image only little."""
 MARGIN_PX = 16.0
-"""For the blur of the mark and for a calibration that differs from the scene's optics."""
+"""Margin for the marker's blur and for a calibration that differs from the scene's optics."""
 ALIGN_PX = (16, 2)
-"""Columns and rows that sensors can begin a region at."""
+"""Multiples of columns and rows at which sensors can begin a region."""
 NEAREST_M = 1e-3
 
 
@@ -32,17 +32,19 @@ class ExplicitRegions(LimitedModel):
 
 
 def volume_points(low_m: Floats, high_m: Floats) -> Floats:
-    """A grid of points (n, 3) that fills the box between two corners (3,)."""
+    """Return a grid of points (n, 3) that fills the box between two corners (3,)."""
     axes = [np.linspace(low, high, GRID) for low, high in zip(low_m, high_m, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 
-def seen_region(points_camera: Floats, lens: Lens, width_px: int, height_px: int) -> Region | None:
-    """The part of a sensor that shows points (n, 3) of the camera's frame, m; None where none do.
+def find_visible_region(
+    points_camera: Floats, lens: Lens, width_px: int, height_px: int
+) -> Region | None:
+    """Return the part of a sensor that shows points (n, 3) of the camera's frame, m; None if none.
 
-    Beyond the picture's corners a lens's polynomial means nothing and may fold back: points out
-    there are drawn in to the circle through the farthest corner, which changes nothing inside.  A
-    volume that reaches behind the camera fills the picture.
+    Beyond the image's corners a lens's polynomial has no meaning and may fold back.  Points out
+    there are moved to the circle through the farthest corner, which changes nothing inside.  A
+    volume that extends behind the camera fills the image.
     """
     in_front = points_camera[points_camera[:, 2] > NEAREST_M]
     if len(in_front) == 0:
@@ -68,10 +70,11 @@ def seen_region(points_camera: Floats, lens: Lens, width_px: int, height_px: int
     return Region(int(begin[0]), int(begin[1]), int(end[0] - begin[0]), int(end[1] - begin[1]))
 
 
-def finger_regions(scene: Scene) -> Regions:
-    """Where each view can show a fingertip: the finger's volume, wider by its radius, and a margin.
+def find_finger_regions(scene: Scene) -> Regions:
+    """Return the region of each view that can show a fingertip.
 
-    Raises DeviceError for a view that sees none of it.
+    It is the finger's volume, extended by the finger's radius and a margin.  Raises DeviceError for
+    a view that sees none of it.
     """
     finger, rig = scene.finger, scene.camera
     low = np.asarray(finger.volume_min_m) - finger.radius_m
@@ -82,7 +85,7 @@ def finger_regions(scene: Scene) -> Regions:
     in_right = rigid.apply(np.asarray(rig.right_from_left), in_left)
     found = []
     for side, points, lens in (("left", in_left, rig.left), ("right", in_right, rig.right)):
-        region = seen_region(points, lens, rig.width_px, rig.height_px)
+        region = find_visible_region(points, lens, rig.width_px, rig.height_px)
         if region is None:
             raise DeviceError(
                 f"the {side} view shows nothing of finger.volume: correct it or "
@@ -92,15 +95,15 @@ def finger_regions(scene: Scene) -> Regions:
     return found[0], found[1]
 
 
-def wanted_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None:
-    """The regions to publish; None: all of both sensors.  Raises DeviceError.
+def resolve_regions(asked: str | ExplicitRegions, scene: Scene) -> Regions | None:
+    """Return the regions to publish; None: all of both sensors.  Raises DeviceError.
 
     asked: "full", "finger", or regions, which must lie on the sensor.
     """
     if asked == "full":
         return None
     if not isinstance(asked, ExplicitRegions):
-        return finger_regions(scene)
+        return find_finger_regions(scene)
     whole = Region(0, 0, scene.camera.width_px, scene.camera.height_px)
     for side, region in (("left", asked.left), ("right", asked.right)):
         if not whole.holds(region):

@@ -1,6 +1,6 @@
-"""A calibration's report: where corners miss, which pairs fit, what was covered, how sure it is.
+"""Write a calibration's report: residuals of corners, quality of pairs, coverage, uncertainty.
 
-One page that needs no other file, and its pictures beside it as PNG.
+The report is one page that needs no other file, with its images beside it as PNG.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from messages.files import write_file
 from nodes.camera.bundle import PARAMETERS, pose_transform
-from nodes.camera.calibration import Calibrated
+from nodes.camera.calibration import CalibrationResult
 from nodes.camera.check import Rig
 from nodes.camera.corners import board_points, describe
 from nodes.models import rigid
@@ -30,7 +30,7 @@ Floats = NDArray[np.float64]
 
 DOTS_PER_INCH = 110
 ARROW_PX = 40.0
-"""Length in the picture of the 95 % longest residual."""
+"""Length in the image of the 95 % longest residual."""
 
 STYLE = """
 body { font: 15px/1.45 sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; }
@@ -40,7 +40,7 @@ img { max-width: 100%; } figcaption { color: #444; }
 """
 
 
-def epipolar_distances(calibrated: Calibrated) -> tuple[Floats, Floats]:
+def epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
     """Right pixels (n, 2) of all common corners, and their signed distances (n,) px from the
 
     epipolar lines of the left ones, both undistorted and in the right camera's pixels.
@@ -64,7 +64,7 @@ def epipolar_distances(calibrated: Calibrated) -> tuple[Floats, Floats]:
     return np.concatenate(places), np.concatenate(distances)
 
 
-def _residuals(calibrated: Calibrated) -> Figure:
+def _residuals(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 2, (13.0, 5.0))
     lengths = np.concatenate(
         [np.linalg.norm(view, axis=1) for views in calibrated.fit.residuals for view in views]
@@ -90,7 +90,7 @@ def _residuals(calibrated: Calibrated) -> Figure:
     return figure
 
 
-def _pairs(calibrated: Calibrated) -> Figure:
+def _pairs(calibrated: CalibrationResult) -> Figure:
     figure, (axis,) = _figure(1, 1, (13.0, 3.6))
     pairs = calibrated.calibration.pairs
     x = np.arange(len(pairs))
@@ -107,7 +107,7 @@ def _pairs(calibrated: Calibrated) -> Figure:
     return figure
 
 
-def _coverage(calibrated: Calibrated) -> Figure:
+def _coverage(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 3, (15.0, 4.2))
     for axis, side in zip(axes[:2], ("left", "right"), strict=True):
         for pair in calibrated.pairs.values():
@@ -128,7 +128,7 @@ def _coverage(calibrated: Calibrated) -> Figure:
     return figure
 
 
-def _epipolar(calibrated: Calibrated) -> Figure:
+def _epipolar(calibrated: CalibrationResult) -> Figure:
     figure, axes = _figure(1, 2, (13.0, 4.6))
     places, off = epipolar_distances(calibrated)
     largest = float(np.percentile(np.abs(off), 98.0))
@@ -144,7 +144,7 @@ def _epipolar(calibrated: Calibrated) -> Figure:
 
 
 def _figure(rows: int, columns: int, size_in: tuple[float, float]) -> tuple[Figure, list[Axes]]:
-    from matplotlib.figure import Figure  # only here: it is slow to import
+    from matplotlib.figure import Figure  # imported here, since it is slow
 
     figure = Figure(figsize=size_in, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -156,8 +156,8 @@ def _as_picture(axis: Axes, size: tuple[int, int], title: str) -> None:
     axis.set_aspect("equal")
 
 
-def parameter_rows(calibrated: Calibrated) -> list[tuple[str, float, float]]:
-    """(name, value, standard deviation) of the rig's 22 numbers."""
+def parameter_rows(calibrated: CalibrationResult) -> list[tuple[str, float, float]]:
+    """Return (name, value, standard deviation) of the rig's 22 numbers."""
     uncertainty = calibrated.calibration.uncertainty
     assert uncertainty is not None
     deviations = np.sqrt(np.diag(uncertainty.covariance))
@@ -167,8 +167,8 @@ def parameter_rows(calibrated: Calibrated) -> list[tuple[str, float, float]]:
     ]
 
 
-def write_report(calibrated: Calibrated, folder: Path) -> Path:
-    """Write `index.html` and the pictures into a folder, which is made; returns the page."""
+def write_report(calibrated: CalibrationResult, folder: Path) -> Path:
+    """Write `index.html` and the images into a folder, which is made; returns the page."""
     folder.mkdir(parents=True, exist_ok=True)
     calibration = calibrated.calibration
     board, uncertainty = calibration.board, calibration.uncertainty

@@ -1,8 +1,8 @@
-"""Which pairs of pictures and which corners to trust, and the rig that they give.
+"""Select the image pairs and corners to trust, and fit the rig to them.
 
-Zhang's method (A flexible new technique for camera calibration, 2000) for each camera alone, then
-both together with all numbers free (`bundle`), which fits held-out pictures better than fixed
-intrinsics do.
+Zhang's method (A flexible new technique for camera calibration, 2000) fits each camera alone. Then
+both are fitted together with all numbers free (`bundle`), which fits held-out images better than
+fixed intrinsics do.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.camera.bundle import (
-    Fit,
     NotDeterminedError,
+    RigFit,
     board_pose,
     fit_rig,
     lens_arrays,
@@ -34,18 +34,18 @@ MISFIT_RATIO = 5.0
 MISFIT_FLOOR_PX = 5.0
 MISFIT = "does not go with the other pairs:"
 CORNER_RATIO = 6.0
-"""A corner further off than this many standard deviations was drawn to something else."""
+"""A corner with a larger residual, in standard deviations, is an outlier."""
 
 CORNER_ROUNDS = 2
-LARGEST_STRAY_SHARE = 0.15
-"""A pair with more stray corners than that is a bad pair, not a good one with strays."""
+MAX_OUTLIER_FRACTION = 0.15
+"""A pair with a larger fraction of outlier corners is dropped as a whole."""
 
 REPEAT_PX = 1.0
-"""Two pairs whose corners lie nearer to each other than that show the board in one place."""
+"""Two pairs whose corners differ by less show the board at one pose."""
 
 
 def single_lens(views: Sequence[View], points: Floats, size: tuple[int, int]) -> Floats:
-    """One lens (8,) from its own views of the board, whose corners are `points` (n, 3) m."""
+    """Fit one lens (8,) to its own views of the board, whose corners are `points` (n, 3) m."""
     _, matrix, distortion, *_ = cv2.calibrateCamera(
         [points[view.ids].astype(np.float32) for view in views],
         [view.pixels.astype(np.float32) for view in views],
@@ -62,13 +62,17 @@ def single_lens(views: Sequence[View], points: Floats, size: tuple[int, int]) ->
 def misfits(
     pairs: Sequence[BoardPair], points: Floats, left: Floats, right: Floats
 ) -> tuple[Floats, Floats]:
-    """How far each pair (n,) is from what most pairs say of the rig, px rms in the right view.
+    """Return each pair's (n,) deviation from most pairs' estimate of the rig, px rms in the right
+    view.
 
-    Each pair alone determines how the cameras stand to each other.  The pair whose answer suits the
-    others best by their median (least median of squares, Rousseeuw 1984) judges them all.  A pair
-    of pictures that do not belong together thus stands out; in a common fit it would bend the rig
-    until all pairs looked equally bad.  left, right: lenses (8,).  The second result is what the
-    judging pair says of right_from_left (6,).
+    Each pair alone determines the relative pose of the cameras.  The pair whose estimate suits the
+    others best by their median is the reference for all (least median of squares, Rousseeuw 1984).
+    Images that do not belong together thus stand out; in a common fit they would distort the rig
+    until all pairs looked equally bad.
+
+    left, right: lenses (8,).
+
+    The second result is the reference pair's right_from_left (6,).
     """
     left_poses = [pose_transform(board_pose(pair.left, points, left)) for pair in pairs]
     right_poses = [pose_transform(board_pose(pair.right, points, right)) for pair in pairs]
@@ -86,8 +90,8 @@ def misfits(
     return np.asarray(errors[judge]), pose_vector(stands[judge])
 
 
-def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> Fit:
-    """Both cameras together, from nothing but the pairs; points: the board's corners (n, 3) m."""
+def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> RigFit:
+    """Fit both cameras together from the pairs alone; points: the board's corners (n, 3) m."""
     left = single_lens([pair.left for pair in pairs], points, size)
     right = single_lens([pair.right for pair in pairs], points, size)
     _, stand = misfits(pairs, points, left, right)
@@ -96,15 +100,15 @@ def fit_pairs(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int])
 
 
 def corner_count(pair: BoardPair) -> int:
-    """Corners of both views."""
+    """Return the number of corners in both views."""
     return len(pair.left.ids) + len(pair.right.ids)
 
 
-def without_stray_corners(fit: Fit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
-    """The pairs without the corners that lie further off than noise can put them.
+def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardPair]:
+    """Return the pairs without outlier corners.
 
-    The standard deviation is taken from the median of the distances, which strays do not move (of
-    distances in a plane the median is 1.1774 standard deviations).
+    The standard deviation follows from the median distance, which outliers do not affect (in a
+    plane the median distance is 1.1774 standard deviations).
     """
     distances = [[np.linalg.norm(view, axis=1) for view in views] for views in fit.residuals]
     every = np.concatenate([view for views in distances for view in views])
@@ -121,9 +125,9 @@ def without_stray_corners(fit: Fit, pairs: Sequence[BoardPair]) -> list[BoardPai
 
 
 def repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
-    """The pairs that show the board where an earlier one did: their numbers and the earlier one's.
+    """Return the pairs that repeat an earlier pose: their numbers and the earlier one's.
 
-    They would count as evidence twice: what corners err by together is the same in both.
+    They would count twice as evidence, since their common errors are the same in both.
     """
     seen: dict[int, BoardPair] = {}
     repeated: dict[int, int] = {}
@@ -140,7 +144,8 @@ def repeats(found: Sequence[BoardPair | str]) -> dict[int, int]:
 
 
 def _apart(pair: BoardPair, other: BoardPair) -> float:
-    """Median distance px of the same corners in two pairs, of the view where it is larger."""
+    """Return the median distance px of the same corners in two pairs, of the view with the larger
+    one."""
     medians = []
     for here, there in ((pair.left, other.left), (pair.right, other.right)):
         _, a, b = np.intersect1d(here.ids, there.ids, assume_unique=True, return_indices=True)
@@ -151,10 +156,11 @@ def _apart(pair: BoardPair, other: BoardPair) -> float:
 
 
 class Selection:
-    """Which pairs are still in, and why the others are not.
+    """Hold which pairs remain, and why the others were dropped.
 
-    good: the pairs that are in, by their number.  reasons: why the others are not.  residuals: what
-    fits left of each pair (2,) px rms, left and right, also of those that were left out for it.
+    good: the remaining pairs, by their number.
+    reasons: why the others were dropped.
+    residuals: of each pair (2,) px rms, left and right, also of dropped pairs.
     """
 
     def __init__(self, found: Sequence[BoardPair | str], names: Sequence[str]) -> None:
@@ -168,7 +174,7 @@ class Selection:
             del self.good[i]
 
     def pairs(self) -> list[BoardPair]:
-        """The pairs that are in; raises CalibrationError when they are too few."""
+        """Return the remaining pairs; raises CalibrationError when they are too few."""
         if len(self.good) < MIN_PAIRS:
             listed = "".join(f"\n  {self._names[i]}: {text}" for i, text in self.reasons.items())
             raise CalibrationError(
@@ -178,7 +184,7 @@ class Selection:
         return list(self.good.values())
 
     def leave_out(self, errors_px: Floats, ratio: float, floor_px: float, what: str) -> bool:
-        """Put out the pairs with large errors; whether there were any."""
+        """Drop the pairs with large errors; return whether there were any."""
         limit_px = max(ratio * float(np.median(errors_px)), floor_px)
         bad = [
             (i, error) for i, error in zip(self.good, errors_px, strict=True) if error > limit_px
@@ -189,12 +195,12 @@ class Selection:
         return bool(bad)
 
     def leave_out_corners(self, cleaned: Sequence[BoardPair]) -> None:
-        """Take the pairs as `cleaned`; put out those of which too much was cleaned away."""
+        """Replace the pairs by `cleaned`; drop those that lost too many corners."""
         for i, pair in zip(list(self.good), cleaned, strict=True):
             whole = self.found[i]
             assert isinstance(whole, BoardPair)
             stray = corner_count(whole) - corner_count(pair)
-            if stray > LARGEST_STRAY_SHARE * corner_count(whole):
+            if stray > MAX_OUTLIER_FRACTION * corner_count(whole):
                 self.reasons[i] = (
                     f"{stray} of {corner_count(whole)} corners lie further off than noise puts them"
                 )
@@ -203,19 +209,19 @@ class Selection:
                 self.good[i] = pair
 
     def stray_corners(self, number: int) -> int:
-        """Corners of both views that were cleaned from a pair."""
+        """Return the number of corners in both views that were removed from a pair."""
         whole = self.found[number]
         if isinstance(whole, str) or number not in self.good:
             return 0
         return corner_count(whole) - corner_count(self.good[number])
 
 
-def fit_selection(selection: Selection, points: Floats, size: tuple[int, int]) -> Fit:
-    """The rig from what is sound of the pairs; the selection then tells what was left out.
+def fit_selection(selection: Selection, points: Floats, size: tuple[int, int]) -> RigFit:
+    """Fit the rig to the trusted pairs and corners; the selection then lists what was dropped.
 
-    Pairs that contradict the others grossly (`misfits`); single corners six standard deviations
-    off; pairs whose residual then exceeds three times the median and half a pixel.  Raises
-    CalibrationError when too few pairs remain or they do not determine the rig.
+    Dropped are pairs that contradict the others grossly (`misfits`), single corners six standard
+    deviations off, and pairs whose residual then exceeds three times the median and half a pixel.
+    Raises CalibrationError when too few pairs remain or they do not determine the rig.
     """
     try:
         pairs = selection.pairs()
@@ -226,7 +232,7 @@ def fit_selection(selection: Selection, points: Floats, size: tuple[int, int]) -
         while True:
             fit = fit_pairs(selection.pairs(), points, size)
             for _ in range(CORNER_ROUNDS):
-                selection.leave_out_corners(without_stray_corners(fit, selection.pairs()))
+                selection.leave_out_corners(drop_outlier_corners(fit, selection.pairs()))
                 fit = fit_pairs(selection.pairs(), points, size)
             rms_px = fit.pair_rms_px()
             selection.residuals.update(zip(selection.good, rms_px, strict=True))
@@ -239,7 +245,7 @@ def fit_selection(selection: Selection, points: Floats, size: tuple[int, int]) -
 
 
 def not_determined(pairs: int, said: str) -> CalibrationError:
-    """What to tell people of pairs that do not fix the rig."""
+    """Make the error for pairs that do not determine the rig."""
     return CalibrationError(
         f"the {pairs} pairs do not determine the rig ({said}); tilt the board differently from "
         "picture to picture"

@@ -1,8 +1,8 @@
-"""Fixes what a camera would choose by itself: exposure, gain, white balance, focus, region.
+"""Fix what a camera would adjust automatically: exposure, gain, white balance, focus, region.
 
-Everything that is set is read back and compared; what a device does not take is told as a warning
-that names property, asked value and the device's value.  Units differ between OpenCV's backends
-(its sources: modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp, cap_aravis.cpp).
+Each setting is read back and compared.  A setting that the device does not accept gives a warning
+with property, requested value and the device's value.  Units differ between OpenCV's backends (its
+sources: modules/videoio/src/cap_v4l.cpp, cap_ximea.cpp, cap_aravis.cpp).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Protocol
 import cv2
 
 from messages.scene import StereoCamera
-from nodes.camera.pictures import Region
+from nodes.camera.image_pair import Region
 
 EXPOSURE_TOLERANCE = 0.05
 RATE_TOLERANCE = 0.02
@@ -21,7 +21,7 @@ MAX_RATE_HZ = 10_000.0
 
 
 class Device(Protocol):
-    """What is used of cv2.VideoCapture here."""
+    """Define the part of cv2.VideoCapture that is used here."""
 
     def get(self, property_id: int, /) -> float: ...
 
@@ -30,13 +30,13 @@ class Device(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Backend:
-    """What one of OpenCV's backends calls a camera's controls.
+    """Hold the names and units of a camera's controls in one of OpenCV's backends.
 
-    exposure_unit_s: what CAP_PROP_EXPOSURE counts, and whether in whole numbers.
-    auto_exposure: property and the value that means "by hand".
-    autos: further things to be switched off (0) where the device has them.
+    exposure_unit_s: unit of CAP_PROP_EXPOSURE, and whether it takes integers.
+    auto_exposure: property and its value for manual exposure.
+    autos: further automatic functions to switch off (0) where the device has them.
     offsets: properties of the region's first column and row, None where OpenCV has none.
-    buffers: frames that the driver may hold.
+    buffers: number of frames that the driver may hold.
     clock: whether CAP_PROP_POS_MSEC after a grab is the driver's stamp of that frame.
     """
 
@@ -52,7 +52,7 @@ class Backend:
 
 BACKENDS = {
     # V4L2_CID_EXPOSURE_ABSOLUTE counts 100 us; V4L2_EXPOSURE_MANUAL is 1.  Two buffers: one that
-    # the driver fills while we hold the other; with one, every second frame may find no room.
+    # the driver fills while we hold the other.  With one, every second frame may find no room.
     "v4l2": Backend(
         api=cv2.CAP_V4L2,
         exposure_unit_s=1e-4,
@@ -84,7 +84,7 @@ BACKENDS = {
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What a device was brought to: exposure (None: not known) and rate, and what it refused."""
+    """Hold a device's settings: exposure (None: not known) and rate, and what it did not accept."""
 
     exposure_s: float | None
     rate_hz: float
@@ -92,7 +92,7 @@ class Settings:
 
 
 def choose_backend(device: int | str, api: str | None) -> Backend | None:
-    """The backend to open a device with; None: whichever OpenCV finds, its controls unknown."""
+    """Return the backend to open a device with; None: chosen by OpenCV, with unknown controls."""
     if api is None:
         api = "v4l2" if isinstance(device, int) or device.startswith("/dev/") else "any"
     return BACKENDS.get(api)
@@ -101,16 +101,17 @@ def choose_backend(device: int | str, api: str | None) -> Backend | None:
 def set_format(
     capture: Device, backend: Backend | None, camera: StereoCamera, views: int, pixel_format: str
 ) -> None:
-    """Ask for the scene's size and rate; what the device then gives is checked by its pictures.
+    """Request the scene's size and rate; the images then show what the device gives.
 
-    views: 2 where one picture holds both views side by side.  pixel_format: "" for OpenCV's choice.
+    views: 2 where one image holds both views side by side.
+    pixel_format: "" for OpenCV's choice.
     """
     if backend is not None and backend.buffers is not None:
         capture.set(cv2.CAP_PROP_BUFFERSIZE, backend.buffers)
     if pixel_format:
         capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter.fourcc(*pixel_format))
     if backend is not None and backend.offsets is not None:
-        # A region left over from before would bound the size.
+        # A region of a previous use would bound the size.
         for offset in backend.offsets:
             capture.set(offset, 0.0)
     capture.set(cv2.CAP_PROP_FRAME_WIDTH, views * camera.width_px)
@@ -121,7 +122,7 @@ def set_format(
 def fix_settings(
     capture: Device, backend: Backend | None, camera: StereoCamera, device: object
 ) -> Settings:
-    """Fix exposure and gain as the scene has them, everything automatic off; read all back."""
+    """Set the scene's exposure and gain, switch everything automatic off, and read all back."""
     warnings: list[str] = []
 
     def warn(what: str, asked: str, got: str) -> None:
@@ -169,9 +170,9 @@ def fix_settings(
 def set_region(
     capture: Device, backend: Backend | None, wanted: Region, camera: StereoCamera
 ) -> Region | None:
-    """Have the device read a region of its sensor only; what it reads then, None: all of it.
+    """Make the device read a region of its sensor, and return what it reads; None: all of it.
 
-    A device that reads less than was wanted, for want of such places, is set back.
+    A device that reads less than requested is set back to the full sensor.
     """
     if backend is None or backend.offsets is None:
         return None

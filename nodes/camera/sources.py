@@ -1,4 +1,4 @@
-"""The parameter `source`: which device or files a camera node reads."""
+"""Define the parameter `source`: which device or files a camera node reads."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Source(LimitedModel):
 
 
 class TwinSource(Source):
-    """The twin's pixels, from the topic twin/stereo."""
+    """The simulator's pixels, from the topic twin/stereo."""
 
     kind: Literal["twin"] = "twin"
 
@@ -26,8 +26,8 @@ class TwinSource(Source):
 class OpenCvSource(Source):
     """Cameras that OpenCV opens: by number, by path, or by a stream's address.
 
-    Two cameras without a common trigger see a moving finger at two times (`docs/camera.md`).  One
-    device that gives both views has no such trouble.
+    Two cameras without a common trigger see a moving finger at two times (`docs/camera.md`); one
+    device that gives both views does not.
     """
 
     kind: Literal["opencv"]
@@ -81,7 +81,7 @@ class ImagesSource(Source):
 
 
 def _kind_alone(source: object) -> object:
-    """Lets a launch file write `source: twin` for a source that needs nothing but its kind."""
+    """Accept `source: twin` in a launch file for a source that needs only its kind."""
     return {"kind": source} if isinstance(source, str) else source
 
 

@@ -1,8 +1,8 @@
-"""How far a measured fingertip is off because the rig is only known from pictures of a board.
+"""Compute the error of a measured fingertip that follows from the uncertainty of the rig.
 
-To first order, from the covariance of the rig's numbers; and from how much the rig changes when
-pairs are left out (jackknife), which sees what the first cannot: corners that err together, a board
-that is not flat, a lens that is not of the model.
+It follows to first order from the covariance of the rig's numbers.  A jackknife, which leaves pairs
+out, also covers common errors of corners, a board that is not flat, and a lens that differs from
+the model.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from nodes.camera.bundle import (
     PARAMETERS,
     RIGHT,
     STAND,
-    Fit,
+    RigFit,
     fit_rig,
     floats,
     lens_arrays,
@@ -30,15 +30,17 @@ from nodes.models import rigid
 Floats = NDArray[np.float64]
 
 GROUPS = 20
-"""The most refits of the jackknife; of more pairs several are left out at a time."""
+"""Maximum number of refits of the jackknife; with more pairs, several are left out at a time."""
 
 
 def view_of_work(
     rig: Floats, size: tuple[int, int], distance_m: float, *, across: int = 5
 ) -> Floats:
-    """Points (n, 3) in the left camera's frame where a fingertip is measured, `distance_m` deep.
+    """Return points (n, 3) in the left camera's frame, `distance_m` deep, where a fingertip is
+    measured.
 
-    A grid over the middle half, each way, of the left picture, as far as the right one shows it.
+    They are a grid over the middle half, in both directions, of the left image, as far as the right
+    image shows it.
     """
     matrix, distortion = lens_arrays(rig[LEFT])
     width, height = size
@@ -52,11 +54,11 @@ def view_of_work(
 
 
 def position_slopes(rig: Floats, points: Floats) -> Floats:
-    """How triangulated positions (n, 3) move with the rig's numbers: (n, 3, 22).
+    """Return the Jacobian (n, 3, 22) of triangulated positions (n, 3) by the rig's numbers.
 
     A fingertip's pixels p = f(x, rig) are given.  The point of least squared image error then obeys
-    A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig, hence
-    dx/drig = -(A'A)^-1 A'B.
+    A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig, hence dx/drig =
+    -(A'A)^-1 A'B.
     """
     count = len(points)
     by_point, by_rig = np.empty((count, 4, 3)), np.zeros((count, 4, len(PARAMETERS)))
@@ -76,24 +78,26 @@ def position_slopes(rig: Floats, points: Floats) -> Floats:
 
 
 def position_spread(slopes: Floats, covariance: Floats) -> tuple[float, float]:
-    """Standard deviations (depth, lateral) m, root mean square over the points of `slopes`.
+    """Return standard deviations (depth, lateral) m, root mean square over the points of `slopes`.
 
-    covariance: of the rig (22, 22).  Lateral: x and y together.
+    covariance: of the rig (22, 22).
+
+    Lateral means x and y together.
     """
     variances = np.einsum("nip,pq,niq->ni", slopes, covariance, slopes).mean(axis=0)
     return float(np.sqrt(variances[2])), float(np.sqrt(variances[0] + variances[1]))
 
 
 def jackknife_covariance(
-    fit: Fit,
+    fit: RigFit,
     pairs: Sequence[BoardPair],
     board: Floats,
     progress: Progress = ignore_progress,
 ) -> Floats:
-    """Covariance (22, 22) of the rig from refits without some of the pairs each.
+    """Return the covariance (22, 22) of the rig from refits without some of the pairs each.
 
-    The delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section 5.5):
-    (G - 1)/G times the scatter of the G refits about their mean.
+    The delete-a-group jackknife (Shao and Tu, The Jackknife and Bootstrap, 1995, section 5.5): (G -
+    1)/G times the scatter of the G refits about their mean.
     """
     groups = min(GROUPS, len(pairs))
     rigs = []
@@ -107,5 +111,5 @@ def jackknife_covariance(
 
 
 def right_from_left_of(rig: Floats) -> Floats:
-    """The transform (4, 4) between the cameras of a rig (22,)."""
+    """Return the transform (4, 4) between the cameras of a rig (22,)."""
     return rigid.transform(pose_transform(rig[STAND])[:3, :3], rig[STAND][3:])

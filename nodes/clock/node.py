@@ -1,4 +1,4 @@
-"""Measures what the other hosts' clocks show, by pings among the clock nodes, one per host."""
+"""Measure the offsets of other hosts' clocks by pings between the clock nodes, one per host."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pydantic import Field
 from messages.base import Header
 from messages.scene import Positive
 from messages.types import ClockEcho, ClockOffset, ClockPing, Clocks
-from nodes.clock.offset import OtherClock, sample_of
+from nodes.clock.offset import OtherClock, make_sample
 from nodes.node import Input, Node, NodeParameters, Output, periodic
 
 SILENT_NS = 2_000_000_000
@@ -15,7 +15,7 @@ FORGOTTEN_NS = 60_000_000_000
 
 
 class ClockParameters(NodeParameters):
-    """Limits that the launch file gives under "clocks"."""
+    """Hold the limits that the launch file gives under "clocks"."""
 
     rate_hz: Positive = 8.0
     max_offset_uncertainty_s: Positive = 0.005
@@ -23,7 +23,7 @@ class ClockParameters(NodeParameters):
 
 
 class ClockNode(Node):
-    """Pings all others, answers them with its next ping, and tells its host what it found."""
+    """Ping all others, answer them with the next ping, and publish the offsets on this host."""
 
     measures_clocks = True
     parameters: ClockParameters
@@ -47,7 +47,7 @@ class ClockNode(Node):
         )
         for echo in ping.echoes:
             if echo.clock_id == self.clock.id and received_ns - echo.sent_ns < 2 * SILENT_NS:
-                sample = sample_of(
+                sample = make_sample(
                     echo.sent_ns,
                     echo.received_ns,
                     header.publish_ns,

@@ -1,10 +1,11 @@
-"""What another clock shows, from pings: bounds that hold, and a best guess between them.
+"""Estimate the offset of another clock from pings: guaranteed bounds, and a best estimate within.
 
-A ping gives four stamps: sent (t1, ours), received (t2, theirs), answered (t3, theirs), heard (t4,
-ours).  No message arrives before it was sent, so the other clock, less ours, was at t1 at most
-t2 - t1, and at t4 at least t3 - t4; how far it has moved in between, the two clocks' rates bound.
-(Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on intersecting intervals.)
-Nothing else is assumed of the network: not that both ways take equally long, not how delays vary.
+A ping gives four stamps: sent (t1, own), received (t2, other), answered (t3, other), received back
+    (t4, own).  No message arrives before it was sent.  The other clock minus ours was therefore at
+    most t2 - t1 at t1, and at least t3 - t4 at t4; the clock rates bound its change in between.
+    (Cristian 1989, "Probabilistic clock synchronization"; Marzullo 1984 on intersecting intervals.)
+    Nothing else is assumed of the network: neither equal delays in both directions, nor how delays
+    vary.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ FIT_SPAN_NS = 5_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The other clock less ours at `at_ns` of ours: within `half_ns` of `offset_ns`."""
+    """Hold the other clock minus ours at `at_ns` of ours: within `half_ns` of `offset_ns`."""
 
     at_ns: int
     offset_ns: int
@@ -28,10 +29,11 @@ class Sample:
 
 
 @dataclass(frozen=True, slots=True)
-class Estimate:
-    """The other clock less ours at `at_ns` of ours, surely within `half_ns` of `offset_ns`.
+class OffsetEstimate:
+    """Hold the other clock minus ours at `at_ns` of ours, certainly within `half_ns` of
+    `offset_ns`.
 
-    drift_ratio: by how much the other one gains on ours, best guess.
+    drift_ratio: rate at which the other clock gains on ours, best estimate.
     """
 
     at_ns: int
@@ -40,25 +42,25 @@ class Estimate:
     drift_ratio: float
 
 
-def sample_of(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -> Sample | None:
-    """One ping's sample, stamps in ns as in the module's text; None for an impossible one.
+def make_sample(t1: int, t2: int, t3: int, t4: int, *, max_drift_ratio: float) -> Sample | None:
+    """Make a ping's sample, stamps in ns as in the module's text; None for an impossible one.
 
-    max_drift_ratio: by how much one clock may gain on the other.
+    max_drift_ratio: maximum rate at which one clock may gain on the other.
     """
     away_ns, there_ns = t4 - t1, t3 - t2
     moved_ns = max_drift_ratio * away_ns
     delay_ns = away_ns - there_ns
     if away_ns < 0 or there_ns < 0 or delay_ns < -moved_ns:
         return None
-    # Twice the offset, to stay with whole numbers.
+    # Twice the offset, which keeps integers.
     twice = (t2 - t1) + (t3 - t4)
     return Sample((t1 + t4) // 2, twice // 2, int(max(0, delay_ns) / 2 + moved_ns / 2) + 1)
 
 
 def bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tuple[int, int]:
-    """Between what the offset (ns) must be at `at_ns`: each sample's bounds, widened by its age.
+    """Return the bounds of the offset (ns) at `at_ns`: each sample's bounds, widened by its age.
 
-    The lower one lies above the upper one where the samples contradict each other.
+    The lower bound exceeds the upper one where the samples contradict each other.
     """
     low = max(
         one.offset_ns - one.half_ns - int(max_drift_ratio * abs(at_ns - one.at_ns)) - 1
@@ -71,11 +73,11 @@ def bounds(samples: list[Sample], at_ns: int, *, max_drift_ratio: float) -> tupl
     return low, high
 
 
-def drift_of(samples: list[Sample]) -> tuple[float, float]:
-    """Line through samples: offset (ns, at the newest one, less its own) and slope.
+def fit_drift(samples: list[Sample]) -> tuple[float, float]:
+    """Fit a line through samples: offset (ns, at the newest one, less its own) and slope.
 
-    Least squares; samples count by the inverse square of their bounds, so that those whose ping met
-    no queue decide.  Slope and offset are 0 while the samples span less than FIT_SPAN_NS.
+    Least squares, weighted by the inverse square of the bounds, so that pings without queueing
+    decide. Slope and offset are 0 while the samples span less than FIT_SPAN_NS.
     """
     newest = samples[-1]
     if newest.at_ns - samples[0].at_ns < FIT_SPAN_NS:
@@ -94,11 +96,11 @@ def drift_of(samples: list[Sample]) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class OtherClock:
-    """The samples of one other clock: of each half second the best, over the last minute.
+    """Hold the samples of one other clock: the best of each half second, over the last minute.
 
-    max_drift_ratio: by how much one clock may gain on the other.
-    resets: how often the samples contradicted each other (a clock was stepped, a machine slept),
-    and were forgotten.
+    max_drift_ratio: maximum rate at which one clock may gain on the other.
+    resets: how often the samples contradicted each other (a clock was stepped, a machine slept) and
+        were deleted.
     """
 
     max_drift_ratio: float
@@ -106,7 +108,7 @@ class OtherClock:
     resets: int = 0
 
     def take(self, sample: Sample) -> None:
-        """Keep a sample, if it is the best of its half second."""
+        """Keep a sample if it is the best of its half second."""
         samples = self.samples
         if samples and sample.at_ns <= samples[-1].at_ns:
             return
@@ -123,14 +125,14 @@ class OtherClock:
             samples.pop()
         samples.append(sample)
 
-    def estimate(self, at_ns: int) -> Estimate | None:
-        """Where the other clock is at `at_ns` of ours; None before the first sample."""
+    def estimate(self, at_ns: int) -> OffsetEstimate | None:
+        """Estimate the other clock at `at_ns` of ours; None before the first sample."""
         if not self.samples:
             return None
         low, high = bounds(self.samples, at_ns, max_drift_ratio=self.max_drift_ratio)
         newest = self.samples[-1]
-        fitted, slope = drift_of(self.samples)
+        fitted, slope = fit_drift(self.samples)
         slope = min(max(slope, -self.max_drift_ratio), self.max_drift_ratio)
         guess = newest.offset_ns + round(fitted + slope * (at_ns - newest.at_ns))
         guess = min(max(guess, low), max(low, high))
-        return Estimate(at_ns, guess, max(guess - low, high - guess, 0), slope)
+        return OffsetEstimate(at_ns, guess, max(guess - low, high - guess, 0), slope)

@@ -13,7 +13,7 @@ from nodes.console.controls import Ask, Html, on_value
 CORRECTIONS = ("two_pass", "four_triangles", "one_plane", "none")
 PICTURES = (
     ("seen", "What the eye sees of the sheet"),
-    ("proper", "What it ought to see"),
+    ("expected", "What it ought to see"),
     ("frame", "What the projector is given"),
 )
 

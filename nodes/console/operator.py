@@ -58,7 +58,7 @@ REPLAYED = (
 MEASURED = "the finger is measured: only a simulated one can be moved from here"
 NO_RECORDER = (
     "there is no recorder in this graph that waits to be told: start it with --console, or give "
-    "its recorder the parameter waits: true"
+    "its recorder the parameter start_paused: true"
 )
 
 
@@ -147,7 +147,7 @@ class Operator:
             self.desk.look.heed(message)
         elif isinstance(message, TwinEye) and self.desk.look.got(message, now_s):
             self._looked_s = now_s
-            for name, image in (("seen", message.seen), ("proper", message.proper)):
+            for name, image in (("seen", message.seen), ("expected", message.expected)):
                 self._page.eye.show_picture(name, smaller(image))
 
     def advance(self, now_s: float, looking: bool) -> None:

@@ -204,4 +204,4 @@ def fade_response(response: Response, lost_s: float, *, hold_s: float, relax_s: 
 
 def predict_position(fingertip: Fingertip, horizon_s: float) -> Floats:
     """Return the expected fingertip position (3,), m, world, `horizon_s` after its exposure."""
-    return path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, horizon_s)[0]
+    return path_at(fingertip.predicted_path_world_m, fingertip.prediction_step_s, horizon_s)[0]

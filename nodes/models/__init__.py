@@ -1,1 +1,1 @@
-"""What several nodes compute with: arrays in, arrays out; no sockets, no clock, no files."""
+"""Computations that several nodes share: arrays in, arrays out; no sockets, no clock, no files."""

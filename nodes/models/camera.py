@@ -1,7 +1,7 @@
-"""Pinhole cameras with Brown's distortion.
+"""Project and undistort by pinhole cameras with Brown's distortion.
 
-A camera frame has x to the right, y down and z along the view.  Points are (..., 3) in metres,
-pixels (..., 2) with the origin at the centre of the top left pixel, as OpenCV has it.
+A camera frame has x to the right, y down and z along the view.  Points are (..., 3) in metres.
+Pixels are (..., 2) with the origin at the centre of the top left pixel, as in OpenCV.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ Floats = NDArray[np.float64]
 
 
 def camera_matrix(fx_px: float, fy_px: float, cx_px: float, cy_px: float) -> Floats:
-    """The 3x3 matrix K of a pinhole."""
+    """Return the 3x3 matrix K of a pinhole camera."""
     return np.array([[fx_px, 0.0, cx_px], [0.0, fy_px, cy_px], [0.0, 0.0, 1.0]])
 
 
 def distort(normalized: Floats, distortion: Floats) -> Floats:
-    """Distorted normalized image coordinates (..., 2) of undistorted ones.
+    """Distort undistorted normalized image coordinates (..., 2).
 
     distortion: k1, k2, p1, p2, k3 (Brown 1966, in OpenCV's order).
     """
@@ -36,11 +36,11 @@ def distort(normalized: Floats, distortion: Floats) -> Floats:
 
 
 def undistort(distorted: Floats, distortion: Floats, *, iterations: int = 20) -> Floats:
-    """Inverse of `distort` by fixed-point iteration; normalized coordinates (..., 2).
+    """Invert `distort` by fixed-point iteration; normalized coordinates (..., 2).
 
-    It ends when no coordinate moves by more than 1e-13, or after `iterations`.  The
-    iteration contracts while the distortion's slope is well below one, which holds inside the
-    picture of any lens that one would measure with.
+    It stops when no coordinate changes by more than 1e-13, or after `iterations`.  The iteration
+    contracts while the distortion's slope is well below one, which holds inside the image of any
+    lens that is fit for measurement.
     """
     k1, k2, p1, p2, k3 = distortion
     point = distorted.copy()
@@ -59,12 +59,12 @@ def undistort(distorted: Floats, distortion: Floats, *, iterations: int = 20) ->
 
 
 def project(points_camera: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Pixels (..., 2) of points (..., 3) in the camera's frame, in front of it (z > 0)."""
+    """Return pixels (..., 2) of points (..., 3) in the camera's frame, in front of it (z > 0)."""
     normalized = distort(points_camera[..., :2] / points_camera[..., 2:], distortion)
     return normalized @ matrix[:2, :2].T + matrix[:2, 2]
 
 
 def normalize(pixels: Floats, matrix: Floats, distortion: Floats) -> Floats:
-    """Undistorted normalized coordinates (..., 2) of pixels: the ray is (x, y, 1)."""
+    """Return undistorted normalized coordinates (..., 2) of pixels: the ray is (x, y, 1)."""
     distorted = (pixels - matrix[:2, 2]) / np.array([matrix[0, 0], matrix[1, 1]])
     return undistort(distorted, distortion)

@@ -1,8 +1,8 @@
-"""Bounded motion: follow a moving target without lag, and without ever jumping.
+"""Bound motion: follow a moving target without lag and without jumps.
 
-A follower that is on its target stays on it, since the target's own velocity is fed forward; one
-that is off gets there with bounded speed and acceleration, and without overshoot if the target
-moves evenly.
+On the target the follower stays on it, since the target's velocity is fed forward.  Off the target
+it approaches with bounded speed and acceleration, and without overshoot if the target moves at
+constant velocity.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from nodes.models.rigid import (
 
 Floats = NDArray[np.float64]
 
-BRAKE_SHARE = 1.0 / 3.0
-"""Share of the acceleration that braking onto the target may use; the rest follows the target."""
+BRAKE_FRACTION = 1.0 / 3.0
+"""Fraction of the acceleration for braking onto the target; the rest follows the target."""
 
 
 def closing_speed(distance: Floats, deceleration: Floats | float, step_s: float) -> Floats:
-    """Largest speeds with which a point at those distances (>= 0) can still stop there.
+    """Return the largest speeds at which a point can still stop within these distances (>= 0).
 
-    Discrete: moving by speed * step_s per step and slowing by deceleration * step_s after each, it
-    arrives exactly, from w^2/(2 a) + w dt/2 = distance; near the end it takes one step.
+    In discrete time it moves by speed * step_s per step and slows by deceleration * step_s after
+    each. It arrives exactly, from w^2/(2 a) + w dt/2 = distance; the last distance takes one step.
     """
     half = 0.5 * deceleration * step_s
     speed = np.sqrt(half * half + 2.0 * deceleration * distance) - half
@@ -47,14 +47,15 @@ def follow(
     max_acceleration: float,
     step_s: float,
 ) -> tuple[Floats, Floats]:
-    """One step of a vector (n,) towards a target that moves with `target_velocity`.
+    """Step a vector (n,) towards a target that moves with `target_velocity`.
 
-    error: target at the end of the step minus the point now.
+    error: target at the end of the step minus the current point.
+
     Returns the displacement over the step and the velocity after it.  Neither the mean speed of the
     step nor the velocity changes faster than `max_acceleration`.
     """
-    target_velocity = _shortened(target_velocity, max_speed)
-    wanted = wanted_velocity(
+    target_velocity = _clamp_length(target_velocity, max_speed)
+    wanted = desired_velocity(
         error,
         target_velocity,
         max_speed=max_speed,
@@ -62,16 +63,16 @@ def follow(
         step_s=step_s,
     )
     distance = _length(error - target_velocity * step_s)
-    reach = (1.0 - BRAKE_SHARE) * max_acceleration * step_s
-    mean = velocity + _shortened(wanted - velocity, reach)
+    reach = (1.0 - BRAKE_FRACTION) * max_acceleration * step_s
+    mean = velocity + _clamp_length(wanted - velocity, reach)
     landed = _length(error - mean * step_s) <= 1e-12 + 1e-9 * distance
-    settles = _length(target_velocity - mean) <= BRAKE_SHARE * max_acceleration * (
+    settles = _length(target_velocity - mean) <= BRAKE_FRACTION * max_acceleration * (
         step_s * (1.0 + 1e-9)
     )
     return mean * step_s, target_velocity if landed and settles else mean
 
 
-def wanted_velocity(
+def desired_velocity(
     error: Floats,
     target_velocity: Floats,
     *,
@@ -79,30 +80,30 @@ def wanted_velocity(
     max_acceleration: float,
     step_s: float,
 ) -> Floats:
-    """The velocity (n,) that closes in on the target as fast as one can still stop there."""
+    """Return the velocity (n,) that approaches the target as fast as it can still stop there."""
     offset = error - target_velocity * step_s
     distance = _length(offset)
     if distance == 0.0:
-        return _shortened(target_velocity, max_speed)
-    brake = BRAKE_SHARE * max_acceleration
+        return _clamp_length(target_velocity, max_speed)
+    brake = BRAKE_FRACTION * max_acceleration
     speed = float(closing_speed(np.array(distance), brake, step_s))
-    return _shortened(target_velocity + offset * (speed / distance), max_speed)
+    return _clamp_length(target_velocity + offset * (speed / distance), max_speed)
 
 
 def _length(vector: Floats) -> float:
-    """The norm of a short vector, at a fifth of the library's cost."""
+    """Return the norm of a short vector, in a fifth of NumPy's time."""
     return sqrt(float(vector @ vector))
 
 
-def _shortened(vector: Floats, longest: float) -> Floats:
-    """The vector, or one of that direction and length `longest`, whichever is shorter."""
+def _clamp_length(vector: Floats, longest: float) -> Floats:
+    """Shorten a vector to the length `longest`, unless it is shorter."""
     length = _length(vector)
     return vector if length <= longest else vector * (longest / length)
 
 
 @dataclass(frozen=True, slots=True)
 class SheetMotion:
-    """Where the sheet is and how it moves: pose, twist (m/s, rad/s), stretch and its rate (1/s)."""
+    """Hold the sheet's pose, twist (m/s, rad/s), stretch ratio and its rate (1/s)."""
 
     world_from_sheet: Floats
     twist_world: Floats
@@ -112,7 +113,7 @@ class SheetMotion:
 
 @dataclass(frozen=True, slots=True)
 class SheetBounds:
-    """How fast the sheet's centre, its orientation and its stretch may change."""
+    """Hold the limits of the motion of the sheet's centre, orientation and stretch."""
 
     speed_m_per_s: float
     acceleration_m_per_s2: float
@@ -124,17 +125,18 @@ class SheetBounds:
 
 @dataclass(frozen=True, slots=True)
 class EdgeBound:
-    """How fast any point of a clamped edge may move, and how far the edge reaches from its middle.
+    """Hold the maximum speed of any point of a clamped edge, and the edge's half length.
 
-    A sheet that turns while it moves is slowed in both alike.  An arm that had to cut the speed of
-    its edge by itself, joint by joint, would leave the sheet's way and so the other arm.
+    Both translation and rotation of the sheet are scaled alike.  If an arm limited its edge alone,
+    joint by joint, it would leave the sheet's path and move away from the other arm.
     """
 
     speed_m_per_s: float
     reach_m: float
 
     def share(self, speed_m_per_s: float, turn_rad_per_s: float) -> float:
-        """The part (0..1) of a speed and a turning speed that keeps the edges within the bound."""
+        """Return the factor (0..1) on linear and angular speed that keeps the edges within the
+        limit."""
         edge = speed_m_per_s + self.reach_m * turn_rad_per_s
         return 1.0 if edge <= self.speed_m_per_s else self.speed_m_per_s / edge
 
@@ -142,12 +144,13 @@ class EdgeBound:
 def follow_sheet(
     now: SheetMotion, target: SheetMotion, *, bounds: SheetBounds, edges: EdgeBound, step_s: float
 ) -> SheetMotion:
-    """The sheet `step_s` (> 0) later, on its way to `target`, which holds at the step's end."""
+    """Return the sheet `step_s` (> 0) later, moved towards `target`, which holds at the step's
+    end."""
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     turned = vector_from_rotation(target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T)
     speed, turn_speed = (
         _length(
-            wanted_velocity(
+            desired_velocity(
                 error, velocity, max_speed=most, max_acceleration=sharpest, step_s=step_s
             )
         )
@@ -199,10 +202,12 @@ def follow_sheet(
 
 
 def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> SheetMotion:
-    """The sheet `step_s` later when it shall come to rest, slowing as fast as the bounds allow."""
-    linear = _slowed(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
-    angular = _slowed(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)
-    rate = _slowed(np.array([now.stretch_rate_per_s]), bounds.stretch_acceleration_per_s2 * step_s)
+    """Return the sheet `step_s` later while it stops as fast as the bounds allow."""
+    linear = _decelerate(now.twist_world[:3], bounds.acceleration_m_per_s2 * step_s)
+    angular = _decelerate(now.twist_world[3:], bounds.turn_acceleration_rad_per_s2 * step_s)
+    rate = _decelerate(
+        np.array([now.stretch_rate_per_s]), bounds.stretch_acceleration_per_s2 * step_s
+    )
     twist = np.concatenate([linear, angular])
     return SheetMotion(
         _orthonormal(moved(now.world_from_sheet, twist, step_s)),
@@ -212,8 +217,8 @@ def coast_sheet(now: SheetMotion, *, bounds: SheetBounds, step_s: float) -> Shee
     )
 
 
-def extrapolated(motion: SheetMotion, duration_s: float) -> SheetMotion:
-    """The motion carried on with its twist and rate for `duration_s` (of either sign)."""
+def extrapolate(motion: SheetMotion, duration_s: float) -> SheetMotion:
+    """Extrapolate the motion with its twist and rate by `duration_s` (of either sign)."""
     return replace(
         motion,
         world_from_sheet=moved(motion.world_from_sheet, motion.twist_world, duration_s),
@@ -221,13 +226,13 @@ def extrapolated(motion: SheetMotion, duration_s: float) -> SheetMotion:
     )
 
 
-def _slowed(velocity: Floats, change: float) -> Floats:
+def _decelerate(velocity: Floats, change: float) -> Floats:
     speed = _length(velocity)
     return np.zeros_like(velocity) if speed <= change else velocity * (1.0 - change / speed)
 
 
 def _orthonormal(pose: Floats) -> Floats:
-    """The pose with its rotation's rounding error taken out (Gram-Schmidt on x, then y)."""
+    """Remove the rotation's rounding error (Gram-Schmidt on x, then y)."""
     x_axis = pose[:3, 0] / _length(pose[:3, 0])
     y_axis = pose[:3, 1] - x_axis * (x_axis @ pose[:3, 1])
     y_axis = y_axis / _length(y_axis)

@@ -1,7 +1,6 @@
-"""A short path ahead: where a thing will be at even steps from now, and between them.
+"""Interpolate a predicted path: positions at equal time steps.
 
-Whoever predicts says where the thing will be at 0, step, 2 step, ... seconds; whoever uses it asks
-for the moment of use.  So the predictor may be as elaborate as it likes without its users knowing.
+A predictor reports positions at 0, step, 2 step, ... seconds; a consumer asks for its own time.
 """
 
 from __future__ import annotations
@@ -12,17 +11,13 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-def even_path(position: Floats, velocity: Floats, *, count: int, step_s: float) -> Floats:
-    """Path (count, 3) of a thing at `position` (3,) m that keeps its `velocity` (3,) m/s."""
-    return position + np.arange(count)[:, None] * step_s * velocity
-
-
 def path_at(path: Floats, step_s: float, lead_s: float) -> tuple[Floats, Floats]:
-    """Position (3,) m and velocity (3,) m/s on a path (n >= 2, 3) `lead_s` after its first point.
+    """Return position (3,) m and velocity (3,) m/s on a path (n >= 2, 3) `lead_s` after its start.
 
-    Between the points a cubic through them whose slopes are their differences (Catmull and Rom
-    1974): a swing of 10 Hz told every 10 ms is met to a hundredth of its amplitude.  Beyond the
-    last point the path goes on as it ended; before the first, as it began.
+    Between the points runs a cubic with central differences as slopes (Catmull and Rom 1974).  An
+    oscillation of 10 Hz sampled every 10 ms is reproduced to a hundredth of its amplitude.  The
+    path is extrapolated linearly at both ends.
+
     Raises ValueError for a path of fewer than two points.
     """
     count = len(path)
@@ -54,7 +49,7 @@ def path_at(path: Floats, step_s: float, lead_s: float) -> tuple[Floats, Floats]
 
 
 def _slope(path: Floats, i: int) -> Floats:
-    """Slope (3,) per step at a point of a path, of second order at its ends too."""
+    """Return the slope (3,) per step at a point of a path, of second order at its ends too."""
     last = len(path) - 1
     if last == 1:
         return np.asarray(path[1] - path[0])

@@ -1,7 +1,7 @@
 """Rigid transforms.
 
-A transform ``a_from_b`` is a 4x4 homogeneous matrix that takes coordinates in frame b to frame a.
-Twists are 6-vectors, linear part first (m/s), then angular (rad/s), both seen in the world frame.
+A transform ``a_from_b`` is a 4x4 homogeneous matrix that maps coordinates in frame b to frame a.
+Twists are 6-vectors, linear part first (m/s), then angular (rad/s), both in the world frame.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ _UNIT: Floats = np.eye(4)
 
 
 def rotation_from_rpy(rpy_rad: ArrayLike) -> Floats:
-    """Rotation matrix of roll, pitch, yaw about the fixed x, y, z axes, in that order (URDF)."""
+    """Return the rotation matrix of roll, pitch, yaw about the fixed x, y, z axes, in that order
+    (URDF)."""
     roll, pitch, yaw = np.asarray(rpy_rad, dtype=np.float64)
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
     cy, sy = np.cos(yaw), np.sin(yaw)
@@ -31,9 +32,9 @@ def rotation_from_rpy(rpy_rad: ArrayLike) -> Floats:
 
 
 def rpy_from_rotation(rotation: Floats) -> Floats:
-    """Roll, pitch, yaw (rad) of a rotation matrix: inverse of `rotation_from_rpy`.
+    """Return roll, pitch, yaw (rad) of a rotation matrix: inverse of `rotation_from_rpy`.
 
-    With the pitch straight up or down roll and yaw turn about one axis; the yaw is then zero.
+    With the pitch at +-90 degrees, roll and yaw have the same axis; the yaw is then zero.
     """
     level = float(np.hypot(rotation[0, 0], rotation[1, 0]))
     pitch = float(np.arctan2(-rotation[2, 0], level))
@@ -44,9 +45,9 @@ def rpy_from_rotation(rotation: Floats) -> Floats:
 
 
 def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
-    """Rotation matrix about `vector_rad` by its length (Rodrigues); exact near zero.
+    """Return the rotation about `vector_rad` by its length (Rodrigues); accurate near zero.
 
-    All nan for a vector that has no finite length.
+    The matrix is all NaN for a vector without a finite length.
     """
     x, y, z = np.asarray(vector_rad, dtype=np.float64).tolist()
     angle = sqrt(x * x + y * y + z * z)
@@ -69,7 +70,7 @@ def rotation_from_vector(vector_rad: ArrayLike) -> Floats:
 
 
 def vector_from_rotation(rotation: Floats) -> Floats:
-    """Rotation vector (rad), length 0..pi, of a rotation matrix; also sound near 0 and pi."""
+    """Return the rotation vector (rad), length 0..pi; accurate near 0 and pi too."""
     w, x, y, z = quaternion_from_rotation(rotation).tolist()
     length = sqrt(x * x + y * y + z * z)
     scale = 2.0 if length < 1e-12 else 2.0 * atan2(length, w) / length
@@ -77,10 +78,10 @@ def vector_from_rotation(rotation: Floats) -> Floats:
 
 
 def quaternion_from_rotation(rotation: Floats) -> Floats:
-    """Unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
 
-    Takes the largest of the four components first (Shepperd's method), so that no division is by a
-    small number.
+    The largest of the four components comes first (Shepperd's method), so that nothing is divided
+    by a small number.
     """
     turn = rotation.tolist()
     diagonal = turn[0][0], turn[1][1], turn[2][2]
@@ -106,13 +107,13 @@ def quaternion_from_rotation(rotation: Floats) -> Floats:
 
 
 def skew(vector: ArrayLike) -> Floats:
-    """Matrix S with S @ u = vector x u."""
+    """Return the matrix S with S @ u = vector x u."""
     x, y, z = np.asarray(vector, dtype=np.float64).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def transform(rotation: Floats, position: ArrayLike) -> Floats:
-    """The 4x4 transform with that rotation and position (m)."""
+    """Return the 4x4 transform with that rotation and position (m)."""
     result = np.eye(4)
     result[:3, :3] = rotation
     result[:3, 3] = position
@@ -120,27 +121,28 @@ def transform(rotation: Floats, position: ArrayLike) -> Floats:
 
 
 def transform_from_rpy(position_m: ArrayLike, rpy_rad: ArrayLike) -> Floats:
-    """The transform of a pose as scenes give it."""
+    """Return the transform of a pose in the form of scenes."""
     return transform(rotation_from_rpy(rpy_rad), position_m)
 
 
 def inverse(a_from_b: Floats) -> Floats:
-    """b_from_a of a rigid a_from_b."""
+    """Return b_from_a of a rigid a_from_b."""
     rotation = a_from_b[:3, :3].T
     return transform(rotation, -rotation @ a_from_b[:3, 3])
 
 
 def apply(a_from_b: Floats, points_b: Floats) -> Floats:
-    """Points (..., 3) of frame b in frame a."""
+    """Transform points (..., 3) of frame b to frame a."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
 def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
-    """Whether a matrix is 4x4 and finite, its rotation proper, its last row (0 0 0 1)."""
+    """Whether a matrix is 4x4, finite and orthonormal, with determinant 1 and last row (0 0 0
+    1)."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         return False
     rotation = matrix[:3, :3]
-    # As numpy.allclose judges it, at a tenth of its cost.
+    # The same test as numpy.allclose, in a tenth of its time.
     allowed = tolerance + 1e-5 * _UNIT
     return bool(
         (np.abs(rotation @ rotation.T - _UNIT[:3, :3]) <= allowed[:3, :3]).all()
@@ -150,20 +152,14 @@ def is_rigid(matrix: Floats, tolerance: float = 1e-6) -> bool:
 
 
 def moved(world_from_body: Floats, twist_world: Floats, duration_s: float) -> Floats:
-    """The body's pose after `duration_s` of a constant twist about its own origin."""
+    """Return the body's pose after `duration_s` of a constant twist about its own origin."""
     rotation = rotation_from_vector(twist_world[3:] * duration_s) @ world_from_body[:3, :3]
     return transform(rotation, world_from_body[:3, 3] + twist_world[:3] * duration_s)
 
 
-def twist_between(world_from_before: Floats, world_from_after: Floats, duration_s: float) -> Floats:
-    """The constant twist that takes one pose to the other in `duration_s` (> 0)."""
-    linear = (world_from_after[:3, 3] - world_from_before[:3, 3]) / duration_s
-    turn = world_from_after[:3, :3] @ world_from_before[:3, :3].T
-    return np.concatenate([linear, vector_from_rotation(turn) / duration_s])
-
-
 def angle_between(a: Floats, b: Floats) -> float:
-    """Angle (rad, 0..pi) between two vectors; exact for small angles, unlike the arc cosine."""
+    """Return the angle (rad, 0..pi) between two vectors; accurate for small angles, unlike
+    arccos."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     across = hypot(ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx)
     return atan2(across, ax * bx + ay * by + az * bz)

@@ -32,10 +32,10 @@ from nodes.models.sheet import (
     push_stiffness_n_per_m,
     stretch_for_edge_force,
 )
-from nodes.models.sheet.laws import (
+from nodes.models.sheet.force_models import (
     CENTRE,
     Place,
-    SheetLaw,
+    SheetForceModel,
     depth_for_force,
     interpolated_inverse,
 )
@@ -138,7 +138,7 @@ class Pull:
     advance_per_depth: float = ADVANCE_PER_DEPTH
 
 
-def pull_of(sheet: SheetSpec, law: SheetLaw) -> Pull:
+def pull_of(sheet: SheetSpec, law: SheetForceModel) -> Pull:
     """The scene's limits less the reserve; a pushed sheet pulls harder, see `present`."""
     force = RESERVE * sheet.max_edge_force_n
     least = sheet.min_stretch_ratio
@@ -151,9 +151,9 @@ def pull_of(sheet: SheetSpec, law: SheetLaw) -> Pull:
     return Pull(least, high, force)
 
 
-def _flat_pull_n(law: SheetLaw, stretch_ratio: float) -> float:
+def _flat_pull_n(law: SheetForceModel, stretch_ratio: float) -> float:
     """Force (N) on each clamp of the unpushed sheet."""
-    pressed = law.press(
+    pressed = law.evaluate(
         stretch_ratio, np.zeros(1), place_m=CENTRE, finger_radius_m=0.03 * law.rubber.width_m
     )
     return float(pressed.edge_force_n[0])
@@ -204,7 +204,7 @@ PULL_BEND = 0.1
 
 def present(
     curve: ObjectCurve,
-    law: SheetLaw,
+    law: SheetForceModel,
     pull: Pull,
     *,
     stretch_ratio: float,
@@ -227,7 +227,7 @@ def present(
         place_m=place_m,
         finger_radius_m=finger_radius_m,
     )
-    own = law.press(stretch_ratio, depths, place_m=place_m, finger_radius_m=finger_radius_m)
+    own = law.evaluate(stretch_ratio, depths, place_m=place_m, finger_radius_m=finger_radius_m)
     asked = _quietly(depths, asked, np.maximum(wanted, own.force_n))
     furthest = _indentation_for_pull(
         law,
@@ -240,7 +240,7 @@ def present(
     held = _bent(asked, furthest)
     growth = (1.0 + pull.advance_per_depth) * depths
     indentation = growth + np.minimum.accumulate(held - growth)
-    pressed = law.press(
+    pressed = law.evaluate(
         stretch_ratio, indentation, place_m=place_m, finger_radius_m=finger_radius_m
     )
     steps = np.diff(indentation) / np.diff(depths)
@@ -257,7 +257,7 @@ def present(
 
 
 def _indentation_for_pull(
-    law: SheetLaw,
+    law: SheetForceModel,
     edge_n: float,
     *,
     stretch_ratio: float,
@@ -271,7 +271,7 @@ def _indentation_for_pull(
     if flat >= edge_n:
         # Reached by rounding only: `pull_of` keeps the flat sheet within the pull.
         return 0.0 if flat > edge_n * (1.0 + 1e-6) else float(grid[0])
-    pulled = law.press(stretch_ratio, grid, place_m=place_m, finger_radius_m=finger_radius_m)
+    pulled = law.evaluate(stretch_ratio, grid, place_m=place_m, finger_radius_m=finger_radius_m)
     added = pulled.edge_force_n - flat
     if added[-1] <= edge_n - flat:
         return float(grid[-1])
@@ -313,7 +313,7 @@ class Compliance:
     stretch_ratio: float
     note: str
     centre: Presented
-    law: SheetLaw
+    law: SheetForceModel
     pull: Pull
     finger_radius_m: float
     _nodes: tuple[Floats, Floats]
@@ -350,7 +350,7 @@ class Compliance:
 
     def presented(self, depths_m: Floats, place_m: Place = CENTRE) -> Floats:
         """The force (n,), N, that the sheet then answers with, by its law."""
-        return self.law.press(
+        return self.law.evaluate(
             self.stretch_ratio,
             self.indentation_m(depths_m, place_m),
             place_m=place_m,
@@ -379,7 +379,7 @@ def _shares(nodes: Floats, at: float) -> Floats:
 
 def fit_compliance(
     curve: ObjectCurve,
-    law: SheetLaw,
+    law: SheetForceModel,
     pull: Pull,
     *,
     deepest_m: float,
@@ -424,7 +424,7 @@ def fit_compliance(
 
 def compliance_at(
     curve: ObjectCurve,
-    law: SheetLaw,
+    law: SheetForceModel,
     pull: Pull,
     *,
     stretch_ratio: float,

@@ -18,7 +18,7 @@ from nodes.models.motion import (
     SheetBounds,
     SheetMotion,
     closing_speed,
-    wanted_velocity,
+    desired_velocity,
 )
 from nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
 
@@ -133,21 +133,21 @@ def _wanted(
     """The mean velocities (7,) of the next step that one would like, the edges' speed kept."""
     away = target.world_from_sheet[:3, 3] - now.world_from_sheet[:3, 3]
     turned = vector_from_rotation(target.world_from_sheet[:3, :3] @ now.world_from_sheet[:3, :3].T)
-    linear = wanted_velocity(
+    linear = desired_velocity(
         away,
         target.twist_world[:3],
         max_speed=bounds.speed_m_per_s,
         max_acceleration=bounds.acceleration_m_per_s2,
         step_s=step_s,
     )
-    angular = wanted_velocity(
+    angular = desired_velocity(
         turned,
         target.twist_world[3:],
         max_speed=bounds.turn_rad_per_s,
         max_acceleration=bounds.turn_acceleration_rad_per_s2,
         step_s=step_s,
     )
-    growth = wanted_velocity(
+    growth = desired_velocity(
         np.array([target.stretch_ratio - now.stretch_ratio]),
         np.array([target.stretch_rate_per_s]),
         max_speed=bounds.stretch_rate_per_s,

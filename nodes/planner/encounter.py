@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from messages.types import Phase
 from nodes.models.rigid import inverse
-from nodes.models.shapes import Nearest, Shape, foot_jacobian, tightest_curvature
+from nodes.models.shapes import Nearest, Shape, projection_jacobian, tightest_curvature
 from nodes.planner.rolling import (
     Contact,
     rim_lift_m,
@@ -243,7 +243,7 @@ def _foot_rate(found: Nearest, velocity: Floats) -> Floats:
     Near a centre of curvature, where it would leap, it is bounded as by `INNERMOST`; there it is 0.
     """
     try:
-        rate = foot_jacobian(found) @ velocity
+        rate = projection_jacobian(found) @ velocity
     except np.linalg.LinAlgError:
         return np.zeros(3)
     most, size = _size(velocity) / INNERMOST, _size(rate)

@@ -27,7 +27,7 @@ from nodes.models.shapes import (
     SphereShape,
     tightest_curvature,
 )
-from nodes.models.shapes.smooth_mesh import usual_smoothing_m
+from nodes.models.shapes.smooth_mesh import default_smoothing_m
 from nodes.models.shapes.triangles import Facets, half_edges, triangle_normals, vertex_normals
 from nodes.planner.rolling import Contact, rolled, tangent, turned
 
@@ -72,13 +72,13 @@ def blended_normals(vertices: Floats, triangles: Indices) -> NormalAt:
 
 def jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
     """Those of `SmoothMeshShape`, each query by itself."""
-    shape = SmoothMeshShape(vertices, triangles, usual_smoothing_m(vertices, triangles))
+    shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     return lambda points: shape.closest(points).normal
 
 
 def followed_jet_normals(vertices: Floats, triangles: Indices) -> NormalAt:
     """Those of `SmoothMeshShape`, on from where it was a third of a millimetre ago."""
-    shape = SmoothMeshShape(vertices, triangles, usual_smoothing_m(vertices, triangles))
+    shape = SmoothMeshShape(vertices, triangles, default_smoothing_m(vertices, triangles))
     earlier: dict[bytes, Floats] = {}
 
     def normal_at(points: Floats) -> Floats:

@@ -14,28 +14,27 @@ from messages.methods import SheetForceMethod
 from messages.scene import Scene
 from nodes.cache import Specification, cached, load_cached
 from nodes.methods import Progress
-from nodes.models.sheet.laws import CubicLaw, LinearLaw, ScaledLaw, SheetLaw
+from nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel, SheetForceModel
 from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.table import TableLaw
+from nodes.models.sheet.tabulated import TabulatedSheetModel
 from nodes.planner.sheet_force import membrane_table, rubber_of
 
 VERSION = 1
 """Version of the computation; another version computes the table again."""
 
 FIELDS = ("stretches", "depths_m", "xs_m", "ys_m", "ratios")
-"""Fields of `TableLaw` that are in the file."""
+"""Fields of `TabulatedSheetModel` that are in the file."""
 
 XS, YS = np.array([0.0, 0.13, 0.25]), np.array([0.0, 0.19, 0.36])
 """Sample points, over the sheet's width and height."""
 
-LAWS: dict[str, Callable[[Rubber], SheetLaw]] = {
-    "linear": LinearLaw,
-    "cubic": CubicLaw,
-    "scaled": ScaledLaw,
+LAWS: dict[str, Callable[[Rubber], SheetForceModel]] = {
+    "linear": LinearSheetModel,
+    "scaled": ScaledSheetModel,
 }
 
 
-def table_cache(scene: Scene) -> Specification[TableLaw]:
+def table_cache(scene: Scene) -> Specification[TabulatedSheetModel]:
     """Describe the cache file of the scene's table."""
     rubber = rubber_of(scene.sheet)
     depends_on = {
@@ -45,9 +44,11 @@ def table_cache(scene: Scene) -> Specification[TableLaw]:
         **asdict(rubber),
     }
 
-    def decode(content: dict[str, NDArray[Any]]) -> TableLaw:
+    def decode(content: dict[str, NDArray[Any]]) -> TabulatedSheetModel:
         stretches, depths_m, xs_m, ys_m, ratios = (content[name] for name in FIELDS)
-        return TableLaw(ScaledLaw(rubber), stretches, depths_m, xs_m, ys_m, ratios)
+        return TabulatedSheetModel(
+            ScaledSheetModel(rubber), stretches, depths_m, xs_m, ys_m, ratios
+        )
 
     return Specification(
         "sheet-force",
@@ -59,7 +60,7 @@ def table_cache(scene: Scene) -> Specification[TableLaw]:
 
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
-) -> TableLaw:
+) -> TabulatedSheetModel:
     """Return the scene's cached table, or compute it by the membrane's finite elements."""
     sheet = scene.sheet
     ends = sorted({sheet.min_stretch_ratio, sheet.max_stretch_ratio})
@@ -77,7 +78,9 @@ def load_or_compute(
     )
 
 
-def law_by(scene: Scene, method: SheetForceMethod, cache_dir: Path | None) -> tuple[SheetLaw, str]:
+def law_by(
+    scene: Scene, method: SheetForceMethod, cache_dir: Path | None
+) -> tuple[SheetForceModel, str]:
     """The scene's ideal sheet by a method, and what to say of it: a table that nobody made yet is
     stood in for by the scaled law."""
     rubber = rubber_of(scene.sheet)
@@ -85,5 +88,7 @@ def law_by(scene: Scene, method: SheetForceMethod, cache_dir: Path | None) -> tu
         return LAWS[method](rubber), method
     table = load_cached(table_cache(scene), cache_dir)
     if table is None:
-        return ScaledLaw(rubber), "scaled law: no table of the sheet's force (flexsheet prepare)"
+        return ScaledSheetModel(
+            rubber
+        ), "scaled; there is no table of the sheet's force: run flexsheet prepare"
     return table, method

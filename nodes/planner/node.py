@@ -25,7 +25,11 @@ CLOCK_SLACK_S = 0.005
 
 
 def _is_finite(fingertip: Fingertip) -> bool:
-    motion = fingertip.position_world_m, fingertip.velocity_world_m_per_s, fingertip.ahead_world_m
+    motion = (
+        fingertip.position_world_m,
+        fingertip.velocity_world_m_per_s,
+        fingertip.predicted_path_world_m,
+    )
     return all(bool(np.isfinite(values).all()) for values in motion)
 
 
@@ -102,10 +106,14 @@ class Planner(Node):
         else:
             if self.parameters.lead_s is None:
                 before_s = self._lead_s
-                furthest_s = (len(fingertip.ahead_world_m) - 1) * fingertip.ahead_step_s
+                furthest_s = (
+                    len(fingertip.predicted_path_world_m) - 1
+                ) * fingertip.prediction_step_s
                 self._lead_s = next_lead_s(before_s, age_s + self.parameters.arrival_s, furthest_s)
                 step_s += self._lead_s - before_s
-            point, velocity = path_at(fingertip.ahead_world_m, fingertip.ahead_step_s, self._lead_s)
+            point, velocity = path_at(
+                fingertip.predicted_path_world_m, fingertip.prediction_step_s, self._lead_s
+            )
             planned = plan.follow_finger(point, velocity, yielding, step_s)
         self._publish(planned, source_ns)
 

@@ -12,19 +12,18 @@ from numpy.typing import NDArray
 from messages.scene import Scene, SheetSpec
 from messages.sheet_calibration import SheetCalibration, refuse_other_sheet
 from nodes.methods import Family, Trial, clip_range
-from nodes.models.sheet.fit import law_of
-from nodes.models.sheet.laws import (
-    CubicLaw,
-    LinearLaw,
-    MembraneLaw,
+from nodes.models.sheet.fit import make_model
+from nodes.models.sheet.force_models import (
+    LinearSheetModel,
+    MembraneSheetModel,
     Place,
-    Pressed,
-    ScaledLaw,
-    SheetLaw,
+    ScaledSheetModel,
+    SheetForce,
+    SheetForceModel,
 )
 from nodes.models.sheet.membrane import push_path
 from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.table import TableLaw, make_table
+from nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
 
 Floats = NDArray[np.float64]
 
@@ -37,17 +36,17 @@ def rubber_of(sheet: SheetSpec) -> Rubber:
     return Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
 
 
-def law_for(sheet: SheetSpec, calibration: SheetCalibration | None = None) -> SheetLaw:
+def law_for(sheet: SheetSpec, calibration: SheetCalibration | None = None) -> SheetForceModel:
     """The law to plan with: as calibrated, else the scaled law of the scene's sheet.
 
     CalibrationMismatchError for a calibration of a sheet of other sizes.
     """
     rubber = rubber_of(sheet)
     if calibration is None:
-        return ScaledLaw(rubber)
+        return ScaledSheetModel(rubber)
     refuse_other_sheet(calibration, sheet)
     mooney = calibration.mooney_share
-    law = law_of(
+    law = make_model(
         rubber,
         modulus_thickness_n_per_m=float(calibration.modulus_thickness_n_per_m.value),
         slack_width_m=float(calibration.slack_width_m.value),
@@ -57,7 +56,9 @@ def law_for(sheet: SheetSpec, calibration: SheetCalibration | None = None) -> Sh
     table = calibration.table
     if table is None:
         return law
-    return TableLaw(law, table.stretch_ratios, table.depths_m, table.xs_m, table.ys_m, table.ratios)
+    return TabulatedSheetModel(
+        law, table.stretch_ratios, table.depths_m, table.xs_m, table.ys_m, table.ratios
+    )
 
 
 TABLE_DEPTHS_M = np.array([0.002, 0.004, 0.008, 0.015, 0.025, 0.04, 0.05])
@@ -72,7 +73,7 @@ def membrane_table(
     finger_radius_m: float,
     depths_m: Floats = TABLE_DEPTHS_M,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> TableLaw:
+) -> TabulatedSheetModel:
     """The table that the membrane's finite elements give: a push for each stretch and place."""
 
     def measure(stretch_ratio: float, depths: Floats, place_m: Place) -> Floats:
@@ -84,8 +85,8 @@ def membrane_table(
             finger_radius_m=finger_radius_m,
         ).forces_n
 
-    return make_table(
-        ScaledLaw(rubber),
+    return make_tabulated_model(
+        ScaledSheetModel(rubber),
         measure,
         stretches=stretches,
         depths_m=depths_m,
@@ -108,7 +109,7 @@ CHART_PLACES: tuple[tuple[str, float, float], ...] = (
 """Names, and x over the width, y over the height."""
 
 
-TableOf = Callable[[Scene], TableLaw]
+TableOf = Callable[[Scene], TabulatedSheetModel]
 
 
 def sheet_force_family(judge: Judge, table_of: TableOf | None) -> Family:
@@ -120,7 +121,7 @@ def sheet_force_family(judge: Judge, table_of: TableOf | None) -> Family:
         name="sheet-force",
         unit="%",
         reference="the twin's membrane",
-        methods=("linear", "cubic", "scaled", "table", "membrane"),
+        methods=("linear", "scaled", "table", "membrane"),
         trials=partial(_trials, judge, table_of),
         tolerance=lambda scene: 100.0 * scene.tolerances.force_ratio,
     )
@@ -130,9 +131,9 @@ def _trials(judge: Judge, table_of: TableOf | None, scene: Scene) -> Iterator[Tr
     sheet, radius = scene.sheet, scene.finger.radius_m
     rubber = rubber_of(sheet)
     middle = 0.5 * (sheet.min_stretch_ratio + sheet.max_stretch_ratio)
-    laws: list[SheetLaw] = [LinearLaw(rubber), CubicLaw(rubber), ScaledLaw(rubber)]
+    laws: list[SheetForceModel] = [LinearSheetModel(rubber), ScaledSheetModel(rubber)]
     if table_of is not None:
-        laws += [table_of(scene), MembraneLaw(rubber)]
+        laws += [table_of(scene), MembraneSheetModel(rubber)]
     stretches = (1.0, middle, sheet.max_stretch_ratio)
     depths_m = clip_range(scene.working_range.push_depth_m, CHART_DEPTHS_M)
     for stretch, depth, (where, x, y) in product(stretches, depths_m, CHART_PLACES):
@@ -148,17 +149,19 @@ def _trials(judge: Judge, table_of: TableOf | None, scene: Scene) -> Iterator[Tr
                 method=law.name,
                 case={"stretch": stretch, "depth_mm": 1e3 * depth, "place": where},
                 run=partial(
-                    law.press,
+                    law.evaluate,
                     stretch,
                     np.array([depth]),
                     place_m=place,
                     finger_radius_m=radius,
                 ),
                 error=partial(_error_percent, true_n=true_n),
-                in_range=not law.outside(stretch, depth, place_m=place, finger_radius_m=radius),
+                in_range=not law.invalid_reason(
+                    stretch, depth, place_m=place, finger_radius_m=radius
+                ),
                 in_scene=stretch >= sheet.min_stretch_ratio,
             )
 
 
-def _error_percent(pressed: Pressed, *, true_n: float) -> float:
+def _error_percent(pressed: SheetForce, *, true_n: float) -> float:
     return 100.0 * abs(float(pressed.force_n[0]) / true_n - 1.0)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Scene
 from messages.types import SoftBody
-from nodes.models.sheet.laws import CENTRE, Place, SheetLaw
+from nodes.models.sheet.force_models import CENTRE, Place, SheetForceModel
 from nodes.planner.compliance import (
     FELT_N,
     Compliance,
@@ -39,7 +39,7 @@ class Yielding:
     alone, by a stretch (the paper's way).
     """
 
-    def __init__(self, scene: Scene, law: SheetLaw, presents: Presents) -> None:
+    def __init__(self, scene: Scene, law: SheetForceModel, presents: Presents) -> None:
         self.stretch_ratio = scene.sheet.min_stretch_ratio
         self.note = ""
         self._scene, self._law, self._presents = scene, law, presents
@@ -88,7 +88,7 @@ class Yielding:
         """Why the law is not to be trusted for the deepest push at the sheet's middle, or nothing;
         what is asked is how deep the finger is in the sheet then."""
         deepest_m = self._scene.working_range.push_depth_m
-        why = self._law.outside(
+        why = self._law.invalid_reason(
             fitted.stretch_ratio,
             float(fitted.indentation_m(deepest_m)),
             place_m=CENTRE,

@@ -39,7 +39,7 @@ class Recorder(Node):
         cls, parameters: RecorderParameters, written: Sequence[Topic]
     ) -> Sequence[str]:
         wanted = parameters.topics or [topic.name for topic in written if topic.logged]
-        told = ("recording",) if parameters.waits else ()
+        told = ("recording",) if parameters.start_paused else ()
         return list(dict.fromkeys((*wanted, *parameters.also, *told)))
 
     def __init__(
@@ -55,7 +55,7 @@ class Recorder(Node):
         self._lost, self._try_again_ns = 0, 0
 
     async def setup(self) -> None:
-        if self.parameters.waits:
+        if self.parameters.start_paused:
             self.note = "waits to be told to record"
         else:
             self._open()
@@ -126,7 +126,7 @@ class Recorder(Node):
         source = self.inputs[port]
         now_ns = self.clock.now_ns()
         source.counts.count(header, now_ns)
-        if self.parameters.waits and source.topic.name == "recording":
+        if self.parameters.start_paused and source.topic.name == "recording":
             self._heed(decode(message, Recording)[0])
         elif source.topic.delivery is Delivery.LATCHED:
             self._latched[port, header.writer] = (message, header)

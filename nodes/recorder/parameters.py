@@ -25,7 +25,7 @@ class RecorderParameters(NodeParameters):
         default=None,
         description="null: unless pictures come, which take longer to compress than to write",
     )
-    waits: bool = Field(
+    start_paused: bool = Field(
         default=False,
         description="record only while a `recording` message says so, to a bag for each time",
     )

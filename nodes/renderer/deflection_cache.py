@@ -14,7 +14,13 @@ from numpy.typing import NDArray
 from messages.scene import Scene
 from nodes.background import enter_background
 from nodes.cache import Specification, cached
-from nodes.models.sheet.dents import DentRange, DentShapes, Push, solve_dents, solve_push
+from nodes.models.sheet.indentation import (
+    IndentationBasis,
+    IndentationCase,
+    IndentationRange,
+    solve_indentation,
+    solve_indentation_basis,
+)
 from nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
@@ -26,7 +32,7 @@ STRETCH_SLACK = 0.01
 """Margin of stretch that the arms may add to the scene's limits."""
 
 FIELDS = ("stretches", "xs_m", "ys_m", "roots", "modes", "coefficients")
-"""Fields of `DentShapes` that are in the file, in their order."""
+"""Fields of `IndentationBasis` that are in the file, in their order."""
 
 MAX_DEPTH_RATIO = 1.2
 """Maximum solved depth over the scene's push depth."""
@@ -34,19 +40,19 @@ MAX_DEPTH_RATIO = 1.2
 Progress = Callable[[int, int], None]
 
 
-def required_shapes(scene: Scene) -> tuple[Rubber, DentRange]:
+def required_shapes(scene: Scene) -> tuple[Rubber, IndentationRange]:
     """Return the sheet of a scene, and the pushes for which the scene needs shapes."""
     sheet = scene.sheet
     rubber = Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa)
-    within = DentRange(
-        least_stretch=max(1.005, sheet.min_stretch_ratio - STRETCH_SLACK),
-        largest_stretch=sheet.max_stretch_ratio + STRETCH_SLACK,
+    within = IndentationRange(
+        min_stretch=max(1.005, sheet.min_stretch_ratio - STRETCH_SLACK),
+        max_stretch=sheet.max_stretch_ratio + STRETCH_SLACK,
         deepest_m=MAX_DEPTH_RATIO * scene.working_range.push_depth_m,
     )
     return rubber, within
 
 
-def shapes_cache(scene: Scene) -> Specification[DentShapes]:
+def shapes_cache(scene: Scene) -> Specification[IndentationBasis]:
     """Describe the cache file of the scene's deflection shapes.
 
     A sheet's shapes depend neither on its thickness nor on its modulus; so neither does the name.
@@ -60,8 +66,8 @@ def shapes_cache(scene: Scene) -> Specification[DentShapes]:
         **asdict(within),
     }
 
-    def decode(content: dict[str, Floats]) -> DentShapes:
-        return DentShapes(
+    def decode(content: dict[str, Floats]) -> IndentationBasis:
+        return IndentationBasis(
             rubber,
             scene.finger.radius_m,
             within.deepest_m,
@@ -78,22 +84,22 @@ def shapes_cache(scene: Scene) -> Specification[DentShapes]:
 
 def load_or_compute(
     scene: Scene, cache_dir: Path | None, progress: Progress = lambda done, total: None
-) -> DentShapes:
+) -> IndentationBasis:
     """Return the scene's cached shapes, or solve them on all cores and store them."""
     rubber, within = required_shapes(scene)
 
-    def solve_all(pushes: Sequence[Push]) -> Iterator[Floats]:
+    def solve_all(pushes: Sequence[IndentationCase]) -> Iterator[Floats]:
         with ProcessPoolExecutor(
             mp_context=get_context("spawn"), initializer=enter_background
         ) as workers:
-            for done, solved in enumerate(workers.map(solve_push, pushes), start=1):
+            for done, solved in enumerate(workers.map(solve_indentation, pushes), start=1):
                 progress(done, len(pushes))
                 yield solved
 
     return cached(
         shapes_cache(scene),
         cache_dir,
-        lambda: solve_dents(
+        lambda: solve_indentation_basis(
             rubber, within=within, finger_radius_m=scene.finger.radius_m, solve_all=solve_all
         ),
     )

@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Sphere
 from nodes.models.rigid import apply
 from nodes.models.shapes import MeshError, Shape
-from nodes.models.shapes.triangles import degenerate, nearest_in_triangles, refined
+from nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles, refine_facets
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
@@ -79,7 +79,7 @@ def make_surface(
         case Mesh(vertices_m=vertices, triangles=coarse):
             try:
                 used, index = np.unique(coarse, return_inverse=True)
-                points, triangles = refined(vertices[used], index.reshape(-1, 3), spacing_m)
+                points, triangles = refine_facets(vertices[used], index.reshape(-1, 3), spacing_m)
             except MeshError as error:
                 raise ValueError(f"spacing_m: {spacing_m}: {error}; or take a larger one") from None
             found = shape.closest(points)
@@ -263,7 +263,9 @@ def transfer_matrix(points: Floats, skin_vertices: Floats, skin_triangles: Indic
     """
     if not np.isfinite(skin_vertices).all():
         raise ValueError("the skin has vertices that are not finite")
-    skin_triangles = skin_triangles[~degenerate(skin_vertices, skin_triangles.astype(np.int64))]
+    skin_triangles = skin_triangles[
+        ~find_degenerate(skin_vertices, skin_triangles.astype(np.int64))
+    ]
     if len(skin_triangles) == 0:
         raise ValueError("the skin has no triangles with an area")
     corners = skin_vertices[skin_triangles]

@@ -16,7 +16,7 @@ from messages.types import Display, SheetTarget, Skin, SoftBody
 from nodes.models.rigid import apply, inverse, transform, transform_from_rpy
 from nodes.models.shapes import make_shape
 from nodes.models.sheet import corners
-from nodes.models.sheet.dents import DentShapes
+from nodes.models.sheet.indentation import IndentationBasis
 from nodes.renderer.correction import (
     NEAR_M,
     ProjectionScreen,
@@ -87,7 +87,7 @@ class SceneRenderer:
         *,
         spacing_m: float,
         samples: int = SAMPLES,
-        dents: DentShapes | None = None,
+        dents: IndentationBasis | None = None,
         sheet_shape: SheetShapeMethod = "reduced_order",
     ) -> None:
         """dents: of the scene's sheet, for the two-pass projection. Without them a pushed sheet is

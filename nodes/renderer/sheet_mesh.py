@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nodes.models.rigid import apply, inverse
-from nodes.models.sheet.dents import DentShapes, triangles_of
+from nodes.models.sheet.indentation import IndentationBasis, triangulate_grid
 from nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
 from nodes.renderer.sheet import SheetPose
 
@@ -64,11 +64,11 @@ def refine_mesh(mesh: SheetMesh, *, halvings: int = 5) -> SheetMesh:
     return SheetMesh(vertices, triangles.astype(np.int32), mesh.note)
 
 
-_grid_triangles = cache(triangles_of)
+_grid_triangles = cache(triangulate_grid)
 """The same array for the same grid, so that no comparison of content is needed."""
 
 
-def deflected_mesh(sheet: SheetPose, dents: DentShapes) -> SheetMesh:
+def deflected_mesh(sheet: SheetPose, dents: IndentationBasis) -> SheetMesh:
     """Return the sheet narrowed by its stretch and deflected by its fingertip.
 
     Edges that are rotated relative to one another rotate the flat sheet evenly between them. The
@@ -95,7 +95,7 @@ def deflected_mesh(sheet: SheetPose, dents: DentShapes) -> SheetMesh:
     return SheetMesh(
         vertices,
         _grid_triangles(rows, columns),
-        dents.outside(stretch, position, depth_m),
+        dents.invalid_reason(stretch, position, depth_m),
     )
 
 

@@ -76,4 +76,4 @@ def predict_fingertip(
     if finger.message is None or not finger.message.valid or age_s > max_age_s:
         return None
     message = finger.message
-    return path_at(message.ahead_world_m, message.ahead_step_s, age_s + horizon_s)[0]
+    return path_at(message.predicted_path_world_m, message.prediction_step_s, age_s + horizon_s)[0]

@@ -17,7 +17,7 @@ from scipy.interpolate import LinearNDInterpolator
 from messages.scene import Scene
 from nodes.methods import Case, Family, Trial, clip_range
 from nodes.models.sheet import edge_poses
-from nodes.models.sheet.dents import triangles_of
+from nodes.models.sheet.indentation import triangulate_grid
 from nodes.models.sheet.membrane import push_path
 from nodes.renderer import deflection_cache
 from nodes.renderer.sheet import SheetPose, estimate_sheet
@@ -93,7 +93,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
                 finger_radius_m=scene.finger.radius_m,
             )
             rows, columns = pushed.rest_m.shape[:2]
-            return SheetMesh(pushed.positions[0].reshape(-1, 3), triangles_of(rows, columns))
+            return SheetMesh(pushed.positions[0].reshape(-1, 3), triangulate_grid(rows, columns))
 
         shapes: dict[str, Callable[[SheetPose], SheetMesh]] = {
             "four_triangles": pyramid_mesh,
@@ -104,7 +104,7 @@ def _trials(reference: ReferenceFactory, solved: bool, scene: Scene) -> Iterator
         if dents is not None:
             shapes |= {"reduced_order": partial(deflected_mesh, dents=dents), "membrane": elements}
             in_range |= {
-                "reduced_order": not dents.outside(stretch, position, depth),
+                "reduced_order": not dents.invalid_reason(stretch, position, depth),
                 "membrane": True,
             }
         truth = reference(scene, *edges, tip)

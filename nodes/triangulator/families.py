@@ -1,6 +1,6 @@
-"""The triangulator's method families: how fast, how accurate, where each breaks.
+"""Benchmark the triangulator's method families: time, accuracy and limits.
 
-A method is timed on what the node does with one pair of pictures, and judged on many.
+The time is that of one image pair, as in the node; the error is that of many.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from messages.scene import Scene
 from nodes.methods import Case, Family, Trial
 from nodes.models import rigid
-from nodes.triangulator.mark import MARK_METHODS, Mark, MarkLooks, find_spots
+from nodes.triangulator.marker import MARKER_METHODS, BlobFilter, Marker, detect_blobs
 from nodes.triangulator.subpixel import PixelNoise
 from nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
+    dlt,
     measure,
-    optimal,
 )
 
 Floats = NDArray[np.float64]
@@ -30,23 +30,23 @@ Image = NDArray[np.uint8]
 CASE_POINTS = 2000
 NOISES_PX = (0.01, 0.025, 0.1, 2.0)
 BASELINES_M = (0.012, 0.06, 0.1205, 0.24)
-"""The least is a tenth of the scene's rig: rays half a metre away are nearly parallel."""
+"""Baselines of the rigs.  The smallest is a tenth of the scene's: rays to a point at half a metre
+are nearly parallel."""
 
-LARGEST_NOISE_PX = 0.1
-"""Of a mark method in its range."""
+MAX_NOISE_PX = 0.1
+"""Maximum noise of a marker method within its range."""
 
 
 def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
-    """Points in slabs of the finger's volume, seen with pixel noise, by rigs of several baselines.
+    """Yield trials with points in slabs of the finger's volume, by pixel noise and baseline.
 
-    In range is what a mark's noise and at least the scene's baseline give; the scene asks for its
-    own baseline, which takes the place of the nearest, and for no more noise than it leaves to the
-    mark.
+    In range are a marker's noise and at least the scene's baseline.  The scene requires its own
+    baseline, which replaces the nearest, and the noise that its tolerance leaves to the marker.
     """
     low, high = scene.finger.volume_min_m, scene.finger.volume_max_m
     own_m = float(np.linalg.norm(scene.camera.right_from_left[:3, 3]))
     nearest_m = min(BASELINES_M, key=lambda baseline_m: abs(baseline_m - own_m))
-    allowed_px = max(min(NOISES_PX), _mark_tolerance_px(scene))
+    allowed_px = max(min(NOISES_PX), _marker_tolerance_px(scene))
     baselines_m = (own_m if each_m == nearest_m else each_m for each_m in BASELINES_M)
     for baseline_m in baselines_m:
         changed = scene.camera.right_from_left.copy()
@@ -67,7 +67,7 @@ def _triangulation_trials(scene: Scene) -> Iterator[Trial]:
                     "noise_px": noise_px,
                     "baseline_mm": round(1e3 * baseline_m, 2),
                 }
-                in_range = baseline_m >= own_m and noise_px <= LARGEST_NOISE_PX
+                in_range = baseline_m >= own_m and noise_px <= MAX_NOISE_PX
                 in_scene = baseline_m == own_m and noise_px <= allowed_px
                 for name in TRIANGULATION_METHODS:
                     yield _triangulation_trial(
@@ -94,7 +94,7 @@ def _triangulation_trial(
     method, rig, (left, right) = TRIANGULATION_METHODS[name], geometry.right_from_left, seen
 
     def error_mm(_: Floats) -> float:
-        """Root mean square; a point that is lost counts as being at the camera."""
+        """Return the root mean square error; a lost point counts as being at the camera."""
         points = rigid.apply(geometry.world_from_left, method(left, right, rig))
         away = np.linalg.norm(points - truth, axis=1)
         depth = rigid.apply(geometry.left_from_world, truth)[:, 2]
@@ -120,67 +120,67 @@ TRIANGULATION = Family(
     tolerance=lambda scene: 1e3 * scene.tolerances.fingertip_m,
 )
 
-MARK_RADIUS_M = 0.003
-MARK_PICTURES = 40
-PICTURE_PX = 57
+MARKER_RADIUS_M = 0.003
+MARKER_IMAGES = 40
+IMAGE_PX = 57
 RAYS = 5
 BLUR_PX = 0.7
-GROUND_LEVEL, MARK_LEVEL = 70.0, 215.0
+GROUND_LEVEL, MARKER_LEVEL = 70.0, 215.0
 GROUND_REACH_PX = 10.0
-"""Half the width of what slopes under a mark."""
+"""Half the width of the slope under a marker."""
 
-MARK_CASES = (
+MARKER_CASES = (
     *((radius_px, noise, 0.0, 0.0) for radius_px in (1.6, 3.2, 6.0) for noise in (1.0, 2.0, 4.0)),
     *((3.2, 1.0, motion_px, 0.0) for motion_px in (2.0, 4.0, 8.0)),
     *((radius_px, 1.0, 0.0, 3.0) for radius_px in (1.6, 3.2, 6.0)),
 )
-"""Radius (px), noise (as multiples of the sensor's), motion in the exposure (px), slope of the
-ground (levels per px).  A mark of 3 mm radius has 3.2 px half a metre away, 6 px at 0.27 m and
-1.6 px at a metre; at 1 m/s it moves by 4 px in 4 ms; a finger that is lit from its side slopes by 2
-or 3 levels per px."""
+"""Radius (px), noise (multiples of the sensor's), motion in the exposure (px), ground slope (levels
+per px).  A marker of 3 mm radius has 3.2 px at half a metre, 6 px at 0.27 m and 1.6 px at 1 m.  At
+1 m/s it moves by 4 px in 4 ms.  A finger lit from its side slopes by 2 or 3 levels per px."""
 
 
 @dataclass(frozen=True, slots=True)
 class DrawnDisc:
-    """A disc as a picture has it: centre, radius and motion in px, standard deviation of the blur,
-    levels of mark and ground, and the ground's slope (levels per px) along y."""
+    """Draw a disc: centre, radius, motion and standard deviation of the blur in px; levels of
+    marker and ground; the ground's slope along y in levels per px."""
 
     centre: Floats
     radius_px: float
     motion: Floats
     blur_px: float = BLUR_PX
-    mark: float = MARK_LEVEL
+    marker: float = MARKER_LEVEL
     ground: float = GROUND_LEVEL
     slope: float = 0.0
 
     def levels(self) -> Floats:
-        """The picture without noise: rays counted, not the fit's formula for an edge."""
-        fine = (np.arange(PICTURE_PX * RAYS) - 0.5 * (RAYS - 1)) / RAYS
+        """Render the image without noise by counting rays, not by the fit's formula for an edge."""
+        fine = (np.arange(IMAGE_PX * RAYS) - 0.5 * (RAYS - 1)) / RAYS
         x, y = fine[None, :] - self.centre[0], fine[:, None] - self.centre[1]
         steps = 1 + int(4.0 * np.linalg.norm(self.motion))
-        lit = np.zeros((PICTURE_PX * RAYS, PICTURE_PX * RAYS))
+        lit = np.zeros((IMAGE_PX * RAYS, IMAGE_PX * RAYS))
         for along in (np.arange(steps) + 0.5) / steps - 0.5:
             away = np.hypot(x - along * self.motion[0], y - along * self.motion[1])
             lit += np.clip(RAYS * (self.radius_px - away) + 0.5, 0.0, 1.0) / steps
         blurred = np.asarray(cv2.GaussianBlur(lit, (0, 0), RAYS * self.blur_px))
-        share = blurred.reshape(PICTURE_PX, RAYS, PICTURE_PX, RAYS).mean(axis=(1, 3))
-        rows = np.clip(np.arange(PICTURE_PX) - self.centre[1], -GROUND_REACH_PX, GROUND_REACH_PX)
+        share = blurred.reshape(IMAGE_PX, RAYS, IMAGE_PX, RAYS).mean(axis=(1, 3))
+        rows = np.clip(np.arange(IMAGE_PX) - self.centre[1], -GROUND_REACH_PX, GROUND_REACH_PX)
         ground = self.ground + self.slope * rows[:, None]
-        return np.asarray(ground + share * (self.mark - ground))
+        return np.asarray(ground + share * (self.marker - ground))
 
 
 def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Image:
-    """A picture as a sensor reads it: photon and read noise, whole numbers."""
+    """Add photon and read noise, and round to whole levels as a sensor does."""
     deviation = np.sqrt(noise.read_levels**2 + levels / noise.photons_per_level)
     seen = levels + deviation * random.standard_normal(levels.shape)
     return np.asarray(np.clip(np.rint(seen), 0, 255), dtype=np.uint8)
 
 
 def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
-    """The Cramer-Rao bound on a drawn disc's centre, per axis, all else of it being unknown too.
+    """Return the Cramer-Rao bound on a disc's centre, px per axis, with all other parameters
+    unknown.
 
-    Slopes of the picture by central differences.  The levels' own information on the noise is left
-    out, as is rounding's.
+    The slopes are central differences.  The information that the levels carry about the noise is
+    neglected, as is rounding.
     """
     levels = disc.levels()
     weights = 1.0 / (noise.read_levels**2 + levels / noise.photons_per_level)
@@ -191,7 +191,7 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
         ("centre", np.array([0.0, step])),
         ("radius_px", step),
         ("blur_px", step),
-        ("mark", 1.0),
+        ("marker", 1.0),
         ("ground", 1.0),
     ):
         value = getattr(disc, name)
@@ -205,11 +205,11 @@ def centre_bound_px(disc: DrawnDisc, noise: PixelNoise) -> float:
 
 
 def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
-    """The mark where the sheet is, resting and at the scene's speed, lit from the front and from
-    the side; as `MARK_CASES`."""
+    """Return the cases at the sheet, at rest and at the scene's speed, lit from front and side, as
+    in `MARKER_CASES`."""
     left_from_world = StereoGeometry.of(scene.camera).left_from_world
     px_per_m = scene.camera.left.fx_px / float(rigid.apply(left_from_world, np.zeros(3))[2])
-    radius_px = round(MARK_RADIUS_M * px_per_m, 2)
+    radius_px = round(MARKER_RADIUS_M * px_per_m, 2)
     motion_m = scene.working_range.speed_m_per_s * scene.camera.exposure_s
     motions = (0.0, round(motion_m * px_per_m, 2))
     return tuple(
@@ -217,22 +217,24 @@ def _scene_cases(scene: Scene) -> tuple[tuple[float, float, float, float], ...]:
     )
 
 
-def _mark_trials(scene: Scene) -> Iterator[Trial]:
-    """Discs all over the pixel grid, moving in all directions; their noise is told as multiples of
-    the scene's sensor's, which is what a fit believes."""
+def _marker_trials(scene: Scene) -> Iterator[Trial]:
+    """Yield trials with discs all over the pixel grid, moving in all directions.
+
+    Their noise is a multiple of the scene's sensor noise, which the fit assumes.
+    """
     asked = _scene_cases(scene)
     sensor = PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level)
-    for radius_px, level, motion_px, slope in dict.fromkeys((*asked, *MARK_CASES)):
+    for radius_px, level, motion_px, slope in dict.fromkeys((*asked, *MARKER_CASES)):
         noise = PixelNoise(level * sensor.read_levels, sensor.photons_per_level / level**2)
         random = np.random.default_rng(1)
-        centres = PICTURE_PX // 2 + random.uniform(-0.5, 0.5, (MARK_PICTURES, 2))
-        angles = random.uniform(0.0, np.pi, MARK_PICTURES)
+        centres = IMAGE_PX // 2 + random.uniform(-0.5, 0.5, (MARKER_IMAGES, 2))
+        angles = random.uniform(0.0, np.pi, MARKER_IMAGES)
         motions = motion_px * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         discs = [
             DrawnDisc(centre, radius_px, motion, slope=slope)
             for centre, motion in zip(centres, motions, strict=True)
         ]
-        pictures = [noisy(disc.levels(), noise, random) for disc in discs]
+        images = [noisy(disc.levels(), noise, random) for disc in discs]
         bound_px = float(np.mean([centre_bound_px(disc, noise) for disc in discs[:4]]))
         case: Case = {
             "radius_px": radius_px,
@@ -240,13 +242,13 @@ def _mark_trials(scene: Scene) -> Iterator[Trial]:
             "motion_px": motion_px,
             "slope_levels_per_px": slope,
         }
-        for name in MARK_METHODS:
+        for name in MARKER_METHODS:
             in_range = radius_px >= 3.0 and level <= 2.0 and motion_px <= 4.0
             in_scene = (radius_px, level, motion_px, slope) in asked
-            yield _mark_trial(
+            yield _marker_trial(
                 name,
                 case,
-                pictures,
+                images,
                 centres,
                 sensor=sensor,
                 bound_px=bound_px,
@@ -255,10 +257,10 @@ def _mark_trials(scene: Scene) -> Iterator[Trial]:
             )
 
 
-def _mark_trial(
+def _marker_trial(
     name: str,
     case: Case,
-    pictures: list[Image],
+    images: list[Image],
     centres: Floats,
     *,
     sensor: PixelNoise,
@@ -266,25 +268,26 @@ def _mark_trial(
     in_range: bool,
     in_scene: bool,
 ) -> Trial:
-    looks, refine = MarkLooks(), MARK_METHODS[name]
+    appearance, refine = BlobFilter(), MARKER_METHODS[name]
 
-    def marks_in(picture: Image) -> list[Mark]:
-        spots = find_spots(picture, looks)
-        return refine([picture] * len(spots), spots, looks, sensor)
+    def markers_in(image: Image) -> list[Marker]:
+        blobs = detect_blobs(image, appearance)
+        return refine([image] * len(blobs), blobs, appearance, sensor)
 
-    def error_px(_: list[Mark]) -> float:
-        """Per axis; a mark that was not found, or not alone, counts as far off as the picture."""
-        found = [marks_in(picture) for picture in pictures]
+    def error_px(_: list[Marker]) -> float:
+        """Return the error per axis; a marker that is missed or not alone counts as the image's
+        size."""
+        found = [markers_in(image) for image in images]
         off = [
-            marks[0].centre - centre if len(marks) == 1 else np.full(2, float(PICTURE_PX))
-            for marks, centre in zip(found, centres, strict=True)
+            markers[0].centre - centre if len(markers) == 1 else np.full(2, float(IMAGE_PX))
+            for markers, centre in zip(found, centres, strict=True)
         ]
         return float(np.sqrt(np.mean(np.square(off))))
 
     return Trial(
         method=name,
         case=case,
-        run=lambda: marks_in(pictures[0]),
+        run=lambda: markers_in(images[0]),
         error=error_px,
         in_range=in_range,
         in_scene=in_scene,
@@ -292,15 +295,16 @@ def _mark_trial(
     )
 
 
-def _mark_tolerance_px(scene: Scene) -> float:
-    """Noise of a mark that moves a fingertip at the screen's centre by the scene's tolerance."""
+def _marker_tolerance_px(scene: Scene) -> float:
+    """Return the marker noise, px, that moves a fingertip at the screen's centre by the scene's
+    tolerance."""
     geometry = StereoGeometry.of(scene.camera)
     left, right = geometry.project(np.zeros(3))
     one_px = measure(
         geometry,
         left,
         right,
-        method=optimal,
+        method=dlt,
         left_covariance=np.eye(2),
         right_covariance=np.eye(2),
     )
@@ -309,11 +313,11 @@ def _mark_tolerance_px(scene: Scene) -> float:
     return scene.tolerances.fingertip_m / one_px.deviation_m
 
 
-MARK = Family(
-    name="mark",
+MARKER = Family(
+    name="marker",
     unit="px",
     reference="true centres of drawn discs",
-    methods=tuple(MARK_METHODS),
-    trials=_mark_trials,
-    tolerance=_mark_tolerance_px,
+    methods=tuple(MARKER_METHODS),
+    trials=_marker_trials,
+    tolerance=_marker_tolerance_px,
 )

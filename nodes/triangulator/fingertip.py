@@ -1,4 +1,4 @@
-"""One stereo pair to one fingertip: marks, pairs of them, triangulation, and why there is none."""
+"""Detect the fingertip in a stereo pair: blobs, their matches, triangulation, rejection reasons."""
 
 from __future__ import annotations
 
@@ -10,114 +10,119 @@ import numpy as np
 from numpy.typing import NDArray
 
 from messages.types import FingertipReason
-from nodes.triangulator.mark import (
+from nodes.triangulator.marker import (
     SHARP_PX,
-    Mark,
-    MarkLooks,
+    Blob,
+    BlobFilter,
+    Marker,
     Refine,
-    Spot,
     Window,
-    find_spots,
-    overexposed,
+    detect_blobs,
+    is_overexposed,
     window_around,
 )
 from nodes.triangulator.subpixel import PixelNoise
-from nodes.triangulator.tracking import Expected
+from nodes.triangulator.tracking import Gate
 from nodes.triangulator.triangulation import (
-    Approach,
-    Measured,
+    ClosestApproach,
     StereoGeometry,
     Triangulate,
+    TriangulatedPoint,
     measure,
-    pixel_and_slope,
-    ray_of,
+    project_with_jacobian,
+    undistort_pixel,
 )
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Origin = tuple[int, int]
 
-SIZE_DEVIATION = 0.2
-"""Of a spot's radius against a mark's at its depth, as a logarithm."""
+SIZE_SIGMA = 0.2
+"""Standard deviation of the logarithm of a blob's radius over the marker's at that depth."""
 
-HEIGHT_DEVIATION = 0.25
-"""Between the heights of one mark in both views, as a logarithm: lenses and angles differ."""
+HEIGHT_SIGMA = 0.25
+"""Standard deviation of the log ratio of a marker's heights in both views: lenses and angles
+differ."""
 
-MISFIT_DEVIATION_PX = 0.5
-"""By which the rays of one mark miss one another before its centres are refined."""
+MISFIT_SIGMA_PX = 0.5
+"""Standard deviation of the distance between a marker's rays before its centres are refined."""
 
-LARGEST_SIZE_OFF = 0.6
-"""Logarithm of a size beyond which a spot is no mark: not within 0.55 to 1.8 times its size."""
+MAX_SIZE_DEVIATION = 0.6
+"""Maximum log ratio of sizes: a marker's blob has 0.55 to 1.8 times the expected size."""
 
 SIZE_SIGMAS = 3.5
-MARK_SIZE_DEVIATION = 0.035
-"""A refined mark has its size within so many standard deviations, this being that of marks beside
-the method's own; one that has not is partly hidden or runs into a light."""
+MARKER_SIZE_SIGMA = 0.035
+"""Bound on a refined marker's size, in standard deviations, and the deviation of real markers,
+which adds to the method's own.  A marker beyond it is partly occluded or merges with a light."""
 
-MATE_SIGMAS = 4.5
-MOTION_APART_PX = 2.5
-"""A mark has about the same size and motion in both views (the distance hardly changes during an
-exposure); one that has not is partly hidden in one of them, or runs into a light there."""
+STEREO_SIZE_SIGMAS = 4.5
+MAX_MOTION_DIFFERENCE_PX = 2.5
+"""Bounds on the differences between both views, in size (standard deviations) and in motion.  The
+distance hardly changes during an exposure.  A marker beyond them is partly occluded in one view, or
+merges with a light there."""
 
 WINDOW_MARGIN_PX = 5
-"""Of a window around the mark itself, so that its surroundings are in it."""
+"""Margin of a window around the marker, so that it includes the surroundings."""
 
-REACH_SIGMAS = 4.0
-"""A finger that is expected somewhere is near there; its reach is so many standard deviations."""
+GATE_RADIUS_SIGMAS = 4.0
+"""The radius of a gate stands for this many standard deviations of the expected position."""
 
-MARGIN = 9.0
-"""A pair is the mark's when every other one is worse by as much, in squared standard deviations:
-by three of them in one thing, or a little in many."""
+AMBIGUITY_MARGIN = 9.0
+"""A match is unique when every other one costs this much more, in squared standard deviations: 3 of
+them in one quantity, or less in several."""
 
 
 @dataclass(frozen=True, slots=True)
-class Eyesight:
-    """How marks are found, refined and triangulated.
+class DetectorConfig:
+    """Hold how markers are detected, refined and triangulated.
 
-    noise_px: standard deviation of a mark's centre; None: as the method states for each mark.
-    max_reprojection_px: a pair of marks that fit worse are not of one point.
-    mark_radius_m: of the mark, which has its size at its depth.
-    max_deviation_m: a point less certain is refused.
+    blob_filter: criteria of a blob.
+    refine, triangulate: the methods.
+    max_reprojection_px: a pair with a larger reprojection error is not of one point.
+    noise_px: standard deviation of a marker's centre; None takes the method's own estimate.
+    marker_radius_m: true radius, which gives the expected size at each depth.
+    max_deviation_m: a point with a larger standard deviation is rejected.
+    sensor: noise of the pixels.
     """
 
-    looks: MarkLooks
+    blob_filter: BlobFilter
     refine: Refine
     triangulate: Triangulate
     max_reprojection_px: float
     noise_px: float | None = None
-    mark_radius_m: float = 0.003
+    marker_radius_m: float = 0.003
     max_deviation_m: float = 0.002
     sensor: PixelNoise = field(default_factory=PixelNoise)
 
 
 @dataclass(frozen=True, slots=True)
-class Pair:
-    """A spot in the left and one in the right picture that could be one mark.
+class BlobPair:
+    """Hold a blob of the left and one of the right image that may be one marker.
 
-    depth_m: from the left camera, of where their rays meet.
-    away: distance from the expected place as a share of the reach; 0 where none is expected.
-    cost: how badly they match one another, a mark's looks and the expected place, in squared
+    depth_m: distance from the left camera to where their rays meet.
+    gate_fraction: distance from the gate's centre over its radius; 0 without a gate.
+    cost: mismatch between the two, with a marker's appearance and with the gate, in squared
         standard deviations.
-    lack: why it is no mark in the volume, if so.
+    rejection_reason: why the pair is not a marker in the volume; None if it may be one.
     """
 
-    left: Spot
-    right: Spot
+    left: Blob
+    right: Blob
     depth_m: float
-    away: float
+    gate_fraction: float
     cost: float
-    lack: FingertipReason | None
+    rejection_reason: FingertipReason | None
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """What could be the finger's mark.
+    """Hold a detection that may be the finger's marker.
 
-    looks: (2,) logarithms of its level and of its surroundings', the mean of both views.
+    appearance: (2,) logarithms of its level and of its surroundings' level, the mean of both views.
     """
 
-    measured: Measured
-    looks: Floats
+    measured: TriangulatedPoint
+    appearance: Floats
 
     @property
     def point(self) -> Floats:
@@ -126,115 +131,119 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """What was found in a pair of pictures.
+class StereoDetection:
+    """Hold what was detected in an image pair.
 
-    reason, measured: as by `locate`.
-    marks: all that look like a mark and are where the finger can be, the likeliest first.
-    others: those that look like one and are elsewhere.
+    reason, measured: as `detect` returns them.
+    markers: all inside the gate, the most likely first.
+    others: those outside the gate.
     """
 
     reason: FingertipReason
-    measured: Measured | None
-    marks: tuple[Candidate, ...] = ()
-    others: tuple[Candidate, ...] = ()
+    measured: TriangulatedPoint | None
+    markers: tuple[Candidate, ...] = ()
+    clutter: tuple[Candidate, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
-class Sight:
-    """What one call of `locate` has to do with: both views, and what is known beforehand."""
+class DetectionInput:
+    """Hold the inputs of one call of `detect`: both views, and what is known beforehand."""
 
     images: tuple[Image, Image]
     origins: tuple[Origin, Origin]
     geometry: StereoGeometry
-    eyesight: Eyesight
+    config: DetectorConfig
     volume: tuple[Floats, Floats]
-    expected: Expected | None
+    gate: Gate | None
 
 
-def locate(
+def detect(
     left: Image,
     right: Image,
     *,
     geometry: StereoGeometry,
-    eyesight: Eyesight,
+    config: DetectorConfig,
     volume: tuple[Floats, Floats],
-    expected: Expected | None,
+    gate: Gate | None,
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
-) -> tuple[FingertipReason, Measured | None]:
-    """Where the mark is in a pair of pictures (height, width), or why that is not known.
+) -> tuple[FingertipReason, TriangulatedPoint | None]:
+    """Locate the marker in an image pair, or tell why that is impossible.
 
-    volume: least and greatest corner of the box where a fingertip can be, world.
-    expected: where it should be, and within which reach: only there is it looked for, since no
-        other light can be the finger then.  None: all of both pictures is searched, and only one
-        pair of spots may look like a mark.
-    origins: column and row of the sensor where each picture begins.
+    left, right: images (height, width).
+    volume: minimum and maximum corner of the box where a fingertip can be, world frame, m.
+    gate: where the fingertip is expected.  Only the gate is searched, since no other light can be
+        the finger.  None searches both images, and then only one pair of blobs may look like a
+        marker.
+    left_origin_px, right_origin_px: column and row of the sensor where each image begins.
 
-    A measurement is given where two rays meet at all, even when the reason is not "ok".
+    The result holds a point wherever two rays meet, even if the reason is not "ok".
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
-    sight = Sight(images, origins, geometry, eyesight, volume, _finite(expected))
-    found = _seen(sight, _windows(sight))
+    inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
+    found = _detect_in(inputs, _search_windows(inputs))
     return found.reason, found.measured
 
 
-def look(
+def detect_all(
     left: Image,
     right: Image,
     *,
     geometry: StereoGeometry,
-    eyesight: Eyesight,
+    config: DetectorConfig,
     volume: tuple[Floats, Floats],
-    expected: Expected | None,
+    gate: Gate | None,
     left_origin_px: Origin = (0, 0),
     right_origin_px: Origin = (0, 0),
-) -> Sighting:
-    """As `locate`, and all marks that are not the one.
+) -> StereoDetection:
+    """Detect the fingertip as `detect` does, and all other markers.
 
-    Where the finger is not found in its window the whole pictures are searched for them.
+    Where the fingertip is not found inside its gate, the whole images are searched for the others.
     """
     images, origins = (left, right), (left_origin_px, right_origin_px)
-    sight = Sight(images, origins, geometry, eyesight, volume, _finite(expected))
-    windows = _windows(sight)
-    found = _seen(sight, windows)
+    inputs = DetectionInput(images, origins, geometry, config, volume, _finite_gate(gate))
+    windows = _search_windows(inputs)
+    found = _detect_in(inputs, windows)
     if found.reason != "ok" and windows != (None, None):
-        found = replace(found, others=_found_in(sight, (None, None)).others)
+        found = replace(found, clutter=_match_in(inputs, (None, None)).clutter)
     return found
 
 
-def _finite(expected: Expected | None) -> Expected | None:
-    """An expected place that is no number is none."""
-    return expected if expected is not None and np.isfinite(expected.point).all() else None
+def _finite_gate(gate: Gate | None) -> Gate | None:
+    """Ignore a gate whose centre is not finite."""
+    return gate if gate is not None and np.isfinite(gate.point).all() else None
 
 
-def _seen(sight: Sight, windows: tuple[Window | None, Window | None]) -> Sighting:
-    found = _found_in(sight, windows)
-    if found.reason != "ok" and _dazzled(sight, windows):
+def _detect_in(
+    inputs: DetectionInput, windows: tuple[Window | None, Window | None]
+) -> StereoDetection:
+    found = _match_in(inputs, windows)
+    if found.reason != "ok" and _is_overexposed(inputs, windows):
         return replace(found, reason="saturated")
     return found
 
 
-def _windows(sight: Sight) -> tuple[Window | None, Window | None]:
-    """Where in both pictures the mark can be; None twice: anywhere, or not in both."""
-    if sight.expected is None:
+def _search_windows(inputs: DetectionInput) -> tuple[Window | None, Window | None]:
+    """Return the part of each image that the gate covers; None twice without a gate or outside a
+    view."""
+    if inputs.gate is None:
         return None, None
-    geometry, found = sight.geometry, list[Window]()
-    in_left = geometry.left_from_world[:3, :3] @ sight.expected.point
+    geometry, found = inputs.geometry, list[Window]()
+    in_left = geometry.left_from_world[:3, :3] @ inputs.gate.point
     in_left += geometry.left_from_world[:3, 3]
     in_right = geometry.right_from_left[:3, :3] @ in_left + geometry.right_from_left[:3, 3]
     for view, point in enumerate((in_left, in_right)):
-        depth_m = float(point[2]) - sight.expected.reach_m
+        depth_m = float(point[2]) - inputs.gate.radius_m
         if depth_m <= 0:
             return None, None
-        pixel = pixel_and_slope(point, geometry.matrices[view], geometry.distortions[view])[0]
+        pixel = project_with_jacobian(point, geometry.matrices[view], geometry.distortions[view])[0]
         reach_px = _focal_px(geometry) * (
-            (sight.expected.reach_m + sight.eyesight.mark_radius_m) / depth_m
+            (inputs.gate.radius_m + inputs.config.marker_radius_m) / depth_m
         )
         window = window_around(
-            pixel - sight.origins[view],
-            sight.images[view].shape,
-            max(sight.eyesight.looks.window_half_px, math.ceil(reach_px) + WINDOW_MARGIN_PX),
+            pixel - inputs.origins[view],
+            inputs.images[view].shape,
+            max(inputs.config.blob_filter.window_half_px, math.ceil(reach_px) + WINDOW_MARGIN_PX),
         )
         if window is None:
             return None, None
@@ -242,202 +251,221 @@ def _windows(sight: Sight) -> tuple[Window | None, Window | None]:
     return found[0], found[1]
 
 
-def _dazzled(sight: Sight, windows: tuple[Window | None, Window | None]) -> bool:
-    """Whether a picture, or the place where the mark should be, is too bright to tell."""
+def _is_overexposed(inputs: DetectionInput, windows: tuple[Window | None, Window | None]) -> bool:
+    """Whether an image, or its part inside the gate, is overexposed."""
     return any(
-        overexposed(image) or overexposed(image, window)
-        for image, window in zip(sight.images, windows, strict=True)
+        is_overexposed(image) or is_overexposed(image, window)
+        for image, window in zip(inputs.images, windows, strict=True)
     )
 
 
-def _found_in(sight: Sight, windows: tuple[Window | None, Window | None]) -> Sighting:
-    """What is in one window of each picture, or in all of it."""
+def _match_in(
+    inputs: DetectionInput, windows: tuple[Window | None, Window | None]
+) -> StereoDetection:
+    """Detect markers in one window of each image, or in whole images."""
     left, right = (
-        find_spots(image, sight.eyesight.looks, window)
-        for image, window in zip(sight.images, windows, strict=True)
+        detect_blobs(image, inputs.config.blob_filter, window)
+        for image, window in zip(inputs.images, windows, strict=True)
     )
     if not left and not right:
-        return Sighting("no_mark", None)
+        return StereoDetection("no_marker", None)
     if not left or not right:
-        return Sighting("mark_in_one_view", None)
-    pairs = _pairs(sight, left, right)
-    likely = [pair for pair in pairs if pair.lack is None]
-    near = [pair for pair in likely if pair.away <= 1.0]
-    others = _sound(sight, _closely(sight, [pair for pair in likely if pair.away > 1.0]))
+        return StereoDetection("marker_in_one_view", None)
+    pairs = _match_blobs(inputs, left, right)
+    likely = [pair for pair in pairs if pair.rejection_reason is None]
+    near = [pair for pair in likely if pair.gate_fraction <= 1.0]
+    clutter = _unique_candidates(
+        inputs, _refine_and_rank(inputs, [pair for pair in likely if pair.gate_fraction > 1.0])
+    )
     if near:
-        return replace(_chosen(sight, near), others=others)
+        return replace(_select_pair(inputs, near), clutter=clutter)
     if likely:
-        nearest = min(likely, key=lambda pair: pair.away)
-        measured = _measured(sight, _refined(sight, [nearest])[0])
-        return Sighting("too_fast", measured, others=others)
+        nearest = min(likely, key=lambda pair: pair.gate_fraction)
+        measured = _triangulate(inputs, _refine_markers(inputs, [nearest])[0])
+        return StereoDetection("too_fast", measured, clutter=clutter)
     if not pairs:
-        return Sighting("inconsistent", None)
-    nearest = min(pairs, key=lambda pair: (pair.lack != "outside_volume", pair.cost))
-    measured = _measured(sight, _refined(sight, [nearest])[0])
-    return Sighting(nearest.lack or "inconsistent", measured)
+        return StereoDetection("inconsistent", None)
+    nearest = min(pairs, key=lambda pair: (pair.rejection_reason != "outside_volume", pair.cost))
+    measured = _triangulate(inputs, _refine_markers(inputs, [nearest])[0])
+    return StereoDetection(nearest.rejection_reason or "inconsistent", measured)
 
 
-def _pairs(sight: Sight, left: Sequence[Spot], right: Sequence[Spot]) -> list[Pair]:
-    """All pairs of spots whose rays meet in front of the cameras.
+def _match_blobs(
+    inputs: DetectionInput, left: Sequence[Blob], right: Sequence[Blob]
+) -> list[BlobPair]:
+    """Match all pairs of blobs whose rays meet in front of the cameras.
 
-    A mark's rays meet in the volume, and there it has the size that is seen.
+    The rays of a marker meet in the volume, at a depth that agrees with its size.
     """
-    geometry, eyesight, expected = sight.geometry, sight.eyesight, sight.expected
+    geometry, config, gate = inputs.geometry, inputs.config, inputs.gate
     left_rays, right_rays = (
-        [ray_of(np.add(spot.centre, origin), matrix, distortion) for spot in spots]
-        for spots, origin, matrix, distortion in zip(
-            (left, right), sight.origins, geometry.matrices, geometry.distortions, strict=True
+        [undistort_pixel(np.add(blob.centre, origin), matrix, distortion) for blob in blobs]
+        for blobs, origin, matrix, distortion in zip(
+            (left, right), inputs.origins, geometry.matrices, geometry.distortions, strict=True
         )
     )
     focal_px, world = _focal_px(geometry), geometry.world_from_left
-    approach = Approach.of(geometry.right_from_left)
+    approach = ClosestApproach.of(geometry.right_from_left)
     pairs = []
     for one, left_ray in zip(left, left_rays, strict=True):
         for other, right_ray in zip(right, right_rays, strict=True):
             if left_ray is None or right_ray is None:
                 continue
-            met = approach.of_rays(left_ray, right_ray)
+            met = approach.between(left_ray, right_ray)
             if met is None:
                 continue
             point, gap_m = met
             depth_m = float(point[2])
             misfit_px = 0.5 * focal_px * gap_m / depth_m
-            sizes = [_size_off(sight, spot.radius, depth_m) for spot in (one, other)]
+            sizes = [_size_deviation(inputs, blob.radius, depth_m) for blob in (one, other)]
             point_world = world[:3, :3] @ point + world[:3, 3]
-            lack: FingertipReason | None = None
-            if misfit_px > eyesight.max_reprojection_px or max(sizes) > LARGEST_SIZE_OFF:
-                lack = "inconsistent"
-            elif not _inside(sight.volume, point_world):
-                lack = "outside_volume"
-            away = 0.0
-            if expected is not None:
-                away = math.dist(point_world, expected.point) / max(expected.reach_m, 1e-6)
+            rejection_reason: FingertipReason | None = None
+            if misfit_px > config.max_reprojection_px or max(sizes) > MAX_SIZE_DEVIATION:
+                rejection_reason = "inconsistent"
+            elif not _inside(inputs.volume, point_world):
+                rejection_reason = "outside_volume"
+            gate_fraction = 0.0
+            if gate is not None:
+                gate_fraction = math.dist(point_world, gate.point) / max(gate.radius_m, 1e-6)
             cost = (
-                (misfit_px / MISFIT_DEVIATION_PX) ** 2
-                + (sizes[0] ** 2 + sizes[1] ** 2) / SIZE_DEVIATION**2
-                + (math.log(one.height / other.height) / HEIGHT_DEVIATION) ** 2
-                + (REACH_SIGMAS * away) ** 2
+                (misfit_px / MISFIT_SIGMA_PX) ** 2
+                + (sizes[0] ** 2 + sizes[1] ** 2) / SIZE_SIGMA**2
+                + (math.log(one.height / other.height) / HEIGHT_SIGMA) ** 2
+                + (GATE_RADIUS_SIGMAS * gate_fraction) ** 2
             )
-            pairs.append(Pair(one, other, depth_m, away, cost, lack))
+            pairs.append(BlobPair(one, other, depth_m, gate_fraction, cost, rejection_reason))
     return pairs
 
 
 @dataclass(frozen=True, slots=True)
-class Refined:
-    """A pair whose spots were looked at closely.
+class RefinedPair:
+    """Hold a pair whose blobs were refined.
 
-    flaw: what speaks against it, if anything does.
+    rejection_reason: why it is not a marker; None if it is one.
     cost: of the pair and of the refined sizes, in squared standard deviations.
     """
 
-    pair: Pair
-    marks: tuple[Mark, Mark]
-    flaw: FingertipReason | None
+    pair: BlobPair
+    markers: tuple[Marker, Marker]
+    rejection_reason: FingertipReason | None
     cost: float
 
 
-def _chosen(sight: Sight, likely: list[Pair]) -> Sighting:
-    """The mark among pairs that could be one, at least one.
+def _select_pair(inputs: DetectionInput, likely: list[BlobPair]) -> StereoDetection:
+    """Select the marker among one or more pairs that may be one.
 
-    Of several that match about as well only those stay that are discs when looked at closely.
+    Of several that match about equally well, only those remain that are discs after refinement.
     """
-    refined = _closely(sight, likely)
-    rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + MARGIN]
-    sound = sorted((one for one in rivals if one.flaw is None), key=lambda one: one.cost)
-    marks = _sound(sight, refined)
+    refined = _refine_and_rank(inputs, likely)
+    rivals = [one for one in refined if one.pair.cost < refined[0].pair.cost + AMBIGUITY_MARGIN]
+    sound = sorted(
+        (one for one in rivals if one.rejection_reason is None), key=lambda one: one.cost
+    )
+    markers = _unique_candidates(inputs, refined)
     if not sound:
-        return Sighting(rivals[0].flaw or "merged", _measured(sight, rivals[0].marks), marks)
-    if len(sound) > 1 and sound[1].cost < sound[0].cost + MARGIN:
-        return Sighting("two_marks", _measured(sight, sound[0].marks), marks)
-    reason, measured = _judged(sight, _measured(sight, sound[0].marks))
-    return Sighting(reason, measured, marks)
+        return StereoDetection(
+            rivals[0].rejection_reason or "merged", _triangulate(inputs, rivals[0].markers), markers
+        )
+    if len(sound) > 1 and sound[1].cost < sound[0].cost + AMBIGUITY_MARGIN:
+        return StereoDetection("two_markers", _triangulate(inputs, sound[0].markers), markers)
+    reason, measured = _validate(inputs, _triangulate(inputs, sound[0].markers))
+    return StereoDetection(reason, measured, markers)
 
 
-def _closely(sight: Sight, pairs: list[Pair]) -> list[Refined]:
-    """Pairs refined, the best first."""
+def _refine_and_rank(inputs: DetectionInput, pairs: list[BlobPair]) -> list[RefinedPair]:
+    """Refine pairs, and sort them by cost."""
     ordered = sorted(pairs, key=lambda pair: pair.cost)
     found = []
-    for pair, marks in zip(ordered, _refined(sight, ordered), strict=True):
-        flaw = _flaw(sight, pair, marks)
-        cost = math.inf if flaw else pair.cost + _fitted_cost(sight, pair, marks)
-        found.append(Refined(pair, marks, flaw, cost))
+    for pair, markers in zip(ordered, _refine_markers(inputs, ordered), strict=True):
+        rejection_reason = _rejection_reason(inputs, pair, markers)
+        cost = math.inf if rejection_reason else pair.cost + _size_cost(inputs, pair, markers)
+        found.append(RefinedPair(pair, markers, rejection_reason, cost))
     return found
 
 
-def _sound(sight: Sight, refined: Sequence[Refined]) -> tuple[Candidate, ...]:
-    """The marks among refined pairs, the best first.
+def _unique_candidates(
+    inputs: DetectionInput, refined: Sequence[RefinedPair]
+) -> tuple[Candidate, ...]:
+    """Return the unique markers among refined pairs, the best first.
 
-    Spots of two marks may match across.  A pair is left out when better ones have both its spots,
-    or one clearly better one has one of them.
+    Blobs of two markers may match crosswise.  A pair is dropped when better pairs have both its
+    blobs, or when a clearly better pair has one of them.
     """
-    kept: list[Refined] = []
-    for one in sorted((one for one in refined if one.flaw is None), key=lambda one: one.cost):
+    kept: list[RefinedPair] = []
+    for one in sorted(
+        (one for one in refined if one.rejection_reason is None), key=lambda one: one.cost
+    ):
         left = [other for other in kept if other.pair.left is one.pair.left]
         right = [other for other in kept if other.pair.right is one.pair.right]
-        clearly = any(other.cost + MARGIN <= one.cost for other in left + right)
+        clearly = any(other.cost + AMBIGUITY_MARGIN <= one.cost for other in left + right)
         if not clearly and not (left and right):
             kept.append(one)
     found = []
     for one in kept:
-        reason, measured = _judged(sight, _measured(sight, one.marks))
+        reason, measured = _validate(inputs, _triangulate(inputs, one.markers))
         if reason == "ok" and measured is not None:
-            found.append(Candidate(measured, _looks(one.pair)))
+            found.append(Candidate(measured, _appearance(one.pair)))
     return tuple(found)
 
 
-def _looks(pair: Pair) -> Floats:
-    levels = [(spot.peak, max(spot.surround, 1.0)) for spot in (pair.left, pair.right)]
+def _appearance(pair: BlobPair) -> Floats:
+    levels = [(blob.peak, max(blob.surround, 1.0)) for blob in (pair.left, pair.right)]
     return np.asarray(np.log(levels).mean(axis=0))
 
 
-def _refined(sight: Sight, pairs: Sequence[Pair]) -> list[tuple[Mark, Mark]]:
-    """The marks of pairs, all refined at once."""
-    eyesight = sight.eyesight
-    images = [image for _ in pairs for image in sight.images]
-    spots = [spot for pair in pairs for spot in (pair.left, pair.right)]
-    marks = eyesight.refine(images, spots, eyesight.looks, eyesight.sensor)
-    return list(zip(marks[::2], marks[1::2], strict=True))
+def _refine_markers(
+    inputs: DetectionInput, pairs: Sequence[BlobPair]
+) -> list[tuple[Marker, Marker]]:
+    """Refine the markers of all pairs at once."""
+    config = inputs.config
+    images = [image for _ in pairs for image in inputs.images]
+    blobs = [blob for pair in pairs for blob in (pair.left, pair.right)]
+    markers = config.refine(images, blobs, config.blob_filter, config.sensor)
+    return list(zip(markers[::2], markers[1::2], strict=True))
 
 
-def _flaw(sight: Sight, pair: Pair, marks: tuple[Mark, Mark]) -> FingertipReason | None:
-    """What speaks against a refined pair: a flaw of either mark, a wrong size, or no likeness."""
-    for mark in marks:
-        if mark.flaw is not None:
-            return mark.flaw
-        deviation = math.hypot(MARK_SIZE_DEVIATION, mark.radius_deviation)
-        if _size_off(sight, mark.radius, pair.depth_m) > SIZE_SIGMAS * deviation:
-            return "blurred" if mark.blur > SHARP_PX else "merged"
-    one, other = marks
+def _rejection_reason(
+    inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]
+) -> FingertipReason | None:
+    """Return why a refined pair is rejected: by either marker, its size, or differences between
+    views."""
+    for marker in markers:
+        if marker.rejection_reason is not None:
+            return marker.rejection_reason
+        deviation = math.hypot(MARKER_SIZE_SIGMA, marker.radius_deviation)
+        if _size_deviation(inputs, marker.radius, pair.depth_m) > SIZE_SIGMAS * deviation:
+            return "blurred" if marker.blur > SHARP_PX else "merged"
+    one, other = markers
     apart_px = min(
         math.dist(one.motion, other.motion),
         math.hypot(one.motion[0] + other.motion[0], one.motion[1] + other.motion[1]),
     )
     deviation = math.hypot(one.radius_deviation, other.radius_deviation)
-    if apart_px > MOTION_APART_PX or abs(math.log(one.radius / other.radius)) > (
-        MATE_SIGMAS * deviation
+    if apart_px > MAX_MOTION_DIFFERENCE_PX or abs(math.log(one.radius / other.radius)) > (
+        STEREO_SIZE_SIGMAS * deviation
     ):
         return "merged"
     return None
 
 
-def _fitted_cost(sight: Sight, pair: Pair, marks: tuple[Mark, Mark]) -> float:
-    """How badly the refined sizes match a mark's, in squared standard deviations."""
+def _size_cost(inputs: DetectionInput, pair: BlobPair, markers: tuple[Marker, Marker]) -> float:
+    """Return the mismatch of the refined sizes, in squared standard deviations."""
     sizes = (
-        _size_off(sight, mark.radius, pair.depth_m)
-        / math.hypot(MARK_SIZE_DEVIATION, mark.radius_deviation)
-        for mark in marks
+        _size_deviation(inputs, marker.radius, pair.depth_m)
+        / math.hypot(MARKER_SIZE_SIGMA, marker.radius_deviation)
+        for marker in markers
     )
     return sum(size**2 for size in sizes)
 
 
-def _size_off(sight: Sight, radius_px: float, depth_m: float) -> float:
-    """Logarithm of a radius over what a mark's is at that depth, without its sign."""
-    expected_px = _focal_px(sight.geometry) * sight.eyesight.mark_radius_m / depth_m
+def _size_deviation(inputs: DetectionInput, radius_px: float, depth_m: float) -> float:
+    """Return the magnitude of the log ratio of a radius to the marker's radius at that depth."""
+    expected_px = _focal_px(inputs.geometry) * inputs.config.marker_radius_m / depth_m
     return abs(math.log(radius_px / expected_px))
 
 
 def _focal_px(geometry: StereoGeometry) -> float:
-    """Of both cameras, whose focal lengths are nearly equal."""
+    """Return the mean focal length of both cameras, which are nearly equal."""
     return 0.5 * float(geometry.matrices[0][0, 0] + geometry.matrices[1][0, 0])
 
 
@@ -445,45 +473,50 @@ def _inside(volume: tuple[Floats, Floats], point_world: Floats) -> bool:
     return bool((point_world >= volume[0]).all() and (point_world <= volume[1]).all())
 
 
-def _measured(sight: Sight, marks: tuple[Mark, Mark]) -> Measured | None:
-    """The point behind two refined marks."""
-    given, hidden = sight.eyesight.noise_px, _hidden_px2(marks) * np.eye(2)
+def _triangulate(
+    inputs: DetectionInput, markers: tuple[Marker, Marker]
+) -> TriangulatedPoint | None:
+    """Triangulate two refined markers."""
+    given, hidden = inputs.config.noise_px, _occlusion_variance_px2(markers) * np.eye(2)
     left, right = (
-        (mark.covariance if given is None else given**2 * np.eye(2)) + hidden for mark in marks
+        (marker.covariance if given is None else given**2 * np.eye(2)) + hidden
+        for marker in markers
     )
     return measure(
-        sight.geometry,
-        marks[0].centre + sight.origins[0],
-        marks[1].centre + sight.origins[1],
-        method=sight.eyesight.triangulate,
+        inputs.geometry,
+        markers[0].centre + inputs.origins[0],
+        markers[1].centre + inputs.origins[1],
+        method=inputs.config.triangulate,
         left_covariance=left,
         right_covariance=right,
     )
 
 
-def _hidden_px2(marks: tuple[Mark, Mark]) -> float:
-    """Variance of a centre, by how much one mark is smaller than its mate.
+def _occlusion_variance_px2(markers: tuple[Marker, Marker]) -> float:
+    """Return the variance of a centre that follows from the size difference between both views.
 
-    What hides a sliver of a disc, or adds one, makes it smaller or larger by half the sliver's
-    width, and moves its centre by as much.  What the method's radii are off by chance is no sliver.
+    An occluder that hides a sliver of a disc moves its centre by half the sliver's width, and
+    shrinks it by as much.  Random errors of the method's radii are subtracted.
     """
-    one, other = marks
+    one, other = markers
     chance = one.radius * math.hypot(one.radius_deviation, other.radius_deviation)
     return max((one.radius - other.radius) ** 2 - chance**2, 0.0)
 
 
-def _judged(sight: Sight, measured: Measured | None) -> tuple[FingertipReason, Measured | None]:
-    """Whether a measurement is one of a fingertip.
+def _validate(
+    inputs: DetectionInput, measured: TriangulatedPoint | None
+) -> tuple[FingertipReason, TriangulatedPoint | None]:
+    """Return whether a measurement is a fingertip's, as its reason.
 
-    One that is too uncertain is refused: rays that are nearly parallel meet anywhere.
+    A point that is too uncertain is rejected, since nearly parallel rays meet anywhere.
     """
-    eyesight = sight.eyesight
+    config = inputs.config
     if (
         measured is None
-        or measured.reprojection_px > eyesight.max_reprojection_px
-        or measured.deviation_m > eyesight.max_deviation_m
+        or measured.reprojection_px > config.max_reprojection_px
+        or measured.deviation_m > config.max_deviation_m
     ):
         return "inconsistent", measured
-    if not _inside(sight.volume, measured.point_world):
+    if not _inside(inputs.volume, measured.point_world):
         return "outside_volume", measured
     return "ok", measured

@@ -1,4 +1,4 @@
-"""The triangulator: pictures in, fingertip out."""
+"""Turn stereo image pairs into a tracked fingertip."""
 
 from __future__ import annotations
 
@@ -13,23 +13,27 @@ from messages.methods import chosen
 from messages.scene import Scene
 from messages.types import Fingertip, FingertipReason, StereoPair
 from nodes.node import Input, Node, Output
-from nodes.triangulator.company import Company
+from nodes.triangulator.data_association import DataAssociation
 from nodes.triangulator.filters import TRACKING_METHODS
-from nodes.triangulator.fingertip import Eyesight, look
-from nodes.triangulator.mark import MARK_METHODS, MarkLooks
-from nodes.triangulator.pairs import refuse_other_pictures
+from nodes.triangulator.fingertip import DetectorConfig, detect_all
+from nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from nodes.triangulator.parameters import TriangulatorParameters
-from nodes.triangulator.skew import sighting_unskewed
+from nodes.triangulator.skew import compensate_detection_skew
 from nodes.triangulator.subpixel import PixelNoise
 from nodes.triangulator.tracking import Tracker, TrackingSettings
-from nodes.triangulator.triangulation import TRIANGULATION_METHODS, Measured, StereoGeometry
+from nodes.triangulator.triangulation import (
+    TRIANGULATION_METHODS,
+    StereoGeometry,
+    TriangulatedPoint,
+    check_images,
+)
 
-AHEAD_STEP_S = 0.01
-"""Between the points of the predicted path; a swing of 10 Hz is told ten times."""
+PREDICTION_STEP_S = 0.01
+"""Time between the points of the predicted path: ten per period of a 10 Hz tremor."""
 
 
 class Triangulator(Node):
-    """Measures the fingertip in each stereo pair and follows it."""
+    """Detect the fingertip in each stereo pair, and track it."""
 
     parameters: TriangulatorParameters
     scene: Input[Scene]
@@ -50,30 +54,32 @@ class Triangulator(Node):
         self.geometry = StereoGeometry.of(scene.camera, self.calibration)
         self.volume = (scene.finger.volume_min_m, scene.finger.volume_max_m)
         self.reasons: Counter[FingertipReason] = Counter()
-        mark = chosen(p.mark, scene.methods.mark, "subpixel_fit")
+        marker = chosen(p.marker, scene.methods.marker, "subpixel_fit")
         triangulation = chosen(p.triangulation, scene.methods.triangulation, "dlt")
-        tracking = chosen(p.tracking, scene.methods.tracking, "hand")
-        self.methods = f"{mark}, {triangulation}, {tracking}"
+        tracking = chosen(p.tracking, scene.methods.tracking, "singer_tremor")
+        self.methods = f"{marker}, {triangulation}, {tracking}"
         self.filter = TRACKING_METHODS[tracking](scene.finger.max_speed_m_per_s)
-        self.eyesight = Eyesight(
-            looks=MarkLooks(
-                min_contrast=p.mark_min_contrast,
-                min_area_px=p.mark_min_area_px,
-                max_area_px=p.mark_max_area_px,
+        self.config = DetectorConfig(
+            blob_filter=BlobFilter(
+                min_contrast=p.marker_min_contrast,
+                min_area_px=p.marker_min_area_px,
+                max_area_px=p.marker_max_area_px,
                 window_half_px=p.window_half_px,
             ),
-            refine=MARK_METHODS[mark],
+            refine=MARKER_METHODS[marker],
             triangulate=TRIANGULATION_METHODS[triangulation],
-            noise_px=p.mark_noise_px,
-            mark_radius_m=p.mark_radius_m,
+            noise_px=p.marker_noise_px,
+            marker_radius_m=p.marker_radius_m,
             max_reprojection_px=p.max_reprojection_px,
             sensor=PixelNoise(scene.camera.read_noise_levels, scene.camera.photons_per_level),
         )
-        self.leads_s = np.arange(0.0, p.ahead_s + 1.5 * AHEAD_STEP_S, AHEAD_STEP_S)
+        self.horizons_s = np.arange(
+            0.0, p.prediction_horizon_s + 1.5 * PREDICTION_STEP_S, PREDICTION_STEP_S
+        )
         self.tracking = TrackingSettings(
             max_speed_m_per_s=scene.finger.max_speed_m_per_s,
             max_acceleration_m_per_s2=p.max_acceleration_m_per_s2,
-            forget_after_s=p.forget_after_s,
+            track_timeout_s=p.track_timeout_s,
             confirm_frames=p.confirm_frames,
         )
         self._begin(self.epoch)
@@ -81,47 +87,50 @@ class Triangulator(Node):
     def on_stereo(self, pair: StereoPair, header: Header) -> None:
         if self.geometry is None:
             return
-        refuse_other_pictures(pair, self.geometry)
+        check_images(pair, self.geometry)
         at_ns = header.source_ns
-        if header.epoch != self.epoch:  # the camera was started anew, and its times with it
+        if header.epoch != self.epoch:  # the camera has restarted, and its clock with it
             self._begin(header.epoch)
-        sight = partial(
-            look,
+        detect_pair = partial(
+            detect_all,
             pair.left,
             pair.right,
             geometry=self.geometry,
-            eyesight=self.eyesight,
+            config=self.config,
             volume=self.volume,
             left_origin_px=pair.left_origin_px,
             right_origin_px=pair.right_origin_px,
         )
-        sighting = sight(expected=self.tracker.expected(at_ns))
+        detection = detect_pair(gate=self.tracker.gate(at_ns))
         if pair.skew_s != 0.0:
             motion = self.tracker.velocity_at(at_ns)
-            sighting = sighting_unskewed(sighting, self.geometry, pair.skew_s, *motion)
+            detection = compensate_detection_skew(detection, self.geometry, pair.skew_s, *motion)
         is_late = self.tracker.is_late(at_ns)
-        reason, measured = self.company.judge(at_ns, sighting, self.tracker)
-        if is_late and reason != "ok":  # what it has to tell is in the track; a later one is out
+        reason, measured = self.association.select_finger(at_ns, detection, self.tracker)
+        if is_late and reason != "ok":  # a newer fingertip was published already
             self.late += 1
         else:
             self.reasons[reason] += 1
             self.fingertip.publish(self._message(at_ns, reason, measured), source_ns=at_ns)
-        if reason == "ok" and self.company.is_survey_due(at_ns):  # nobody waits for it
-            self.company.survey(at_ns, sight(expected=None))
+        if reason == "ok" and self.association.is_clutter_search_due(at_ns):
+            # After publishing, since nothing waits for this search.
+            self.association.track_clutter(at_ns, detect_pair(gate=None))
         self._note()
 
     def _begin(self, epoch: int) -> None:
         self.epoch = epoch
         self.tracker = Tracker(self.filter, self.tracking)
-        self.company = Company()
+        self.association = DataAssociation()
 
     def _note(self) -> None:
         counts = ", ".join(f"{count} {reason}" for reason, count in self.reasons.items())
         self.note = f"{counts}; {self.late} late; by {self.methods}"
 
-    def _message(self, at_ns: int, reason: FingertipReason, measured: Measured | None) -> Fingertip:
+    def _message(
+        self, at_ns: int, reason: FingertipReason, measured: TriangulatedPoint | None
+    ) -> Fingertip:
         tracker = self.tracker
-        track = tracker.track_at(at_ns, self.leads_s)
+        track = tracker.predict_at(at_ns, self.horizons_s)
         return Fingertip(
             valid=reason == "ok",
             state=tracker.state(at_ns),
@@ -129,8 +138,8 @@ class Triangulator(Node):
             position_world_m=track.position,
             velocity_world_m_per_s=track.velocity,
             covariance=track.covariance,
-            ahead_world_m=track.ahead,
-            ahead_step_s=AHEAD_STEP_S,
+            predicted_path_world_m=track.ahead,
+            prediction_step_s=PREDICTION_STEP_S,
             measured_world_m=track.position if measured is None else measured.point_world,
             reprojection_px=0.0 if measured is None else measured.reprojection_px,
         )

@@ -1,4 +1,4 @@
-"""What can be set of the triangulator."""
+"""Parameters of the triangulator node."""
 
 from __future__ import annotations
 
@@ -7,38 +7,57 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from messages.methods import MarkMethod, TrackingMethod, TriangulationMethod
+from messages.methods import MarkerMethod, TrackingMethod, TriangulationMethod
 from messages.scene import Positive
 from nodes.node import NodeParameters
 
 
 class TriangulatorParameters(NodeParameters):
-    """How the mark is found, triangulated and tracked."""
+    """Hold how the marker is detected, triangulated and tracked."""
 
     calibration: Path | None = Field(
-        default=None, description="file of `flexsheet calibrate stereo`; null: the scene's optics"
+        default=None,
+        description="file of `flexsheet calibrate stereo`; null takes the scene's optics",
     )
-    mark: MarkMethod | Literal["auto"] = Field(
-        default="auto", description="auto: as the scene's methods say, else subpixel_fit"
+    marker: MarkerMethod | Literal["auto"] = Field(
+        default="auto",
+        description="refinement of the marker's centre; auto takes the scene's method, else "
+        "subpixel_fit",
     )
     triangulation: TriangulationMethod | Literal["auto"] = Field(
-        default="auto", description="auto: as the scene's methods say, else dlt"
+        default="auto", description="triangulation method; auto takes the scene's method, else dlt"
     )
-    mark_noise_px: Positive | None = Field(
-        default=None, description="of a mark's centre; null: as the method states for each"
+    marker_noise_px: Positive | None = Field(
+        default=None,
+        description="standard deviation of a marker's centre; null takes the method's estimate",
     )
-    mark_radius_m: Positive = 0.003
-    max_reprojection_px: Positive = 1.5
-    mark_min_contrast: Positive = 60.0
-    mark_min_area_px: Annotated[int, Field(ge=1)] = 4
-    mark_max_area_px: Annotated[int, Field(ge=1)] = 1500
-    window_half_px: Annotated[int, Field(ge=8)] = 16
+    marker_radius_m: Positive = Field(default=0.003, description="true radius of the marker")
+    max_reprojection_px: Positive = Field(
+        default=1.5, description="maximum reprojection error of a marker pair"
+    )
+    marker_min_contrast: Positive = Field(
+        default=60.0, description="minimum height of a marker above its surroundings, levels of 255"
+    )
+    marker_min_area_px: Annotated[int, Field(ge=1)] = Field(
+        default=4, description="minimum number of pixels of a marker"
+    )
+    marker_max_area_px: Annotated[int, Field(ge=1)] = Field(
+        default=1500, description="maximum number of pixels of a marker"
+    )
+    window_half_px: Annotated[int, Field(ge=8)] = Field(
+        default=16, description="half the side of the smallest search window"
+    )
     tracking: TrackingMethod | Literal["auto"] = Field(
-        default="auto", description="auto: as the scene's methods say, else hand"
+        default="auto",
+        description="filter of the fingertip; auto takes the scene's method, else singer_tremor",
     )
     max_acceleration_m_per_s2: Positive = Field(
-        default=60.0, description="of a finger; marks that go sharper are not followed"
+        default=60.0, description="maximum acceleration of a finger; points beyond it are rejected"
     )
-    forget_after_s: Positive = 0.1
-    confirm_frames: Annotated[int, Field(ge=1)] = 3
-    ahead_s: Positive = Field(default=0.12, description="how far ahead fingertips are predicted")
+    track_timeout_s: Positive = Field(
+        default=0.1, description="time without a point after which the track is lost"
+    )
+    confirm_frames: Annotated[int, Field(ge=1)] = Field(
+        default=3, description="number of consistent points that begin a track"
+    )
+    prediction_horizon_s: Positive = Field(default=0.12, description="length of the predicted path")

@@ -1,4 +1,4 @@
-"""Two cameras without a common trigger see a moving finger at two times; what that does, undone."""
+"""Compensate the motion between two exposures of cameras without a common trigger."""
 
 from __future__ import annotations
 
@@ -7,59 +7,70 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.triangulator.fingertip import Sighting
-from nodes.triangulator.triangulation import Measured, StereoGeometry, pixel_and_slope
+from nodes.triangulator.fingertip import StereoDetection
+from nodes.triangulator.triangulation import (
+    StereoGeometry,
+    TriangulatedPoint,
+    project_with_jacobian,
+)
 
 Floats = NDArray[np.float64]
 
 
-def unskewed(
-    measured: Measured,
+def compensate_skew(
+    measured: TriangulatedPoint,
     geometry: StereoGeometry,
     skew_s: float,
     velocity: Floats,
     velocity_covariance: Floats,
-) -> Measured:
-    """The point (3,) at the middle between both exposures, the right one `skew_s` after the left.
+) -> TriangulatedPoint:
+    """Return the point (3,) at the middle between both exposures.
 
-    velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).  To first order a
-    finger that moves at v is measured off by M v, M = s (A_r J_r - 1/2), with J_r the slope of the
-    right pixel and A_r the part of the triangulation that takes it: mostly in depth, by speed times
-    skew times depth over baseline.  What is not known of v adds to the covariance.
+    skew_s: time of the right exposure after the left one.
+    velocity: (3,) m/s of the finger in the world, with its covariance (3, 3).
+
+    To first order, a finger with velocity v is measured with the error M v, M = s (A_r J_r - 1/2).
+    J_r is the Jacobian of the right pixel, and A_r the part of the triangulation that takes it.
+    The error is mostly in depth: speed times skew times depth over baseline.  The uncertainty of v
+    adds to the covariance.
     """
     world = geometry.world_from_left[:3, :3]
     in_left = geometry.left_from_world[:3, :3] @ measured.point_world
     in_left = in_left + geometry.left_from_world[:3, 3]
     rig = geometry.right_from_left
     in_right = rig[:3, :3] @ in_left + rig[:3, 3]
-    left = pixel_and_slope(in_left, geometry.matrices[0], geometry.distortions[0])[1]
-    right = pixel_and_slope(in_right, geometry.matrices[1], geometry.distortions[1])[1]
+    left = project_with_jacobian(in_left, geometry.matrices[0], geometry.distortions[0])[1]
+    right = project_with_jacobian(in_right, geometry.matrices[1], geometry.distortions[1])[1]
     right = right @ rig[:3, :3]
-    # The singular case was refused when the point was measured.
-    share = np.linalg.solve(left.T @ left + right.T @ right, right.T @ right)
-    off = skew_s * (world @ share @ world.T - 0.5 * np.eye(3))
+    # The singular case was rejected when the point was triangulated.
+    right_weight = np.linalg.solve(left.T @ left + right.T @ right, right.T @ right)
+    error = skew_s * (world @ right_weight @ world.T - 0.5 * np.eye(3))
     return replace(
         measured,
-        point_world=measured.point_world - off @ velocity,
-        covariance=measured.covariance + off @ velocity_covariance @ off.T,
+        point_world=measured.point_world - error @ velocity,
+        covariance=measured.covariance + error @ velocity_covariance @ error.T,
     )
 
 
-def sighting_unskewed(
-    sighting: Sighting,
+def compensate_detection_skew(
+    detection: StereoDetection,
     geometry: StereoGeometry,
     skew_s: float,
     velocity: Floats,
     velocity_covariance: Floats,
-) -> Sighting:
-    """All that was found, each as if it were the finger; see `unskewed`."""
+) -> StereoDetection:
+    """Compensate all detections, each as if it were the finger; see `compensate_skew`."""
 
-    def mended(measured: Measured) -> Measured:
-        return unskewed(measured, geometry, skew_s, velocity, velocity_covariance)
+    def corrected(measured: TriangulatedPoint) -> TriangulatedPoint:
+        return compensate_skew(measured, geometry, skew_s, velocity, velocity_covariance)
 
     return replace(
-        sighting,
-        measured=None if sighting.measured is None else mended(sighting.measured),
-        marks=tuple(replace(mark, measured=mended(mark.measured)) for mark in sighting.marks),
-        others=tuple(replace(mark, measured=mended(mark.measured)) for mark in sighting.others),
+        detection,
+        measured=None if detection.measured is None else corrected(detection.measured),
+        markers=tuple(
+            replace(marker, measured=corrected(marker.measured)) for marker in detection.markers
+        ),
+        clutter=tuple(
+            replace(marker, measured=corrected(marker.measured)) for marker in detection.clutter
+        ),
     )

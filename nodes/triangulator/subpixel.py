@@ -1,17 +1,17 @@
-"""The mark's centre by maximum likelihood: a smeared disc fitted to the pixels around it.
+"""Estimate a marker's centre by maximum likelihood: fit a motion-blurred disc to its pixels.
 
-The picture of a mark is an even disc, spread by the lens and the pixel's own area, drawn out by its
+The image of a marker is a uniform disc, blurred by the lens and the pixel's area, smeared by its
 motion during the exposure, on ground that may slope.  The level at a distance d outside its edge is
 
-    level = ground (1 - S) + mark S,    S = mean over the motion of Phi(-d / blur),
+    level = ground (1 - S) + marker S,    S = mean over the motion of Phi(-d / blur),
 
-with Phi the normal distribution's integral.  All of it is fitted at once by Gauss and Newton's
-method, each pixel weighted by its noise, and the inverse of the Fisher information is the
-covariance of the result: the Cramer-Rao bound, if pictures are as the model has it.  Where they are
-not, the misfit shows, and its odd part widens the covariance.
+with Phi the normal cumulative distribution.  A Gauss-Newton method fits all parameters at once,
+with each pixel weighted by its noise.  The inverse of the Fisher information is the covariance of
+the result: the Cramer-Rao bound, if images follow the model.  Otherwise the residuals show it, and
+their odd part widens the covariance.
 
-Centre and slopes are odd in the picture and all else is even, so that a wrong radius, blur, level
-or motion spoils the certainty of the centre, but does not move it.
+Centre and slopes change the image oddly, all other parameters evenly.  A wrong radius, blur, level
+or motion therefore affects the stated certainty of the centre, but does not move it.
 """
 
 from __future__ import annotations
@@ -27,52 +27,52 @@ from scipy.special import ndtr
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-X, Y, RADIUS, BLUR, MARK, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range(10)
+X, Y, RADIUS, BLUR, MARKER, GROUND, SLOPE_X, SLOPE_Y, MOTION_X, MOTION_Y = range(10)
 STILL_PARAMETERS = 8
 ODD = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0])
-"""Parameters that change the picture oddly about the disc's centre."""
+"""Parameters that change the image oddly about the disc's centre."""
 
 WHITE = 255
 MARGIN_PX = 3.0
-LEAST_MARGIN_PX = 1.25
+MIN_MARGIN_PX = 1.25
 MARGIN_PER_MOTION = 0.5
-"""The fit looks so far beyond the disc: enough to know the ground, short of the finger's own edge;
-that edge comes nearer by the motion, and is no ground that slopes evenly."""
+"""Width of the surroundings in the fit: enough to estimate the ground, and short of the finger's
+edge.  That edge comes nearer by the motion, and is not a uniform slope."""
 
 PRIOR_WEIGHTS = np.array(
     [1e-6, 1e-6, 1.0, 1.0, 200.0**-2, 60.0**-2, 30.0**-2, 30.0**-2, 0.25, 0.25]
 )
-"""What is believed of the start: so little that it only counts where the pixels say nothing, as of
-the level of a mark that is overexposed all over."""
+"""Inverse prior variances of the start.  They are so small that they only count where pixels carry
+no information, as for the level of a saturated marker."""
 
-LEAST = np.array([0.5, 0.3])
-LARGEST = np.array([40.0, 8.0])
+MIN_SHAPE = np.array([0.5, 0.3])
+MAX_SHAPE = np.array([40.0, 8.0])
 """Bounds of radius and blur, px."""
 
 MOTION_STEP_PX = 1.8
-"""The motion is summed at steps no longer than this; the blur closes the gaps."""
+"""Maximum step of the sum over the motion; the blur closes the gaps."""
 
-LEAST_MOTION_PX = 2.0
-"""A motion too short to be told from blur is not fitted."""
+MIN_MOTION_PX = 2.0
+"""A shorter motion cannot be distinguished from blur and is not fitted."""
 
 PEAK_OF_NORMAL = 1.0 / math.sqrt(2.0 * math.pi)
 
 ITERATIONS = 8
-SETTLED_PX = np.array([0.02, 0.02, 0.05, 0.05])
-"""Of centre, radius and blur: a last step as short is the last that is taken.  It leaves its square
-over the blur, less than a thousandth of a pixel."""
+CONVERGED_STEP_PX = np.array([0.02, 0.02, 0.05, 0.05])
+"""Steps of centre, radius and blur that end the iteration.  Such a step leaves an error of its
+square over the blur, less than a thousandth of a pixel."""
 
-LARGEST_STEP_PX = 0.7
-LARGEST_SHIFT_PX = 2.0
-"""A centre that leaves its start by more is not of the disc that was seen."""
+MAX_STEP_PX = 0.7
+MAX_SHIFT_PX = 2.0
+"""Bounds on one step, and on the centre's distance from its start; beyond, it is another disc."""
 
-LEAST_VARIANCE_RATIO = 0.7
-"""The noise that residuals show is believed down to this share of what the sensor's model says."""
+MIN_VARIANCE_RATIO = 0.7
+"""Lower bound on the noise estimated from residuals, as a fraction of the sensor model's."""
 
 
 @dataclass(frozen=True, slots=True)
 class PixelNoise:
-    """A sensor's noise: the variance of a level L is read_levels^2 + L / photons_per_level."""
+    """Hold a sensor's noise: the variance of a level L is read_levels^2 + L / photons_per_level."""
 
     read_levels: float = 1.5
     photons_per_level: float = 40.0
@@ -80,24 +80,25 @@ class PixelNoise:
 
 @dataclass(frozen=True, slots=True)
 class DiscStart:
-    """Where a fit begins: centre (x, y), radius, blur, motion (x, y) in px; levels of both."""
+    """Hold the start of a fit: centre (x, y), radius, blur and motion (x, y) in px; both levels."""
 
     centre: tuple[float, float]
     radius: float
     blur: float
-    mark: float
+    marker: float
     ground: float
     motion: tuple[float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class DiscFit:
-    """A fitted disc.
+    """Hold a fitted disc.
 
-    centre: (2,) px with covariance (2, 2) px^2; radius, blur and motion (x, y) in px.
-    height: levels between ground and mark.
-    misfit: root mean square of what noise does not explain, as a share of the height.
-    settled: false where the fit did not come to rest at a disc.
+    centre: (2,) px with covariance (2, 2) px^2.
+    radius, blur, motion: px; motion is (x, y).
+    height: levels between ground and marker.
+    misfit: root mean square of the residuals beyond noise, as a fraction of the height.
+    converged: false where the fit did not converge to a disc.
     """
 
     centre: Floats
@@ -107,52 +108,61 @@ class DiscFit:
     motion: tuple[float, float]
     height: float
     misfit: float
-    settled: bool
+    converged: bool
 
 
 def fit_discs(
-    pictures: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
+    images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
 ) -> list[DiscFit]:
-    """Fit one disc in each picture (height, width); all at once, since small arrays cost by call.
+    """Fit one disc in each image (height, width), all at once, since each NumPy call has a fixed
+    cost.
 
-    Pixels outside the picture and outside the disc's own surroundings are left out.  One that is
-    white counts only while the model is darker than it.
+    Pixels outside the image and outside the disc's surroundings are excluded.  A white pixel counts
+    only while the model is darker.
     """
     if not starts:
         return []
-    seen = _seen(pictures, starts, noise)
+    seen = _detect_in(images, starts, noise)
     start = np.array(
         [
-            (x, y, one.radius, one.blur, one.mark, one.ground, 0.0, 0.0, *one.motion)
+            (x, y, one.radius, one.blur, one.marker, one.ground, 0.0, 0.0, *one.motion)
             for one, (x, y) in zip(starts, seen.offsets, strict=True)
         ]
     )
-    if max(math.hypot(*one.motion) for one in starts) < LEAST_MOTION_PX:
+    if max(math.hypot(*one.motion) for one in starts) < MIN_MOTION_PX:
         start = start[:, :STILL_PARAMETERS]
-    solved = _solved(seen, start)
+    solved = _solve(seen, start)
     covariances = np.linalg.inv(solved.information)[:, :RADIUS, :RADIUS]
     shifts = np.abs(solved.found - start)[:, :RADIUS].max(axis=1).tolist()
     return [
-        _judged(
+        _validate(
             parameters,
             corner,
             covariance,
             fitness,
-            settled=solved.settled and shift < LARGEST_SHIFT_PX,
+            converged=solved.converged and shift < MAX_SHIFT_PX,
         )
         for parameters, corner, covariance, fitness, shift in zip(
-            solved.found.tolist(), seen.corners, covariances, _fitness(solved), shifts, strict=True
+            solved.found.tolist(),
+            seen.corners,
+            covariances,
+            _fit_residuals(solved),
+            shifts,
+            strict=True,
         )
     ]
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
-    """Where Gauss and Newton's method ended, and what its last picture was like.
+class DiscSolution:
+    """Hold the result of the Gauss-Newton iteration, and the residuals of its last image.
 
-    found: (n, parameters), after the last step, which took `gains` (n, parameters) off the weighted
-    squares of the residuals (n, s s), to first order.  weights: (n, s s), of the pixels that
-    counted.  information: (n, parameters, parameters).
+    found: (n, parameters) after the last step.
+    residuals: (n, s s).
+    weights: (n, s s), zero for excluded pixels.
+    information: (n, parameters, parameters).
+    gains: (n, parameters), by which the last step reduced the weighted squares of the residuals, to
+        first order.
     """
 
     found: Floats
@@ -160,16 +170,16 @@ class Solved:
     weights: Floats
     information: Floats
     gains: Floats
-    settled: bool
+    converged: bool
 
 
-def _solved(seen: Seen, start: Floats) -> Solved:
-    """The most likely parameters (n, parameters) of the discs, from where they start."""
+def _solve(seen: DiscCutouts, start: Floats) -> DiscSolution:
+    """Return the most likely parameters (n, parameters) of the discs."""
     believed = PRIOR_WEIGHTS[: start.shape[1]]
     prior = np.diag(believed)
-    found, settled, used = start.copy(), False, seen.weights
+    found, converged, used = start.copy(), False, seen.weights
     for _ in range(ITERATIONS):
-        model, slopes = _disc(found, seen.x, seen.y)
+        model, slopes = _render_disc(found, seen.x, seen.y)
         residuals = seen.levels - model
         if seen.white is not None:
             used = np.where(seen.white & (residuals < 0), 0.0, seen.weights)
@@ -178,22 +188,22 @@ def _solved(seen: Seen, start: Floats) -> Solved:
         gradient = (weighted @ residuals[:, :, None])[:, :, 0] - believed * (found - start)
         step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
         shape = step[:, : BLUR + 1]
-        np.maximum(np.minimum(shape, LARGEST_STEP_PX), -LARGEST_STEP_PX, out=shape)
+        np.maximum(np.minimum(shape, MAX_STEP_PX), -MAX_STEP_PX, out=shape)
         found += step
         bounded = found[:, RADIUS : BLUR + 1]
-        np.maximum(np.minimum(bounded, LARGEST), LEAST, out=bounded)
-        if (np.abs(shape) < SETTLED_PX).all():
-            settled = True
+        np.maximum(np.minimum(bounded, MAX_SHAPE), MIN_SHAPE, out=bounded)
+        if (np.abs(shape) < CONVERGED_STEP_PX).all():
+            converged = True
             break
-    return Solved(found, residuals, used, information, gradient * step, settled)
+    return DiscSolution(found, residuals, used, information, gradient * step, converged)
 
 
-def _fitness(solved: Solved) -> list[tuple[float, int, float, float]]:
-    """Of each fit: weighted squares of what it leaves, its pixels, the sum of their weights, and
-    the noise that the odd part of what it leaves shows, as a ratio of variances.
+def _fit_residuals(solved: DiscSolution) -> list[tuple[float, int, float, float]]:
+    """Return for each fit: weighted squares of the residuals, number of pixels, sum of weights,
+    variance ratio.
 
-    That part alone, the difference of pixels that mirror one another in the centre, can have moved
-    the centre.
+    The variance ratio is the noise that the odd part of the residuals shows, over the sensor's.
+    Only that part, the difference of pixels mirrored about the centre, can have moved the centre.
     """
     residuals, weights, gains = solved.residuals, solved.weights, solved.gains
     squares = np.einsum("ni,ni,ni->n", residuals, residuals, weights) - gains.sum(axis=1)
@@ -215,12 +225,14 @@ def _fitness(solved: Solved) -> list[tuple[float, int, float, float]]:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """Square cut-outs of n pictures, s pixels a side, each around the start of a disc.
+class DiscCutouts:
+    """Hold square cut-outs of n images, s pixels a side, each around the start of a disc.
 
-    corners: column and row of each cut-out's first pixel, from which its coordinates count.
-    offsets: the starting centres in them.  levels, weights: (n, s s).  x: (n, 1, s), y: (n, s, 1).
-    white: (n, s s) where a pixel is overexposed; None where none is.
+    corners: column and row of each cut-out's first pixel, the origin of its coordinates.
+    offsets: starting centres in these coordinates.
+    levels, weights: (n, s s).
+    x, y: coordinates (n, 1, s) and (n, s, 1).
+    white: (n, s s) where a pixel is saturated; None where none is.
     """
 
     corners: list[tuple[int, int]]
@@ -232,11 +244,13 @@ class Seen:
     white: NDArray[np.bool_] | None
 
 
-def _seen(pictures: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise) -> Seen:
-    """Cut out what the fit looks at; outside the picture the weight is zero."""
+def _detect_in(
+    images: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNoise
+) -> DiscCutouts:
+    """Cut out the pixels of the fits; outside the image their weight is zero."""
     lengths = [math.hypot(*one.motion) for one in starts]
     reaches = [
-        one.radius + max(MARGIN_PX - MARGIN_PER_MOTION * length, LEAST_MARGIN_PX)
+        one.radius + max(MARGIN_PX - MARGIN_PER_MOTION * length, MIN_MARGIN_PX)
         for one, length in zip(starts, lengths, strict=True)
     ]
     half = 1 + int(
@@ -250,21 +264,21 @@ def _seen(pictures: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNo
         np.arange(side, dtype=float).reshape(side, 1),
     )
     corners, offsets, white = [], [], False
-    for i, (picture, one, length) in enumerate(zip(pictures, starts, lengths, strict=True)):
+    for i, (image, one, length) in enumerate(zip(images, starts, lengths, strict=True)):
         left, top = round(one.centre[0]) - half, round(one.centre[1]) - half
         centre = (one.centre[0] - left, one.centre[1] - top)
         corners.append((left, top))
         offsets.append(centre)
         rows = slice(max(top, 0), max(top + side, 0))
         columns = slice(max(left, 0), max(left + side, 0))
-        part = picture[rows, columns]
+        part = image[rows, columns]
         place = (
             slice(rows.start - top, rows.start - top + part.shape[0]),
             slice(columns.start - left, columns.start - left + part.shape[1]),
         )
         levels[i][place] = part
         dx, dy = x - centre[0], y - centre[1]
-        if length > LEAST_MOTION_PX:
+        if length > MIN_MOTION_PX:
             along = (dx * one.motion[0] + dy * one.motion[1]) / length**2
             along = np.minimum(np.maximum(along, -0.5), 0.5)
             dx, dy = dx - along * one.motion[0], dy - along * one.motion[1]
@@ -274,7 +288,7 @@ def _seen(pictures: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNo
         ]
         white = white or int(part.max(initial=0)) >= WHITE
     flat = levels.reshape(count, side * side)
-    return Seen(
+    return DiscCutouts(
         corners,
         offsets,
         flat,
@@ -285,10 +299,10 @@ def _seen(pictures: Sequence[Image], starts: Sequence[DiscStart], noise: PixelNo
     )
 
 
-def _disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Levels (n, s s) of discs and their slopes (n, parameters, s s).
+def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
+    """Return levels (n, s s) of discs and their slopes (n, parameters, s s).
 
-    x: (1, 1, s), y: (1, s, 1).  Along a motion the disc stands at k places: (n, k, s, s) inside.
+    x: (1, 1, s), y: (1, s, 1).  A moving disc is summed at k positions: (n, k, s, s).
     """
     count, parameters = found.shape
     moving = parameters > STILL_PARAMETERS
@@ -317,13 +331,13 @@ def _disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     np.add.reduce(ax, axis=1, out=slopes[:, X])
     np.add.reduce(ay, axis=1, out=slopes[:, Y])
     ground = columns[GROUND] + (columns[SLOPE_X] * dx + columns[SLOPE_Y] * dy)
-    height = columns[MARK] - ground
+    height = columns[MARKER] - ground
     if moving:
         np.add.reduce(along * ax, axis=1, out=slopes[:, MOTION_X])
         np.add.reduce(along * ay, axis=1, out=slopes[:, MOTION_Y])
         slopes[:, MOTION_X:] *= height[:, None]
-    slopes[:, :MARK] *= height[:, None]
-    slopes[:, MARK] = share
+    slopes[:, :MARKER] *= height[:, None]
+    slopes[:, MARKER] = share
     left = np.subtract(1.0, share, out=slopes[:, GROUND])
     np.multiply(left, dx, out=slopes[:, SLOPE_X])
     np.multiply(left, dy, out=slopes[:, SLOPE_Y])
@@ -331,30 +345,30 @@ def _disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     return levels.reshape(count, side * side), slopes.reshape(count, parameters, side * side)
 
 
-def _judged(
+def _validate(
     found: list[float],
     corner: tuple[int, int],
     covariance: Floats,
     fitness: tuple[float, int, float, float],
     *,
-    settled: bool,
+    converged: bool,
 ) -> DiscFit:
-    """What a fit came to: its covariance widened by what the noise does not explain.
+    """Make the result of a fit, its covariance widened by residuals beyond noise.
 
-    fitness: as `_fitness` gives it.
+    fitness: as `_fit_residuals` returns it.
     """
     squares, pixels, weight, ratio = fitness
-    x, y, radius, blur, mark, ground, _, _, *motion = found
-    height = mark - ground
+    x, y, radius, blur, marker, ground, _, _, *motion = found
+    height = marker - ground
     excess = max(squares - pixels, 0.0) / max(weight, 1e-12)
     return DiscFit(
         centre=np.array([corner[0] + x, corner[1] + y]),
-        covariance=covariance * max(ratio, LEAST_VARIANCE_RATIO),
-        # A round edge that is blurred looks as if it lay blur^2 / 2 radius further in.
+        covariance=covariance * max(ratio, MIN_VARIANCE_RATIO),
+        # A blurred round edge appears to lie blur^2 / 2 radius further in.
         radius=radius + 0.5 * blur * blur / radius,
         blur=blur,
         motion=(motion[0], motion[1]) if motion else (0.0, 0.0),
         height=height,
         misfit=math.sqrt(excess) / max(abs(height), 1e-6),
-        settled=settled and height > 0.0,
+        converged=converged and height > 0.0,
     )

@@ -1,6 +1,6 @@
-"""Which measured points enter the track: the gate, late ones, loss and how a track begins.
+"""Decide which measured points enter the track: gating, late points, loss and track initiation.
 
-What a track makes of its points is the filter's (`nodes.triangulator.filters`).
+The filter in `nodes.triangulator.filters` estimates the motion from these points.
 """
 
 from __future__ import annotations
@@ -15,63 +15,63 @@ from messages.types import FingertipState
 from nodes.triangulator.filters import Estimate, Filter
 
 Floats = NDArray[np.float64]
-Verdict = Literal["ok", "too_fast", "unconfirmed"]
-"""On a measured point: it is of the track; no finger moves so fast; it might begin a track, or came
-after a later one and mends what there is."""
+GateResult = Literal["ok", "too_fast", "unconfirmed"]
+"""Result for a measured point: it is in the track; it is faster than a finger; it may begin a
+track, or came late and corrected the track."""
 
 GATE_SIGMAS = 5.0
-"""Errors of measurement and prediction that the gate forgives on top of a finger's motion."""
+"""Errors of measurement and prediction that the gate allows beyond a finger's motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class TrackingSettings:
-    """How a finger moves, and when a track begins and ends.
+    """Hold a finger's limits of motion, and when a track begins and ends.
 
-    max_speed_m_per_s, max_acceleration_m_per_s2: faster or sharper is no finger.
-    forget_after_s: without a point for so long the track is lost.
-    confirm_frames: points in a row that must agree with one another before they begin a track, or
-        take the place of one that they do not agree with.
-    remember_s: how far back a point that comes late can still be put in its place.
+    max_speed_m_per_s, max_acceleration_m_per_s2: limits of a finger; faster points are rejected.
+    track_timeout_s: the track is lost after this long without a point.
+    confirm_frames: consecutive points that must agree before they begin a track, or replace one
+        that they contradict.
+    history_s: age up to which a late point can still be inserted.
     """
 
     max_speed_m_per_s: float
     max_acceleration_m_per_s2: float = 60.0
-    forget_after_s: float = 0.1
+    track_timeout_s: float = 0.1
     confirm_frames: int = 3
-    remember_s: float = 0.25
+    history_s: float = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Fix:
-    """A measured point (3,) with its covariance (3, 3)."""
+class PositionMeasurement:
+    """Hold a measured point (3,) m with its covariance (3, 3) m^2."""
 
     at_ns: int
     measured: Floats
     covariance: Floats
 
-    def reaches(self, later: Fix, max_speed: float) -> bool:
-        """Whether a finger can get from this point to a later one, but for their noise."""
-        way = float(np.linalg.norm(later.measured - self.measured))
+    def can_reach(self, later: PositionMeasurement, max_speed: float) -> bool:
+        """Whether a finger can move from this point to a later one, allowing for noise."""
+        distance = float(np.linalg.norm(later.measured - self.measured))
         noise = float(np.sqrt(np.trace(self.covariance) + np.trace(later.covariance)))
-        return way <= max_speed * (later.at_ns - self.at_ns) * 1e-9 + GATE_SIGMAS * noise
+        return distance <= max_speed * (later.at_ns - self.at_ns) * 1e-9 + GATE_SIGMAS * noise
 
 
 @dataclass(frozen=True, slots=True)
-class Expected:
-    """Where the finger should be: a point (3,) m, and how far from it a finger can be."""
+class Gate:
+    """Hold a ball around the predicted point (3,) m that contains the finger."""
 
     point: Floats
-    reach_m: float
+    radius_m: float
 
-    def holds(self, fix: Fix) -> bool:
-        """Whether a measured point can be the finger's, but for its noise."""
-        noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(fix.covariance)))
-        return float(np.linalg.norm(fix.measured - self.point)) <= self.reach_m + noise_m
+    def contains(self, measurement: PositionMeasurement) -> bool:
+        """Whether a measured point can be the finger's, allowing for its noise."""
+        noise_m = GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
+        return float(np.linalg.norm(measurement.measured - self.point)) <= self.radius_m + noise_m
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
-    """What is known of the finger at one time, and the path (n, 3) predicted from then on.
+class TrackPrediction:
+    """Hold the finger's state at one time, and its predicted path (n, 3) m.
 
     covariance: (6, 6) of position (3,) m and velocity (3,) m/s.
     """
@@ -82,156 +82,174 @@ class Track:
     ahead: Floats
 
 
-UNKNOWN = np.diag([1.0] * 3 + [10.0] * 3)
-"""Covariance (m, m/s) before the finger was ever seen."""
+INITIAL_COVARIANCE = np.diag([1.0] * 3 + [10.0] * 3)
+"""Covariance (m, m/s) before the first detection."""
 
 
 class Tracker:
-    """A track, and the rule by which measured points enter it."""
+    """Track one finger, and gate the points that enter the track."""
 
     def __init__(self, filter_: Filter, settings: TrackingSettings) -> None:
         self.filter, self.settings = filter_, settings
-        self._history: list[tuple[Fix, Estimate]] = []
-        self._challengers: list[Fix] = []
-        self._late: list[Fix] = []
+        self._history: list[tuple[PositionMeasurement, Estimate]] = []
+        self._tentative_track: list[PositionMeasurement] = []
+        self._late: list[PositionMeasurement] = []
 
     @property
     def estimate(self) -> Estimate | None:
-        """The newest; it stays when the track is lost."""
+        """Newest estimate, which remains when the track is lost."""
         return self._history[-1][1] if self._history else None
 
     def is_late(self, at_ns: int) -> bool:
-        """Whether a point of that time would come after a later one."""
+        """Whether a point of that time is older than the newest one."""
         return self.estimate is not None and at_ns <= self.estimate.at_ns
 
     def state(self, at_ns: int) -> FingertipState:
-        """Of the track at a time not before its newest point."""
-        if not self._alive(at_ns):
-            return "acquiring" if self._challengers else "lost"
+        """Return the state of the track at a time not before its newest point."""
+        if not self._is_alive(at_ns):
+            return "acquiring" if self._tentative_track else "lost"
         assert self.estimate is not None
         return "tracking" if at_ns == self.estimate.at_ns else "coasting"
 
-    def expected(self, at_ns: int) -> Expected | None:
-        """Where the finger can be at a time after the newest point; None without a track.
+    def gate(self, at_ns: int) -> Gate | None:
+        """Return where the finger can be at a time after the newest point.
 
-        Of the time before its newest point a track says nothing.
+        None without a track, and for times before its newest point.
         """
-        if not self._alive(at_ns) or self.is_late(at_ns):
+        if not self._is_alive(at_ns) or self.is_late(at_ns):
             return None
-        return self._expected_after(*self._history[-1], at_ns)
+        return self._gate_after(*self._history[-1], at_ns)
 
-    def _expected_after(self, fix: Fix, estimate: Estimate, at_ns: int) -> Expected:
-        """Where the finger can be at a time after one of the track's points."""
+    def _gate_after(self, measurement: PositionMeasurement, estimate: Estimate, at_ns: int) -> Gate:
+        """Return where the finger can be at a time after one of the track's points."""
         dt = (at_ns - estimate.at_ns) * 1e-9
-        point = self.filter.ahead(estimate, np.array([dt]))[0]
+        point = self.filter.predict(estimate, np.array([dt]))[0]
         spread = self.filter.moments(estimate)[2]
         sigma = np.sqrt(np.trace(spread[:3, :3]) + dt * dt * np.trace(spread[3:, 3:]))
-        turn_m = 0.5 * self.settings.max_acceleration_m_per_s2 * dt * dt
-        way_m = self.settings.max_speed_m_per_s * dt
-        away_m = float(np.linalg.norm(point - fix.measured))
-        # A finger is where its acceleration leads, and where its speed does: the smaller counts.
-        reach_m = min(turn_m + GATE_SIGMAS * float(sigma), way_m + away_m)
-        return Expected(point, reach_m + GATE_SIGMAS * float(np.sqrt(np.trace(fix.covariance))))
+        acceleration_m = 0.5 * self.settings.max_acceleration_m_per_s2 * dt * dt
+        travel_m = self.settings.max_speed_m_per_s * dt
+        offset_m = float(np.linalg.norm(point - measurement.measured))
+        # Both the acceleration limit and the speed limit bound the motion: take the smaller bound.
+        radius_m = min(acceleration_m + GATE_SIGMAS * float(sigma), travel_m + offset_m)
+        return Gate(
+            point, radius_m + GATE_SIGMAS * float(np.sqrt(np.trace(measurement.covariance)))
+        )
 
-    def track_at(self, at_ns: int, leads_s: Floats) -> Track:
-        """The track at a time not before its newest point; a lost one stays where it was lost."""
+    def predict_at(self, at_ns: int, horizons_s: Floats) -> TrackPrediction:
+        """Predict the finger from a time not before the newest point; a lost one stays where it was
+        lost."""
         estimate = self.estimate
         if estimate is None:
-            return Track(np.zeros(3), np.zeros(3), UNKNOWN, np.zeros((len(leads_s), 3)))
+            return TrackPrediction(
+                np.zeros(3), np.zeros(3), INITIAL_COVARIANCE, np.zeros((len(horizons_s), 3))
+            )
         position, velocity, covariance = self.filter.moments(estimate)
-        if not self._alive(at_ns):
-            return Track(position, np.zeros(3), covariance, np.tile(position, (len(leads_s), 1)))
+        if not self._is_alive(at_ns):
+            return TrackPrediction(
+                position, np.zeros(3), covariance, np.tile(position, (len(horizons_s), 1))
+            )
         since_s = (at_ns - estimate.at_ns) * 1e-9
-        ahead = self.filter.ahead(estimate, since_s + leads_s)
-        return Track(ahead[0], velocity, covariance, ahead)
+        ahead = self.filter.predict(estimate, since_s + horizons_s)
+        return TrackPrediction(ahead[0], velocity, covariance, ahead)
 
     def velocity_at(self, at_ns: int) -> tuple[Floats, Floats]:
-        """The finger's velocity (3,) m/s and its covariance (3, 3), as far as they are known."""
-        if self.estimate is None or not self._alive(at_ns):
+        """Return the finger's velocity (3,) m/s and its covariance (3, 3); zero without a track."""
+        if self.estimate is None or not self._is_alive(at_ns):
             return np.zeros(3), np.eye(3) * (self.settings.max_speed_m_per_s / 3.0) ** 2
         _, velocity, covariance = self.filter.moments(self.estimate)
         return velocity, covariance[3:, 3:]
 
-    def take(self, at_ns: int, measured: Floats, covariance: Floats) -> Verdict:
-        """Judge a measured point (3,) with its covariance (3, 3), and let it in if it may."""
-        fix = Fix(at_ns, measured, covariance)
+    def update(self, at_ns: int, measured: Floats, covariance: Floats) -> GateResult:
+        """Add a measured point (3,) with its covariance (3, 3) to the track, if the gate allows
+        it."""
+        measurement = PositionMeasurement(at_ns, measured, covariance)
         if self.is_late(at_ns):
-            return self._take_late(fix)
+            return self._insert_late(measurement)
         self._late = []
-        expected = self.expected(at_ns)
-        if expected is None:
-            return self._challenge(fix, "unconfirmed")
-        if not expected.holds(fix):
-            return self._challenge(fix, "too_fast")
-        self._challengers = []
-        self._append(fix)
+        gate = self.gate(at_ns)
+        if gate is None:
+            return self._extend_tentative_track(measurement, "unconfirmed")
+        if not gate.contains(measurement):
+            return self._extend_tentative_track(measurement, "too_fast")
+        self._tentative_track = []
+        self._append(measurement)
         return "ok"
 
-    def _alive(self, at_ns: int) -> bool:
+    def _is_alive(self, at_ns: int) -> bool:
         newest = self.estimate
         return newest is not None and (
-            (at_ns - newest.at_ns) * 1e-9 <= self.settings.forget_after_s
+            (at_ns - newest.at_ns) * 1e-9 <= self.settings.track_timeout_s
         )
 
-    def _append(self, fix: Fix) -> None:
+    def _append(self, measurement: PositionMeasurement) -> None:
         newest = self.estimate
         estimate = (
-            self.filter.started(fix.at_ns, fix.measured, fix.covariance)
+            self.filter.initialize(measurement.at_ns, measurement.measured, measurement.covariance)
             if newest is None
-            else self.filter.updated(newest, fix.at_ns, fix.measured, fix.covariance)
+            else self.filter.update(
+                newest, measurement.at_ns, measurement.measured, measurement.covariance
+            )
         )
-        oldest_ns = fix.at_ns - round(self.settings.remember_s * 1e9)
+        oldest_ns = measurement.at_ns - round(self.settings.history_s * 1e9)
         self._history = [entry for entry in self._history if entry[0].at_ns >= oldest_ns]
-        self._history.append((fix, estimate))
+        self._history.append((measurement, estimate))
 
-    def _challenge(self, fix: Fix, refusal: Verdict) -> Verdict:
-        """Count a point that is not of the track; with enough that agree a new one begins."""
-        self._challengers = self._agreeing(self._challengers, fix)
-        if len(self._challengers) < self.settings.confirm_frames:
+    def _extend_tentative_track(
+        self, measurement: PositionMeasurement, refusal: GateResult
+    ) -> GateResult:
+        """Add a point outside the track to the tentative track, which replaces the track once
+        confirmed."""
+        self._tentative_track = self._consistent_run(self._tentative_track, measurement)
+        if len(self._tentative_track) < self.settings.confirm_frames:
             return refusal
-        return self._begin(self._challengers)
+        return self._begin(self._tentative_track)
 
-    def _agreeing(self, before: list[Fix], fix: Fix) -> list[Fix]:
-        """The points in a row that a finger can have been at, up to this one."""
-        last = before[-1] if before else None
-        if last is None or (fix.at_ns - last.at_ns) * 1e-9 > self.settings.forget_after_s:
-            return [fix]
-        follows = fix.at_ns > last.at_ns and last.reaches(fix, self.settings.max_speed_m_per_s)
-        return [*before, fix] if follows else [fix]
+    def _consistent_run(
+        self, previous: list[PositionMeasurement], measurement: PositionMeasurement
+    ) -> list[PositionMeasurement]:
+        """Return the consecutive points that one finger can have passed, up to this one."""
+        last = previous[-1] if previous else None
+        if last is None or (measurement.at_ns - last.at_ns) * 1e-9 > self.settings.track_timeout_s:
+            return [measurement]
+        follows = measurement.at_ns > last.at_ns and last.can_reach(
+            measurement, self.settings.max_speed_m_per_s
+        )
+        return [*previous, measurement] if follows else [measurement]
 
-    def _begin(self, fixes: list[Fix]) -> Verdict:
-        self._history, self._challengers, self._late = [], [], []
-        for fix in fixes:
-            self._append(fix)
+    def _begin(self, measurements: list[PositionMeasurement]) -> GateResult:
+        self._history, self._tentative_track, self._late = [], [], []
+        for measurement in measurements:
+            self._append(measurement)
         return "ok"
 
-    def _take_late(self, fix: Fix) -> Verdict:
-        """Put a point in its place in time, and let the filter go over the later ones again.
+    def _insert_late(self, measurement: PositionMeasurement) -> GateResult:
+        """Insert a late point into the history, and filter the later points again.
 
-        Late points in a row, with none in between that is not, mean that the clock has stepped
-        back: the track begins anew with them.  What is older than all that is remembered, was known
-        already, comes where none is missing, or lies where no finger could have been is left out.
+        Several late points in a row mean that the clock has stepped back, so that the track
+        restarts with them.  A late point is dropped if it is older than the history, a duplicate,
+        outside a gap in the history, or outside the gate.
         """
-        self._late = self._agreeing(self._late, fix)
+        self._late = self._consistent_run(self._late, measurement)
         if len(self._late) >= self.settings.confirm_frames:
             return self._begin(self._late)
-        place = sum(entry[0].at_ns < fix.at_ns for entry in self._history)
-        again = [entry[0] for entry in self._history[place:]]
+        index = sum(entry[0].at_ns < measurement.at_ns for entry in self._history)
+        later = [entry[0] for entry in self._history[index:]]
         fits = (
-            place > 0
-            and again[0].at_ns != fix.at_ns
-            and self._is_missing_between(place - 1, place)
-            and self._expected_after(*self._history[place - 1], fix.at_ns).holds(fix)
-            and fix.reaches(again[0], self.settings.max_speed_m_per_s)
+            index > 0
+            and later[0].at_ns != measurement.at_ns
+            and self._is_missing_between(index - 1, index)
+            and self._gate_after(*self._history[index - 1], measurement.at_ns).contains(measurement)
+            and measurement.can_reach(later[0], self.settings.max_speed_m_per_s)
         )
         if fits:
-            self._history = self._history[:place]
-            for entry in (fix, *again):
+            self._history = self._history[:index]
+            for entry in (measurement, *later):
                 self._append(entry)
         return "unconfirmed"
 
-    def _is_missing_between(self, before: int, after: int) -> bool:
-        """Whether so much time lies between two points of the track that one should be there."""
+    def _is_missing_between(self, previous: int, after: int) -> bool:
+        """Whether two points of the track are so far apart in time that one between them is
+        missing."""
         times_ns = np.array([entry[0].at_ns for entry in self._history])
         usual_ns = float(np.median(np.diff(times_ns)))
-        return float(times_ns[after] - times_ns[before]) > 1.5 * usual_ns
+        return float(times_ns[after] - times_ns[previous]) > 1.5 * usual_ns

@@ -1,8 +1,8 @@
-"""The twin's arms: RV-1A manipulators with servo lag behind Modbus TCP servers.
+"""Simulate the arms: RV-1A manipulators with servo lag behind Modbus TCP servers.
 
-Written on its own from `docs/modbus.md` and the arm's dimensions; shares nothing with the bridge
-that it judges.  Forward kinematics is a product of exponentials (Brockett 1984; Lynch and Park,
-Modern Robotics, ch. 4), inverse kinematics Gauss-Newton on it.
+This module was written from `docs/modbus.md` and the arm's dimensions only, and shares nothing with
+the bridge that it tests.  The forward kinematics is a product of exponentials (Brockett 1984; Lynch
+and Park, Modern Robotics, ch. 4), the inverse kinematics a Gauss-Newton method on it.
 """
 
 from __future__ import annotations
@@ -39,24 +39,29 @@ Fault = Literal[
     "frozen",
     "lagging",
 ]
-"""What an arm suffers from on request.
+"""Faults of an arm on request.
 
-silent: answers nothing.  slow: answers LATE_S late.  exception: answers with a Modbus exception (a
-real-time packet of another type).  bad_crc: damages its answers (real-time: cuts them short).
-old_version: speaks an older register map.  repeated: counts as in the answer before.
-frozen: answers, but its joints stay.  lagging: does all LATE_S late.
+silent: does not answer.
+slow: answers LATE_S late.
+exception: answers with a Modbus exception (real-time: a packet of another type).
+bad_crc: damages its answers (real-time: truncates them).
+old_version: uses an older register map.
+repeated: repeats the counter of the previous answer.
+frozen: answers, but its joints do not move.
+lagging: does everything LATE_S late.
 """
 
 LATE_S = 0.05
 
-# A client that goes away in the middle of an answer is no news; the library dumps its last packets.
+# A client that disconnects within an answer is not worth a log entry; the library dumps packets.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 CONTROLLER_CYCLE_S = 0.0071
 
 
-def refuse_beyond_loopback(address: str) -> str:
-    """An address that this computer alone reaches; ValueError: an arm obeys whoever reaches it."""
+def check_loopback(address: str) -> str:
+    """Return an address that only this computer reaches; ValueError otherwise, since an arm obeys
+    any client."""
     if not ipaddress.ip_address(address).is_loopback:
         raise ValueError(
             f"{address} is beyond loopback, and whoever reaches an arm's server moves the arm"
@@ -113,10 +118,11 @@ def _turns(joints_rad: Floats) -> Floats:
     return np.asarray(np.eye(4) + np.sin(angles) * _CROSS + (1.0 - np.cos(angles)) * _SQUARE)
 
 
-def joints_for(base_from_flange: Floats, guess_rad: Floats) -> Floats:
-    """Joints (6,) within the ranges for a flange pose, by damped Gauss-Newton from a guess.
+def solve_inverse_kinematics(base_from_flange: Floats, guess_rad: Floats) -> Floats:
+    """Solve the joints (6,) within their ranges for a flange pose, by damped Gauss-Newton from a
+    guess.
 
-    ValueError when it does not settle within a micrometre and a microradian.
+    Raises ValueError unless it converges to a micrometre and a microradian.
     """
     joints = guess_rad.copy()
     for _ in range(200):
@@ -137,7 +143,7 @@ def joints_for(base_from_flange: Floats, guess_rad: Floats) -> Floats:
 
 
 def _pose_error(wanted: Floats, present: Floats) -> Floats:
-    """Shift (m) and small rotation (rad) from the present pose to the wanted one."""
+    """Return translation (m) and small rotation (rad) from the present pose to the wanted one."""
     turn = wanted[:3, :3] @ present[:3, :3].T
     spin = 0.5 * np.array(
         [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -146,12 +152,12 @@ def _pose_error(wanted: Floats, present: Floats) -> Floats:
 
 
 def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """As numpy.clip, at a fifth of its cost for six numbers."""
+    """Clip like numpy.clip, in a fifth of its time for six numbers."""
     return np.minimum(np.maximum(values, lowest), highest)
 
 
-def slowed(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
-    """Joint velocities (..., 6) after braking for a while: all in proportion, along their path."""
+def decelerate(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
+    """Return joint velocities (..., 6) after braking: scaled in proportion, along their path."""
     stopping_s = (np.abs(velocity_rad_per_s) / ACCELERATION_RAD_PER_S2).max(axis=-1, keepdims=True)
     left = np.maximum(stopping_s - duration_s, 0.0) / np.maximum(stopping_s, 1e-12)
     return np.asarray(velocity_rad_per_s * left)
@@ -159,11 +165,12 @@ def slowed(velocity_rad_per_s: Floats, duration_s: float) -> Floats:
 
 @dataclass(slots=True)
 class Servo:
-    """Six joints that follow set-points like critically damped second-order servos.
+    """Move six joints towards set-points like critically damped second-order servos.
 
-    lag_s: how far a joint trails a set-point that moves evenly.  joints_rad is what the encoders at
-    the motors see; driven_rad is where the joints are beyond their gears, whose play of
-    `backlash_rad` leaves a joint standing for so long when its motor turns back.
+    lag_s: lag of a joint behind a set-point of constant velocity.
+    joints_rad: positions of the encoders at the motors.
+    driven_rad: positions behind the gears.  Their backlash of `backlash_rad` delays a joint when
+        its motor reverses.
     """
 
     joints_rad: Floats
@@ -176,7 +183,8 @@ class Servo:
         self.driven_rad = self.joints_rad.copy()
 
     def advance(self, wanted_rad: Floats, duration_s: float, *, braking: bool = False) -> None:
-        """Move on by `duration_s` in steps of at most a millisecond; braking stops on the way."""
+        """Advance by `duration_s` in steps of at most a millisecond; `braking` stops along the
+        path."""
         if braking and not self.velocity_rad_per_s.any():
             return
         steps = max(1, int(np.ceil(duration_s / 1e-3)))
@@ -184,7 +192,7 @@ class Servo:
         natural = 2.0 / self.lag_s
         for _ in range(steps):
             if braking:
-                speed = slowed(self.velocity_rad_per_s, step_s)
+                speed = decelerate(self.velocity_rad_per_s, step_s)
             else:
                 pull = natural * (
                     natural * (wanted_rad - self.joints_rad) - 2.0 * self.velocity_rad_per_s
@@ -198,14 +206,14 @@ class Servo:
 
 
 class Controller:
-    """One arm's controller: takes command blocks, refuses what it must, answers with its status.
+    """Simulate one arm's controller: it checks command blocks and answers with its status.
 
-    It refuses as a Modbus exception what is not a valid new command (magic, version, CRC, mode,
-    sequence), and falls into its fault state, where it brakes and stays, for joints out of range or
-    not finite, for a set-point that leaps, and when no command came for `watchdog_s` while moving.
-    An `idle` command clears a fault and may start the sequence anew.
+    It rejects an invalid new command (magic, version, CRC, mode, sequence) by a Modbus exception.
+    It enters its fault state, where it brakes and stops, for joints out of range or not finite, for
+    a jump of the set-point, and when no command came for `watchdog_s` while moving.  An `idle`
+    command clears a fault and may restart the sequence.
 
-    cycle_s: a set-point acts from the controller's next cycle on; 0: at once.
+    cycle_s: a set-point takes effect at the controller's next cycle; 0: at once.
     """
 
     def __init__(
@@ -239,7 +247,7 @@ class Controller:
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
-        """Let `duration_s` pass; trips the watchdog."""
+        """Advance by `duration_s`; trips the watchdog."""
         end_s = self._time_s + duration_s
         while self._orders and self._orders[0][0] <= end_s:
             due_s, wanted_rad = self._orders.popleft()
@@ -255,14 +263,14 @@ class Controller:
             self.servo.advance(self._acting_rad, duration_s, braking=self.state != STATE_MOVING)
 
     def take(self, registers: list[int]) -> bool:
-        """Judge a written command block; false refuses it as a Modbus exception."""
+        """Check a written command block; False rejects it by a Modbus exception."""
         block = struct.pack(f">{len(registers)}H", *registers)
         if len(block) != _COMMAND.size:
             return self._refuse()
         magic, version, sequence, _, mode, _, *joints, crc = _COMMAND.unpack(block)
         if magic != 0x4653 or version != 1 or crc != zlib.crc32(block[:-4]) or mode > _STOP:
             return self._refuse()
-        # Forward by less than half the circle, so that the 32-bit counter may wrap.
+        # Accept a step by less than half the range, so that the 32-bit counter may wrap.
         newer = 0 < (sequence - self.accepted) % 2**32 < 2**31
         if mode != _IDLE and not newer:
             return self._refuse()
@@ -295,7 +303,7 @@ class Controller:
             self._orders.append((self._due_s(), joints))
 
     def _due_s(self) -> float:
-        """When a set-point that comes now is to act."""
+        """Return the time at which a set-point that arrives now takes effect."""
         due_s = self._time_s + (LATE_S if self.fault == "lagging" else 0.0)
         return math.ceil(due_s / self._cycle_s) * self._cycle_s if self._cycle_s else due_s
 
@@ -309,7 +317,7 @@ class Controller:
         return False
 
     def status_registers(self) -> list[int]:
-        """The status block, with the joints as measured now."""
+        """Return the status block, with the present joints."""
         measured = self.servo.joints_rad + self._noise_rad * self._random.standard_normal(6)
         block = _STATUS.pack(
             0x4653,
@@ -329,7 +337,7 @@ class Controller:
 
 
 class ArmServer:
-    """A Modbus TCP server in front of a controller."""
+    """Serve a controller by Modbus TCP."""
 
     def __init__(
         self, controller: Controller, *, host: str, port: int, before: Callable[[], None]
@@ -341,7 +349,7 @@ class ArmServer:
         self._server: ModbusTcpServer | None = None
 
     async def start(self) -> None:
-        """Listen; OSError or RuntimeError when the port is taken."""
+        """Listen; raises OSError or RuntimeError when the port is taken."""
         device = SimDevice(
             1,
             simdata=[
@@ -350,13 +358,13 @@ class ArmServer:
             ],
             action=self._act,
         )
-        # A missing device is not answered at all: that is how this server falls silent.
+        # A missing device gets no answer at all, which makes this server silent.
         self._server = ModbusTcpServer(device, address=self._address, ignore_missing_devices=True)
         await self._server.serve_forever(background=True)
 
     @property
     def port(self) -> int:
-        """The port listened on (useful when it was given as 0)."""
+        """The port of the server (useful when it was given as 0)."""
         listener: Any = None if self._server is None else self._server.transport
         if listener is None:
             raise RuntimeError("the arm's server does not listen")
@@ -383,7 +391,7 @@ class ArmServer:
             return ExcCodes.DEVICE_FAILURE
         if fault == "slow" and written:
             await asyncio.sleep(LATE_S)
-        # Of a read and write in one, the write comes first and has brought the arm up to date.
+        # In a combined read and write, the write comes first and has updated the arm.
         if written or function_code != _READ_AND_WRITE:
             self._before()
         if written:

@@ -1,4 +1,4 @@
-"""The twin's two arms on the network: servers that move, and the truth about them."""
+"""Simulate two arms on the network, and publish their true poses."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from nodes.twin.arms import (
     Controller,
     Fault,
     Floats,
+    check_loopback,
     forward,
-    joints_for,
-    refuse_beyond_loopback,
+    solve_inverse_kinematics,
 )
 from nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
 
-Loopback = Annotated[str, AfterValidator(refuse_beyond_loopback)]
+Loopback = Annotated[str, AfterValidator(check_loopback)]
 
 START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
@@ -53,7 +53,7 @@ class TwinArmsParameters(NodeParameters):
 
 
 class TwinArmsNode(Node):
-    """Simulates both arms; they are switched on by the first scene, holding the sheet in it."""
+    """Simulate both arms; the first scene switches them on, with the sheet in their grippers."""
 
     opens_devices: ClassVar[bool] = True
 
@@ -89,7 +89,7 @@ class TwinArmsNode(Node):
             self.servers[side] = server
 
     def _server(self, side: str, joints_rad: Floats, port: int, seed: int) -> ArmServer | MxtServer:
-        """An arm at those joints, behind a server of the protocol."""
+        """Start an arm at those joints, behind a server of the protocol."""
         given, before = self.parameters, partial(self._advance, side)
         if given.protocol == "mxt":
             mxt = MxtController(
@@ -115,15 +115,17 @@ class TwinArmsNode(Node):
         return ArmServer(controller, host=given.host, port=port, before=before)
 
     def _start_joints(self, side: str, spec: ArmSpec, scene: Scene) -> Floats:
-        """Joints that hold the sheet in the imaginary screen, just stretched."""
+        """Return joints that hold the sheet in the screen plane, just stretched."""
         half = 0.5 * scene.sheet.width_m * scene.sheet.min_stretch_ratio
         edge = transform(np.eye(3), [-half if side == "left" else half, 0.0, 0.0])
         clamp = spec.flange_from_edge
         flange = edge @ inverse(transform_from_rpy(clamp.position_m, clamp.rpy_rad))
-        return joints_for(inverse(self._world_from_base[side]) @ flange, START_GUESS_RAD)
+        return solve_inverse_kinematics(
+            inverse(self._world_from_base[side]) @ flange, START_GUESS_RAD
+        )
 
     def _advance(self, side: str) -> None:
-        """Bring an arm to the present instant."""
+        """Advance an arm to the present time."""
         now_ns = self.clock.now_ns()
         duration_s = (now_ns - self._moved_ns[side]) * 1e-9
         self._moved_ns[side] = now_ns

@@ -1,7 +1,7 @@
-"""Pictures of a calibration board, as the twin's rig sees it, and the poses it is shown in.
+"""Render images of a calibration board for the simulated rig, and choose the board's poses.
 
-Each pixel's rays are cast onto the board's plane.  An edge of a square is smeared over the one ray
-that it crosses, so that the corners lie where the optics put them, to a few thousandths of a pixel.
+The rays of each pixel are intersected with the board's plane.  An edge of a square is blurred over
+the one ray that it crosses, so that corners are accurate to a few thousandths of a pixel.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from messages.calibration import Board
 from messages.scene import Lens, StereoCamera
 from nodes.models.rigid import apply, rotation_from_vector, transform
-from nodes.twin.pixels import Sensor, quantized
+from nodes.twin.pixels import Sensor, quantize
 from nodes.twin.rig import pixels_of, slopes_of
 
 Floats = NDArray[np.float64]
@@ -29,27 +29,27 @@ PAPER_LEVEL = 175.0
 INK_LEVEL = 22.0
 ROOM_LEVEL = 45.0
 BORDER_SQUARES = 0.6
-"""White border around the squares."""
+"""Width of the white border around the squares, in squares."""
 
 TILTS_RAD = (0.0, 0.35, 0.6, 0.45, 0.25)
-SHARES_OF_HEIGHT = (0.95, 0.5, 0.75, 0.35, 0.6)
-"""What share of the picture's height the board fills, held upright: near and far."""
+HEIGHT_FRACTIONS = (0.95, 0.5, 0.75, 0.35, 0.6)
+"""Fractions of the image's height that the upright board fills: near and far."""
 
 MARGIN_PX = 6.0
-CHARUCO_SEEN = 0.6
-"""A ChArUco board may be cut by the picture as long as this share of its corners is seen."""
+MIN_CHARUCO_FRACTION = 0.6
+"""Minimum fraction of a ChArUco board's corners in view; the board may be cut off otherwise."""
 
 CHARUCO_NEARER = 1.2
-"""It is shown nearer by this, since its markers are small."""
+"""Factor by which a ChArUco board is shown nearer, since its markers are small."""
 
 
 class BoardError(ValueError):
-    """A board that cannot be drawn; the message says what to change."""
+    """Raised for a board that cannot be rendered; the message says what to change."""
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """Uneven light on a board: its level's change across the picture, and the room's texture."""
+    """Hold the uneven light on a board: its gradient across the image, and the room's texture."""
 
     gain: float
     slope_x: float
@@ -58,7 +58,7 @@ class Light:
 
 
 class TwinBoard:
-    """Shows a board to a rig, whose lenses are the true ones; noise and light come from `seed`."""
+    """Show a board to a rig with the true lenses; noise and light come from `seed`."""
 
     def __init__(
         self, camera: StereoCamera, board: Board, *, seed: int, sensor: Sensor | None = None
@@ -71,9 +71,10 @@ class TwinBoard:
         self._rays = tuple(self._cast(lens) for lens in (camera.left, camera.right))
 
     def _cast(self, lens: Lens) -> Singles:
-        """Slopes (RAYS*height, RAYS*width, 2) of the rays through the picture.
+        """Return slopes (RAYS*height, RAYS*width, 2) of the rays through the image.
 
-        Lenses bend so little from pixel to pixel that the rays of one pixel are evenly spread.
+        The distortion varies so little between pixels that the rays of one pixel are equally
+        spaced.
         """
         height, width = self.camera.height_px, self.camera.width_px
         pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
@@ -87,7 +88,8 @@ class TwinBoard:
         return rays
 
     def corners(self, left_from_board: Floats) -> tuple[Floats, Floats]:
-        """True pixels (rows*columns, 2) of the inner corners in both views, columns first."""
+        """Return the true pixels (rows*columns, 2) of the inner corners in both views, columns
+        first."""
         board = self.board
         grid = np.mgrid[: board.columns, : board.rows].T.reshape(-1, 2) * board.square_m
         points = np.concatenate([grid, np.zeros((len(grid), 1))], axis=1)
@@ -95,7 +97,8 @@ class TwinBoard:
         return left, right
 
     def _views(self, left_from_board: Floats, points: Floats) -> list[Floats]:
-        """Pixels (n, 2) of the board's points (n, 3) in each view; all must lie before both."""
+        """Return pixels (n, 2) of the board's points (n, 3) in each view; all must lie before
+        both."""
         seen = []
         for lens, eye_from_left in (
             (self.camera.left, np.eye(4)),
@@ -108,16 +111,16 @@ class TwinBoard:
         return seen
 
     def pair(self, left_from_board: Floats) -> tuple[Image, Image]:
-        """The left and right picture of the board at a pose (4, 4)."""
+        """Render the left and the right image of the board at a pose (4, 4)."""
         left, right = self.levels(left_from_board)
         return self._exposed(left), self._exposed(right)
 
     def _exposed(self, levels: Singles) -> Image:
         noise = self._random.standard_normal(levels.shape, dtype=np.float32)
-        return quantized(levels + self.sensor.noise(levels) * noise)
+        return quantize(levels + self.sensor.noise(levels) * noise)
 
     def levels(self, left_from_board: Floats) -> tuple[Singles, Singles]:
-        """Both pictures before noise and rounding, (height, width)."""
+        """Render both images before noise and rounding, (height, width)."""
         self._views(left_from_board, self._outline())
         light = self._light()
         left, right = (
@@ -136,7 +139,7 @@ class TwinBoard:
         return Light(gain, slope_x, slope_y, np.clip(room, 5.0, 90.0).astype(np.float32))
 
     def _outline(self) -> Floats:
-        """Points (n, 3) along the edge of the board's paper, in the board's frame."""
+        """Return points (n, 3) along the edge of the board's paper, in the board's frame."""
         board = self.board
         low = -(1.0 + BORDER_SQUARES) * board.square_m
         high = np.array([board.columns, board.rows]) * board.square_m + BORDER_SQUARES * (
@@ -154,7 +157,7 @@ class TwinBoard:
         return np.concatenate([flat, np.zeros((len(flat), 1))], axis=1)
 
     def _drawn(self, rays: Singles, eye_from_board: Floats, light: Light) -> Singles:
-        """Levels of one view; lens blur and falling light included."""
+        """Render one view with lens blur and vignetting."""
         height, width = self.camera.height_px, self.camera.width_px
         levels = light.room.copy()
         in_eye = apply(eye_from_board, self._outline())
@@ -176,14 +179,15 @@ class TwinBoard:
         return np.asarray(levels * lit, dtype=np.float32)
 
     def _through_lens(self, fine: Singles) -> Singles:
-        """Mean over each pixel of what the rays see, blurred before the pixels sample it."""
+        """Average the rays of each pixel, after the lens blur."""
         spread = RAYS * self.sensor.blur_px
         smooth = cv2.GaussianBlur(fine, (0, 0), spread, borderType=cv2.BORDER_REPLICATE)
         height, width = fine.shape[0] // RAYS, fine.shape[1] // RAYS
         return np.asarray(smooth.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3)), np.float32)
 
     def _seen(self, rays: Singles, eye_from_board: Floats) -> tuple[Singles, Singles]:
-        """Level of the board where each ray meets its plane, and the share that meets it."""
+        """Return the level of the board where each ray meets its plane, and the fraction that meets
+        it."""
         board = self.board
         plane_from_ray = np.linalg.inv(eye_from_board[:3, [0, 1, 3]]).astype(np.float32)
         on_plane = rays @ plane_from_ray[:, :2].T + plane_from_ray[:, 2]
@@ -213,10 +217,11 @@ class TwinBoard:
         return self.board.marker_m / self.board.square_m
 
     def poses(self, count: int) -> list[Floats]:
-        """Poses `left_from_board` (4, 4) as a careful person would show the board.
+        """Return poses `left_from_board` (4, 4) as a careful person would show the board.
 
-        Round the picture's middle, corners and edges, near and far, tilted to all sides; each as
-        far out as both views still see the whole board (of a ChArUco board, most of it).
+        They cover the image's centre, corners and edges, near and far, with tilts in all
+        directions.  Each is as far out as both views still contain the whole board (of a ChArUco
+        board, most of it).
         """
         board = self.board
         middle = 0.5 * board.square_m * np.array([board.columns - 1, board.rows - 1])
@@ -225,9 +230,9 @@ class TwinBoard:
         nearer = 1.0 if board.kind == "chessboard" else CHARUCO_NEARER
         poses: list[Floats] = []
         for number in range(count):
-            share = nearer * SHARES_OF_HEIGHT[number % len(SHARES_OF_HEIGHT)]
+            share = nearer * HEIGHT_FRACTIONS[number % len(HEIGHT_FRACTIONS)]
             tilt_rad = TILTS_RAD[number % len(TILTS_RAD)] + self._random.uniform(0.0, 0.1)
-            # The golden angle: no two tilts lean alike, however many there are.
+            # The golden angle: no two tilts have the same direction, for any number of poses.
             towards = 2.399963 * number
             turn = rotation_from_vector(
                 tilt_rad * np.array([np.cos(towards), np.sin(towards), 0.0])
@@ -238,7 +243,7 @@ class TwinBoard:
         return poses
 
     def _placed(self, turn: Floats, depth_m: float, way: Floats, middle: Floats) -> Floats:
-        """The board, so turned, pushed as far out as it may be; further away if it must be."""
+        """Place the rotated board as far out as possible, and farther away if necessary."""
         between_m = -0.5 * float(self.camera.right_from_left[0, 3])
         half = 0.5 * np.array([self.camera.width_px, self.camera.height_px])
         reach = half / np.array([self.camera.left.fx_px, self.camera.left.fy_px])
@@ -257,7 +262,7 @@ class TwinBoard:
         return posed(out)
 
     def _shown(self, left_from_board: Floats) -> bool:
-        """Whether enough of the board is in both pictures: all of its paper, or enough corners."""
+        """Whether enough of the board is in both images: all of its paper, or enough corners."""
         whole = self.board.kind == "chessboard"
         try:
             views = self._views(left_from_board, self._outline())
@@ -266,7 +271,7 @@ class TwinBoard:
         if not whole:
             views = list(self.corners(left_from_board))
         size = np.array([self.camera.width_px, self.camera.height_px])
-        needed = 1.0 if whole else CHARUCO_SEEN
+        needed = 1.0 if whole else MIN_CHARUCO_FRACTION
         return all(
             np.mean(((view >= MARGIN_PX) & (view <= size - 1 - MARGIN_PX)).all(axis=1)) >= needed
             for view in views
@@ -274,10 +279,11 @@ class TwinBoard:
 
 
 def _markers(board: Board) -> NDArray[np.bool_]:
-    """Which cells are black: (rows+1, columns+1, n, n), n cells a side with the black border.
+    """Return which cells are black: (rows+1, columns+1, n, n), n cells a side with the black
+    border.
 
-    Numbered row by row over the white squares, the first square being black, as OpenCV numbers
-    them.  Raises BoardError for a board without markers or with more than its dictionary holds.
+    Markers are numbered by row over the white squares, with a black first square, as in OpenCV.
+    Raises BoardError for a board without markers or with more than its dictionary holds.
     """
     if board.marker_m is None or board.dictionary is None:
         raise BoardError("board: a ChArUco board needs marker_m and dictionary")
@@ -308,9 +314,9 @@ def _markers(board: Board) -> NDArray[np.bool_]:
 
 
 def _marker_ink(squares: Singles, markers: NDArray[np.bool_], share: float) -> Singles:
-    """Ink (0 or 1) of the markers at places (..., 2) counted in squares; `share` of one is theirs.
+    """Return the ink (0 or 1) of the markers at positions (..., 2) in squares.
 
-    Squares without a marker have none.
+    share: fraction of a square that its marker covers.  Squares without a marker have no ink.
     """
     rows, columns, cells, _ = markers.shape
     column = np.clip(np.floor(squares[..., 0]).astype(np.intp), 0, columns - 1)

@@ -1,9 +1,9 @@
-"""The judge of the picture: what an eye sees on the true sheet, by tracing rays.
+"""Render what an eye sees on the true sheet by ray tracing, as the reference of the display.
 
-A measuring camera stands at the eye; its picture plane is the imaginary screen (z = 0), a square
-window about the origin.  Each ray is followed to the sheet's triangles, from there to the
-projector, and takes the colour that the projector sends there.  The object itself is traced in the
-same way, as it ought to be seen.  Sizes are then measured in the pictures, as the paper did.
+A measuring camera stands at the eye.  Its image plane is the screen plane (z = 0), a square window
+about the origin.  Each ray is traced to the sheet's triangles and from there to the projector, and
+takes the colour that the projector sends there.  The object itself is traced in the same way, as
+the expected image.  Sizes are then measured in the images, as in the paper.
 
 It shares no code with the renderer: own rays, own projector, own object.
 """
@@ -36,24 +36,27 @@ HALF_WINDOW_M = 0.12
 MARGIN_PX = 3
 SEEN_SAMPLES = 2
 FLAT_SAMPLES, SOFT_SAMPLES = 8, 4
-"""A silhouette is measured, so its edge is sampled more finely than shading needs."""
+"""Samples per pixel and direction: a silhouette is measured and needs finer sampling than
+shading."""
 
 SHADOW_TOLERANCE = 0.002
-"""Relative depth behind the lit surface from which a point lies in its shadow."""
+"""Relative depth behind the lit surface beyond which a point is in shadow."""
 
 LIGHT = np.array([-0.35, 0.6, 0.72]) / np.linalg.norm([-0.35, 0.6, 0.72])
 AMBIENT, WRAP, SHEEN, SHEEN_EXPONENT = 0.25, 0.35, 0.10, 20.0
 GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0, 1.05]), 0.025
-"""What a soft object looks like in this light; docs/renderer.md says what they are."""
+"""Appearance of a soft object in this light; see docs/renderer.md."""
 
 
 class NotMeasurableError(ValueError):
-    """The picture does not show what is to be measured; the message says what is missing."""
+    """Raised when an image does not show what is to be measured; the message says what is
+    missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class Rays:
-    """A fan of rays: from `origin` (3,) along first + column * right + row * down, each (3,)."""
+    """Hold a fan of rays: from `origin` (3,) along first + column * right + row * down, each
+    (3,)."""
 
     origin: Floats
     first: Floats
@@ -70,11 +73,11 @@ class Rays:
 
 @dataclass(frozen=True, slots=True)
 class Hits:
-    """First hits of a fan of rays.
+    """Hold the first hits of a fan of rays.
 
-    triangle: (height, width), -1 where nothing is hit.  inverse_range: (height, width), one over
-    the ray parameter of the hit, 0 where there is none.  weights: (triangles, 3, 3), which take
-    (1, column, row) to unscaled barycentric weights.
+    triangle: (height, width), -1 where nothing is hit.
+    inverse_range: (height, width), one over the ray parameter of the hit, 0 without a hit.
+    weights: (triangles, 3, 3), which map (1, column, row) to unscaled barycentric weights.
     """
 
     triangle: NDArray[np.int32]
@@ -86,8 +89,8 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
     """Intersect a fan of rays with triangles (triangles, 3) of vertices (vertices, 3).
 
     A direction d = sum of w_i (vertex_i - origin) meets the triangle where all w_i >= 0, at the
-    parameter 1 / sum(w); the weights are linear in column and row.  Triangles that reach behind the
-    origin, or are seen edge-on, are not hit.
+    parameter 1 / sum(w).  The weights are linear in column and row.  Triangles that extend behind
+    the origin, or are seen edge-on, are not hit.
     """
     corners = (vertices - rays.origin)[triangles]
     basis = np.column_stack([rays.first, rays.right, rays.down])
@@ -123,7 +126,7 @@ def first_hits(rays: Rays, vertices: Floats, triangles: Indices) -> Hits:
 
 
 class TrueProjector:
-    """The projector on the true sheet: which pixel lights a point, and where a pixel lands."""
+    """Map between projector pixels and points of the true sheet."""
 
     def __init__(self, projector: Projector, vertices: Floats, triangles: Indices) -> None:
         """vertices: (vertices, 3) of the sheet, world.  triangles: (triangles, 3)."""
@@ -131,7 +134,8 @@ class TrueProjector:
         self._world_from_projector = transform_from_rpy(pose.position_m, pose.rpy_rad)
         self._lens = lens
         self._size = np.array([projector.width_px, projector.height_px])
-        # Rays are of a picture without distortion, with a margin for pixels that a lens bends in.
+        # The rays are those of an image without distortion, with a margin for pixels that the lens
+        # bends in.
         edge = np.array([(x, y) for x in np.linspace(0, 1, 9) for y in np.linspace(0, 1, 9)])
         border = edge * (self._size - 1)
         self._margin = 0
@@ -155,7 +159,7 @@ class TrueProjector:
         return first_hits(self._rays, self._vertices, self._triangles)
 
     def _straight(self, pixels: Floats) -> Floats:
-        """Where pixels (..., 2) would be without the lens's distortion."""
+        """Return the positions that pixels (..., 2) would have without the lens's distortion."""
         lens = self._lens
         if not any(lens.distortion):
             return pixels
@@ -163,9 +167,9 @@ class TrueProjector:
         return np.asarray(slopes_of(lens, pixels) * focal + centre)
 
     def pixels_of(self, points: Floats) -> tuple[Floats, Bools]:
-        """Projector pixels (..., 2) that send light towards points (..., 3), and which are lit.
+        """Return projector pixels (..., 2) that light points (..., 3), and which points are lit.
 
-        Not lit: outside the picture, or behind another part of the sheet.
+        A point is not lit outside the image, or behind another part of the sheet.
         """
         local = apply(inverse(self._world_from_projector), points)
         depth = local[..., 2]
@@ -182,8 +186,9 @@ class TrueProjector:
         lit = inside & (share >= first * (1.0 - SHADOW_TOLERANCE))
         return pixels, lit
 
-    def lands_at(self, pixels: Floats) -> tuple[Floats, Bools]:
-        """World points (n, 3) of the sheet that pixels (n, 2) light first, and which do."""
+    def intersect_surface(self, pixels: Floats) -> tuple[Floats, Bools]:
+        """Return world points (n, 3) of the sheet that pixels (n, 2) light first, and which
+        exist."""
         inside: Bools = np.all((pixels >= -0.5) & (pixels <= self._size - 0.5), axis=1)
         places = self._straight(np.where(inside[:, None], pixels, 0.0)) + self._margin
         limit = np.array([self._rays.width - 1, self._rays.height - 1])
@@ -199,13 +204,13 @@ class TrueProjector:
 
 
 Box = tuple[int, int, int, int]
-"""Part of a picture: left, top, and behind its last column and row."""
+"""Part of an image: left, top, and the column and row behind its last."""
 
 
 def eye_rays(eye: Floats, *, metres_per_px: float, size: int, box: Box, samples: int) -> Rays:
-    """Rays of the measuring camera through part of its picture of `size` x `size` pixels.
+    """Make the measuring camera's rays through part of its image of `size` x `size` pixels.
 
-    `samples` x `samples` rays to a pixel, top left first.
+    Each pixel has `samples` x `samples` rays, top left first.
     """
     left, top, right, bottom = box
     pitch = metres_per_px / samples
@@ -230,18 +235,19 @@ def seen(
     metres_per_px: float = METRES_PER_PX,
     half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
-    """The picture (rows, columns, 3) that the measuring camera takes of the sheet.
+    """Render the image (rows, columns, 3) that the measuring camera takes of the sheet.
 
-    projected: the projector's picture (height, width, 3), top row first.  Black where there is no
-    sheet, and where a fold keeps the light away.
+    projected: the projector's image (height, width, 3), top row first.
+
+    The image is black where there is no sheet, and where a fold blocks the light.
     """
     vertices, triangles = sheet.positions.reshape(-1, 3), sheet.triangles()
     projector = TrueProjector(scene.projector, vertices, triangles)
     size = round(2.0 * half_window_m / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
-    # Where nothing is projected nothing is seen: only the light's own part is traced.
+    # Only the lit part is traced, since nothing else is visible.
     bright = np.argwhere(projected.any(axis=2))[:, ::-1].astype(np.float64)
-    points, lands = projector.lands_at(bright)
+    points, lands = projector.intersect_surface(bright)
     lands &= points[:, 2] < eye[2] - 1e-3
     box = _box(points[lands], eye, metres_per_px, size)
     if box is None:
@@ -261,7 +267,7 @@ def seen(
 
 
 def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | None:
-    """The part of the picture that shows points (n, 3), with a margin; None for none of it."""
+    """Return the part of the image that shows points (n, 3), with a margin; None if it is empty."""
     if len(points) == 0:
         return None
     on_screen = eye[:2] + (points[:, :2] - eye[:2]) * (eye[2] / (eye[2] - points[:, 2:]))
@@ -274,13 +280,13 @@ def _box(points: Floats, eye: Floats, metres_per_px: float, size: int) -> Box | 
 
 
 def _put(whole: Image, box: Box, samples_of: NDArray[np.float32], samples: int) -> None:
-    """Average samples x samples to a pixel and put them into their part of the picture."""
+    """Average samples x samples into a pixel and store them in their part of the image."""
     left, top, right, bottom = box
     blocks = samples_of.reshape(bottom - top, samples, right - left, samples, -1)
     whole[top:bottom, left:right] = np.rint(blocks.mean(axis=(1, 3)))
 
 
-def proper(
+def render_expected(
     true_object: TrueObject,
     *,
     eye: Floats,
@@ -288,16 +294,16 @@ def proper(
     metres_per_px: float = METRES_PER_PX,
     half_window_m: float = HALF_WINDOW_M,
 ) -> Image:
-    """The picture (rows, columns, 3) that the eye ought to see: the object itself, on black.
+    """Render the expected image (rows, columns, 3): the object itself, on black.
 
-    The object must lie before the eye (ValueError).
+    Raises ValueError unless the object lies before the eye.
     """
     if (true_object.vertices[:, 2] > eye[2] - 1e-3).any():
         raise ValueError("the object reaches up to the eye")
     vertices, triangles = true_object.vertices, true_object.triangles
     size = round(2.0 * half_window_m / metres_per_px)
     whole = np.zeros((size, size, 3), np.uint8)
-    # Only the object's own part of the picture is traced, so that it can be traced finely.
+    # Only the object's own part of the image is traced, which allows fine sampling.
     box = _box(vertices, eye, metres_per_px, size)
     if box is None:
         return whole
@@ -329,7 +335,7 @@ def proper(
 
 
 def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) -> Floats:
-    """Colours (n, 3) of a soft object without a texture, where it has those normals (n, 3)."""
+    """Return colours (n, 3) of a soft object without a texture at normals (n, 3)."""
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     half = to_eye / np.linalg.norm(to_eye, axis=1, keepdims=True) + LIGHT
     half /= np.linalg.norm(half, axis=1, keepdims=True)
@@ -341,7 +347,7 @@ def _soft(colour: Floats, *, normals: Floats, to_eye: Floats, sunk_m: Floats) ->
 
 
 class _Silhouette:
-    """The largest bright blob of a picture, and where lines through it begin and end."""
+    """Find the largest bright blob of an image, and where lines through it begin and end."""
 
     def __init__(self, picture: Image) -> None:
         gray = picture.astype(np.float64).mean(axis=2)
@@ -357,18 +363,19 @@ class _Silhouette:
             raise NotMeasurableError(f"the largest bright blob has only {area} pixels")
         if left == 0 or top == 0 or left + width == mask.shape[1] or top + height == mask.shape[0]:
             raise NotMeasurableError("the object reaches the picture's border")
-        # Other blobs go; a margin keeps the edge's own soft pixels.
+        # Other blobs are removed; a margin keeps the edge's own soft pixels.
         keep = cv2.dilate((labels == largest).astype(np.uint8), np.ones((9, 9), np.uint8))
         self._gray = np.where(keep > 0, gray, 0.0) / self.white
         self.middle_column = left + 0.5 * (width - 1)
         self.middle_row = top + 0.5 * (height - 1)
 
     def rows_of_column(self, column: float) -> tuple[float, float]:
-        """Where the object begins and ends (rows) on a column, between columns interpolated."""
+        """Return where the object begins and ends (rows) on a column, interpolated between
+        columns."""
         return self._ends_between(self._gray.T, column)
 
     def columns_of_row(self, row: float) -> tuple[float, float]:
-        """Where the object begins and ends (columns) on a row."""
+        """Return where the object begins and ends (columns) on a row."""
         return self._ends_between(self._gray, row)
 
     def _ends_between(self, lines: Floats, at: float) -> tuple[float, float]:
@@ -382,10 +389,10 @@ class _Silhouette:
 
 
 def _ends(profile: Floats) -> tuple[float, float]:
-    """Sub-pixel first and last edge of a bright run.
+    """Return the subpixel first and last edge of a bright run.
 
-    The edge is where a sharp one would have to be for the same light: exact for any blur that is
-    symmetric, unlike the crossing of half the brightness.
+    The edge is where a sharp edge would give the same light.  This is exact for any symmetric blur,
+    unlike the crossing of half the brightness.
     """
     bright = np.nonzero(profile > 0.5)[0]
     if len(bright) < 12:
@@ -403,8 +410,8 @@ def _edge(profile: Floats, first: int) -> float:
 
 
 INSET = 0.05
-"""Widths of the tilted cylinder are taken this share of its height inside the upper and lower edge,
-where its rounded corners no longer count."""
+"""Widths of the tilted cylinder are measured this fraction of its height inside the upper and lower
+edge, away from its rounded corners."""
 
 MIDDLE_COLUMNS = 17
 """Heights are means over this many columns about the middle."""
@@ -418,9 +425,10 @@ def _height(shape: _Silhouette) -> tuple[float, float]:
 
 
 def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, float]:
-    """Height, upside width and downside width (m) of the cylinder in a flat-shaded picture.
+    """Measure height, upside width and downside width (m) of the cylinder in a flat-shaded image.
 
-    As section VI-B measures them.  NotMeasurableError when it is cut off, broken or missing.
+    The method is that of section VI-B.  Raises NotMeasurableError when it is cut off, broken or
+    missing.
     """
     shape = _Silhouette(picture)
     top, bottom = _height(shape)
@@ -435,9 +443,10 @@ def tilt_sizes(picture: Image, metres_per_px: float) -> tuple[float, float, floa
 
 
 def push_sizes(picture: Image, metres_per_px: float) -> tuple[float, float]:
-    """Height and width (m) through the middle of the cylinder in a flat-shaded picture.
+    """Measure height and width (m) through the middle of the cylinder in a flat-shaded image.
 
-    As section VI-C measures them.  NotMeasurableError when it is cut off, broken or missing.
+    The method is that of section VI-C.  Raises NotMeasurableError when it is cut off, broken or
+    missing.
     """
     shape = _Silhouette(picture)
     top, bottom = _height(shape)
@@ -460,11 +469,13 @@ def _sheet_between(
 
 
 @dataclass(frozen=True, slots=True)
-class Situation:
-    """The truth in which a frame was shown.
+class EyeSituation:
+    """Hold the true state at which a frame was shown.
 
-    world_from_flange_...: (4, 4).  finger_tip: (3,) or None.  skin_vertices, displacement:
-    (skin vertices, 3) and skin_triangles: (skin triangles, 3), or all None for the object at rest.
+    world_from_flange_left, world_from_flange_right: (4, 4).
+    finger_tip: (3,) or None.
+    skin_vertices, displacement: (skin vertices, 3), and skin_triangles: (skin triangles, 3), or all
+        None for the object at rest.
     """
 
     scene: Scene
@@ -484,7 +495,8 @@ def true_sheet(
     world_from_flange_right: Floats,
     finger_tip: Floats | None,
 ) -> DeformedSheet:
-    """The membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or None."""
+    """Solve the membrane between the true flanges (4, 4), pushed by the true fingertip (3,) or
+    None."""
     arms = scene.arms
     edges = [
         world_from_flange
@@ -497,18 +509,21 @@ def true_sheet(
     return _sheet_between(scene, edges[0], edges[1], finger_tip)
 
 
-class Camera:
-    """The measuring camera: takes pictures, and keeps what does not change between them."""
+class EyeCamera:
+    """Render images of the measuring camera, and cache what does not change between them."""
 
     def __init__(self) -> None:
         self._scene: Scene | None = None
         self._body: TrueBody | None = None
-        self._proper: tuple[tuple[bytes, ...], Image] | None = None
+        self._expected: tuple[tuple[bytes, ...], Image] | None = None
 
-    def take(self, projected: Image, situation: Situation, *, eye: Floats) -> tuple[Image, Image]:
-        """What the eye sees of a projected picture, and what it ought to: both (rows, columns, 3).
+    def take(
+        self, projected: Image, situation: EyeSituation, *, eye: Floats
+    ) -> tuple[Image, Image]:
+        """Render what the eye sees of a projected image, and the expected image: both (rows,
+        columns, 3).
 
-        Raises NotConvergedError or ValueError when the situation has no picture.
+        Raises NotConvergedError or ValueError when the state has no image.
         """
         sheet = true_sheet(
             situation.scene,
@@ -519,13 +534,13 @@ class Camera:
         scale = situation.metres_per_px
         return (
             seen(projected, sheet, situation.scene, eye=eye, metres_per_px=scale),
-            self._proper_picture(situation, eye),
+            self._expected_image(situation, eye),
         )
 
-    def _proper_picture(self, situation: Situation, eye: Floats) -> Image:
+    def _expected_image(self, situation: EyeSituation, eye: Floats) -> Image:
         if self._body is None or self._scene is not situation.scene:
             self._scene, self._body = situation.scene, TrueBody(situation.scene)
-            self._proper = None
+            self._expected = None
         skin, triangles = situation.skin_vertices, situation.skin_triangles
         displacement = situation.displacement
         moved = displacement is not None and bool(displacement.any())
@@ -533,7 +548,7 @@ class Camera:
         key: tuple[bytes, ...] = (settings.tobytes(),)
         if skin is not None and displacement is not None and moved:
             key += (skin.tobytes(), displacement.tobytes())
-        if self._proper is None or self._proper[0] != key:
+        if self._expected is None or self._expected[0] != key:
             true_object = (
                 self._body.displaced(
                     skin.astype(np.float64), triangles, displacement.astype(np.float64)
@@ -541,8 +556,8 @@ class Camera:
                 if moved and skin is not None and triangles is not None and displacement is not None
                 else self._body.at_rest()
             )
-            picture = proper(
+            picture = render_expected(
                 true_object, eye=eye, flat=situation.flat, metres_per_px=situation.metres_per_px
             )
-            self._proper = key, picture
-        return self._proper[1]
+            self._expected = key, picture
+        return self._expected[1]

@@ -1,4 +1,4 @@
-"""The twin's eye: takes pictures of the projected frames on the true sheet, for the experiments."""
+"""Simulate the user's eye: render the projected frames on the true sheet, for the experiments."""
 
 from __future__ import annotations
 
@@ -12,31 +12,38 @@ from messages.base import Header
 from messages.scene import Positive, Projector, Scene
 from messages.types import Display, Eye, Frame, Skin, SoftBody, TwinArms, TwinEye, TwinFinger
 from nodes.node import Input, Node, NodeParameters, Output
-from nodes.twin.eye import METRES_PER_PX, Camera, Floats, Situation
+from nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
+from nodes.twin.render_queue import RenderQueue
 
-Key = tuple[str, str]
+Job = tuple[EyeSituation, Floats, Frame, Header]
 
 
 class TwinEyeParameters(NodeParameters):
-    metres_per_px: Positive = Field(default=METRES_PER_PX, description="on the imaginary screen")
-    most_waiting: int = Field(default=32, ge=1, description="labels that may wait for a picture")
+    metres_per_px: Positive = Field(
+        default=METRES_PER_PX, description="size of a pixel on the screen plane"
+    )
+    max_queue: int = Field(
+        default=32, ge=1, description="number of labels that may wait to be rendered"
+    )
     projector: Projector | None = Field(
         default=None,
-        description="the true one, as the scene's key writes it; null: as the scene says",
+        description="true projector, in the scene's format; null takes the scene's",
     )
-    eye_stale_s: Positive = Field(default=0.1, description="an older `eye` is the scene's")
-    again_after_s: Positive = Field(
-        default=5.0, description="the same label is pictured anew after this long at the earliest"
+    eye_stale_s: Positive = Field(
+        default=0.1, description="maximum age of `eye`; afterwards the scene's eyes count"
+    )
+    min_interval_s: Positive = Field(
+        default=5.0, description="minimum time before the same label is rendered again"
     )
 
 
 class TwinEyeNode(Node):
-    """Pictures each labelled mono frame that carries pixels, one per label and correction.
+    """Render each labelled mono frame that carries pixels, once per label and correction.
 
-    A picture takes about a second, so further frames of a label that waits, or was just pictured,
-    are passed over on purpose; they are not counted as lost.  The sheet is the true one at the
-    instant that the frame was drawn for, a few milliseconds after it arrives; the finger is the one
-    of the newest exposure before that, the body the solver's newest.
+    An image takes about a second.  Further frames of a label that waits, or was just rendered, are
+    therefore skipped; they do not count as lost.  The sheet is the true one at the time that the
+    frame was drawn for, a few milliseconds after it arrives.  The finger is that of the newest
+    exposure before, the body the solver's newest.
     """
 
     parameters: TwinEyeParameters
@@ -51,16 +58,15 @@ class TwinEyeNode(Node):
     twin__eye: Output[TwinEye]
 
     async def setup(self) -> None:
-        self._camera = Camera()
+        self._camera = EyeCamera()
         self._worker = ThreadPoolExecutor(1, thread_name_prefix=self.name)
-        self._waiting: dict[Key, tuple[Situation, Floats, Frame, Header]] = {}
-        self._last: tuple[Key, int] | None = None
-        self._refused: set[Key] = set()
+        given = self.parameters
+        self._queue = RenderQueue[Job](given.max_queue, given.min_interval_s)
         self._before_light: tuple[Frame, Header] | None = None
         self._task: asyncio.Task[None] | None = None
 
     async def close(self) -> None:
-        self._waiting.clear()
+        self._queue.clear()
         if self._task is not None:
             await asyncio.gather(self._task, return_exceptions=True)
         self._worker.shutdown()
@@ -71,15 +77,14 @@ class TwinEyeNode(Node):
 
     def on_frame(self, frame: Frame, header: Header) -> None:
         key = (frame.label, frame.correction)
-        if not frame.pixels or not frame.label or key in self._waiting or self._just_taken(key):
+        if not frame.pixels or not frame.label or self._queue.is_known(key, self.clock.now_ns()):
             return
         if self.scene.message is None or self.twin__arms.message is None:
-            self.note = "waits for the scene and the true arms"
+            self.note = "waits for the scene and the simulated arms"
         elif frame.stereo != "mono":
-            self.note = f'pictures mono frames only; "{frame.label}" is {frame.stereo}'
-        elif len(self._waiting) >= self.parameters.most_waiting:
-            if key not in self._refused:
-                self._refused.add(key)
+            self.note = f'renders mono frames only; "{frame.label}" is {frame.stereo}'
+        elif self._queue.is_full:
+            if self._queue.reject(key):
                 self.report_error("on_frame", OverflowError(f'no room for "{frame.label}"'))
         elif self._before_light is None:
             self._before_light = (frame, header)
@@ -94,17 +99,17 @@ class TwinEyeNode(Node):
         self._before_light = None
         situation = self._situation(scene, arms)
         eye = self._true_eye(scene)
-        self._waiting[frame.label, frame.correction] = (situation, eye, frame, frame_header)
+        self._queue.add((frame.label, frame.correction), (situation, eye, frame, frame_header))
         if self._task is None or self._task.done():
             self._task = asyncio.get_running_loop().create_task(self._picture_all())
 
-    def _situation(self, scene: Scene, arms: TwinArms) -> Situation:
+    def _situation(self, scene: Scene, arms: TwinArms) -> EyeSituation:
         finger, body, skin = self.twin__finger.message, self.soft_body.message, self.skin.message
         matching = body is not None and skin is not None and body.mesh_id == skin.mesh_id
         display = self.display.message
         if self.parameters.projector is not None:
             scene = scene.model_copy(update={"projector": self.parameters.projector})
-        return Situation(
+        return EyeSituation(
             scene=scene,
             world_from_flange_left=arms.world_from_flange_left,
             world_from_flange_right=arms.world_from_flange_right,
@@ -117,35 +122,28 @@ class TwinEyeNode(Node):
         )
 
     def _true_eye(self, scene: Scene) -> Floats:
-        """Where the eyes are now, (3,): what tracks them is right, without it the scene."""
+        """Return the present eye position (3,): the tracked one, else the scene's."""
         tracked = self.eye.message if self.eye.age_s() <= self.parameters.eye_stale_s else None
         seen = tracked is not None and tracked.valid
         return tracked.centre_world_m if tracked and seen else scene.eyes.centre_world_m
 
-    def _just_taken(self, key: Key) -> bool:
-        if self._last is None or self._last[0] != key:
-            return False
-        return self.clock.now_ns() - self._last[1] < self.parameters.again_after_s * 1e9
-
     async def _picture_all(self) -> None:
-        while self._waiting:
-            key, (situation, eye, frame, header) = next(iter(self._waiting.items()))
+        while self._queue:
+            key, (situation, eye, frame, header) = self._queue.next()
             await self.call("picture", self._picture, situation, eye, frame, header)
-            self._waiting.pop(key, None)
-            self._refused.discard(key)
-            self._last = (key, self.clock.now_ns())
+            self._queue.finish(key, self.clock.now_ns())
 
     async def _picture(
-        self, situation: Situation, eye: Floats, frame: Frame, header: Header
+        self, situation: EyeSituation, eye: Floats, frame: Frame, header: Header
     ) -> None:
         job = partial(self._camera.take, frame.pixels[0], situation, eye=eye)
-        seen, proper = await asyncio.get_running_loop().run_in_executor(self._worker, job)
+        seen, expected = await asyncio.get_running_loop().run_in_executor(self._worker, job)
         picture = TwinEye(
             label=frame.label,
             correction=frame.correction,
             metres_per_px=self.parameters.metres_per_px,
             seen=seen,
-            proper=proper,
+            expected=expected,
         )
-        self.note = f'pictured "{frame.label}"'
+        self.note = f'rendered "{frame.label}"'
         self.twin__eye.publish(picture, source_ns=header.source_ns)

@@ -1,8 +1,8 @@
-"""The twin's finger: where a person's fingertip is at any time, as a pure function.
+"""Simulate a person's fingertip as a pure function of time.
 
-A motion is what one path message and one seed determine.  Everything about it can be computed again
-from those two, for any time, so the truth behind a picture is exact.  Positions are in the world
-frame, metres; times are seconds since the path was given.
+One path message and one seed determine a motion.  It can be computed again from both at any time,
+so that the truth behind an image is exact.  Positions are in the world frame, m; times are in
+seconds since the path was given.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ Floats = NDArray[np.float64]
 Real = TypeVar("Real", float, Floats)
 
 ROUNDING_S = 0.04
-"""Half the time over which corners of lines are rounded off: a hand does not jerk."""
+"""Half the time over which corners of lines are rounded, since a hand does not jerk."""
 
 EASE_SPEED_M_PER_S = 0.4
-"""Peak speed of the reach from where the finger is to a path's first point."""
+"""Peak speed of the reach from the present position to a path's first point."""
 
 MIN_EASE_S = 0.3
 WANDER_BAND_HZ = (0.15, 1.2)
@@ -31,27 +31,27 @@ TREMOR_BAND_HZ = (8.0, 12.0)
 
 
 class FingerPathError(ValueError):
-    """A path that the finger cannot follow; the message says why and what to change."""
+    """Raised for a path that the finger cannot follow; the message says why and what to change."""
 
 
 @dataclass(frozen=True, slots=True)
-class Sines:
-    """Band-limited noise: per axis a sum of sines; standard deviation 1, continuous for ever."""
+class SineSum:
+    """Hold band-limited noise: a sum of sines per axis with standard deviation 1, for all times."""
 
     frequencies_hz: Floats
     phases_rad: Floats
 
     @staticmethod
-    def drawn(band_hz: tuple[float, float], generator: np.random.Generator) -> Sines:
-        """Seven sines per axis, one in each seventh of the band, at random within it."""
+    def drawn(band_hz: tuple[float, float], generator: np.random.Generator) -> SineSum:
+        """Draw seven sines per axis, one in each seventh of the band, at random within it."""
         edges = np.linspace(*band_hz, 8)
-        return Sines(
+        return SineSum(
             frequencies_hz=generator.uniform(edges[:-1], edges[1:], (3, 7)),
             phases_rad=generator.uniform(0.0, 2.0 * np.pi, (3, 7)),
         )
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """Value and rate of change (1/s), each (3,)."""
+        """Return value and rate of change (1/s), each (3,)."""
         pace = 2.0 * np.pi * self.frequencies_hz
         angle = pace * time_s + self.phases_rad
         scale = np.sqrt(2.0 / self.frequencies_hz.shape[1])
@@ -59,7 +59,7 @@ class Sines:
 
 
 class Path(Protocol):
-    """Where the steady part of a finger is at any time: at rest before and after the path."""
+    """Define the steady part of a finger's motion: at rest before and after the path."""
 
     @property
     def points(self) -> Floats: ...
@@ -69,25 +69,26 @@ class Path(Protocol):
 
     @property
     def begins_s(self) -> float:
-        """When the finger leaves the first point, zero or less: it must have come to rest there."""
+        """Time, zero or less, when the finger leaves the first point; before, it must have come to
+        rest."""
         ...
 
     def speeds(self) -> Floats:
-        """A bound on the speed (n-1,) m/s between each point and the next."""
+        """Return a bound on the speed (n-1,) m/s between each point and the next."""
         ...
 
     def at(self, time_s: float) -> tuple[Floats, Floats]:
-        """Position (m) and velocity (m/s), each (3,)."""
+        """Return position (m) and velocity (m/s), each (3,)."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class RoundedLines:
-    """A polyline in time, its corners rounded by a moving mean of +-ROUNDING_S.
+    """Follow a polyline in time, its corners rounded by a moving mean of +-ROUNDING_S.
 
-    The mean of a polyline is exact through its integral; it never leaves the polyline's hull and
-    never exceeds its speed, and its velocity is continuous.  It is made for paths of a few points:
-    the mean takes ROUNDING_S^2 / 6 times the acceleration off a motion that bends between them.
+    The mean of a polyline is exact through its integral.  It never leaves the polyline's hull,
+    never exceeds its speed, and has a continuous velocity.  It is meant for paths of a few points:
+    the mean removes ROUNDING_S^2 / 6 times the acceleration from a motion that bends between them.
     """
 
     times_s: Floats
@@ -96,7 +97,8 @@ class RoundedLines:
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> RoundedLines:
-        """The path through points (n, 3) at increasing times (n,), the first taken as time 0."""
+        """Make the path through points (n, 3) at increasing times (n,), the first taken as time
+        0."""
         times = times_s - times_s[0]
         areas = 0.5 * (points[1:] + points[:-1]) * np.diff(times)[:, None]
         integral = np.concatenate([np.zeros((1, 3)), np.cumsum(areas, axis=0)])
@@ -116,7 +118,7 @@ class RoundedLines:
         return np.asarray(ways / np.diff(self.times_s))
 
     def _corner(self, time_s: float) -> tuple[Floats, Floats]:
-        """The polyline's position and its integral since time 0 at one time."""
+        """Return the polyline's position, and its integral since time 0."""
         if time_s <= 0.0:
             return self.points[0], self.points[0] * time_s
         if time_s >= self.times_s[-1]:
@@ -140,10 +142,10 @@ class RoundedLines:
 
 @dataclass(frozen=True, slots=True)
 class SmoothPath:
-    """A cubic spline through samples of a motion, at rest at both ends.
+    """Follow a cubic spline through samples of a motion, at rest at both ends.
 
-    Between samples `h` apart it is off by some h^4 / 100 times the motion's fourth derivative:
-    below a micrometre for a reach of 10 mm in 50 ms that is sampled every 4 ms.
+    Between samples `h` apart its error is some h^4 / 100 times the motion's fourth derivative.
+    This is below a micrometre for a reach of 10 mm in 50 ms that is sampled every 4 ms.
     """
 
     times_s: Floats
@@ -153,7 +155,8 @@ class SmoothPath:
 
     @staticmethod
     def through(times_s: Floats, points: Floats) -> SmoothPath:
-        """The path through points (n >= 2, 3) at increasing times (n,), the first as time 0."""
+        """Make the path through points (n >= 2, 3) at increasing times (n,), the first as time
+        0."""
         times = times_s - times_s[0]
         spline = CubicSpline(times, points, bc_type="clamped")
         return SmoothPath(times, points, spline, spline.derivative())
@@ -169,8 +172,8 @@ class SmoothPath:
     def speeds(self) -> Floats:
         """See `Path`.
 
-        Velocity is quadratic between samples, so it stays within the triangle of its three Bezier
-        points: both ends' velocities, and three times the mean velocity less both.
+        Velocity is quadratic between samples, so that it stays within the triangle of its three
+        Bezier points: both ends' velocities, and three times the mean velocity less both.
         """
         ends = self.rate(self.times_s)
         mean = np.diff(self.points, axis=0) / np.diff(self.times_s)[:, None]
@@ -187,8 +190,8 @@ class SmoothPath:
         return self.spline(time_s), self.rate(time_s)
 
 
-def checked_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
-    """The path through points (n, 3) at times (n,).
+def validate_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
+    """Make the path through points (n, 3) at times (n,).
 
     Raises FingerPathError for a path without points or with times that do not increase.
     """
@@ -204,7 +207,7 @@ def checked_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
             f"times_s[{at + 1}] = {times_s[at + 1]:.6g} does not come after times_s[{at}] = "
             f"{times_s[at]:.6g}"
         )
-    # A single point is a place to rest, which needs no curve.
+    # A single point is a point of rest, which needs no curve.
     if joined_by == "spline" and len(points) > 1:
         return SmoothPath.through(times_s, points)
     return RoundedLines.through(times_s, points)
@@ -212,7 +215,7 @@ def checked_path(times_s: Floats, points: Floats, joined_by: PathJoin) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class FingerState:
-    """The fingertip at one instant; `path_time_s` is negative while it eases to the path."""
+    """Hold the fingertip at one time; `path_time_s` is negative during the reach to the path."""
 
     position: Floats
     velocity: Floats
@@ -222,11 +225,11 @@ class FingerState:
 
 @dataclass(frozen=True, slots=True)
 class FingerMotion:
-    """A path, the reach to its start, and a person's unsteadiness.
+    """Combine a path, the reach to its start, and a person's unsteadiness.
 
     start, start_velocity: the steady part (without wander and tremor) when the path was given.
-    amplitudes: (wander, tremor) at the start and on the path; they fade over during the reach.
-    age_s: unsteadiness goes on from motion to motion; this is its time when the path was given.
+    amplitudes: (wander, tremor) at the start and on the path; they blend during the reach.
+    age_s: time of the unsteadiness when the path was given; it continues from motion to motion.
     """
 
     path: Path
@@ -236,12 +239,12 @@ class FingerMotion:
     amplitudes_before_m: tuple[float, float]
     amplitudes_m: tuple[float, float]
     age_s: float
-    wander: Sines = field(repr=False)
-    tremor: Sines = field(repr=False)
+    wander: SineSum = field(repr=False)
+    tremor: SineSum = field(repr=False)
 
     @staticmethod
     def resting(position: Floats, *, seed: int) -> FingerMotion:
-        """A finger held still at `position`."""
+        """Make a finger that rests at `position`."""
         generator = np.random.default_rng(seed)
         return FingerMotion(
             path=RoundedLines.through(np.zeros(1), position[None]),
@@ -251,8 +254,8 @@ class FingerMotion:
             amplitudes_before_m=(0.0, 0.0),
             amplitudes_m=(0.0, 0.0),
             age_s=0.0,
-            wander=Sines.drawn(WANDER_BAND_HZ, generator),
-            tremor=Sines.drawn(TREMOR_BAND_HZ, generator),
+            wander=SineSum.drawn(WANDER_BAND_HZ, generator),
+            tremor=SineSum.drawn(TREMOR_BAND_HZ, generator),
         )
 
     def followed_by(
@@ -266,13 +269,15 @@ class FingerMotion:
         max_speed_m_per_s: float,
         joined_by: PathJoin = "rounded_lines",
     ) -> FingerMotion:
-        """The motion when a path is given `at_s` into this one.
+        """Return the motion after a path is given `at_s` into this one.
 
-        wander_m: standard deviation per axis.  tremor_m: amplitude, so its standard deviation is
-        tremor_m / sqrt(2).  Raises FingerPathError for a path without points, with times that do
-        not increase, or faster than a finger.
+        wander_m: standard deviation per axis.
+        tremor_m: amplitude, so that its standard deviation is tremor_m / sqrt(2).
+
+        Raises FingerPathError for a path without points, with times that do not increase, or faster
+        than a finger.
         """
-        path = checked_path(times_s, points, joined_by)
+        path = validate_path(times_s, points, joined_by)
         speeds = path.speeds()
         if (speeds > max_speed_m_per_s).any():
             at = int(np.argmax(speeds))
@@ -298,7 +303,8 @@ class FingerMotion:
         return time_s - self.ease_s + self.path.begins_s
 
     def _steady(self, time_s: float) -> tuple[Floats, Floats, tuple[float, float]]:
-        """Position and velocity without unsteadiness, and the (wander, tremor) amplitudes."""
+        """Return position and velocity without unsteadiness, and the (wander, tremor)
+        amplitudes."""
         if time_s >= self.ease_s:
             position, velocity = self.path.at(self._path_time_s(time_s))
             return position, velocity, self.amplitudes_m
@@ -313,7 +319,7 @@ class FingerMotion:
         return position, velocity, amplitudes
 
     def at(self, time_s: float) -> FingerState:
-        """The true fingertip `time_s` after the path was given."""
+        """Return the true fingertip `time_s` after the path was given."""
         position, velocity, amplitudes = self._steady(time_s)
         _, share_rate = smoothstep(np.clip(time_s / self.ease_s, 0.0, 1.0))
         noises = ((self.wander, 1.0), (self.tremor, np.sqrt(0.5)))
@@ -334,17 +340,19 @@ class FingerMotion:
 
 
 def smoothstep(s: Real) -> tuple[Real, Real]:
-    """Minimum-jerk rise from 0 to 1 over s = 0..1 and its slope (Flash and Hogan 1985)."""
+    """Return the minimum-jerk rise from 0 to 1 over s = 0..1 and its slope (Flash and Hogan
+    1985)."""
     return s**3 * (10.0 - 15.0 * s + 6.0 * s * s), 30.0 * s * s * (1.0 - s) ** 2
 
 
 def _reach(
     s: float, duration_s: float, start: Floats, start_velocity: Floats, path: Path
 ) -> tuple[Floats, Floats]:
-    """Minimum-jerk reach at share `s` of its time, from `start` to rest at the path's first point.
+    """Return a minimum-jerk reach at the fraction `s` of its time, from `start` to the path's first
+    point.
 
-    Gives position (m) and velocity (m/s).  The start's velocity dies out by the quintic Hermite
-    function s (1-s)^3 (1+3s), so that both are continuous.
+    The result is position (m) and velocity (m/s).  The start's velocity decays by the quintic
+    Hermite function s (1-s)^3 (1+3s), so that both are continuous.
     """
     share, slope = smoothstep(s)
     carried = s * (1.0 - s) ** 3 * (1.0 + 3.0 * s)

@@ -1,4 +1,4 @@
-"""The twin's finger and the stereo camera that looks at it."""
+"""Simulate the finger and the stereo camera that observes it."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from nodes.node import Input, Node, NodeParameters, Output
 from nodes.twin.clutter import CLUTTER
 from nodes.twin.finger import FingerMotion, FingerState
 from nodes.twin.pixels import TwinCamera
-from nodes.twin.rig import true_camera
+from nodes.twin.rig import make_true_camera
 
 
 class TwinFingerParameters(NodeParameters):
-    """seed: of the finger's unsteadiness and the camera's noise."""
+    """Hold the parameters; `seed` determines the finger's unsteadiness and the camera's noise."""
 
     seed: int = 1
     rest_world_m: tuple[float, float, float] = Field(
@@ -34,7 +34,7 @@ class TwinFingerParameters(NodeParameters):
 
 
 class TwinFingerNode(Node):
-    """Moves a true finger along the path it is given and takes its picture at the camera's rate."""
+    """Move a true finger along its path, and render its images at the camera's rate."""
 
     parameters: TwinFingerParameters
     scene: Input[Scene]
@@ -51,7 +51,7 @@ class TwinFingerNode(Node):
 
     @cached_property
     def has_scene(self) -> asyncio.Event:
-        """Set by the first scene."""
+        """Event that the first scene sets."""
         return asyncio.Event()
 
     async def setup(self) -> None:
@@ -68,7 +68,7 @@ class TwinFingerNode(Node):
             rest = np.array(self.parameters.rest_world_m)
             self.motion = FingerMotion.resting(rest, seed=self.parameters.seed)
             self.motion_from_ns = self.clock.now_ns()
-        rig, clutter = true_camera(scene.camera), CLUTTER[self.parameters.clutter]
+        rig, clutter = make_true_camera(scene.camera), CLUTTER[self.parameters.clutter]
         radius_m, seed = scene.finger.radius_m, self.parameters.seed
         self.camera = TwinCamera(rig, finger_radius_m=radius_m, seed=seed, clutter=clutter)
         self.max_speed_m_per_s = scene.finger.max_speed_m_per_s
@@ -83,7 +83,8 @@ class TwinFingerNode(Node):
             self._follow(path)
 
     def _follow(self, path: FingerPath) -> None:
-        """Go over to a path now; a path that cannot be followed raises and changes nothing."""
+        """Switch to a path now; a path that cannot be followed raises an error and changes
+        nothing."""
         now_ns = self.clock.now_ns()
         self.motion = self.motion.followed_by(
             (now_ns - self.motion_from_ns) * 1e-9,
@@ -97,11 +98,11 @@ class TwinFingerNode(Node):
         self.motion_from_ns, self.path_label = now_ns, path.label
 
     def truth(self, at_ns: int) -> FingerState:
-        """The fingertip at a time of this node's clock."""
+        """Return the fingertip at a time of this node's clock."""
         return self.motion.at((at_ns - self.motion_from_ns) * 1e-9)
 
     def expose(self, middle_ns: int) -> StereoPair:
-        """Take the picture whose exposure has its middle at `middle_ns`; publishes the truth.
+        """Render the image pair whose exposure is centred at `middle_ns`, and publish the truth.
 
         Needs a scene.
         """
@@ -131,7 +132,7 @@ class TwinFingerNode(Node):
         )
 
     async def _film(self) -> None:
-        """Expose on a fixed grid of times; a frame whose time has passed is missed and counted."""
+        """Expose on a fixed grid of times; a frame whose time has passed is counted as missed."""
         await self.has_scene.wait()
         start_ns = self.clock.now_ns()
         while True:
@@ -145,7 +146,7 @@ class TwinFingerNode(Node):
             await self.call("frame", self._take_frame, start_ns)
 
     async def _take_frame(self, start_ns: int) -> None:
-        """One frame from the start of its exposure until it is read out."""
+        """Process one frame from the start of its exposure until it is read out."""
         middle_ns = start_ns + self.exposure_ns // 2
         pair = self.expose(middle_ns)
         read_out_ns = start_ns + self.exposure_ns + round(1e9 * self.parameters.transfer_s)

@@ -36,7 +36,7 @@ from numpy.typing import ArrayLike, NDArray
 from messages.scene import Scene
 from messages.types import FingerPath
 from nodes.twin.finger import smoothstep
-from nodes.twin.paths import over_surface, placed_path, touchable
+from nodes.twin.paths import map_to_surface, place_path, touchable
 
 Floats = NDArray[np.float64]
 Sampled = tuple[Floats, Floats]
@@ -58,7 +58,7 @@ PRESS_M = 0.002
 
 EXPLORE_M_PER_S = 0.086
 REACH_PEAK_M_PER_S = 0.35
-SHORTEST_REACH_S = 0.3
+MIN_REACH_S = 0.3
 BRAKE_S = 0.05
 PEAK_OF_MEAN = 1.875
 
@@ -81,7 +81,7 @@ def minimum_jerk(start: ArrayLike, moves: Sequence[tuple[float, ArrayLike]]) -> 
     return times, corners[move] + share * (corners[move + 1] - corners[move])
 
 
-def way_of_speeds(phases: Sequence[tuple[float, float]]) -> Sampled:
+def integrate_speed_profile(phases: Sequence[tuple[float, float]]) -> Sampled:
     """The way (n,) m of a finger that changes its speed from rest: (duration s, speed m/s at end).
 
     Speed goes over as a reach's position does, so acceleration is continuous.
@@ -120,7 +120,7 @@ def touched(motion: Sampled) -> Sampled:
 def _on_surface(scene: Scene, label: str, motion: Sampled) -> FingerPath:
     """The path of a motion that touches: the hand is held out, and steadied by the object."""
     times, places = touched(motion)
-    return placed_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
+    return place_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
 
 
 def hold(scene: Scene, *, seed: int = 1) -> FingerPath:
@@ -133,7 +133,7 @@ def hover(scene: Scene, *, seed: int = 1) -> FingerPath:
     """Hold still in the air for 5 s with the arm held out, where tremor is greatest."""
     place = (0.0, 0.0, 0.5 * HOVER_M)
     times, places = minimum_jerk(place, [(5.0, place)])
-    return placed_path(scene, "hover", times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
+    return place_path(scene, "hover", times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
 
 
 def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed: int) -> FingerPath:
@@ -147,13 +147,13 @@ def _reaches(scene: Scene, label: str, peak_m_per_s: float, rest_s: float, seed:
     for turn in range(10):
         height = -TOUCH_M if turn % 2 == 0 else generator.uniform(0.03, 0.09)
         place = np.array([*generator.uniform(-half, half), height])
-        ends = over_surface(scene, np.array([here, place]))
+        ends = map_to_surface(scene, np.array([here, place]))
         way_m = float(np.linalg.norm(ends[1] - ends[0]))
-        moves += [(max(SHORTEST_REACH_S, PEAK_OF_MEAN * way_m / peak_m_per_s), place)]
+        moves += [(max(MIN_REACH_S, PEAK_OF_MEAN * way_m / peak_m_per_s), place)]
         moves += [(rest_s, place)]
         here = place
     times, places = minimum_jerk(start, moves)
-    return placed_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
+    return place_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_ARM_M)
 
 
 def reach(scene: Scene, *, seed: int = 1) -> FingerPath:
@@ -194,7 +194,7 @@ def _taps(
         pressed, above = (along, arc, -PRESS_M), (along, arc, lift_m)
         moves += [(pace * reach_s, pressed), (pace * rest_s, pressed), (pace * reach_s, above)]
     times, places = minimum_jerk(start, moves)
-    return placed_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
+    return place_path(scene, label, times, places, wander_m=WANDER_M, tremor_m=TREMOR_HAND_M)
 
 
 def tap(scene: Scene, *, seed: int = 1) -> FingerPath:
@@ -224,7 +224,7 @@ def stop(scene: Scene, *, seed: int = 1) -> FingerPath:
     for leg, rest_s in enumerate(lag_s):
         signed = speed if leg % 4 < 2 else -speed
         phases += [(start_s, signed), (even_s, signed), (BRAKE_S, 0.0), (float(rest_s), 0.0)]
-    times, way = way_of_speeds(phases)
+    times, way = integrate_speed_profile(phases)
     return _on_surface(scene, "stop", (times, _pressing(way - half, TOUCH_M)))
 
 
@@ -242,7 +242,7 @@ def reverse(scene: Scene, *, seed: int = 1) -> FingerPath:
         here += signed * (way / speed + 1e-3)
         signed = -signed
     phases += [(turn_s, 0.0)]
-    times, way = way_of_speeds(phases)
+    times, way = integrate_speed_profile(phases)
     return _on_surface(scene, "reverse", (times, _pressing(way - 0.5 * half, TOUCH_M)))
 
 
@@ -266,7 +266,7 @@ def _rounds(turns: int, turn_s: float) -> Sampled:
     """The angle (n,) rad of so many turns, begun and ended at rest over a quarter of a turn."""
     pace = 2.0 * np.pi / turn_s
     ramp_s = 0.25 * turn_s
-    return way_of_speeds([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])
+    return integrate_speed_profile([(ramp_s, pace), (turns * turn_s - ramp_s, pace), (ramp_s, 0.0)])
 
 
 def _drawing_m(scene: Scene) -> float:

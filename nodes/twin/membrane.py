@@ -25,7 +25,7 @@ Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
 CELLS = 32
-FINEST_SHARE = 0.008
+MIN_CELL_FRACTION = 0.008
 """Cell under the finger over the sheet's side: 1.9 mm of 240."""
 
 SLACK_TENSION = 2e-4
@@ -34,10 +34,10 @@ SLACK_TENSION = 2e-4
 CONTACT_PA_PER_M = 1e10
 """Pressure of the finger per depth of penetration: 0.01 mm under 10 N on 1 cm2."""
 
-LARGEST_STEP_RADII = 0.7
+MAX_STEP_RADII = 0.7
 """Advance of the finger per step, in its radii: a longer one could jump through the sheet."""
 
-MOST_ITERATIONS = 80
+MAX_ITERATIONS = 80
 
 
 class NotConvergedError(RuntimeError):
@@ -90,7 +90,7 @@ def graded_axis(length_m: float, cells: int, focus_m: float | None) -> Floats:
     away = np.abs(samples - np.clip(focus_m, 0.0, length_m)) / length_m
 
     def counted(growth: float) -> Floats:
-        density = 1.0 / (length_m * (FINEST_SHARE + growth * away))
+        density = 1.0 / (length_m * (MIN_CELL_FRACTION + growth * away))
         steps = 0.5 * (density[1:] + density[:-1]) * np.diff(samples)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
@@ -356,7 +356,7 @@ def solve(
 
     finger = None
     if finger_tip is not None and depth > 0.0:
-        steps = int(np.ceil(depth / (LARGEST_STEP_RADII * finger_radius_m)))
+        steps = int(np.ceil(depth / (MAX_STEP_RADII * finger_radius_m)))
         advance = -(depth / steps) * normal
         carried = _cone(mesh, focus, rubber)
         stuck = np.zeros(len(positions), bool)
@@ -403,7 +403,7 @@ def _relax(mesh: _Mesh, start: Floats, finger: _Finger | None) -> tuple[Floats, 
 
     current = energy(positions)
     residual = np.inf
-    for iteration in range(1, MOST_ITERATIONS + 1):
+    for iteration in range(1, MAX_ITERATIONS + 1):
         gradient, stiffness = mesh.forces(positions)
         contact = np.zeros((len(positions), 3, 3))
         if finger is not None:

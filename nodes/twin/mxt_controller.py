@@ -24,7 +24,7 @@ from nodes.twin.arms import (
     Floats,
     Servo,
     forward,
-    joints_for,
+    solve_inverse_kinematics,
 )
 
 Address = tuple[str, int]
@@ -244,7 +244,7 @@ def _set_point(send_type: int, data: Floats, flags: int, before_rad: Floats) -> 
         if flags != structure_flags(before_rad):
             raise MxtError("a pose on another branch")
         try:
-            joints = joints_for(pose_from(data), before_rad)
+            joints = solve_inverse_kinematics(pose_from(data), before_rad)
         except (ValueError, np.linalg.LinAlgError) as error:
             raise MxtError("a pose out of reach") from error
     if (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():

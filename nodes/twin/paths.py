@@ -23,7 +23,7 @@ from nodes.twin.finger import FingerPathError, SmoothPath
 
 Floats = NDArray[np.float64]
 FAR_M = 2.0
-FARTHEST_M = 0.5
+MAX_DISTANCE_M = 0.5
 STRIDE_M = 0.001
 GRID_M = 0.003
 """How far straightest ways go, in what strides, and how far apart the grid's places lie."""
@@ -33,17 +33,17 @@ OF_WIDTH = 0.7
 OF_HEIGHT = 0.9
 """Of an object that ends, of the sheet's width and of its usable half-height this is stroked."""
 
-MOST_GROUNDS = 4
+MAX_CACHED_GROUNDS = 4
 _GROUNDS: dict[bytes, Ground] = {}
 
-SPEED_SHARE = 0.8
+SPEED_FRACTION = 0.8
 """Of a finger's largest speed, that a path may ask for: unsteadiness comes on top."""
 
-PRESS_SHARE = 1.0 / 6.0
+PRESS_FRACTION = 1.0 / 6.0
 """Of the scene's push depth, that a recorded hand presses at most."""
 
 
-def over_surface(scene: Scene, places: Floats) -> Floats:
+def map_to_surface(scene: Scene, places: Floats) -> Floats:
     """World points (n, 3) of places (n, 3) on the scene's object."""
     return _ground_of(scene).points(places)
 
@@ -109,7 +109,7 @@ class Ground:
         """How far one can go on from the front until it leans too much or ends, and whether it
         ends."""
         here, way_m = front, 0.0
-        while way_m < FARTHEST_M:
+        while way_m < MAX_DISTANCE_M:
             heading = heading - here.normal * (heading @ here.normal)
             heading = heading / np.linalg.norm(heading)
             there = self._shape.closest(here.point + STRIDE_M * heading, previous=here.point)
@@ -189,7 +189,7 @@ def _ground_of(scene: Scene) -> Ground:
     """The scene's ground; the latest few are kept, since a path asks for it many times."""
     key = pickle.dumps((scene.object, scene.working_range, scene.sheet, scene.name))
     if key not in _GROUNDS:
-        while len(_GROUNDS) >= MOST_GROUNDS:
+        while len(_GROUNDS) >= MAX_CACHED_GROUNDS:
             _GROUNDS.pop(next(iter(_GROUNDS)))
         _GROUNDS[key] = Ground(scene)
     return _GROUNDS[key]
@@ -202,14 +202,14 @@ def inside(scene: Scene, points: Floats, margin_m: float) -> bool:
     return bool((points >= low).all() and (points <= high).all())
 
 
-def times_slowed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
+def limit_path_speed(scene: Scene, times_s: Floats, points: Floats) -> Floats:
     """The times (n,), stretched by one factor if the path is too fast for the scene's finger."""
     fastest = float(SmoothPath.through(times_s, points).speeds().max())
-    slower = max(1.0, fastest / (SPEED_SHARE * scene.finger.max_speed_m_per_s))
+    slower = max(1.0, fastest / (SPEED_FRACTION * scene.finger.max_speed_m_per_s))
     return np.asarray((times_s - times_s[0]) * slower)
 
 
-def placed_path(
+def place_path(
     scene: Scene,
     label: str,
     times_s: Floats,
@@ -229,12 +229,12 @@ def placed_path(
         (
             points
             for share in np.linspace(1.0, 0.0, 41)
-            if inside(scene, points := over_surface(scene, share * places), margin_m)
+            if inside(scene, points := map_to_surface(scene, share * places), margin_m)
         ),
         None,
     )
     if shrunk is None:
-        front = over_surface(scene, np.zeros((1, 3)))[0]
+        front = map_to_surface(scene, np.zeros((1, 3)))[0]
         raise FingerPathError(
             f'path "{label}": the object\'s front at {np.round(front, 4).tolist()} m is not '
             f"{margin_m:.2g} m inside finger.volume_min_m..volume_max_m: widen the volume or move "
@@ -242,7 +242,7 @@ def placed_path(
         )
     return FingerPath(
         label=label,
-        times_s=times_slowed(scene, times_s, shrunk),
+        times_s=limit_path_speed(scene, times_s, shrunk),
         positions_world_m=shrunk,
         wander_m=wander_m,
         tremor_m=tremor_m,
@@ -276,23 +276,23 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
     points *= min(1.0, float((room / np.maximum(high - low, 1e-9)).min()))
 
     half = 0.5 * room
-    press_m = scene.working_range.push_depth_m * PRESS_SHARE
+    press_m = scene.working_range.push_depth_m * PRESS_FRACTION
     touch = np.quantile(points[:, 2], 0.3)
     places = np.stack(
         [
-            _within(points[:, 0], half[0]),
-            _within(points[:, 1], half[1]),
+            _soft_clip(points[:, 0], half[0]),
+            _soft_clip(points[:, 1], half[1]),
             # A skin gives way, it does not stop a hand.
-            _not_below(points[:, 2] - touch, -press_m, 0.5 * press_m),
+            _soft_max(points[:, 2] - touch, -press_m, 0.5 * press_m),
         ],
         axis=1,
     )
     within = np.clip(
-        over_surface(scene, places), scene.finger.volume_min_m, scene.finger.volume_max_m
+        map_to_surface(scene, places), scene.finger.volume_min_m, scene.finger.volume_max_m
     )
     return FingerPath(
         label=csv_path.stem,
-        times_s=times_slowed(scene, times_s, within),
+        times_s=limit_path_speed(scene, times_s, within),
         positions_world_m=within,
         wander_m=0.0,
         tremor_m=0.0,
@@ -300,15 +300,15 @@ def recorded_path(csv_path: Path, scene: Scene) -> FingerPath:
     )
 
 
-def _not_below(values: Floats, floor: float, bend: float) -> Floats:
+def _soft_max(values: Floats, floor: float, bend: float) -> Floats:
     """Values (n,) kept above a floor by a hyperbola, so that they turn there within some `bend`."""
     above = values - floor
     return np.asarray(floor + 0.5 * (above + np.hypot(above, bend)))
 
 
-def _within(values: Floats, half: float) -> Floats:
+def _soft_clip(values: Floats, half: float) -> Floats:
     """Values (n,) kept within +-half, turning over a fifth of it."""
-    return -_not_below(-_not_below(values, -half, 0.2 * half), -half, 0.2 * half)
+    return -_soft_max(-_soft_max(values, -half, 0.2 * half), -half, 0.2 * half)
 
 
 def _read_recording(csv_path: Path) -> Floats:

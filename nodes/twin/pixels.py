@@ -27,12 +27,12 @@ from nodes.twin.clutter import (
     CLUTTER,
     FINGER_DIRECTION,
     FINGER_LENGTH_M,
-    MARK_RADIUS_M,
+    MARKER_RADIUS_M,
     Clutter,
+    FixedPoint,
     Highlight,
-    SecondMark,
+    SecondMarker,
     Sheet,
-    Still,
 )
 from nodes.twin.rig import pixel_of, pixels_per_slope, slopes_of
 
@@ -60,13 +60,13 @@ SHADE = 0.35
 SIDE_LIGHT = 0.2
 """How much brighter than the ridge the flank towards the lamp is, and darker the other."""
 
-NEAREST_M = 0.02
+MIN_DEPTH_M = 0.02
 """What comes nearer to a camera than this is not drawn."""
 
 ALONG = (0.0, 0.3, 0.5, 0.7, 1.0)
 """Where along a limb its place in the picture is looked up to find the window that holds it."""
 
-EMPTY_SHARE = 1.2
+EMPTY_FRACTION = 1.2
 """Overlapping windows are joined if that takes no more than so many times their pixels."""
 
 GRAIN = 1 << 21
@@ -84,7 +84,7 @@ class Sensor:
     exposure: factor on all light; above 1 the mark saturates.
     """
 
-    mark_level: float = 215.0
+    marker_level: float = 215.0
     finger_level: float = 85.0
     background_level: float = 32.0
     texture_level: float = 9.0
@@ -174,8 +174,8 @@ class TwinCamera:
     ) -> None:
         self.camera = camera
         self.finger_radius_m = finger_radius_m
-        self.mark_radius_m = MARK_RADIUS_M
-        self.mark_offset_m = np.zeros(3)
+        self.marker_radius_m = MARKER_RADIUS_M
+        self.marker_offset_m = np.zeros(3)
         self.sensor = Sensor() if sensor is None else sensor
         self.clutter = CLUTTER["none"] if clutter is None else clutter
         self._random = np.random.default_rng(seed)
@@ -190,25 +190,25 @@ class TwinCamera:
             self._eye("right", camera.right, right_from_world, sheet),
         )
 
-    def altered(
+    def with_changes(
         self,
         *,
         sensor: Sensor | None = None,
-        mark_radius_m: float | None = None,
-        mark_offset_m: Floats | None = None,
+        marker_radius_m: float | None = None,
+        marker_offset_m: Floats | None = None,
     ) -> TwinCamera:
         """The same camera before the same background, with another mark or sensor for the rest.
 
-        mark_offset_m: where the mark sits, from the fingertip, in the world's directions.
+        marker_offset_m: where the mark sits, from the fingertip, in the world's directions.
         """
         other = copy.copy(self)
         other.sensor = self.sensor if sensor is None else sensor
-        other.mark_radius_m = self.mark_radius_m if mark_radius_m is None else mark_radius_m
-        other.mark_offset_m = self.mark_offset_m if mark_offset_m is None else mark_offset_m
+        other.marker_radius_m = self.marker_radius_m if marker_radius_m is None else marker_radius_m
+        other.marker_offset_m = self.marker_offset_m if marker_offset_m is None else marker_offset_m
         return other
 
     def picture(
-        self, position: Position, *, exposure_s: float, mark: bool = True, time_s: float = 0.0
+        self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Image, Image]:
         """The left and right pictures of a fingertip at `position(seconds from mid-exposure)`.
 
@@ -217,19 +217,19 @@ class TwinCamera:
         """
         instants_s, tips = self._instants(position, exposure_s)
         left, right = (
-            self._exposed(eye, self._draw(eye, tips, time_s + instants_s, mark=mark))
+            self._exposed(eye, self._draw(eye, tips, time_s + instants_s, marker=marker))
             for eye in self.eyes
         )
         return left, right
 
     def levels(
-        self, position: Position, *, exposure_s: float, mark: bool = True, time_s: float = 0.0
+        self, position: Position, *, exposure_s: float, marker: bool = True, time_s: float = 0.0
     ) -> tuple[Singles, Singles]:
         """Both pictures (height, width) as light: before noise, saturation and rounding."""
         instants_s, tips = self._instants(position, exposure_s)
         pictures = []
         for eye in self.eyes:
-            windows = self._draw(eye, tips, time_s + instants_s, mark=mark)
+            windows = self._draw(eye, tips, time_s + instants_s, marker=marker)
             pictures.append(eye.canvas.copy())
             _wipe(eye, windows)
         return pictures[0], pictures[1]
@@ -240,7 +240,7 @@ class TwinCamera:
         travel_px = 0.0
         for eye in self.eyes:
             (first, first_depth), (last, last_depth) = (eye.see(end) for end in ends)
-            if min(first_depth, last_depth) > NEAREST_M:
+            if min(first_depth, last_depth) > MIN_DEPTH_M:
                 travel_px = max(travel_px, float(np.linalg.norm(last - first)))
         steps = max(1, math.ceil(travel_px / MOTION_STEP_PX))
         instants_s = exposure_s * ((np.arange(steps) + 0.5) / steps - 0.5)
@@ -257,9 +257,9 @@ class TwinCamera:
     def _read_out(self, levels: Singles) -> Image:
         start = int(self._random.integers(GRAIN - levels.size))
         noise = self._grain[start : start + levels.size].reshape(levels.shape)
-        return quantized(levels + self.sensor.noise(levels) * noise)
+        return quantize(levels + self.sensor.noise(levels) * noise)
 
-    def _draw(self, eye: Eye, tips: Floats, times_s: Floats, *, mark: bool) -> list[Window]:
+    def _draw(self, eye: Eye, tips: Floats, times_s: Floats, *, marker: bool) -> list[Window]:
         """Draw all that is not background on the eye's canvas; gives the windows it touches.
 
         tips: (n, 3) over the exposure, times_s: (n,).
@@ -278,9 +278,9 @@ class TwinCamera:
         ends = np.stack([tip, tip + FINGER_LENGTH_M * np.array(FINGER_DIRECTION)])
         radii_m = (self.finger_radius_m, 1.2 * self.finger_radius_m)
         windows.append(self._limb(eye, ends, radii_m, sensor.finger_level, way, lit=True))
-        if mark:
-            at = tips + self.mark_offset_m
-            windows.append(self._disc(eye, at, self.mark_radius_m, sensor.mark_level))
+        if marker:
+            at = tips + self.marker_offset_m
+            windows.append(self._disc(eye, at, self.marker_radius_m, sensor.marker_level))
         for thing in _spots(clutter, eye.side):
             if not _is_static(thing):
                 places = np.stack([thing.path.at(float(instant)) for instant in times_s])
@@ -295,7 +295,7 @@ class TwinCamera:
                 windows.append(self._limb(eye, ends, radii_m, occluder.level, moved, lit=False))
         return [window for window in windows if window is not None]
 
-    def _spot(self, eye: Eye, thing: SecondMark | Highlight, places: Floats) -> Window | None:
+    def _spot(self, eye: Eye, thing: SecondMarker | Highlight, places: Floats) -> Window | None:
         adds = isinstance(thing, Highlight)
         return self._disc(eye, places, thing.radius_m, thing.level, adds=adds)
 
@@ -316,7 +316,7 @@ class TwinCamera:
         what is thinner than its own edges.
         """
         (x0, y0, z0), (x1, y1, z1) = apply(eye.camera_from_world, ends).tolist()
-        if min(z0, z1) <= NEAREST_M:
+        if min(z0, z1) <= MIN_DEPTH_M:
             return None
         u0, v0, u1, v1 = x0 / z0, y0 / z0, x1 / z1, y1 / z1
         width0, width1 = radii_m[0] / z0, radii_m[1] / z1
@@ -361,7 +361,7 @@ class TwinCamera:
         adds: its light adds to what is there, instead of hiding it.
         """
         in_camera = apply(eye.camera_from_world, places)
-        if in_camera[:, 2].min() <= NEAREST_M:
+        if in_camera[:, 2].min() <= MIN_DEPTH_M:
             return None
         x, y, z = in_camera.mean(axis=0).tolist()
         spread_px = self.sensor.spread_px(z, eye.lens.fx_px)
@@ -370,7 +370,7 @@ class TwinCamera:
         window = eye.window(pixels, reach_px)
         if window is None:
             return None
-        cover = ball_cover(eye, in_camera, radius_m, spread_px, window)
+        cover = rasterize_ball(eye, in_camera, radius_m, spread_px, window)
         canvas = eye.canvas[window]
         light = np.float32(level * self.sensor.exposure)
         canvas += cover * (light if adds else light - canvas)
@@ -409,7 +409,7 @@ class TwinCamera:
             coarse = self._random.standard_normal((cells, cells), dtype=np.float32)
             texture += share * cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
         level = self.sensor.background_level + self.sensor.texture_level * texture
-        return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.mark_level), dtype=np.float32)
+        return np.asarray(np.clip(level, 2.0, 0.4 * self.sensor.marker_level), dtype=np.float32)
 
     def _grained(self, sheet: Sheet) -> Singles:
         """The sheet's levels, one per half grain: fine grain, blotches, one side lit more."""
@@ -452,7 +452,7 @@ def _slopes(lens: Lens, width: int, height: int) -> Floats:
     return slopes
 
 
-def ball_cover(
+def rasterize_ball(
     eye: Eye, centres: Floats, radius_m: float, spread_px: float, window: Window
 ) -> Singles:
     """Share of each pixel's light that comes from a ball, the mean over its centres (n, 3).
@@ -478,19 +478,19 @@ def ball_cover(
     return np.asarray(cover / single(len(centres)), dtype=np.float32)
 
 
-def quantized(levels: Singles) -> Image:
+def quantize(levels: Singles) -> Image:
     """Digital numbers as the converter gives them: rounded, clipped at 0 and 255."""
     return np.minimum(np.maximum(np.rint(levels), 0.0), 255.0).astype(np.uint8)
 
 
-def _spots(clutter: Clutter, side: Side) -> list[SecondMark | Highlight]:
+def _spots(clutter: Clutter, side: Side) -> list[SecondMarker | Highlight]:
     """The marks and highlights that one camera sees."""
-    spots: list[SecondMark | Highlight] = [*clutter.marks, *clutter.highlights]
+    spots: list[SecondMarker | Highlight] = [*clutter.markers, *clutter.highlights]
     return [spot for spot in spots if spot.views in ("both", side)]
 
 
-def _is_static(thing: SecondMark | Highlight) -> bool:
-    return isinstance(thing.path, Still) and not thing.carried
+def _is_static(thing: SecondMarker | Highlight) -> bool:
+    return isinstance(thing.path, FixedPoint) and not thing.carried
 
 
 def _wipe(eye: Eye, windows: list[Window]) -> None:
@@ -515,7 +515,7 @@ def disjoint(windows: list[Window]) -> list[Window]:
             slice(min(one[0].start, other[0].start), max(one[0].stop, other[0].stop)),
             slice(min(one[1].start, other[1].start), max(one[1].stop, other[1].stop)),
         )
-        if _area(both) <= EMPTY_SHARE * (_area(one) + _area(other)):
+        if _area(both) <= EMPTY_FRACTION * (_area(one) + _area(other)):
             apart.remove(other)
             pending.append(both)
         else:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from messages.scene import Lens, Pose, Projector, Scene, StereoCamera
 from nodes.models.rigid import apply, inverse, rotation_from_vector, transform, transform_from_rpy
-from nodes.twin.pixels import Sensor, quantized
+from nodes.twin.pixels import Sensor, quantize
 from nodes.twin.rig import pixels_of, slopes_of
 
 Floats = NDArray[np.float64]
@@ -32,11 +32,11 @@ SPREAD_PX = 0.5
 """Standard deviation of a projector's pixel on the sheet: lens and rubber."""
 
 FOCAL_DEVIATION, CENTRE_DEVIATION_PX = 0.01, 6.0
-OFFSET_DEVIATION_M, TURN_DEVIATION_RAD = 0.004, 0.006
+OFFSET_DEVIATION_M, ROTATION_DEVIATION_RAD = 0.004, 0.006
 RADIAL_DEVIATION, TANGENTIAL_DEVIATION = 0.04, 0.001
 
 
-def true_projector(projector: Projector, *, seed: int) -> Projector:
+def make_true_projector(projector: Projector, *, seed: int) -> Projector:
     """A projector as it might really stand where a scene has it by tape measure and data sheet."""
     random = np.random.default_rng(seed)
 
@@ -50,7 +50,7 @@ def true_projector(projector: Projector, *, seed: int) -> Projector:
     p1, p2 = TANGENTIAL_DEVIATION * deviation(2)
     added = (k1, 0.5 * k2, p1, p2, 0.0)
     k = [float(old + new) for old, new in zip(lens.distortion, added, strict=True)]
-    turned = rotation_from_vector(TURN_DEVIATION_RAD * deviation(3))
+    turned = rotation_from_vector(ROTATION_DEVIATION_RAD * deviation(3))
     return projector.model_copy(
         update={
             "lens": Lens(
@@ -132,7 +132,7 @@ class LitSheet:
             level = cv2.GaussianBlur(level.astype(np.float32), (0, 0), RAYS * self._sensor.blur_px)
             mean = level.reshape(height, RAYS, width, RAYS).mean(axis=(1, 3), dtype=np.float32)
             noise = self._random.standard_normal(mean.shape, dtype=np.float32)
-            pictures.append(quantized(mean + self._sensor.noise(mean) * noise))
+            pictures.append(quantize(mean + self._sensor.noise(mean) * noise))
         return pictures
 
     def _lit_by(

@@ -37,13 +37,13 @@ TANGENTIAL_DEVIATION = 0.0004
 OFFSET_DEVIATION_M = 0.0001
 """Standard deviation, per axis, of where the right camera is screwed on."""
 
-TURN_DEVIATION_RAD = 0.004
+ROTATION_DEVIATION_RAD = 0.004
 """Standard deviation, per axis, of how the right camera is turned: 0.23 degrees."""
 
 NEWTON_STEPS = 12
 
 
-def true_camera(camera: StereoCamera) -> StereoCamera:
+def make_true_camera(camera: StereoCamera) -> StereoCamera:
     """The rig behind a data sheet: the same for the same device name, another for any other.
 
     Deviations are normal, cut at two standard deviations.  Where the left camera stands in the
@@ -77,7 +77,7 @@ def true_camera(camera: StereoCamera) -> StereoCamera:
         )
 
     left, right = built(camera.left), built(camera.right)
-    turn = rotation_from_vector(TURN_DEVIATION_RAD * deviation(3))
+    turn = rotation_from_vector(ROTATION_DEVIATION_RAD * deviation(3))
     moved = transform(turn, OFFSET_DEVIATION_M * deviation(3))
     return camera.model_copy(
         update={"left": left, "right": right, "right_from_left": moved @ camera.right_from_left}

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
 from nodes.models.rigid import apply, transform_from_rpy
 from nodes.models.shapes import Shape, make_shape
-from nodes.models.shapes.triangles import degenerate, nearest_in_triangles
+from nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -20,7 +20,7 @@ Indices = NDArray[np.intp]
 AROUND, ALONG = 160, 40
 """Vertices about the x axis, and rows of them along it."""
 PLANE_CELLS = 64
-LONGEST_EDGE_M = 0.004
+MAX_EDGE_M = 0.004
 """Of a mesh object's triangles, once they are cut up."""
 NEAREST_VERTICES = 3
 """Of a skin: the triangles about so many of them are looked at for the nearest point."""
@@ -113,7 +113,7 @@ def _feet(points: Floats, vertices: Floats, triangles: Indices) -> tuple[Indices
 
     ValueError where no triangle has an area.
     """
-    triangles = triangles[~degenerate(vertices, triangles)]
+    triangles = triangles[~find_degenerate(vertices, triangles)]
     if not len(triangles):
         raise ValueError("the skin has no triangles with an area")
     # Triangles by corner: those of one vertex stand together.
@@ -223,11 +223,11 @@ def _reach(geometry: Sphere | Ellipsoid | RoundedBox, shape: Shape) -> Floats:
 
 
 def _cut_up(vertices: Floats, triangles: Indices) -> tuple[Floats, Indices]:
-    """All triangles in four, again and again, until no edge is longer than `LONGEST_EDGE_M`."""
+    """All triangles in four, again and again, until no edge is longer than `MAX_EDGE_M`."""
     while True:
         corners = vertices[triangles]
         longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
-        if longest <= LONGEST_EDGE_M:
+        if longest <= MAX_EDGE_M:
             return vertices, triangles
         ends = np.concatenate([triangles[:, [i, (i + 1) % 3]] for i in range(3)])
         edges, which = np.unique(np.sort(ends, axis=1), axis=0, return_inverse=True)

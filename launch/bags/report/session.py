@@ -350,7 +350,10 @@ class Session:
                 pair = (("left camera", message.left), ("right camera", message.right))
                 self.stereo.take(seconds, self._finger_said, pair)
             case TwinEye():
-                pair = (("what the eye sees", message.seen), ("what it should see", message.proper))
+                pair = (
+                    ("what the eye sees", message.seen),
+                    ("what it should see", message.expected),
+                )
                 self.eye.take(seconds, named(message.label, message.correction), pair)
             case Frame():
                 self.frames += 1

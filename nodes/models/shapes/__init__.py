@@ -1,4 +1,4 @@
-"""Shapes of the virtual objects, see `surface` for what all of them answer."""
+"""Shapes of the virtual objects; `surface` defines what all of them offer."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from nodes.models.shapes.surface import (
     Convex,
     Nearest,
     Shape,
-    foot_jacobian,
     principal_curvatures,
+    projection_jacobian,
     tightest_curvature,
 )
 from nodes.models.shapes.triangles import MeshError
@@ -34,10 +34,13 @@ SHAPES: dict[str, type[Shape]] = {
 
 
 def make_shape(geometry: Mapping[str, Any]) -> Shape:
-    """The shape of a scene's geometry: `make_shape(dict(scene.object.geometry))`.
+    """Make the shape of a scene's geometry: `make_shape(dict(scene.object.geometry))`.
 
-    `shape` names it, the other keys are its measures, named as the class's; a key `origin` is for
-    people.  KeyError for another name, ValueError (MeshError) for measures that make no solid.
+    `shape` names it; the other keys are its dimensions, with the names of the class's fields.  A
+    key `origin` is ignored.
+
+    Raises KeyError for an unknown name, and ValueError (MeshError) for dimensions that make no
+    solid.
     """
     measures = {key: value for key, value in geometry.items() if key not in ("shape", "origin")}
     return SHAPES[geometry["shape"]](**measures)
@@ -55,8 +58,8 @@ __all__ = [
     "Shape",
     "SmoothMeshShape",
     "SphereShape",
-    "foot_jacobian",
     "make_shape",
     "principal_curvatures",
+    "projection_jacobian",
     "tightest_curvature",
 ]

@@ -1,21 +1,23 @@
-"""A closed triangle mesh as a smooth surface, for a sheet that must not rattle over facets.
+"""Represent a closed triangle mesh as a smooth surface, so that the sheet does not rattle on
+facets.
 
-Two steps, the first when the shape is built.  `rho` is the length over which is smoothed.
+The surface is built in two steps, the first when the shape is made.  `rho` is the smoothing length.
 
 1. Osculating jets (Cazals and Pouget, Estimating Differential Quantities Using Polynomial Fitting
-   of Osculating Jets, 2005): about a choice of the mesh's vertices a quadratic is fitted to the
-   vertices around, by least squares.  Position, normal and shape operator A of each give the
-   signed distance to second order: s_i(x) = n_i d + d A_i d / 2 with d = x - p_i.
-2. Partition of unity (Ohtake et al., Multi-level Partition of Unity Implicits, 2003):
-   f(x) = sum w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and
-   w_i = 0 past t_i = 1.  The surface is f = 0.  Weights are three times continuously
-   differentiable, and so is f: along a path the normal has a continuous second derivative, which
-   facets, interpolated vertex normals and patches joined with a common tangent plane do not give.
-   Supports are half as thick along the normal as across it, so that the two sides of a thin part
-   do not see one another.
+of Osculating Jets, 2005): about selected vertices a quadratic is fitted to the vertices around by
+least squares.  Position, normal and shape operator A of each give the signed distance to second
+order: s_i(x) = n_i d + d A_i d / 2 with d = x - p_i.
+2. Partition of unity (Ohtake et al., Multi-level Partition of Unity Implicits, 2003): f(x) = sum
+w_i s_i / sum w_i with w_i = (1 - t_i)^4, t_i = (d d + 3 (n_i d)^2) / rho^2, and w_i = 0 beyond t_i
+= 1.  The surface is f = 0.
 
-Edges sharper than `rho` are rounded over about that length; how far that takes the surface from the
-mesh is measured (`deviation_m`).
+The weights are three times continuously differentiable, and so is f.  Along a path the normal thus
+has a continuous second derivative, unlike with facets, interpolated vertex normals, or patches
+joined with a common tangent plane.  Supports are half as thick along the normal as across it, so
+that the two sides of a thin part do not affect one another.
+
+Edges sharper than `rho` are rounded over about that length; `deviation_m` measures the resulting
+distance of the surface from the mesh.
 """
 
 from __future__ import annotations
@@ -26,24 +28,24 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nodes.models.shapes.surface import (
-    SAME_M,
+    EQUAL_DISTANCE_M,
     Bools,
-    Feet,
     Floats,
     Nearest,
+    SurfaceProjections,
     Triple,
-    checked,
-    checked_previous,
+    check_points,
+    check_positive,
+    check_previous,
     descend,
     descend_one,
-    positive,
 )
 from nodes.models.shapes.triangles import (
     Indices,
     MeshError,
     check_mesh,
     half_edges,
-    refined,
+    refine_facets,
     vertex_normals,
 )
 
@@ -53,35 +55,35 @@ FIT_RATIO = 1.25
 """A jet is fitted to the vertices within this many `rho`."""
 SPACING_RATIO = 1.0 / 3.0
 """Jets of one side of the surface lie at least this many `rho` apart."""
-STEEPEST = 0.2
-"""Cosine of the steepest normal, against a jet's, of a vertex that it is fitted to."""
-TIGHTEST = 2.0
-"""Curvatures are bounded by this over `rho`; what is sharper is smoothed to it."""
+MIN_NORMAL_COSINE = 0.2
+"""Minimum cosine between a jet's normal and that of a vertex in its fit."""
+MAX_CURVATURE_RATIO = 2.0
+"""Curvatures are bounded by this over `rho`; sharper ones are smoothed to it."""
 EDGE = 1.5
-"""A curvature so many times the tightest of a jet comes of jets that face apart: an edge."""
+"""A curvature this many times a jet's maximum comes from jets of different directions: an edge."""
 OFF_ONE, FAR_OFF_ONE = 0.35, 0.6
-"""f is nearly a distance, its gradient's length nearly one.  Where that is off by more than the
-first, jets that face apart pull at f: an edge.  By more than the second: f = 0 beyond the rim of a
-thin part, which is no surface."""
-LEAST_SUPPORT = 0.1
-"""On the mesh the weights add up to several times this; less is beyond such a rim as well."""
+"""f is nearly a distance, with a gradient of nearly unit length.  A deviation above the first bound
+comes from jets of different directions: an edge.  Above the second, f = 0 beyond the rim of a thin
+part, which is no surface."""
+MIN_SUPPORT = 0.1
+"""Minimum sum of the weights; on the mesh it is several times this, and less beyond a rim."""
 MEMBERS_KNOWN = 0.1
-"""So many `rho` from where the supports around were looked up, they still are all."""
+"""Distance, in `rho`, over which a list of the supports around a point remains complete."""
 STRIDE_RATIO = 0.4
-"""A descent goes at most this many `rho` a step, so that it never leaves the supports."""
+"""Maximum step of a descent in `rho`, so that it never leaves the supports."""
 REST_RATIO = 1e-3
-"""A step under this many `rho` is a descent's last; it leaves nanometres, and some 1e-5 rad."""
+"""A descent ends at a step below this many `rho`; it leaves nanometres, and some 1e-5 rad."""
 APART_RATIO = 0.4
-"""Nearest points that far apart, in `rho`, are two."""
-MOST_DEVIATION = 0.22
-"""The surface stays within this many `rho` of the mesh, or `rho` is too long for it."""
-MOST_OF_EXTENT = 1.0 / 3.0
-MOST_WAYS = 6
-"""So many places besides the first are tried for the nearest of all."""
-LEAST_SHARE = 0.1
-"""Close to a centre of curvature, where I + h A is less than this, any foot of a jet is rough."""
-RIM_SHARE = 0.8
-"""From this share of a circle's radius on, what rises in it counts less and less."""
+"""Nearest points farther apart than this, in `rho`, are distinct."""
+MAX_DEVIATION_RATIO = 0.22
+"""Maximum distance of the surface from the mesh in `rho`; otherwise `rho` is too long."""
+MAX_EXTENT_FRACTION = 1.0 / 3.0
+MAX_STARTS = 6
+"""Number of further starts that are tried for the global nearest point."""
+MIN_CURVATURE_FACTOR = 0.1
+"""Near a centre of curvature, where I + h A is below this, a jet's nearest point is inaccurate."""
+RIM_FRACTION = 0.8
+"""From this fraction of a circle's radius on, the weight of what rises in it decreases."""
 CHUNK = 2048
 
 _IDENTITY = np.eye(3)
@@ -89,10 +91,10 @@ if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
 
-def usual_smoothing_m(vertices: Floats, triangles: Indices) -> float:
-    """A length to smooth over that hides the facets and keeps the form: 1.75 usual edges.
+def default_smoothing_m(vertices: Floats, triangles: Indices) -> float:
+    """Return a smoothing length that hides the facets and preserves the form: 1.75 typical edges.
 
-    Shorter ones let facets through, longer ones flatten what is curved over a few edges; see
+    Shorter lengths show facets, longer ones flatten what is curved over a few edges; see
     docs/shapes.md for figures.
     """
     run = half_edges(triangles)
@@ -101,24 +103,26 @@ def usual_smoothing_m(vertices: Floats, triangles: Indices) -> float:
 
 
 class SmoothMeshShape:
-    """A closed mesh, smoothed over `smoothing_m`; see the module's text."""
+    """Smooth a closed mesh over `smoothing_m`; see the module's text."""
 
     def __init__(self, vertices_m: Floats, triangles: NDArray[np.integer], smoothing_m: float):
         """MeshError for a mesh that is no solid's surface or too small to be smoothed so;
         ValueError for a length that is not positive."""
-        positive(smoothing_m=smoothing_m)
+        check_positive(smoothing_m=smoothing_m)
         vertices = np.asarray(vertices_m, dtype=np.float64)
         faces = np.asarray(triangles, dtype=np.int64)
         check_mesh(vertices, faces)
         extent = float(np.ptp(vertices[faces], axis=(0, 1)).max())
-        if smoothing_m > MOST_OF_EXTENT * extent:
+        if smoothing_m > MAX_EXTENT_FRACTION * extent:
             raise MeshError(
                 f"smoothed over {smoothing_m * 1e3:.3g} mm little would be left of an object of "
                 f"{extent * 1e3:.3g} mm; smooth over a shorter length"
             )
         self.smoothing_m = smoothing_m
         used = np.unique(faces)
-        fine_vertices, fine = refined(vertices[used], np.searchsorted(used, faces), smoothing_m)
+        fine_vertices, fine = refine_facets(
+            vertices[used], np.searchsorted(used, faces), smoothing_m
+        )
         self._centre, self._normal, self._operator = _jets(fine_vertices, fine, smoothing_m)
         from scipy.spatial import cKDTree  # late, as all of scipy: processes must start quickly
 
@@ -137,12 +141,12 @@ class SmoothMeshShape:
 
     def deviation_m(self) -> float:
         """The largest distance of the mesh's vertices, edges' middles and triangles' centres from
-        the smooth surface; MeshError where it is more than `MOST_DEVIATION` of `smoothing_m`.
+        the smooth surface; MeshError where it is more than `MAX_DEVIATION_RATIO` of `smoothing_m`.
 
         Takes as long as some thousand queries, so a shape does not ask it of itself.
         """
         deviation = float(np.abs(self.closest(self._samples).height_m).max())
-        if deviation > MOST_DEVIATION * self.smoothing_m:
+        if deviation > MAX_DEVIATION_RATIO * self.smoothing_m:
             raise MeshError(
                 f"smoothed over {self.smoothing_m * 1e3:.3g} mm the surface leaves the mesh by "
                 f"{deviation * 1e3:.3g} mm; smooth over a shorter length or refine the mesh"
@@ -152,13 +156,14 @@ class SmoothMeshShape:
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided where two separate places are as near.
 
-        `on_edge` where the surface is more sharply curved than `EDGE * TIGHTEST / smoothing_m`: at
-        rims thinner than `smoothing_m` and at rounded edges, which a sheet cannot roll over.
+        `on_edge` where the surface is more sharply curved than `EDGE * MAX_CURVATURE_RATIO /
+        smoothing_m`: at rims thinner than `smoothing_m` and at rounded edges, which a sheet cannot
+        roll over.
         """
-        queries = checked(points)
-        before = checked_previous(previous, queries)
+        queries = check_points(points)
+        before = check_previous(previous, queries)
         if queries.ndim == 1 and before is not None:
-            going_on = self._going_on(queries, before)
+            going_on = self._continue_from(queries, before)
             if going_on is not None:
                 return going_on
         flat = queries.reshape(-1, 3)
@@ -169,15 +174,15 @@ class SmoothMeshShape:
         for start in range(0, len(flat), CHUNK):
             part = slice(start, start + CHUNK)
             begun = None if earlier is None else earlier[part]
-            feet, undecided[part] = self._feet(flat[part], begun)
+            feet, undecided[part] = self._project(flat[part], begun)
             point[part], normal[part] = feet.point, feet.normal
             operator[part], steepness[part] = feet.shape_operator, feet.steepness
             support[part] = feet.support
         height = ((flat - point) * normal).sum(-1)
         # The Frobenius norm, one to root two times the larger curvature: no eigenvalues needed.
         sharpness = np.sqrt(np.square(operator).sum((1, 2)))
-        on_edge = sharpness > EDGE * TIGHTEST / self.smoothing_m
-        on_edge |= (np.abs(steepness - 1.0) > OFF_ONE) | (support < LEAST_SUPPORT)
+        on_edge = sharpness > EDGE * MAX_CURVATURE_RATIO / self.smoothing_m
+        on_edge |= (np.abs(steepness - 1.0) > OFF_ONE) | (support < MIN_SUPPORT)
         shape = queries.shape
         return Nearest(
             point.reshape(shape),
@@ -192,14 +197,14 @@ class SmoothMeshShape:
         """See `Shape`."""
         return self.closest(points).height_m
 
-    def _going_on(self, query: Floats, before: Floats) -> Nearest | None:
+    def _continue_from(self, query: Floats, before: Floats) -> Nearest | None:
         """`closest` for one query (3,) whose descent from the point before ends well, as nearly all
         do; else None."""
         feet = self._descend_one(query, before)
         if not feet.is_nearest[0]:
             return None
         point, normal, operator = feet.point[0], feet.normal[0], feet.shape_operator[0]
-        edge = EDGE * TIGHTEST / self.smoothing_m
+        edge = EDGE * MAX_CURVATURE_RATIO / self.smoothing_m
         on_edge = bool(
             float(np.einsum("ij,ij", operator, operator)) > edge * edge
             or abs(feet.steepness[0] - 1.0) > OFF_ONE
@@ -209,7 +214,7 @@ class SmoothMeshShape:
             point, normal, height, operator, np.array(on_edge), np.zeros((), dtype=np.bool_)
         )
 
-    def _feet(self, queries: Floats, before: Floats | None) -> tuple[Feet, Bools]:
+    def _project(self, queries: Floats, before: Floats | None) -> tuple[SurfaceProjections, Bools]:
         """The feet of queries (n, 3), going on from those found before, and which are undecided."""
         if before is None:
             return self._nearest_of_all(queries)
@@ -221,12 +226,12 @@ class SmoothMeshShape:
             _put(feet, lost, anew)
         return feet, undecided
 
-    def _nearest_of_all(self, queries: Floats) -> tuple[Feet, Bools]:
+    def _nearest_of_all(self, queries: Floats) -> tuple[SurfaceProjections, Bools]:
         """The nearest feet, whatever was found before.
 
         A descent from the nearest jet ends at distance D.  Any nearer place has a jet within the
         cover c of it, which by the bound on curvature is at most sqrt(D^2 + c^2 (1 + 4 D / rho))
-        away; descents are made from those that `_promising` leaves of them as well.
+        away; descents are made from those that `_select_starts` leaves of them as well.
         """
         nearest, rho = self._tree.query(queries)[1], self.smoothing_m
         start = self._centre[nearest]
@@ -236,20 +241,20 @@ class SmoothMeshShape:
         begun = np.linalg.norm(queries - start, axis=1)
         feet.is_nearest[way > begun + self._cover] = False
         way = np.where(feet.is_nearest, way, begun)
-        slack = self._cover**2 * (1.0 + 2.0 * TIGHTEST * way / rho)
+        slack = self._cover**2 * (1.0 + 2.0 * MAX_CURVATURE_RATIO * way / rho)
         lists = self._tree.query_ball_point(queries, np.sqrt(way**2 + slack))
         undecided = np.zeros(len(queries), dtype=bool)
-        rows, jets = self._promising(queries, lists, feet.point, way)
+        rows, jets = self._select_starts(queries, lists, feet.point, way)
         if len(rows):
             other = self._descend(queries[rows], self._centre[jets])
             other_way = np.linalg.norm(queries[rows] - other.point, axis=1)
             for i in np.flatnonzero(other.is_nearest):
                 row, shorter = rows[i], way[rows[i]] - other_way[i]
                 apart = float(np.linalg.norm(other.point[i] - feet.point[row])) > APART_RATIO * rho
-                if shorter > SAME_M or not feet.is_nearest[row]:
+                if shorter > EQUAL_DISTANCE_M or not feet.is_nearest[row]:
                     _put(feet, rows[i : i + 1], other, np.array([i]))
                     way[row], undecided[row] = other_way[i], False
-                elif apart and shorter > -SAME_M:
+                elif apart and shorter > -EQUAL_DISTANCE_M:
                     undecided[row] = True
         lost = np.flatnonzero(~feet.is_nearest)
         if len(lost):
@@ -259,7 +264,7 @@ class SmoothMeshShape:
             feet.support[lost], undecided[lost] = 0.0, True
         return feet, undecided
 
-    def _promising(
+    def _select_starts(
         self, queries: Floats, lists: list[list[int]], feet: Floats, way: Floats
     ) -> tuple[Indices, Indices]:
         """Rows of queries and jets that a point nearer than `way` (n,) may lie at, away from the
@@ -282,7 +287,7 @@ class SmoothMeshShape:
         values, vectors = np.linalg.eigh(_IDENTITY + height[:, :, None] * self._operator[jets])
         along = (np.swapaxes(vectors, 1, 2) @ across[:, :, None])[:, :, 0]
         # Feet of quadratics are rough, hence the room that is given.
-        reach = 1.5 * self._cover * np.maximum(values, LEAST_SHARE)
+        reach = 1.5 * self._cover * np.maximum(values, MIN_CURVATURE_FACTOR)
         hopeful = (values[:, 0] > 0.0) & (np.abs(along) <= reach).all(axis=1)
         rough_way = np.linalg.norm(queries[rows] - self._on_jet(queries[rows], jets), axis=1)
         hopeful &= rough_way < way[rows] + self._cover
@@ -291,19 +296,19 @@ class SmoothMeshShape:
         for i in np.argsort(np.square(offset).sum(1)):
             kept = taken.setdefault(int(rows[i]), [])
             apart = np.square(self._centre[jets[kept]] - self._centre[jets[i]]).sum(1) > square
-            if len(kept) < MOST_WAYS and apart.all():
+            if len(kept) < MAX_STARTS and apart.all():
                 kept.append(int(i))
         chosen = np.array(sorted(i for kept in taken.values() for i in kept), dtype=np.int64)
         return rows[chosen], jets[chosen]
 
-    def _descend(self, queries: Floats, starts: Floats) -> Feet:
+    def _descend(self, queries: Floats, starts: Floats) -> SurfaceProjections:
         rho = self.smoothing_m
         feet = descend(
             self._level, queries, starts, stride_m=STRIDE_RATIO * rho, rest_m=REST_RATIO * rho
         )
         return _on_surface_only(feet)
 
-    def _descend_one(self, query: Floats, start: Floats) -> Feet:
+    def _descend_one(self, query: Floats, start: Floats) -> SurfaceProjections:
         rho = self.smoothing_m
         feet = descend_one(
             _LevelNear(self, start),
@@ -322,7 +327,7 @@ class SmoothMeshShape:
         within = np.flatnonzero((height > 0.0) & (across < radius_m * radius_m))
         if not len(within):
             return 0.0
-        share = (1.0 - np.sqrt(np.maximum(across[within], 0.0)) / radius_m) / (1.0 - RIM_SHARE)
+        share = (1.0 - np.sqrt(np.maximum(across[within], 0.0)) / radius_m) / (1.0 - RIM_FRACTION)
         return float((height[within] * np.minimum(share, 1.0)).max())
 
     def _on_jet(self, queries: Floats, jet: Indices) -> Floats:
@@ -451,14 +456,19 @@ class _LevelNear:
         return value, gradient.tolist(), (hessian / total).tolist(), support
 
 
-def _on_surface_only(feet: Feet) -> Feet:
+def _on_surface_only(feet: SurfaceProjections) -> SurfaceProjections:
     """The feet, those that f = 0 beyond a rim brought forth not called nearest."""
     beyond_rim = np.abs(feet.steepness - 1.0) > FAR_OFF_ONE
-    feet.is_nearest[beyond_rim | (feet.support < LEAST_SUPPORT)] = False
+    feet.is_nearest[beyond_rim | (feet.support < MIN_SUPPORT)] = False
     return feet
 
 
-def _put(feet: Feet, rows: Indices, other: Feet, chosen: Bools | slice = slice(None)) -> None:
+def _put(
+    feet: SurfaceProjections,
+    rows: Indices,
+    other: SurfaceProjections,
+    chosen: Bools | slice = slice(None),
+) -> None:
     """Put the chosen of other feet into rows."""
     feet.point[rows], feet.normal[rows] = other.point[chosen], other.normal[chosen]
     feet.shape_operator[rows] = other.shape_operator[chosen]
@@ -475,11 +485,11 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
     run = half_edges(triangles)
     order = np.argsort(run[:, 0], kind="stable")
     ring = np.split(run[order, 1], np.cumsum(np.bincount(run[:, 0], minlength=len(vertices)))[:-1])
-    chosen = _thinned(vertices, rough, tree, SPACING_RATIO * rho)
+    chosen = _thin_out(vertices, rough, tree, SPACING_RATIO * rho)
     points, normals, operators = np.empty((len(chosen), 3)), [], []
     for row, vertex in enumerate(chosen):
         ball = tree.query_ball_point(vertices[vertex], FIT_RATIO * rho)
-        level = [i for i in ball if rough[i] @ rough[vertex] > STEEPEST]
+        level = [i for i in ball if rough[i] @ rough[vertex] > MIN_NORMAL_COSINE]
         patch = _connected(int(vertex), set(level), ring)
         points[row], normal, operator = _jet(vertices[vertex], rough[vertex], vertices[patch], rho)
         normals.append(normal)
@@ -487,7 +497,7 @@ def _jets(vertices: Floats, triangles: Indices, rho: float) -> tuple[Floats, Flo
     return points, np.array(normals), np.array(operators)
 
 
-def _thinned(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
+def _thin_out(vertices: Floats, normals: Floats, tree: cKDTree, spacing: float) -> list[int]:
     """Vertices of which no two that face the same way are nearer than `spacing`; every other vertex
     has one of them so near."""
     taken, covered = [], np.zeros(len(vertices), dtype=bool)
@@ -536,7 +546,7 @@ def _jet(
     graph = np.zeros((3, 3))
     graph[:2, :2] = -np.array([[xx, xy], [xy, yy]]) / (steepness * reach)
     values, vectors = np.linalg.eigh(tangent @ graph @ tangent)
-    bound = TIGHTEST / rho
+    bound = MAX_CURVATURE_RATIO / rho
     bounded = np.clip(values, -bound, bound)
     turned = frame @ vectors
     operator = turned @ np.diag(bounded) @ turned.T

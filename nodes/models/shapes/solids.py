@@ -1,4 +1,4 @@
-"""The shapes that have a formula: cylinder, sphere, plane, ellipsoid, rounded box."""
+"""Shapes with a formula: cylinder, sphere, plane, ellipsoid, rounded box."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nodes.models.shapes.surface import (
+    EQUAL_DISTANCE_M,
     FRONT,
-    SAME_M,
     Bools,
     Convex,
     Floats,
     Nearest,
     Triple,
-    checked,
-    checked_previous,
+    check_points,
+    check_positive,
+    check_previous,
     descend,
     descend_one,
-    positive,
 )
 
 _IDENTITY = np.eye(3)
@@ -29,19 +29,19 @@ _IDENTITY = np.eye(3)
 class CylinderShape(Convex):
     """Circular cylinder about the x axis, centred on the origin.
 
-    Only its side is touchable: the sheet is held along x, so a finger beyond an end cap is given
-    the rim's nearest point of the side, flagged `on_edge`.
+    Only its side is touchable: the sheet is clamped along x, so that a finger beyond an end cap
+        gets the nearest point of the side's rim, with `on_edge`.
     """
 
     radius_m: float
     length_m: float
 
     def __post_init__(self) -> None:
-        positive(radius_m=self.radius_m, length_m=self.length_m)
+        check_positive(radius_m=self.radius_m, length_m=self.length_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided on the axis."""
-        queries = checked(points)
+        queries = check_points(points)
         radial = queries * np.array([0.0, 1.0, 1.0])
         normal, radius, undecided = _directions(radial, previous, queries, across=(1, 2))
         half = 0.5 * self.length_m
@@ -55,14 +55,14 @@ class CylinderShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`; of the solid with its end caps."""
-        queries = checked(points)
+        queries = check_points(points)
         aside = np.hypot(queries[..., 1], queries[..., 2]) - self.radius_m
         beyond = np.abs(queries[..., 0]) - 0.5 * self.length_m
         outside = np.hypot(np.maximum(aside, 0.0), np.maximum(beyond, 0.0))
         return np.asarray(outside + np.minimum(np.maximum(aside, beyond), 0.0))
 
     def angle_rad(self, point: Floats) -> float:
-        """Angle of a point (3,) about the axis, 0 on +z, growing towards +y."""
+        """Return the angle of a point (3,) about the axis, 0 on +z, growing towards +y."""
         return float(np.arctan2(point[1], point[2]))
 
 
@@ -73,11 +73,11 @@ class SphereShape(Convex):
     radius_m: float
 
     def __post_init__(self) -> None:
-        positive(radius_m=self.radius_m)
+        check_positive(radius_m=self.radius_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided at the centre."""
-        queries = checked(points)
+        queries = check_points(points)
         normal, radius, undecided = _directions(queries, previous, queries, across=(0, 1, 2))
         operator = (_IDENTITY - _outer(normal)) / self.radius_m
         nowhere = np.zeros(radius.shape, dtype=bool)
@@ -86,7 +86,7 @@ class SphereShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`."""
-        return np.asarray(np.linalg.norm(checked(points), axis=-1) - self.radius_m)
+        return np.asarray(np.linalg.norm(check_points(points), axis=-1) - self.radius_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,12 +97,12 @@ class PlaneShape(Convex):
     height_m: float
 
     def __post_init__(self) -> None:
-        positive(width_m=self.width_m, height_m=self.height_m)
+        check_positive(width_m=self.width_m, height_m=self.height_m)
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; past the rectangle (x along the width, y along the height) `on_edge`."""
-        queries = checked(points)
-        checked_previous(previous, queries)
+        queries = check_points(points)
+        check_previous(previous, queries)
         half = 0.5 * np.array([self.width_m, self.height_m, np.inf])
         point = np.clip(queries, -half, half)
         point[..., 2] = 0.0
@@ -115,7 +115,7 @@ class PlaneShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`; of the whole half-space."""
-        return checked(points)[..., 2].copy()
+        return check_points(points)[..., 2].copy()
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,20 +126,20 @@ class EllipsoidShape(Convex):
 
     def __post_init__(self) -> None:
         for axis, length in zip("xyz", self.semi_axes_m, strict=True):
-            positive(**{f"semi_axes_m ({axis})": length})
+            check_positive(**{f"semi_axes_m ({axis})": length})
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
         """See `Shape`; undecided on the medial disc, across the shortest axis."""
-        queries = checked(points)
-        before = checked_previous(previous, queries)
+        queries = check_points(points)
+        before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
         undecided = self._undecided(flat)
         if before is None:
             point = self._nearest(flat, np.broadcast_to(FRONT, flat.shape))
         else:
             starts = before.reshape(-1, 3)
-            # The centre, where the level set has no slope, tells no side.
-            blind = np.linalg.norm(starts, axis=-1, keepdims=True) < SAME_M
+            # At the centre the level set has no slope and gives no side.
+            blind = np.linalg.norm(starts, axis=-1, keepdims=True) < EQUAL_DISTANCE_M
             starts = np.where(blind, FRONT * self.semi_axes_m, starts)
             least = min(self.semi_axes_m)
             stride_m, rest_m = 0.5 * least, 1e-7 * least
@@ -175,7 +175,7 @@ class EllipsoidShape(Convex):
         return self.closest(points).height_m
 
     def _level(self, points: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """The ellipsoid as a level set, see `LevelSet`; supported everywhere."""
+        """Evaluate the ellipsoid as a level set, see `LevelSet`; supported everywhere."""
         inverse = 1.0 / np.square(self.semi_axes_m)
         gradient = points * inverse
         value = 0.5 * ((points * gradient).sum(-1) - 1.0)
@@ -185,38 +185,43 @@ class EllipsoidShape(Convex):
     def _level_at(
         self, point: Triple
     ) -> tuple[float, Triple, tuple[Triple, Triple, Triple], float]:
-        """The same, see `LevelAt`."""
+        """Evaluate it at a single point, see `LevelAt`."""
         (x, y, z), (a, b, c) = point, self.semi_axes_m
         p, q, r = 1.0 / (a * a), 1.0 / (b * b), 1.0 / (c * c)
         value = 0.5 * (x * x * p + y * y * q + z * z * r - 1.0)
         return value, (x * p, y * q, z * r), ((p, 0.0, 0.0), (0.0, q, 0.0), (0.0, 0.0, r)), 1.0
 
     def _undecided(self, queries: Floats) -> Bools:
-        """Whether queries lie where two surface points are as near: on a plane of symmetry, within
-        the centres of curvature of the other two directions."""
+        """Return whether two surface points are equally near to queries.
+
+        That is so on a plane of symmetry, within the centres of curvature of the other two
+        directions.
+        """
         axes = np.array(self.semi_axes_m)
         shortest = np.flatnonzero(axes <= axes.min() * (1.0 + 1e-9))
         others = np.setdiff1d(np.arange(3), shortest)
         focal = (axes[others] ** 2 - axes.min() ** 2) / axes[others]
         inside = (np.square(queries[:, others] / focal).sum(-1)) < 1.0
-        on_plane = np.linalg.norm(queries[:, shortest], axis=-1) < SAME_M
+        on_plane = np.linalg.norm(queries[:, shortest], axis=-1) < EQUAL_DISTANCE_M
         return np.asarray(on_plane & inside)
 
     def _nearest(self, queries: Floats, sides: Floats) -> Floats:
-        """The nearest of all surface points, (n, 3).
+        """Return the nearest of all surface points, (n, 3).
 
-        With e the semi-axes the foot is x_i = e_i^2 q_i / (t + e_i^2), where t is the largest root
-        of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to an Ellipsoid, 2013).
-        As a trust-region problem's, the root is found in the reciprocal norm, which is concave and
-        almost straight, so that Newton's method rises to it from the left and never passes it
-        (Conn, Gould, Toint, Trust-Region Methods, sec. 7.3).  A query on a plane of symmetry is
-        moved off it, towards `sides` (n, 3), by a billionth of the shortest axis: no pole is met.
+        With e the semi-axes, the nearest point is x_i = e_i^2 q_i / (t + e_i^2), where t is the
+        largest root of sum (e_i q_i / (t + e_i^2))^2 = 1 (Eberly, Distance from a Point to an
+        Ellipsoid, 2013).  As for a trust-region problem, the root is found in the reciprocal norm.
+        That norm is concave and almost straight, so that Newton's method approaches it from the
+        left and never passes it (Conn, Gould, Toint, Trust-Region Methods, sec. 7.3).  A query on a
+        plane of symmetry is moved off it, towards `sides` (n, 3), by a billionth of the shortest
+        axis, which avoids the poles.
         """
         axes = np.array(self.semi_axes_m)
         nudge = 1e-9 * axes.min()
         towards = sides / np.maximum(np.linalg.norm(sides, axis=-1, keepdims=True), 1e-300)
         moved = np.where(np.abs(queries) < nudge, nudge * towards, queries)
-        # A side without a part across the shortest axis tells nothing: then the positive one.
+        # A side without a component across the shortest axis decides nothing: take the positive
+        # one.
         moved = np.where(np.abs(moved) < 1e-3 * nudge, 1e-3 * nudge, moved)
         size, squares = np.abs(moved) * axes, axes**2
         root = (size - squares).max(axis=-1)
@@ -229,7 +234,7 @@ class EllipsoidShape(Convex):
             if not (np.abs(step) > 1e-15 * (np.abs(root) + squares.min())).any():
                 break
         foot = squares * moved / (root[:, None] + squares)
-        # On the surface to rounding, whatever the last step left.
+        # Project onto the surface, to remove what the last step left.
         return np.asarray(foot / np.linalg.norm(foot / axes, axis=-1, keepdims=True))
 
 
@@ -237,7 +242,9 @@ class EllipsoidShape(Convex):
 class RoundedBoxShape(Convex):
     """Box about the origin whose edges and corners are rounded by a ball.
 
-    size_m: full extents along x, y, z, rounding included; edge_radius_m: at most half the least.
+    size_m: full extents along x, y, z, rounding included.
+    edge_radius_m: at most half the smallest extent.
+
     Its normal is continuous; its curvature steps between faces, edges (1/r once) and corners.
     """
 
@@ -246,8 +253,8 @@ class RoundedBoxShape(Convex):
 
     def __post_init__(self) -> None:
         for axis, length in zip("xyz", self.size_m, strict=True):
-            positive(**{f"size_m ({axis})": length})
-        positive(edge_radius_m=self.edge_radius_m)
+            check_positive(**{f"size_m ({axis})": length})
+        check_positive(edge_radius_m=self.edge_radius_m)
         if 2.0 * self.edge_radius_m > min(self.size_m):
             raise ValueError(
                 f"edge_radius_m is {self.edge_radius_m}, more than half the least size "
@@ -255,9 +262,9 @@ class RoundedBoxShape(Convex):
             )
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """See `Shape`; undecided inside where two faces are as near."""
-        queries = checked(points)
-        before = checked_previous(previous, queries)
+        """See `Shape`; undecided inside where two faces are equally near."""
+        queries = check_points(points)
+        before = check_previous(previous, queries)
         flat = queries.reshape(-1, 3)
         core = self._core()
         nearest_core = np.clip(flat, -core, core)
@@ -293,21 +300,22 @@ class RoundedBoxShape(Convex):
 
     def signed_distance(self, points: ArrayLike) -> Floats:
         """See `Shape`."""
-        away = np.abs(checked(points)) - self._core()
+        away = np.abs(check_points(points)) - self._core()
         outside = np.linalg.norm(np.maximum(away, 0.0), axis=-1)
         return np.asarray(outside + np.minimum(away.max(axis=-1), 0.0) - self.edge_radius_m)
 
     def _core(self) -> Floats:
-        """Half extents (3,) of the box that the ball rolls on from inside."""
+        """Half extents (3,) of the box that contains the ball's centre."""
         return 0.5 * np.array(self.size_m) - self.edge_radius_m
 
     def _nearest_face(
         self, queries: Floats, before: Floats | None
     ) -> tuple[np.ndarray[tuple[int], np.dtype[np.int64]], Floats, Floats, Bools]:
-        """Axis, sign and depth below the core's face of the face to take, and whether it is tied.
+        """Return axis, sign and depth below the core's face of the nearest face, and whether it is
+        tied.
 
-        With points found before, only faces that are theirs, or border on their rounded edge, are
-        taken.  Without, ties go to the last of -x, -y, -z, x, y, z: the front before all.
+        With previous points, only their faces, or those at their rounded edge, are considered.
+        Without, ties are resolved in the order z, y, x, -z, -y, -x: the front first.
         """
         core = self._core()
         # Columns z, y, x, -z, -y, -x, so that the first of equals is the front.
@@ -316,12 +324,12 @@ class RoundedBoxShape(Convex):
         if before is not None:
             out = (before - np.clip(before, -core, core)) / self.edge_radius_m
             allowed = np.concatenate([out, -out], axis=1)[:, [2, 1, 0, 5, 4, 3]] > 0.5
-            # A point that is not of the surface decides nothing.
+            # A previous point that is not on the surface decides nothing.
             allowed |= ~allowed.any(axis=1, keepdims=True)
         first = margins.min(axis=1)
-        tied = (margins < first[:, None] + SAME_M).sum(axis=1) > 1
+        tied = (margins < first[:, None] + EQUAL_DISTANCE_M).sum(axis=1) > 1
         chosen = np.where(allowed, margins, np.inf)
-        # Rounding must not choose between equals.
+        # Rounding errors must not decide between equals.
         face = (chosen <= chosen.min(axis=1, keepdims=True) + 1e-12).argmax(axis=1)
         depth = margins[np.arange(len(face)), face]
         return 2 - face % 3, np.where(face < 3, 1.0, -1.0), depth, tied
@@ -334,20 +342,21 @@ def _outer(normal: Floats) -> Floats:
 def _directions(
     offsets: Floats, previous: ArrayLike | None, queries: Floats, *, across: tuple[int, ...]
 ) -> tuple[Floats, Floats, Bools]:
-    """Unit directions of offsets from an axis or a centre, their lengths, and where undecided.
+    """Return unit directions of offsets from an axis or a centre, their lengths, and where
+    undecided.
 
-    across: the coordinates that offsets have.  Undecided ones follow the points found before, or
-    `FRONT`.
+    across: the coordinates that offsets have.  Undecided ones follow the previous points, or
+        `FRONT`.
     """
-    before = checked_previous(previous, queries)
+    before = check_previous(previous, queries)
     length = np.linalg.norm(offsets, axis=-1)
-    undecided = length < SAME_M
+    undecided = length < EQUAL_DISTANCE_M
     direction = offsets
     if undecided.any():
         kept = np.zeros(3)
         kept[list(across)] = 1.0
         sides = np.broadcast_to(FRONT, offsets.shape) if before is None else before * kept
-        blind = np.linalg.norm(sides, axis=-1) < SAME_M
+        blind = np.linalg.norm(sides, axis=-1) < EQUAL_DISTANCE_M
         sides = np.where(blind[..., None], FRONT, sides)
         direction = np.where(undecided[..., None], sides, offsets)
     unit = direction / np.linalg.norm(direction, axis=-1)[..., None]

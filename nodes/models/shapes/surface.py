@@ -1,9 +1,9 @@
-"""What every shape answers: the nearest surface point, with its normal and curvature.
+"""Define what every shape offers: the nearest surface point, with its normal and curvature.
 
-Points are (3,) or (n, 3) arrays in the object's frame, lengths in metres; answers have the same
+Points are (3,) or (n, 3) arrays in the object's frame, lengths in metres; results have the same
 leading shape.  Normals point out of the object.  Curvature is given as the shape operator W, a
-symmetric 3x3 matrix with W n = 0: along the surface the normal turns by dn = W dp, so that its two
-other eigenvalues are the principal curvatures, positive where the object is convex (do Carmo,
+symmetric 3x3 matrix with W n = 0.  Along the surface the normal changes by dn = W dp, so that its
+two other eigenvalues are the principal curvatures, positive where the object is convex (do Carmo,
 Differential Geometry of Curves and Surfaces, ch. 3).
 """
 
@@ -20,27 +20,27 @@ from numpy.typing import ArrayLike, NDArray
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SAME_M = 1e-6
-"""Two ways to the surface that differ by less than this are equally long."""
+EQUAL_DISTANCE_M = 1e-6
+"""Distances to the surface that differ by less than this count as equal."""
 
-FARTHEST_M = 1e6
-"""A query farther from the origin than this is a mistake, not a place."""
+MAX_QUERY_M = 1e6
+"""A query farther from the origin than this is an error."""
 
 FRONT = np.array([0.0, 0.0, 1.0])
-"""Where all surface points are equally near and none was touched before, this side is taken: of an
-object that is not turned, it faces the user."""
+"""Side that is chosen where all surface points are equally near and there is no previous point.  It
+faces the user if the object is not rotated."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nearest:
-    """The touchable surface points nearest to some queries; shapes as the queries', see above.
+    """Hold the touchable surface points nearest to some queries; shapes as the queries'.
 
-    height_m: of the query above the tangent plane at `point`, negative below it.  It is the signed
-        distance, but past an end.
+    height_m: height of the query above the tangent plane at `point`, negative below it.  It is the
+        signed distance, except past an end.
     shape_operator: (..., 3, 3) at `point`, 1/m.
-    on_edge: the query lies past an end of the touchable surface, `point` is on its rim; or `point`
-        is on an edge of a mesh.  There a sheet can be presented, but not rolled on.
-    undecided: another point is as near; which one was taken follows from `previous` or `FRONT`.
+    on_edge: the query lies past an end of the touchable surface and `point` is on its rim, or
+        `point` is on an edge of a mesh.  A sheet can be tangent there, but cannot roll on.
+    undecided: another point is equally near; `previous` or `FRONT` decided between them.
     """
 
     point: Floats
@@ -52,36 +52,38 @@ class Nearest:
 
 
 class Shape(Protocol):
-    """A solid with a touchable surface."""
+    """Define a solid with a touchable surface."""
 
     def closest(self, points: ArrayLike, *, previous: ArrayLike | None = None) -> Nearest:
-        """The nearest touchable points.
+        """Return the nearest touchable points.
 
-        previous: the surface points found just before, shaped as `points`.  The answer continues
-            from there: where several points are equally near, and inside the object also where a
-            nearer one has appeared elsewhere, the nearest point of the same neighbourhood is kept
-            as long as there is one.  Leave it out when a finger comes anew.
+        previous: the surface points of the previous queries, shaped as `points`.  Where several
+            points are equally near, and inside the object also where a nearer one appears
+            elsewhere, the nearest point of the same neighbourhood is kept as long as it exists.
+            Leave it out for a new contact.
 
-        ValueError for NaN, infinity, another shape than (3,) or (n, 3), or beyond `FARTHEST_M`.
+        Raises ValueError for NaN, infinity, another shape than (3,) or (n, 3), or points beyond
+        `MAX_QUERY_M`.
         """
         ...
 
     def signed_distance(self, points: ArrayLike) -> Floats:
-        """Distance (m) to the whole solid's surface, negative inside; errors as `closest`."""
+        """Return the distance (m) to the whole solid's surface, negative inside; errors as
+        `closest`."""
         ...
 
     def rise_m(self, point: Floats, normal: Floats, radius_m: float) -> float:
-        """How far the object rises above its tangent plane at a surface point (3,), within
-        `radius_m` of the point along that plane; 0 where it is not hollow.
+        """Return how far the object rises above its tangent plane at a surface point (3,).
 
-        It is continuous in the point and the normal: what stands near the rim of that circle counts
-        less and less.
+        Only the surface within `radius_m` of the point along that plane counts; 0 where it is not
+        concave. The result is continuous in the point and the normal: what rises near the rim of
+        that circle has a smaller weight.
         """
         ...
 
 
 class Convex:
-    """A solid that nowhere rises above its tangent planes."""
+    """Base of a solid that never rises above its tangent planes."""
 
     __slots__ = ()
 
@@ -91,11 +93,11 @@ class Convex:
 
 
 def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats, Floats]:
-    """Principal curvatures (..., 2), rising (1/m), and their directions (..., 2, 3).
+    """Return the principal curvatures (..., 2), ascending (1/m), and their directions (..., 2, 3).
 
-    The directions are unit tangents; at an umbilic (sphere, plane) any two at right angles.
+    The directions are unit tangents; at an umbilic (sphere, plane) any two perpendicular ones.
     """
-    # The normal's own eigenvalue, zero, is moved out of the way of the two that count.
+    # The normal's own eigenvalue, zero, is shifted away from the two relevant ones.
     bound = 1.0 + np.linalg.norm(shape_operator, axis=(-2, -1))
     outer = normal[..., :, None] * normal[..., None, :]
     values, vectors = np.linalg.eigh(shape_operator + 2.0 * bound[..., None, None] * outer)
@@ -103,21 +105,21 @@ def principal_curvatures(shape_operator: Floats, normal: Floats) -> tuple[Floats
 
 
 def tightest_curvature(shape_operator: Floats) -> float:
-    """The larger principal curvature (1/m) of one shape operator (3, 3).
+    """Return the larger principal curvature (1/m) of one shape operator (3, 3).
 
-    Of the two, with k1 + k2 the trace and k1^2 + k2^2 the squares' sum.
+    It follows from k1 + k2, the trace, and k1^2 + k2^2, the sum of squares.
     """
     total = float(np.einsum("ii", shape_operator))
     squares = float(np.einsum("ij,ij", shape_operator, shape_operator))
     return 0.5 * (total + sqrt(max(2.0 * squares - total * total, 0.0)))
 
 
-def foot_jacobian(found: Nearest) -> Floats:
-    """d point / d query, (..., 3, 3): how the nearest point moves as the query does.
+def projection_jacobian(found: Nearest) -> Floats:
+    """Return d point / d query, (..., 3, 3): how the nearest point moves with the query.
 
-    On a parallel surface at height h, W becomes W (I + h W)^-1; hence the foot moves by
-    P (I + h W)^-1, and the normal by W times that.  Inside, at a centre of curvature, I + h W is
-    singular: there the foot has no rate, and LinAlgError is raised.
+    On a parallel surface at height h, W becomes W (I + h W)^-1.  The projected point therefore
+    moves by P (I + h W)^-1, and the normal by W times that.  At a centre of curvature inside, I + h
+    W is singular and LinAlgError is raised.
     """
     normal, operator = found.normal, found.shape_operator
     tangent = np.eye(3) - normal[..., :, None] * normal[..., None, :]
@@ -125,45 +127,46 @@ def foot_jacobian(found: Nearest) -> Floats:
     return np.asarray(np.linalg.solve(np.eye(3) + height * operator, tangent))
 
 
-def checked(points: ArrayLike, name: str = "points") -> Floats:
-    """`points` as floats (3,) or (n, 3); ValueError says what is wrong with them."""
+def check_points(points: ArrayLike, name: str = "points") -> Floats:
+    """Return `points` as floats (3,) or (n, 3); ValueError says what is wrong with them."""
     array = np.asarray(points, dtype=np.float64)
     if array.ndim not in (1, 2) or array.shape[-1] != 3:
         raise ValueError(f"{name} of shape {array.shape}, wanted (3,) or (n, 3)")
     # A comparison with NaN is false, hence the double negation.
-    if array.size and not (np.abs(array) <= FARTHEST_M).all():
-        raise ValueError(f"{name} hold NaN, infinity or places beyond {FARTHEST_M:g} m")
+    if array.size and not (np.abs(array) <= MAX_QUERY_M).all():
+        raise ValueError(f"{name} hold NaN, infinity or places beyond {MAX_QUERY_M:g} m")
     return array
 
 
-def checked_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
-    """`previous` as floats, shaped as `points`; ValueError otherwise."""
+def check_previous(previous: ArrayLike | None, points: Floats) -> Floats | None:
+    """Return `previous` as floats, shaped as `points`; ValueError otherwise."""
     if previous is None:
         return None
-    array = checked(previous, "previous")
+    array = check_points(previous, "previous")
     if array.shape != points.shape:
         raise ValueError(f"previous of shape {array.shape}, points of shape {points.shape}")
     return array
 
 
-def positive(**lengths_m: float) -> None:
-    """ValueError unless every length is a positive number."""
+def check_positive(**lengths_m: float) -> None:
+    """Raise ValueError unless every length is a positive number."""
     for name, length in lengths_m.items():
         if not (np.isfinite(length) and length > 0.0):
             raise ValueError(f"{name} is {length}, wanted a positive length in metres")
 
 
 LevelSet = Callable[[Floats], tuple[Floats, Floats, Floats, Floats]]
-"""Points (n, 3) to a function's values (n,), gradients (n, 3) and Hessians (n, 3, 3), and to how
-well it is supported there (n,), in its own measure.  It is zero on the surface, grows outwards."""
+"""Function of points (n, 3) that returns values (n,), gradients (n, 3), Hessians (n, 3, 3) and
+support (n,).  It is zero on the surface and grows outwards."""
 
 
 @dataclass(frozen=True, slots=True)
-class Feet:
-    """Where descents to the surface ended: points, normals (n, 3), shape operators (n, 3, 3).
+class SurfaceProjections:
+    """Hold points, normals (n, 3) and shape operators (n, 3, 3) where descents to the surface
+    ended.
 
     steepness, support: (n,) length of the level set's gradient, and its support.
-    is_nearest: (n,) the descent came to rest at a point that is nearest within its neighbourhood.
+    is_nearest: (n,) the descent converged to a point that is nearest within its neighbourhood.
     """
 
     point: Floats
@@ -174,22 +177,23 @@ class Feet:
     is_nearest: Bools
 
 
-MOST_STEPS = 25
-LEAST_BEND = 0.02
-"""Floor of the size of the reduced Hessian's eigenvalues (1 on a flat surface): close to a centre
-of curvature the full Newton step would be too long; past it, downhill is the other way."""
+MAX_STEPS = 25
+MIN_EIGENVALUE = 0.02
+"""Lower bound on the eigenvalues' size in the reduced Hessian (1 on a flat surface).  Close to a
+centre of curvature the full Newton step would be too long; past it, descent has the opposite
+sign."""
 
 
 def descend(
     level: LevelSet, queries: Floats, starts: Floats, *, stride_m: float, rest_m: float
-) -> Feet:
-    """From `starts` (n, 3) along the surface to the points nearest to `queries` (n, 3).
+) -> SurfaceProjections:
+    """Move from `starts` (n, 3) along the surface to the points nearest to `queries` (n, 3).
 
-    Newton's method for min |x - q|^2 on f(x) = 0 (Nocedal and Wright, Numerical Optimization,
-    ch. 18): each step goes back to the surface along the gradient, and along the surface by the
-    reduced system with the Lagrangian's Hessian I + lambda H, whose eigenvalues are kept positive
-    so that it always goes downhill.  No step is longer than `stride_m`, and one under `rest_m` is
-    the last: what it leaves is of second order in it, of the normal too.
+    Newton's method for min |x - q|^2 on f(x) = 0 (Nocedal and Wright, Numerical Optimization, ch.
+    18).  Each step returns to the surface along the gradient, and moves along the surface by the
+    reduced system with the Lagrangian's Hessian I + lambda H.  Its eigenvalues are kept positive,
+    so that each step descends.  No step is longer than `stride_m`, and one under `rest_m` is the
+    last: its error is of second order, and so is that of the normal.
     """
     count = len(queries)
     point = np.array(starts, dtype=np.float64)
@@ -197,7 +201,7 @@ def descend(
     steepness, support = np.empty(count), np.empty(count)
     is_nearest = np.zeros(count, dtype=bool)
     moving = np.arange(count)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         x = point[moving]
         value, gradient, hessian, known = level(x)
         square = (gradient * gradient).sum(-1)
@@ -211,7 +215,7 @@ def descend(
         fall = (-value / square)[:, None] * gradient
         slope = tangent @ (offset[:, :, None] - bend @ fall[:, :, None])
         values, vectors = np.linalg.eigh(tangent @ bend @ tangent + outward)
-        bounded = np.maximum(np.abs(values), LEAST_BEND)
+        bounded = np.maximum(np.abs(values), MIN_EIGENVALUE)
         along = np.swapaxes(vectors, 1, 2) @ slope / bounded[:, :, None]
         step = (vectors @ along)[:, :, 0] + fall
         size = np.sqrt((step * step).sum(-1))
@@ -221,15 +225,15 @@ def descend(
         point[moving] = x + step
         normal[moving] = turned / np.sqrt((turned * turned).sum(-1))[:, None]
         operator[moving] = weingarten
-        # Where eigenvalues are bounded the steps shrink slowly: the last must be far shorter.
-        slow = values[:, 0] < LEAST_BEND
+        # Bounded eigenvalues shrink the steps slowly, so that the last step must be far shorter.
+        slow = values[:, 0] < MIN_EIGENVALUE
         resting = size <= np.where(slow, 1e-3 * rest_m, rest_m)
         steepness[moving], support[moving] = length, known
         is_nearest[moving] = resting & (values[:, 0] > 0.0)
         if resting.all():
             break
         moving = moving[~resting]
-    return Feet(point, normal, operator, steepness, support, is_nearest)
+    return SurfaceProjections(point, normal, operator, steepness, support, is_nearest)
 
 
 _IDENTITY = np.eye(3)
@@ -241,16 +245,17 @@ LevelAt = Callable[[Triple], tuple[float, Sequence[float], Sequence[Sequence[flo
 
 def descend_one(
     level: LevelAt, query: Floats, start: Floats, *, stride_m: float, rest_m: float
-) -> Feet:
-    """`descend` for one query (3,), at a fraction of its cost; the feet are of length one.
+) -> SurfaceProjections:
+    """Descend as `descend` for one query (3,), at a fraction of its time; the results have length
+    one.
 
-    Written out in the tangent plane's two directions, since arrays of three numbers cost more than
-    their sums.
+    It is written out in the two directions of the tangent plane, since arrays of three numbers cost
+    more than their sums.
     """
     qx, qy, qz = query.tolist()
     x, y, z = start.tolist()
     is_nearest = False
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         value, (gx, gy, gz), hessian, support = level((x, y, z))
         square = max(gx * gx + gy * gy + gz * gz, 1e-300)
         length = sqrt(square)
@@ -276,14 +281,14 @@ def descend_one(
         x += t1 * e[0] + t2 * f[0] + fall * ux
         y += t1 * e[1] + t2 * f[1] + fall * uy
         z += t1 * e[2] + t2 * f[2] + fall * uz
-        if size <= (rest_m if low >= LEAST_BEND else 1e-3 * rest_m):
+        if size <= (rest_m if low >= MIN_EIGENVALUE else 1e-3 * rest_m):
             is_nearest = low > 0.0
             break
     basis = np.array([e, f])
     inner = np.array([[h11, h12], [h12, h22]]) / length
-    # By the last step's part within the first's tangent plane, as the operator is.
+    # Rotated with the last step's part within the first tangent plane, like the operator.
     turned = np.array([ux, uy, uz]) + np.array([t1, t2]) @ inner @ basis
-    return Feet(
+    return SurfaceProjections(
         np.array([[x, y, z]]),
         (turned / sqrt(turned @ turned))[None],
         (basis.T @ inner @ basis)[None],
@@ -294,8 +299,8 @@ def descend_one(
 
 
 def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
-    """Two unit vectors that make a basis with a third (Duff et al., Building an Orthonormal Basis,
-    Revisited, 2017)."""
+    """Return two unit vectors that form a basis with a third (Duff et al., Building an Orthonormal
+    Basis, Revisited, 2017)."""
     side = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (side + z)
     b = x * y * a
@@ -305,13 +310,13 @@ def _tangents(x: float, y: float, z: float) -> tuple[Triple, Triple]:
 def _downhill(
     b11: float, b12: float, b22: float, slope: tuple[float, float]
 ) -> tuple[float, float, float]:
-    """The Newton step of a symmetric 2x2 system, its eigenvalues' sizes kept from zero, and the
-    smaller eigenvalue."""
+    """Return the Newton step of a symmetric 2x2 system with eigenvalues kept away from zero, and
+    the smaller eigenvalue."""
     middle, spread = 0.5 * (b11 + b22), hypot(0.5 * (b11 - b22), b12)
     turn = 0.5 * atan2(2.0 * b12, b11 - b22)
     c, s = cos(turn), sin(turn)
-    along_high = (c * slope[0] + s * slope[1]) / max(abs(middle + spread), LEAST_BEND)
-    along_low = (c * slope[1] - s * slope[0]) / max(abs(middle - spread), LEAST_BEND)
+    along_high = (c * slope[0] + s * slope[1]) / max(abs(middle + spread), MIN_EIGENVALUE)
+    along_low = (c * slope[1] - s * slope[0]) / max(abs(middle - spread), MIN_EIGENVALUE)
     return c * along_high - s * along_low, s * along_high + c * along_low, middle - spread
 
 

@@ -1,6 +1,6 @@
-"""Triangle meshes as they are: checks, normals, the nearest point of the facets.
+"""Check triangle meshes, and compute normals and the nearest points of facets.
 
-Vertices are (v, 3) m, triangles (t, 3) indices of vertices, counter-clockwise seen from outside.
+Vertices are (v, 3) m, triangles (t, 3) indices of vertices, counter-clockwise from outside.
 """
 
 from __future__ import annotations
@@ -13,65 +13,67 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-MOST_TRIANGLES = 100_000
-FLATTEST = 1e-6
-"""A triangle whose height is less than this share of its longest edge has no direction."""
-FOLDED_RAD = np.radians(175.0)
-"""Two neighbours that meet at a sharper angle than this lie on one another."""
+MAX_TRIANGLES = 100_000
+MIN_HEIGHT_RATIO = 1e-6
+"""A triangle whose height over its longest edge is smaller has no direction."""
+MAX_DIHEDRAL_RAD = np.radians(175.0)
+"""Neighbours with a larger angle between their normals are folded onto one another."""
 
 
 class MeshError(ValueError):
-    """A mesh that bounds no solid; the text says why, and what helps."""
+    """Raised for a mesh that bounds no solid; the message says why and what to do."""
 
 
 def check_mesh(vertices: Floats, triangles: Indices) -> None:
     """Raise MeshError unless the mesh is the closed, consistently wound surface of a solid.
 
-    Refused: not finite, empty, larger than `MOST_TRIANGLES`, indices out of range, degenerate or
-    repeated triangles, holes, edges of more than two triangles, inconsistent winding, parts that
-    touch in one vertex only, triangles folded onto their neighbours, inside out.  Intersections of
-    triangles that are no neighbours are dearer to find: see `intersecting`.
+    Rejected are meshes that are not finite, empty, larger than `MAX_TRIANGLES`, or inside out. So
+    are indices out of range, degenerate or repeated triangles, holes, edges of more than two
+    triangles, inconsistent winding, parts that share one vertex only, and triangles folded onto
+    their neighbours.  Intersections of other triangles are more expensive to find: see
+    `count_intersections`.
     """
     if vertices.ndim != 2 or vertices.shape[1:] != (3,) or triangles.shape[1:] != (3,):
         raise MeshError(f"arrays of shapes {vertices.shape} and {triangles.shape} are no mesh")
     if len(triangles) < 4:
         raise MeshError(f"a mesh of {len(triangles)} triangles bounds no solid")
-    if len(triangles) > MOST_TRIANGLES:
+    if len(triangles) > MAX_TRIANGLES:
         raise MeshError(
-            f"{len(triangles)} triangles, at most {MOST_TRIANGLES} are taken; decimate the mesh"
+            f"{len(triangles)} triangles, at most {MAX_TRIANGLES} are taken; decimate the mesh"
         )
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         raise MeshError(f"a triangle names a vertex that is not among the {len(vertices)}")
     if not np.isfinite(vertices).all():
         raise MeshError("a vertex is NaN or infinite")
-    flat = int(degenerate(vertices, triangles).sum())
+    flat = int(find_degenerate(vertices, triangles).sum())
     if flat:
         raise MeshError(f"{flat} triangles are degenerate (no area); remove them")
     _check_edges(triangles)
     _check_fans(triangles)
-    folded = int((dihedrals_rad(vertices, triangles)[1] > FOLDED_RAD).sum())
+    folded = int((dihedrals_rad(vertices, triangles)[1] > MAX_DIHEDRAL_RAD).sum())
     if folded:
         raise MeshError(f"{folded} pairs of neighbouring triangles lie on one another; untangle it")
     if volume_m3(vertices, triangles) <= 0.0:
         raise MeshError("the mesh is inside out; reverse its triangles")
 
 
-def degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
-    """Which triangles (t,) have no direction: repeated vertices, or all three in a line."""
+def find_degenerate(vertices: Floats, triangles: Indices) -> NDArray[np.bool_]:
+    """Return which triangles (t,) have no direction: repeated vertices, or all three collinear."""
     corners = vertices[triangles]
     sides = np.roll(corners, -1, axis=1) - corners
     longest = np.square(sides).sum(-1).max(-1)
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=-1)
-    return np.asarray(doubled <= FLATTEST * longest)
+    return np.asarray(doubled <= MIN_HEIGHT_RATIO * longest)
 
 
 def half_edges(triangles: Indices) -> Indices:
-    """(3 t, 2): the edges as each triangle runs along them, its first, second and third in turn."""
+    """Return (3 t, 2) the edges in each triangle's direction: its first, second and third in
+    turn."""
     return np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
 
 
 def _check_edges(triangles: Indices) -> None:
-    """Every edge is run along once in each direction."""
+    """Raise MeshError unless every edge occurs once in each direction."""
     run = half_edges(triangles)
     edges, uses = np.unique(np.sort(run, axis=1), axis=0, return_counts=True)
     open_edges, crowded = int((uses == 1).sum()), int((uses > 2).sum())
@@ -85,14 +87,14 @@ def _check_edges(triangles: Indices) -> None:
 
 
 def _check_fans(triangles: Indices) -> None:
-    """The triangles about each vertex form one fan."""
+    """Raise MeshError unless the triangles about each vertex form one fan."""
     count = len(triangles)
     first, second = _neighbours(triangles)
     # Corner c of triangle t has number c * count + t; across an edge the corners of both triangles
     # at each of its two ends belong together.
     ends = [(first, (second + count) % (3 * count)), ((first + count) % (3 * count), second)]
     rows, columns = (np.concatenate(side) for side in zip(*ends, strict=True))
-    from scipy.sparse import coo_array  # late, as all of scipy: processes must start quickly
+    from scipy.sparse import coo_array  # imported here, since processes must start quickly
     from scipy.sparse.csgraph import connected_components
 
     joined = coo_array((np.ones(len(rows)), (rows, columns)), shape=(3 * count, 3 * count))
@@ -102,10 +104,12 @@ def _check_fans(triangles: Indices) -> None:
         raise MeshError(f"parts of the surface touch in {pinched} single vertices; separate them")
 
 
-def wound_alike(triangles: Indices) -> Indices:
-    """The triangles (t, 3), some turned over, so that neighbours across edges of two triangles run
-    alike; in each connected part those are turned that are fewer.  Where that cannot be, as on a
-    Möbius strip, `check_mesh` will find the seam."""
+def unify_winding(triangles: Indices) -> Indices:
+    """Reverse some triangles (t, 3) so that neighbours across edges have the same winding.
+
+    In each connected part the fewer triangles are reversed.  Where that is impossible, as on a
+    Möbius strip, `check_mesh` finds the seam.
+    """
     count = len(triangles)
     run = half_edges(triangles)
     _, which, uses = np.unique(
@@ -139,7 +143,7 @@ def wound_alike(triangles: Indices) -> Indices:
 
 
 def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
-    """Pairs of half-edges (numbers of rows of `half_edges`) that run along one another."""
+    """Return pairs of half-edges (row numbers of `half_edges`) of the same edge."""
     run = half_edges(triangles)
     span = int(triangles.max()) + 1
     forward, backward = run[:, 0] * span + run[:, 1], run[:, 1] * span + run[:, 0]
@@ -150,15 +154,15 @@ def _neighbours(triangles: Indices) -> tuple[Indices, Indices]:
 
 
 def triangle_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Unit normals (t, 3)."""
+    """Return unit normals (t, 3)."""
     corners = vertices[triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return np.asarray(normal / np.linalg.norm(normal, axis=1, keepdims=True))
 
 
 def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
-    """Unit normals (v, 3): means of the triangles', weighted by their angle at the vertex (Thürmer
-    and Wüthrich 1998)."""
+    """Return unit normals (v, 3): means of the triangles' normals, weighted by their angle at the
+    vertex (Thürmer and Wüthrich 1998)."""
     corners, normal = vertices[triangles], triangle_normals(vertices, triangles)
     total = np.zeros_like(vertices)
     for i in range(3):
@@ -171,7 +175,8 @@ def vertex_normals(vertices: Floats, triangles: Indices) -> Floats:
 
 
 def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats]:
-    """Edges (e, 2) of a closed mesh, and the angles (e,) between the normals on their two sides."""
+    """Return the edges (e, 2) of a closed mesh, and the angles (e,) between the normals on their
+    sides."""
     normal, count = triangle_normals(vertices, triangles), len(triangles)
     first, second = _neighbours(triangles)
     one, other = normal[first % count], normal[second % count]
@@ -180,16 +185,16 @@ def dihedrals_rad(vertices: Floats, triangles: Indices) -> tuple[Indices, Floats
 
 
 def volume_m3(vertices: Floats, triangles: Indices) -> float:
-    """Enclosed volume, negative when the triangles run clockwise."""
+    """Return the enclosed volume, negative when the triangles are clockwise."""
     corners = vertices[triangles] - vertices[triangles].mean(axis=(0, 1))
     return float((corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum() / 6.0)
 
 
-def refined(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
-    """The same facets in smaller triangles, no edge longer than `longest_m`.
+def refine_facets(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Floats, Indices]:
+    """Divide the facets into smaller triangles with no edge longer than `longest_m`.
 
-    Each long edge is halved in all triangles that have it, until none is left, so that a closed
-    mesh stays closed.  MeshError where that would take more than `MOST_TRIANGLES`.
+    Each long edge is halved in all its triangles until none is left, so that a closed mesh stays
+    closed.  Raises MeshError where that would take more than `MAX_TRIANGLES`.
     """
     while True:
         run = np.sort(half_edges(triangles), axis=1)
@@ -206,15 +211,15 @@ def refined(vertices: Floats, triangles: Indices, longest_m: float) -> tuple[Flo
         middle[halved] = len(vertices) + np.arange(int(halved.sum()))
         vertices = np.concatenate([vertices, vertices[edges[halved]].mean(axis=1)])
         triangles = np.concatenate(list(_split(triangles, middle[which])))
-        if len(triangles) > MOST_TRIANGLES:
+        if len(triangles) > MAX_TRIANGLES:
             raise MeshError(
                 f"edges up to {length.max():.3g} m cannot be cut down to {longest_m:.3g} m within "
-                f"{MOST_TRIANGLES} triangles; smooth over a longer distance"
+                f"{MAX_TRIANGLES} triangles; smooth over a longer distance"
             )
 
 
 def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
-    """The triangles cut at the middles (t, 3) of their edges; -1 where an edge stays whole."""
+    """Split the triangles at the middles (t, 3) of their edges; -1 keeps an edge whole."""
     cuts = (middle >= 0).sum(axis=1)
     yield triangles[cuts == 0]
     for i in range(3):
@@ -235,11 +240,11 @@ def _split(triangles: Indices, middle: Indices) -> Iterator[Indices]:
         yield np.stack(one, axis=1)
 
 
-def intersecting(vertices: Floats, triangles: Indices) -> int:
-    """How many pairs of triangles cut through one another.
+def count_intersections(vertices: Floats, triangles: Indices) -> int:
+    """Count the pairs of triangles that cut through one another.
 
-    Found: an edge of one passing through the inside of another with which it shares no vertex.  Not
-    found: triangles that only touch, or overlap in one plane.
+    Found is an edge of one that passes through the inside of another with which it shares no
+    vertex. Triangles that only touch, or overlap in one plane, are not found.
     """
     corners = vertices[triangles]
     centre = corners.mean(axis=1)
@@ -262,8 +267,11 @@ def intersecting(vertices: Floats, triangles: Indices) -> int:
 
 
 def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indices]]:
-    """Pairs of balls (rows, columns) that overlap, in portions; balls of like size are searched
-    together, so that one large triangle does not make all of them neighbours."""
+    """Yield pairs of overlapping balls (rows, columns) in portions.
+
+    Balls of similar size are searched together, so that one large triangle does not make all of
+    them neighbours.
+    """
     from scipy.spatial import cKDTree
 
     octave = np.floor(np.log2(radius)).astype(int)
@@ -283,7 +291,7 @@ def _close_pairs(centre: Floats, radius: Floats) -> Iterator[tuple[Indices, Indi
 
 
 def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
-    """Which segments (n, 3) pass through the inside of their triangles (n, 3, 3) (Möller and
+    """Return which segments (n, 3) pass through the inside of their triangles (n, 3, 3) (Möller and
     Trumbore, Fast, Minimum Storage Ray/Triangle Intersection, 1997)."""
     along = end - start
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -302,8 +310,8 @@ def _passes(start: Floats, end: Floats, corners: Floats) -> NDArray[np.bool_]:
 
 
 def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
-    """Barycentric coordinates (n, 3) of the nearest points of triangles (n, 3, 3) to points (n, 3)
-    (Ericson, Real-Time Collision Detection, sec. 5.1.5)."""
+    """Return barycentric coordinates (n, 3) of the points of triangles (n, 3, 3) nearest to points
+    (n, 3) (Ericson, Real-Time Collision Detection, sec. 5.1.5)."""
     a = corners[:, 0]
     first, second = corners[:, 1] - a, corners[:, 2] - a
     offset = points - a
@@ -332,10 +340,10 @@ def nearest_in_triangles(points: Floats, corners: Floats) -> Floats:
 
 
 class Facets:
-    """The facets of a mesh, to be asked for nearest points."""
+    """Find nearest points on the facets of a mesh."""
 
     def __init__(self, vertices: Floats, triangles: Indices) -> None:
-        """MeshError where the mesh has none."""
+        """Build the search tree; MeshError for a mesh without triangles."""
         if not len(triangles):
             raise MeshError("a mesh without triangles has no surface")
         self.corners = vertices[triangles]
@@ -346,8 +354,8 @@ class Facets:
         self._tree = cKDTree(self._centre)
 
     def nearest(self, points: Floats) -> tuple[Indices, Floats]:
-        """The triangles (n,) that hold the facets' points nearest to points (n, 3), and their
-        barycentric coordinates (n, 3) there."""
+        """Return the triangles (n,) nearest to points (n, 3), and the nearest points' barycentric
+        coordinates (n, 3)."""
         reach = self._tree.query(points)[0] + self._reach
         lists = self._tree.query_ball_point(points, reach * (1.0 + 1e-12))
         chosen, weights = np.empty(len(points), dtype=np.int64), np.empty((len(points), 3))

@@ -1,7 +1,7 @@
-"""The rubber sheet: where its edges are, and how it pushes back.
+"""Model the rubber sheet: the poses of its edges, its shape and its forces.
 
 Sheet frame: origin at the centre, x from the left clamped edge to the right one, y along the edges,
-z towards the user.
+    z towards the user.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The scaled law fitted to measured pushes: what rubber this is, and how wide it is when slack."""
+"""Fit the scaled force model to measured pushes: the rubber's stiffness and the slack width."""
 
 from __future__ import annotations
 
@@ -9,32 +9,37 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from nodes.models.sheet.laws import ScaledLaw, SheetLaw
+from nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel
 from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.table import TableLaw
+from nodes.models.sheet.tabulated import TabulatedSheetModel
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 FORCE_NOISE_N = 0.01
 EDGE_NOISE_N = 0.1
-LAW_RATIO = 0.03
-"""What the law itself is off by: residuals are weighed by this share of the force and the noise."""
+MODEL_ERROR_RATIO = 0.03
+"""Error of the model itself; residuals are weighted by this fraction of the force and by the
+noise."""
 
-STRAY_SIGMAS = 5.0
-"""A row further off than this is left out; the fit is then made anew without it."""
+OUTLIER_SIGMAS = 5.0
+"""A row with a larger residual is an outlier; the fit is repeated without it."""
 
-MOST_SPREAD = 0.5
-"""A number known to no better than this share of itself is not known."""
+MAX_RELATIVE_DEVIATION = 0.5
+"""A parameter with a larger relative standard deviation is undetermined."""
 
 
-class FitError(ValueError):
-    """Rows that do not determine the law; the message says what is missing."""
+class SheetModelFitError(ValueError):
+    """Raised for rows that do not determine the model; the message names what is missing."""
 
 
 @dataclass(frozen=True, slots=True)
-class Push:
-    """One measured push.  place_m: on the stretched sheet.  edge_force_n: None if not measured."""
+class MeasuredPush:
+    """Hold one measured push.
+
+    place_m: on the stretched sheet.
+    edge_force_n: None if not measured.
+    """
 
     edge_distance_m: float
     depth_m: float
@@ -45,15 +50,17 @@ class Push:
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
-    """The fitted law and how well it is known.
+class SheetModelFit:
+    """Hold the fitted model and its uncertainty.
 
-    law: takes stretch ratios over the nominal width.  names, values, standard_deviations: what was
-    fitted, in the same order.  used (n,): which rows.  residual_ratio (n,): measured force over the
-    law's, less one.  rms_ratio: of the used ones above the noise.
+    law: takes stretch ratios over the nominal width.
+    names, values, standard_deviations: the fitted parameters, in the same order.
+    used: (n,), which rows.
+    residual_ratio: (n,) measured over fitted force, minus one.
+    rms_ratio: of the used rows above the noise.
     """
 
-    law: ScaledLaw
+    law: ScaledSheetModel
     names: tuple[str, ...]
     values: tuple[float, ...]
     standard_deviations: tuple[float, ...]
@@ -63,43 +70,48 @@ class Fit:
     worst_ratio: float
 
 
-def law_of(
+def make_model(
     nominal: Rubber,
     *,
     modulus_thickness_n_per_m: float,
     slack_width_m: float,
     cubic_ratio: float,
     mooney_share: float,
-) -> ScaledLaw:
-    """The scaled law of a sheet with these numbers, for stretch ratios over the nominal width."""
+) -> ScaledSheetModel:
+    """Make the scaled model of a sheet with these parameters, for stretch ratios over the nominal
+    width."""
     rubber = replace(
         nominal,
         width_m=slack_width_m,
         young_modulus_pa=modulus_thickness_n_per_m / nominal.thickness_m,
         mooney_share=mooney_share,
     )
-    return ScaledLaw(rubber, cubic_ratio, nominal.width_m / slack_width_m)
+    return ScaledSheetModel(rubber, cubic_ratio, nominal.width_m / slack_width_m)
 
 
 NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_share")
 
 
-def fit_law(pushes: Sequence[Push], nominal: Rubber, *, with_mooney: bool = False) -> Fit:
-    """Robust least squares (soft L1, then without strays) over modulus x thickness, slack width,
-    cubic ratio and, if wanted, Mooney's share.
+def fit_sheet_model(
+    pushes: Sequence[MeasuredPush], nominal: Rubber, *, with_mooney: bool = False
+) -> SheetModelFit:
+    """Fit modulus x thickness, slack width, cubic ratio and optionally the Mooney fraction.
 
-    FitError where there are too few rows, or rows that leave a number open.
+    Robust least squares: soft L1, then without outliers.  Raises SheetModelFitError for too few
+        rows, or rows that leave a parameter undetermined.
     """
     names = NAMES if with_mooney else NAMES[:3]
     if len(pushes) < 2 * len(names):
-        raise FitError(f"{len(pushes)} rows; {2 * len(names)} or more are needed for {names}")
+        raise SheetModelFitError(
+            f"{len(pushes)} rows; {2 * len(names)} or more are needed for {names}"
+        )
     start = np.array([np.log(nominal.young_modulus_pa * nominal.thickness_m), 0.0, 0.0, 0.1])
     low = np.array([start[0] - 7.0, -0.1, -2.0, 0.0])
     high = np.array([start[0] + 7.0, 0.1, 2.0, 0.95])
     size = len(names)
 
-    def law_at(numbers: Floats) -> ScaledLaw:
-        return law_of(
+    def model_at(numbers: Floats) -> ScaledSheetModel:
+        return make_model(
             nominal,
             modulus_thickness_n_per_m=float(np.exp(numbers[0])),
             slack_width_m=nominal.width_m * (1.0 + float(numbers[1])),
@@ -107,13 +119,13 @@ def fit_law(pushes: Sequence[Push], nominal: Rubber, *, with_mooney: bool = Fals
             mooney_share=float(numbers[3]) if with_mooney else nominal.mooney_share,
         )
 
-    def misfit(numbers: Floats, used: Bools) -> Floats:
-        return _misfit(law_at(numbers), pushes, nominal.width_m, used)
+    def residuals(numbers: Floats, used: Bools) -> Floats:
+        return _residuals(model_at(numbers), pushes, nominal.width_m, used)
 
     used = np.ones(len(pushes), dtype=bool)
     for loss in ("soft_l1", "linear"):
         solved = least_squares(
-            misfit,
+            residuals,
             start[:size],
             args=(used,),
             bounds=(low[:size], high[:size]),
@@ -122,10 +134,10 @@ def fit_law(pushes: Sequence[Push], nominal: Rubber, *, with_mooney: bool = Fals
         )
         start[:size] = solved.x
         if loss == "soft_l1":
-            off = np.abs(_misfit(law_at(solved.x), pushes, nominal.width_m, used, fold=True))
-            used = off <= STRAY_SIGMAS * max(1.0, 1.4826 * float(np.median(off)))
+            off = np.abs(_residuals(model_at(solved.x), pushes, nominal.width_m, used, fold=True))
+            used = off <= OUTLIER_SIGMAS * max(1.0, 1.4826 * float(np.median(off)))
             if used.sum() < 2 * size:
-                raise FitError(
+                raise SheetModelFitError(
                     f"{int((~used).sum())} of {len(pushes)} rows contradict the others: no law "
                     "fits them; check units and signs"
                 )
@@ -133,9 +145,11 @@ def fit_law(pushes: Sequence[Push], nominal: Rubber, *, with_mooney: bool = Fals
     spread = max(1.0, float(solved.fun @ solved.fun) / freedom)
     information = solved.jac.T @ solved.jac
     if np.linalg.cond(information) > 1e14:
-        raise FitError("the rows leave a number open: push at several stretches and depths")
+        raise SheetModelFitError(
+            "the rows leave a number open: push at several stretches and depths"
+        )
     deviations = np.sqrt(np.diag(np.linalg.inv(information)) * spread)
-    law = law_at(solved.x)
+    law = model_at(solved.x)
     values = (
         law.rubber.young_modulus_pa * law.rubber.thickness_m,
         law.rubber.width_m,
@@ -144,17 +158,17 @@ def fit_law(pushes: Sequence[Push], nominal: Rubber, *, with_mooney: bool = Fals
     )[:size]
     scale = (values[0], nominal.width_m, values[2], 1.0)[:size]
     stated = tuple(float(d) * one for d, one in zip(deviations, scale, strict=True))
-    if deviations[0] > MOST_SPREAD or deviations[2] > 2.0 * MOST_SPREAD:
-        at = 0 if deviations[0] > MOST_SPREAD else 2
-        raise FitError(
+    if deviations[0] > MAX_RELATIVE_DEVIATION or deviations[2] > 2.0 * MAX_RELATIVE_DEVIATION:
+        at = 0 if deviations[0] > MAX_RELATIVE_DEVIATION else 2
+        raise SheetModelFitError(
             f"{names[at]} is known to {100 * deviations[at]:.0f} % only: push at more stretches, "
             "and to greater depths"
         )
-    ratio = _ratios(law, pushes, nominal.width_m)
+    ratio = _force_ratios(law, pushes, nominal.width_m)
     force = np.array([push.force_n for push in pushes])
     counted = used & (force > 3.0 * FORCE_NOISE_N)
     counted = counted if counted.any() else used
-    return Fit(
+    return SheetModelFit(
         law=law,
         names=names,
         values=values,
@@ -166,8 +180,11 @@ def fit_law(pushes: Sequence[Push], nominal: Rubber, *, with_mooney: bool = Fals
     )
 
 
-def _answers(law: SheetLaw, pushes: Sequence[Push], width_m: float) -> tuple[Floats, Floats]:
-    """The law's forces and edge forces (n,), N; pushes alike but for depth are asked at once."""
+def _predict(
+    law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float
+) -> tuple[Floats, Floats]:
+    """Return the model's forces and edge forces (n,), N, with one call for pushes that differ in
+    depth only."""
     forces, edges = np.empty(len(pushes)), np.empty(len(pushes))
     groups: dict[tuple[float, tuple[float, float], float], list[int]] = {}
     for number, push in enumerate(pushes):
@@ -175,48 +192,52 @@ def _answers(law: SheetLaw, pushes: Sequence[Push], width_m: float) -> tuple[Flo
         groups.setdefault(key, []).append(number)
     for (distance, place, radius), numbers in groups.items():
         depths = np.array([pushes[number].depth_m for number in numbers])
-        pressed = law.press(distance / width_m, depths, place_m=place, finger_radius_m=radius)
+        pressed = law.evaluate(distance / width_m, depths, place_m=place, finger_radius_m=radius)
         forces[numbers], edges[numbers] = pressed.force_n, pressed.edge_force_n
     return forces, edges
 
 
-def _misfit(
-    law: SheetLaw, pushes: Sequence[Push], width_m: float, used: Bools, *, fold: bool = False
+def _residuals(
+    law: SheetForceModel,
+    pushes: Sequence[MeasuredPush],
+    width_m: float,
+    used: Bools,
+    *,
+    fold: bool = False,
 ) -> Floats:
-    """Weighed differences: of the used rows' forces, then of their edge forces; or, folded, the
+    """Return weighted residuals: the used rows' forces, then their edge forces; or, folded, the
     larger of the two for every row (n,)."""
-    forces, edges = _answers(law, pushes, width_m)
+    forces, edges = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
     pulled = np.array(
         [np.nan if push.edge_force_n is None else push.edge_force_n for push in pushes]
     )
-    pressing = (forces - measured) / np.hypot(FORCE_NOISE_N, LAW_RATIO * measured)
-    pulling = (edges - pulled) / np.hypot(EDGE_NOISE_N, LAW_RATIO * pulled)
+    pressing = (forces - measured) / np.hypot(FORCE_NOISE_N, MODEL_ERROR_RATIO * measured)
+    pulling = (edges - pulled) / np.hypot(EDGE_NOISE_N, MODEL_ERROR_RATIO * pulled)
     if fold:
         larger: Floats = np.fmax(np.abs(pressing), np.abs(pulling))
         return larger
     return np.concatenate([pressing[used], pulling[used & np.isfinite(pulled)]])
 
 
-def _ratios(law: SheetLaw, pushes: Sequence[Push], width_m: float) -> Floats:
-    """Measured force over the law's, less one (n,)."""
-    forces, _ = _answers(law, pushes, width_m)
+def _force_ratios(law: SheetForceModel, pushes: Sequence[MeasuredPush], width_m: float) -> Floats:
+    """Return measured over fitted force, minus one (n,)."""
+    forces, _ = _predict(law, pushes, width_m)
     measured = np.array([push.force_n for push in pushes])
     ratios: Floats = measured / np.maximum(forces, 1e-6) - 1.0
     return ratios
 
 
-def table_from(
-    law: ScaledLaw, pushes: Sequence[Push], used: Bools, nominal_width_m: float
-) -> TableLaw:
-    """A table of the used rows over the law; FitError unless they make a full grid.
+def tabulate_pushes(
+    law: ScaledSheetModel, pushes: Sequence[MeasuredPush], used: Bools, nominal_width_m: float
+) -> TabulatedSheetModel:
+    """Tabulate the used rows over the model; SheetModelFitError unless they form a full grid.
 
-    Stretches, x and y must come in all combinations (places by their distance from the middle);
-    each may have depths of its own, which are brought to common ones, within the depths that all
-    of them reach.
+    Stretches, x and y must occur in all combinations (positions by their distance from the centre).
+    Depths may differ between them; they are interpolated to common depths that all rows cover.
     """
     cells: dict[tuple[float, float, float], list[tuple[float, float]]] = {}
-    ratios = _ratios(law, pushes, nominal_width_m) + 1.0
+    ratios = _force_ratios(law, pushes, nominal_width_m) + 1.0
     for push, ratio, good in zip(pushes, ratios, used, strict=True):
         key = (
             round(push.edge_distance_m / nominal_width_m, 4),
@@ -231,11 +252,13 @@ def table_from(
     ]
     if not cells or missing:
         what = f"no rows at stretch, x, y {missing[0]}" if missing else "no row is left"
-        raise FitError(f"{what}: a table needs every combination of stretch and place")
+        raise SheetModelFitError(f"{what}: a table needs every combination of stretch and place")
     shallowest = max(min(depth for depth, _ in rows) for rows in cells.values())
     deepest = min(max(depth for depth, _ in rows) for rows in cells.values())
     if not shallowest < deepest:
-        raise FitError("a table needs depths that all stretches and places have in common")
+        raise SheetModelFitError(
+            "a table needs depths that all stretches and places have in common"
+        )
     least = min(len({depth for depth, _ in rows}) for rows in cells.values())
     depths = np.geomspace(shallowest, deepest, max(2, min(least, 12)))
     entries = np.empty((len(axes[0]), len(depths), len(axes[1]), len(axes[2])))
@@ -244,4 +267,6 @@ def table_from(
         means = [np.mean([r for depth, r in rows if depth == one]) for one in known]
         at = (axes[0].index(s), slice(None), axes[1].index(x), axes[2].index(y))
         entries[at] = np.interp(np.log(depths), np.log(known), means)
-    return TableLaw(law, np.array(axes[0]), depths, np.array(axes[1]), np.array(axes[2]), entries)
+    return TabulatedSheetModel(
+        law, np.array(axes[0]), depths, np.array(axes[1]), np.array(axes[2]), entries
+    )

@@ -1,4 +1,4 @@
-"""Where a sheet between two edges is."""
+"""Compute poses of the sheet, its edges and the flanges from one another."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ Floats = NDArray[np.float64]
 
 
 def edge_poses(world_from_sheet: Floats, edge_distance_m: float) -> tuple[Floats, Floats]:
-    """world_from_edge of the left and the right clamped edge, axes as the sheet's."""
+    """Return world_from_edge of the left and the right clamped edge, with the sheet's axes."""
     offset = 0.5 * edge_distance_m * world_from_sheet[:3, 0]
     rotation, centre = world_from_sheet[:3, :3], world_from_sheet[:3, 3]
     return transform(rotation, centre - offset), transform(rotation, centre + offset)
 
 
 def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats) -> Floats:
-    """world_from_sheet between two edges: centre in the middle, x through both, y their mean.
+    """Return world_from_sheet between two edges: centre in the middle, x through both, y their
+    mean.
 
-    The edges may differ in tilt and twist; x goes exactly from one to the other, y is the mean of
-    the edges' y axes made perpendicular to it.  Degenerate when the edges coincide.
+    The edges may differ in tilt and twist.  x points exactly from one to the other, and y is the
+    mean of the edges' y axes made perpendicular to x.  Degenerate when the edges coincide.
     """
     left, right = world_from_left_edge, world_from_right_edge
     x_axis = right[:3, 3] - left[:3, 3]
@@ -34,7 +35,8 @@ def sheet_from_edges(world_from_left_edge: Floats, world_from_right_edge: Floats
 
 
 def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_m: float) -> Floats:
-    """The sheet's corners (4, 3) in the world: left bottom, right bottom, right top, left top."""
+    """Return the sheet's corners (4, 3) in the world: left bottom, right bottom, right top, left
+    top."""
     half = 0.5 * height_m
     left, right = world_from_left_edge, world_from_right_edge
     return np.array(
@@ -48,5 +50,5 @@ def corners(world_from_left_edge: Floats, world_from_right_edge: Floats, height_
 
 
 def flange_pose(world_from_edge: Floats, flange_from_edge: Floats) -> Floats:
-    """world_from_flange of the arm that holds an edge there."""
+    """Return world_from_flange of the arm that holds an edge there."""
     return world_from_edge @ inverse(flange_from_edge)

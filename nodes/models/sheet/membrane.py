@@ -1,18 +1,18 @@
-"""The sheet as a finite-element membrane: the most exact of its force laws, and the slowest.
+"""Solve the sheet as a finite-element membrane: the most accurate force model, and the slowest.
 
-Bilinear cells, integrated at four points, of incompressible Mooney-Rivlin rubber in plane stress,
+The elements are bilinear cells with four integration points, of incompressible Mooney-Rivlin rubber
+in plane stress,
 
     W = C1 (I1 - 3) + C2 (I2 - 3),    E = 6 (C1 + C2)
 
 (neo-Hookean for C2 = 0).  A membrane carries no compression: it wrinkles.  Where the smaller
-principal stretch falls below what it is in simple tension, l2 < l1^-1/2, the energy is that of
-simple tension alone, and nothing where both are slack (tension field: Pipkin, IMA J. Appl. Math.
-36, 1986).  The stress and its tangent are written in the principal frame of C = F'F, which serves
-every isotropic energy.
+principal stretch is below that of simple tension, l2 < l1^-1/2, the energy is that of simple
+tension, and zero where both are slack (tension field: Pipkin, IMA J. Appl. Math. 36, 1986).  Stress
+and tangent are written in the principal frame of C = F'F, which holds for every isotropic energy.
 
-The fingertip is a rigid sphere pushed in along the flat sheet's normal.  What it has touched keeps
-to it, as rubber keeps to skin.  The equilibria along the push are found one from the other by
-Newton's method, damped (Levenberg, Marquardt) where the slack sheet offers no resistance.
+The fingertip is a rigid sphere pushed in along the flat sheet's normal.  Nodes that it has touched
+stick to it, as rubber sticks to skin.  Newton's method finds the equilibria along the push from one
+another, with damping (Levenberg, Marquardt) where the slack sheet has no stiffness.
 """
 
 from __future__ import annotations
@@ -32,31 +32,33 @@ Bools = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 CELLS = 32
-FINEST_RADII = 0.3
-"""Cell under the finger, in finger radii."""
+MIN_CELL_RADII = 0.3
+"""Cell size under the finger, in finger radii."""
 STEP_RADII = 0.4
-"""Largest advance of the finger from one equilibrium to the next, in its radii."""
-BED_PER_MODULUS = 2e5
-"""Pressure of the finger per depth of penetration, in E t / width^2."""
-MOST_ITERATIONS = 120
+"""Maximum advance of the finger between equilibria, in its radii."""
+PENALTY_PER_MODULUS = 2e5
+"""Contact penalty stiffness: pressure per depth of penetration, in E t / width^2."""
+MAX_ITERATIONS = 120
 GAUSS = 0.5 / np.sqrt(3.0)
-"""Of the two points along a cell's side from its middle, over the side."""
+"""Distance of the two integration points from a cell's middle, over its side."""
 TOLERANCE = 1e-7
 """Residual at equilibrium, in E t width."""
 
 
 class NoEquilibriumError(ArithmeticError):
-    """No equilibrium of the membrane was found; the message says where and how far off."""
+    """Raised when no equilibrium of the membrane is found; the message has position and
+    residual."""
 
 
 @dataclass(frozen=True, slots=True)
 class PushPath:
-    """Equilibria of one push, a row per depth.
+    """Hold the equilibria of one push, a row per depth.
 
-    depths_m (n,).  forces_n (n,): of the sheet on the finger, along its normal.  edge_forces_n
-    (n,): on each clamp, along the line between them (mean of both).  positions (n, rows, columns,
-    3): in the frame of the flat sheet, origin at its centre.  rest_m (rows, columns, 2): of the
-    same nodes in the slack sheet, from its centre.
+    depths_m: (n,).
+    forces_n: (n,) of the sheet on the finger, along its normal.
+    edge_forces_n: (n,) on each clamp, along the line between them (mean of both).
+    positions: (n, rows, columns, 3) in the frame of the flat sheet, origin at its centre.
+    rest_m: (rows, columns, 2) of the same nodes in the slack sheet, from its centre.
     """
 
     depths_m: Floats
@@ -75,11 +77,13 @@ def push_path(
     finger_radius_m: float,
     cells: int = CELLS,
 ) -> PushPath:
-    """Equilibria as a fingertip pushes to each of the ascending depths (n,), m, one after another.
+    """Solve the equilibria as a fingertip pushes to each of the ascending depths (n,), m.
 
-    stretch_ratio: distance of the edges over the slack width.  place_m: (x, y) of the push on the
-    stretched sheet, from its centre.  ValueError for a place off the sheet or depths that do not
-    ascend from 0; NoEquilibriumError where none was found.
+    stretch_ratio: distance of the edges over the slack width.
+    place_m: (x, y) of the push on the stretched sheet, from its centre.
+
+    Raises ValueError for a position off the sheet or depths that do not ascend from 0, and
+    NoEquilibriumError.
     """
     depths = np.asarray(depths_m, dtype=np.float64)
     if (
@@ -95,26 +99,26 @@ def push_path(
     )
     if not (0.0 < focus[0] < rubber.width_m and 0.0 < focus[1] < rubber.height_m):
         raise ValueError(f"place {place_m} is not on the sheet")
-    grid = _Grid(rubber, focus, FINEST_RADII * finger_radius_m, cells)
+    grid = _Grid(rubber, focus, MIN_CELL_RADII * finger_radius_m, cells)
     state = _flat(grid, stretch_ratio)
-    state = _settle(grid, state, None)
+    state = _solve_equilibrium(grid, state, None)
     foot: Floats = np.array([*place_m, 0.0], dtype=np.float64)
-    kept = np.zeros(len(state), dtype=bool)
+    sticking = np.zeros(len(state), dtype=bool)
     depth = 0.0
     rows: list[tuple[float, float, Floats]] = []
     for wanted in depths:
         steps = max(1, int(np.ceil((wanted - depth) / (STEP_RADII * finger_radius_m))))
         advance = float(wanted - depth) / steps
         for _ in range(steps if wanted > depth else 0):
-            state = _carried(grid, state, foot, kept, (depth, advance))
+            state = _carried(grid, state, foot, sticking, (depth, advance))
             depth += advance
             centre = foot.copy()
             centre[2] = finger_radius_m - depth
-            ball = _Ball(centre, finger_radius_m, grid.bed, kept)
-            state = _settle(grid, state, ball)
-            kept = kept | ball.touched(state)
+            ball = _Ball(centre, finger_radius_m, grid.penalty, sticking)
+            state = _solve_equilibrium(grid, state, ball)
+            sticking = sticking | ball.touched(state)
         inner = grid.gradient(state).reshape(-1, 3)
-        finger = -inner[kept, 2].sum()
+        finger = -inner[sticking, 2].sum()
         left, right = inner[grid.left, 0].sum(), inner[grid.right, 0].sum()
         rows.append((float(finger), float(0.5 * (right - left)), state))
     return PushPath(
@@ -127,7 +131,7 @@ def push_path(
 
 
 def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floats:
-    """(cells + 1,) coordinates from 0 to length_m: a node at the focus, spacing growing from there.
+    """Return coordinates (cells + 1,) from 0 to length_m: a node at the focus, and growing spacing.
 
     On either side x = sinh(k u) / sinh(k), u uniform, with the k that gives the finest cell.
     """
@@ -150,7 +154,7 @@ def graded(length_m: float, focus_m: float, finest_m: float, cells: int) -> Floa
 
 
 class _Grid:
-    """Cells of the rest sheet, their strain, and the pattern of the stiffness matrix."""
+    """Hold the cells of the rest sheet, their strain, and the pattern of the stiffness matrix."""
 
     def __init__(self, rubber: Rubber, focus: Floats, finest_m: float, cells: int) -> None:
         x = graded(rubber.width_m, float(focus[0]), finest_m, cells)
@@ -170,7 +174,7 @@ class _Grid:
         u, v = (each.ravel() for each in np.meshgrid(*[[0.5 - GAUSS, 0.5 + GAUSS]] * 2))
         by_u = np.stack([v - 1.0, 1.0 - v, v, -v], axis=1)
         by_v = np.stack([u - 1.0, -u, u, 1.0 - u], axis=1)
-        # (cells, 4 points, 4 nodes, 2): gradient of the hat functions; F = sum of positions x
+        # (cells, 4 points, 4 nodes, 2): gradient of the shape functions; F = sum of positions x
         # gradient.
         self.hats = np.stack(
             [by_u / width[:, None, None], by_v / height[:, None, None]], axis=-1
@@ -179,7 +183,7 @@ class _Grid:
         self.volume = np.repeat(0.25 * area * rubber.thickness_m, 4)
         node_area = np.bincount(self.cells.ravel(), np.repeat(0.25 * area, 4), len(self.rest))
         pressure = rubber.young_modulus_pa * rubber.thickness_m / rubber.width_m**2
-        self.bed = np.asarray(BED_PER_MODULUS * pressure * node_area, dtype=np.float64)
+        self.penalty = np.asarray(PENALTY_PER_MODULUS * pressure * node_area, dtype=np.float64)
         self.left, self.right = number[:, 0], number[:, -1]
         clamped = np.zeros(len(self.rest), dtype=bool)
         clamped[self.left] = clamped[self.right] = True
@@ -194,7 +198,7 @@ class _Grid:
         self._diagonal = np.searchsorted(self._keys, np.arange(size) * (size + 1))
 
     def strain(self, positions: Floats) -> tuple[Floats, Floats]:
-        """F (points, 3, 2) and C = F'F (points, 2, 2); four points to a cell."""
+        """Return F (points, 3, 2) and C = F'F (points, 2, 2); four points per cell."""
         at_corners = np.repeat(positions[self.cells].transpose(0, 2, 1), 4, axis=0)
         deformed = at_corners @ self.hats
         return deformed, deformed.transpose(0, 2, 1) @ deformed
@@ -205,20 +209,20 @@ class _Grid:
         return float(self.volume @ relaxed(large, small, self.c1, self.c2)[0])
 
     def gradient(self, positions: Floats) -> Floats:
-        """Forces (3 nodes,) that hold the sheet there, N."""
+        """Return the nodal forces (3 nodes,) in N that hold the sheet there."""
         deformed, c = self.strain(positions)
         stress, _ = stress_and_tangent(c, self.c1, self.c2, tangent=False)
         local = self.volume[:, None, None] * self.hats @ stress @ deformed.transpose(0, 2, 1)
-        return self._gathered(local)
+        return self._assemble(local)
 
-    def _gathered(self, local: Floats) -> Floats:
-        """Forces of the points (points, 4, 3) summed at the nodes (3 nodes,)."""
+    def _assemble(self, local: Floats) -> Floats:
+        """Sum the forces of the points (points, 4, 3) at the nodes (3 nodes,)."""
         by_cell = local.reshape(-1, 4, 12).sum(axis=1)
         sums = np.bincount(self._coordinates.ravel(), by_cell.ravel(), minlength=self._size)
         return np.asarray(sums, dtype=np.float64)
 
-    def _summed(self, blocks: Floats) -> Floats:
-        """Stiffnesses of the points (points, ...) summed into the entries of the pattern."""
+    def _scatter(self, blocks: Floats) -> Floats:
+        """Sum the stiffnesses of the points (points, ...) into the entries of the pattern."""
         by_cell = blocks.reshape(-1, 4, 144).sum(axis=1)
         sums = np.bincount(self._slots, by_cell.ravel(), minlength=len(self._keys))
         return np.asarray(sums, dtype=np.float64)
@@ -226,7 +230,8 @@ class _Grid:
     def system(
         self, positions: Floats, added: Floats, free: Bools, damping: float
     ) -> tuple[Floats, csc_array]:
-        """Gradient (3 nodes,) and the stiffness of the free coordinates; added (nodes, 3, 3)."""
+        """Return the gradient (3 nodes,) and the stiffness of the free coordinates; added (nodes,
+        3, 3)."""
         deformed, c = self.strain(positions)
         stress, tangent = stress_and_tangent(c, self.c1, self.c2, tangent=True)
         volume, hats = self.volume[:, None, None], self.hats
@@ -244,7 +249,7 @@ class _Grid:
         geometric = volume * hats @ stress @ hats.transpose(0, 2, 1)
         for axis in range(3):
             blocks[:, :, axis, :, axis] += geometric
-        values = self._summed(blocks)
+        values = self._scatter(blocks)
         values[self._diagonal] += damping
         for node in np.flatnonzero(added.any(axis=(1, 2))):
             at = 3 * node + np.arange(3)
@@ -255,11 +260,11 @@ class _Grid:
             (values[keep], (number[self._rows[keep]], number[self._columns[keep]])),
             shape=(int(free.sum()),) * 2,
         )
-        return self._gathered(local), matrix
+        return self._assemble(local), matrix
 
 
 def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
-    """Eigenvalues (n,) of C (n, 2, 2), the larger first, and the larger one's direction (n, 2)."""
+    """Return the eigenvalues (n,) of C (n, 2, 2), the larger first, and its direction (n, 2)."""
     middle, half = 0.5 * (c[:, 0, 0] + c[:, 1, 1]), 0.5 * (c[:, 0, 0] - c[:, 1, 1])
     spread = np.hypot(half, c[:, 0, 1])
     angle = 0.5 * np.arctan2(c[:, 0, 1], half)
@@ -267,9 +272,10 @@ def principal(c: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def relaxed(large: Floats, small: Floats, c1: float, c2: float) -> tuple[Floats, Floats, Floats]:
-    """Energy of squared principal stretches p >= q (n,), per rest volume, with its derivatives.
+    """Return the energy of squared principal stretches p >= q (n,) per rest volume, and
+    derivatives.
 
-    Returns W (n,), [W_p, W_q] (2, n) and [W_pp, W_qq, W_pq] (3, n).
+    W is (n,), [W_p, W_q] is (2, n) and [W_pp, W_qq, W_pq] is (3, n).
     """
     p = np.maximum(large, 1.0)
     taut = small > p**-0.5
@@ -290,7 +296,7 @@ def relaxed(large: Floats, small: Floats, c1: float, c2: float) -> tuple[Floats,
             c1 / pq**2 + c2,
         ]
     )
-    # Loose: the width follows freely, so that only the slope along the tension is left.
+    # Here the width is free, so that only the stiffness along the tension remains.
     loose = ~taut
     first[1, loose] = 0.0
     along = second[0, loose] - second[2, loose] ** 2 / second[1, loose]
@@ -300,7 +306,8 @@ def relaxed(large: Floats, small: Floats, c1: float, c2: float) -> tuple[Floats,
 
 
 def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tuple[Floats, Floats]:
-    """Second Piola-Kirchhoff stress (n, 2, 2), and its tangent (n, 3, 3) for [E11, E22, 2 E12]."""
+    """Return the second Piola-Kirchhoff stress (n, 2, 2) and its tangent (n, 3, 3) for [E11, E22, 2
+    E12]."""
     large, small, direction = principal(c)
     _, first, second = relaxed(large, small, c1, c2)
     cos, sin = direction.T
@@ -326,11 +333,11 @@ def stress_and_tangent(c: Floats, c1: float, c2: float, *, tangent: bool) -> tup
 
 
 class _Ball:
-    """The fingertip: presses nodes that lie in it outwards; what it kept before moves with it."""
+    """Press nodes inside the fingertip outwards, and move the nodes that stick to it."""
 
-    def __init__(self, centre: Floats, radius_m: float, bed: Floats, kept: Bools) -> None:
-        self.centre, self.radius, self.kept = centre, radius_m, kept
-        self._bed = np.where(kept, 0.0, bed)
+    def __init__(self, centre: Floats, radius_m: float, penalty: Floats, sticking: Bools) -> None:
+        self.centre, self.radius, self.sticking = centre, radius_m, sticking
+        self._bed = np.where(sticking, 0.0, penalty)
 
     def _reach(self, positions: Floats) -> tuple[Floats, Floats]:
         offset = positions - self.centre
@@ -345,7 +352,7 @@ class _Ball:
         return 0.5 * float(self._bed @ self._reach(positions)[0] ** 2)
 
     def gradient(self, positions: Floats) -> tuple[Floats, Floats]:
-        """Gradient (nodes, 3) and the definite part of its derivative (nodes, 3, 3)."""
+        """Return the gradient (nodes, 3) and the definite part of its derivative (nodes, 3, 3)."""
         inside, outward = self._reach(positions)
         stiff = np.where(inside > 0.0, self._bed, 0.0)
         return -(stiff * inside)[:, None] * outward, np.einsum(
@@ -360,11 +367,11 @@ def _flat(grid: _Grid, stretch_ratio: float) -> Floats:
 
 
 def _carried(
-    grid: _Grid, state: Floats, foot: Floats, kept: Bools, push: tuple[float, float]
+    grid: _Grid, state: Floats, foot: Floats, sticking: Bools, push: tuple[float, float]
 ) -> Floats:
-    """A guess at the next equilibrium: the dent grows in proportion, the first one is a cone.
+    """Guess the next equilibrium: the indentation grows in proportion; the first one is a cone.
 
-    push: the depth there and how much deeper the finger goes.
+    push: depth there, and the further depth of the finger.
     """
     depth, advance = push
     grown = state.copy()
@@ -374,13 +381,13 @@ def _carried(
         away = np.hypot(state[:, 0] - foot[0], state[:, 1] - foot[1])
         grown[:, 2] = -advance * np.maximum(1.0 - away / np.abs(grid.centre).max(), 0.0)
         grown[grid.clamped, 2] = 0.0
-    grown[kept] = state[kept] - [0.0, 0.0, advance]
+    grown[sticking] = state[sticking] - [0.0, 0.0, advance]
     return grown
 
 
-def _settle(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
-    """The equilibrium near `start`, its clamped and kept nodes staying where they are."""
-    held = grid.clamped if ball is None else grid.clamped | ball.kept
+def _solve_equilibrium(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
+    """Solve the equilibrium near `start` with clamped and sticking nodes fixed."""
+    held = grid.clamped if ball is None else grid.clamped | ball.sticking
     free = np.repeat(~held, 3)
     positions, damping = start, 1e-7
     stiffness_scale = grid.force_scale / grid.centre[0]
@@ -390,7 +397,7 @@ def _settle(grid: _Grid, start: Floats, ball: _Ball | None) -> Floats:
         return grid.energy(at) + (0.0 if ball is None else ball.energy(at))
 
     current, residual = energy(positions), np.inf
-    for _ in range(MOST_ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         push = np.zeros_like(start)
         if ball is not None:
             push, added = ball.gradient(positions)

@@ -1,4 +1,4 @@
-"""The rubber of a sheet: what every force law starts from."""
+"""Describe the rubber of a sheet, the input of every force model."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 
 @dataclass(frozen=True, slots=True)
 class Rubber:
-    """A sheet clamped along two edges `width_m` apart, each `height_m` long, when slack.
+    """Hold a sheet clamped along two edges `width_m` apart, each `height_m` long, when slack.
 
-    mooney_share: C2 / (C1 + C2) of Mooney and Rivlin's incompressible rubber with E = 6 (C1 + C2),
-    from 0 (neo-Hookean) to below 1.
+    mooney_share: C2 / (C1 + C2) of incompressible Mooney-Rivlin rubber with E = 6 (C1 + C2), from 0
+        (neo-Hookean) to below 1.
     """
 
     width_m: float
@@ -22,7 +22,7 @@ class Rubber:
     mooney_share: float = 0.0
 
     def __post_init__(self) -> None:
-        """ValueError for a size, modulus or share outside of its range."""
+        """Raise ValueError for a size, modulus or Mooney fraction outside its range."""
         sizes = (self.width_m, self.height_m, self.thickness_m, self.young_modulus_pa)
         if not (np.isfinite(sizes).all() and min(sizes) > 0.0):
             raise ValueError(f"sheet's sizes and modulus {sizes} must be finite and above zero")

@@ -1,22 +1,22 @@
-"""How hard the sheet pulls at its clamps, and what that alone says of how it yields."""
+"""Estimate the force on the clamps, and the stiffness that follows from it alone."""
 
 from __future__ import annotations
 
 CLAMPED_EDGE_FACTOR = 1.08
-"""How much more force the clamps' hold across the width adds to plain uniaxial tension.
+"""Ratio of the edge force to plain uniaxial tension, since the clamps hold the width.
 
 Fitted to membrane FE of a square sheet clamped at two edges (24x24, neo-Hookean): 5.1, 12.3, 23.4,
-43.0 N at stretch 1.02, 1.05, 1.10, 1.20 for 1 MPa, 240 x 240 x 1 mm; the rule is within 2 %.
+43.0 N at stretch 1.02, 1.05, 1.10, 1.20 for 1 MPa, 240 x 240 x 1 mm.  The rule is within 2 %.
 """
 
 PUSH_FACTOR = 0.95
-"""Small-push stiffness over edge force per length: 0.9-1.0 for a fingertip of radius 10 mm."""
+"""Stiffness of a small push over edge force per length: 0.9-1.0 for a fingertip of radius 10 mm."""
 
 
 def edge_force_n(
     stretch_ratio: float, *, young_modulus_pa: float, height_m: float, thickness_m: float
 ) -> float:
-    """Force (N) on each clamped edge of the unpushed sheet; 0 when slack.
+    """Return the force (N) on each clamped edge of the unpushed sheet; 0 when slack.
 
     Incompressible neo-Hookean strip, (E/3) A (s - 1/s^2), times CLAMPED_EDGE_FACTOR.
     """
@@ -30,7 +30,7 @@ def edge_force_n(
 def stretch_for_edge_force(
     force_n: float, *, young_modulus_pa: float, height_m: float, thickness_m: float
 ) -> float:
-    """Inverse of `edge_force_n` for force >= 0 (Newton; the rule is smooth and increasing)."""
+    """Invert `edge_force_n` for force >= 0 (Newton; the rule is smooth and increasing)."""
     scale = CLAMPED_EDGE_FACTOR * young_modulus_pa / 3.0 * height_m * thickness_m
     wanted = max(force_n, 0.0) / scale
     stretch = 1.0 + wanted / 3.0
@@ -43,10 +43,10 @@ def stretch_for_edge_force(
 
 
 def push_stiffness_n_per_m(edge_force: float, *, width_m: float) -> float:
-    """Force per depth (N/m) of a small push at the sheet's centre under that edge force (N)."""
+    """Return the force per depth (N/m) of a small push at the centre under that edge force (N)."""
     return PUSH_FACTOR * edge_force / width_m
 
 
 def edge_force_for_stiffness(stiffness_n_per_m: float, *, width_m: float) -> float:
-    """Inverse of `push_stiffness_n_per_m`."""
+    """Invert `push_stiffness_n_per_m`."""
     return stiffness_n_per_m * width_m / PUSH_FACTOR

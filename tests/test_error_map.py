@@ -14,9 +14,9 @@ from nodes.models.rigid import transform
 from nodes.models.sheet import edge_poses
 from nodes.renderer.gl import DrawStyle, headless_context
 from nodes.renderer.scene_renderer import SceneRenderer
+from nodes.twin.error_map import PERIOD_M, RANGE_M, RIM_PX, error_map
 from nodes.twin.eye import seen
 from nodes.twin.membrane import Rubber, solve
-from nodes.twin.places import PERIOD_M, RANGE_M, RIM_PX, error_map
 
 Image = NDArray[np.uint8]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")

@@ -1,7 +1,7 @@
-"""A sheet's law as a table: what was measured or computed over what the scaled law says.
+"""Correct the scaled force model by a table of measured or computed ratios.
 
-The quotient of the two hardly changes, so that few entries are enough, and between them and for
-other fingertips the scaled law goes on.
+The ratio varies little, so that few entries suffice.  The scaled model interpolates between them,
+and covers other fingertips.
 """
 
 from __future__ import annotations
@@ -13,24 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from nodes.models.sheet.laws import Place, Pressed, ScaledLaw
+from nodes.models.sheet.force_models import Place, ScaledSheetModel, SheetForce
 from nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
 Measure = Callable[[float, Floats, Place], Floats]
-"""Forces (n,) at a stretch ratio, depths (n,) and a place."""
+"""Forces (n,) at a stretch ratio, depths (n,) and a position."""
 
 
 @dataclass(frozen=True, slots=True)
-class TableLaw:
-    """The scaled law times a tabulated quotient.
+class TabulatedSheetModel:
+    """Multiply the scaled model by a tabulated ratio.
 
-    stretches (a,), depths_m (b,), xs_m (c,), ys_m (d,): ascending, the places in the quadrant of
-    positive x and y, as the sheet is symmetric.  ratios (a, b, c, d).  Linear between stretches
-    and places, a monotone cubic between depths, and constant beyond the ends.
+    stretches, depths_m, xs_m, ys_m: ascending axes (a,), (b,), (c,), (d,); positions lie in the
+        quadrant of positive x and y, since the sheet is symmetric.
+    ratios: (a, b, c, d); linear between stretches and positions, a monotone cubic between depths,
+        and constant beyond the ends.
     """
 
-    base: ScaledLaw
+    base: ScaledSheetModel
     stretches: Floats
     depths_m: Floats
     xs_m: Floats
@@ -39,7 +40,8 @@ class TableLaw:
     name: str = "table"
 
     def __post_init__(self) -> None:
-        """ValueError for axes that do not ascend, ratios of another shape or not above zero."""
+        """Raise ValueError for axes that do not ascend, or ratios of another shape or not
+        positive."""
         axes = (self.stretches, self.depths_m, self.xs_m, self.ys_m)
         shape = tuple(len(axis) for axis in axes)
         if 0 in shape or any((np.diff(axis) <= 0.0).any() for axis in axes):
@@ -53,10 +55,10 @@ class TableLaw:
     def rubber(self) -> Rubber:
         return self.base.rubber
 
-    def press(
+    def evaluate(
         self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
-    ) -> Pressed:
-        pressed = self.base.press(
+    ) -> SheetForce:
+        pressed = self.base.evaluate(
             stretch_ratio, depths_m, place_m=place_m, finger_radius_m=finger_radius_m
         )
         ratios = _between(self.stretches, stretch_ratio, self.ratios)
@@ -69,13 +71,13 @@ class TableLaw:
             within = np.clip(depths_m, self.depths_m[0], self.depths_m[-1])
             ratio = curve(within)
             slope = np.where(within == depths_m, curve(within, 1), 0.0)
-        return Pressed(
+        return SheetForce(
             pressed.force_n * ratio,
             pressed.stiffness_n_per_m * ratio + pressed.force_n * slope,
             pressed.edge_force_n,
         )
 
-    def outside(
+    def invalid_reason(
         self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
     ) -> str:
         x, y = abs(place_m[0]), abs(place_m[1])
@@ -92,7 +94,7 @@ class TableLaw:
 
 
 def _between(axis: Floats, value: float, entries: Floats) -> Floats:
-    """Entries (n, ...) at a value of their first axis, linearly; constant beyond the ends."""
+    """Interpolate entries (n, ...) linearly along their first axis; constant beyond the ends."""
     if len(axis) == 1:
         return np.asarray(entries[0])
     value = float(np.clip(value, axis[0], axis[-1]))
@@ -101,8 +103,8 @@ def _between(axis: Floats, value: float, entries: Floats) -> Floats:
     return np.asarray((1.0 - share) * entries[upper - 1] + share * entries[upper])
 
 
-def make_table(
-    base: ScaledLaw,
+def make_tabulated_model(
+    base: ScaledSheetModel,
     measure: Measure,
     *,
     stretches: Floats,
@@ -111,18 +113,18 @@ def make_table(
     ys_m: Floats,
     finger_radius_m: float,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> TableLaw:
-    """The table of what `measure` says; `progress` is told of each of its questions."""
+) -> TabulatedSheetModel:
+    """Make the table from what `measure` returns; `progress` reports each of its calls."""
     ratios = np.empty((len(stretches), len(depths_m), len(xs_m), len(ys_m)))
     total, done = len(stretches) * len(xs_m) * len(ys_m), 0
     for a, stretch in enumerate(stretches):
         for c, x in enumerate(xs_m):
             for d, y in enumerate(ys_m):
                 place = (float(x), float(y))
-                scaled = base.press(
+                scaled = base.evaluate(
                     float(stretch), depths_m, place_m=place, finger_radius_m=finger_radius_m
                 )
                 ratios[a, :, c, d] = measure(float(stretch), depths_m, place) / scaled.force_n
                 done += 1
                 progress(done, total)
-    return TableLaw(base, stretches, depths_m, xs_m, ys_m, ratios)
+    return TabulatedSheetModel(base, stretches, depths_m, xs_m, ys_m, ratios)

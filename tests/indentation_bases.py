@@ -4,24 +4,28 @@ from __future__ import annotations
 
 from functools import cache
 
-from nodes.models.sheet.dents import DentRange, DentShapes, solve_dents
+from nodes.models.sheet.indentation import (
+    IndentationBasis,
+    IndentationRange,
+    solve_indentation_basis,
+)
 from nodes.models.sheet.rubber import Rubber
 
 RUBBER = Rubber(0.24, 0.24, 0.001, 1e6)
 RADIUS_M = 0.007
-LEAST_STRETCH, LARGEST_STRETCH, DEEPEST_M = 1.04, 1.06, 0.03
+LEAST_STRETCH, MAX_STRETCH_RATIO, DEEPEST_M = 1.04, 1.06, 0.03
 ELEMENT_CELLS = 20
 
 
 @cache
-def few_dents() -> DentShapes:
-    within = DentRange(
+def few_dents() -> IndentationBasis:
+    within = IndentationRange(
         LEAST_STRETCH,
-        LARGEST_STRETCH,
+        MAX_STRETCH_RATIO,
         DEEPEST_M,
         stretch_nodes=2,
         place_nodes=2,
         depth_nodes=6,
         element_cells=ELEMENT_CELLS,
     )
-    return solve_dents(RUBBER, within=within, finger_radius_m=RADIUS_M)
+    return solve_indentation_basis(RUBBER, within=within, finger_radius_m=RADIUS_M)

@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.triangulator.company import ALONE_S, FORGIVEN_S, Company
+from nodes.triangulator.data_association import (
+    CLUTTER_RELEASE_TIME_S,
+    SOLE_CANDIDATE_TIME_S,
+    DataAssociation,
+)
 from nodes.triangulator.filters import TRACKING_METHODS
-from nodes.triangulator.fingertip import Candidate, Sighting
+from nodes.triangulator.fingertip import Candidate, StereoDetection
 from nodes.triangulator.tracking import Tracker, TrackingSettings
-from nodes.triangulator.triangulation import Measured
+from nodes.triangulator.triangulation import TriangulatedPoint
 
 Floats = NDArray[np.float64]
 Place = Callable[[float], Floats]
@@ -26,46 +30,54 @@ class Bench:
 
     def __init__(self) -> None:
         settings = TrackingSettings(max_speed_m_per_s=1.5)
-        self.tracker = Tracker(TRACKING_METHODS["hand"](1.5), settings)
-        self.company = Company()
+        self.tracker = Tracker(TRACKING_METHODS["singer_tremor"](1.5), settings)
+        self.association = DataAssociation()
         self.random = np.random.default_rng(1)
         self.time_s = 10.0
 
-    def show(self, *marks: tuple[Place, Floats]) -> tuple[str, Floats | None]:
+    def show(self, *markers: tuple[Place, Floats]) -> tuple[str, Floats | None]:
         """One picture of marks with their looks: the reason, and the point that was chosen."""
         self.time_s += FRAME_S
         at_ns = round(1e9 * self.time_s)
         candidates = [
             Candidate(
-                Measured(
+                TriangulatedPoint(
                     place(self.time_s) + self.random.multivariate_normal(np.zeros(3), NOISE),
                     NOISE,
                     0.05,
                 ),
-                looks + 0.005 * self.random.standard_normal(2),
+                appearance + 0.005 * self.random.standard_normal(2),
             )
-            for place, looks in marks
+            for place, appearance in markers
         ]
-        expected = self.tracker.expected(at_ns)
+        expected = self.tracker.gate(at_ns)
         near = [
             one
             for one in candidates
-            if expected is None or np.linalg.norm(one.point - expected.point) <= expected.reach_m
+            if expected is None or np.linalg.norm(one.point - expected.point) <= expected.radius_m
         ]
         far = [one for one in candidates if all(one is not other for other in near)]
         reason = (
-            "ok" if len(near) == 1 else "two_marks" if near else "too_fast" if far else "no_mark"
+            "ok"
+            if len(near) == 1
+            else "two_markers"
+            if near
+            else "too_fast"
+            if far
+            else "no_marker"
         )
         first = (near or far or [None])[0]
         measured = None if first is None else first.measured
-        sighting = Sighting(reason, measured, tuple(near), tuple(far))
-        verdict, chosen = self.company.judge(at_ns, sighting, self.tracker)
-        if verdict == "ok" and self.company.is_survey_due(at_ns):
-            self.company.survey(at_ns, sighting)
-        return verdict, None if chosen is None else chosen.point_world
+        detection = StereoDetection(reason, measured, tuple(near), tuple(far))
+        result, chosen = self.association.select_finger(at_ns, detection, self.tracker)
+        if result == "ok" and self.association.is_clutter_search_due(at_ns):
+            self.association.track_clutter(at_ns, detection)
+        return result, None if chosen is None else chosen.point_world
 
-    def run(self, seconds: float, *marks: tuple[Place, Floats]) -> list[tuple[str, Floats | None]]:
-        return [self.show(*marks) for _ in range(round(seconds / FRAME_S))]
+    def run(
+        self, seconds: float, *markers: tuple[Place, Floats]
+    ) -> list[tuple[str, Floats | None]]:
+        return [self.show(*markers) for _ in range(round(seconds / FRAME_S))]
 
 
 def finger(time_s: float) -> Floats:
@@ -114,13 +126,13 @@ def test_marks_that_pass_through_one_another_do_not_change_places() -> None:
 
 def test_two_unknown_marks_are_one_too_many() -> None:
     bench = Bench()
-    assert set(reasons(bench.run(2.0, (finger, SKIN), (bead, SKIN)))) == {"two_marks"}
+    assert set(reasons(bench.run(2.0, (finger, SKIN), (bead, SKIN)))) == {"two_markers"}
 
 
 def test_of_two_unknown_marks_the_one_that_moves_is_the_finger() -> None:
     bench = Bench()
     shown = bench.run(2.0, (finger, SKIN), (lambda _: np.array([0.06, 0.0, 0.0]), SKIN))
-    assert shown[0][0] == "two_marks"
+    assert shown[0][0] == "two_markers"
     assert shown[-1][0] == "ok"
     assert all_at(shown, finger, bench)
 
@@ -140,8 +152,8 @@ def test_a_moving_mark_that_stays_alone_becomes_the_finger_in_the_end() -> None:
     bench = Bench()
     bench.run(0.3, (finger, SKIN))
     bench.run(0.5, (finger, SKIN), (bead, SKIN))
-    assert "ok" not in reasons(bench.run(0.9 * FORGIVEN_S, (bead, SKIN)))
-    shown = bench.run(0.1 * FORGIVEN_S + 2.0 * ALONE_S, (bead, SKIN))
+    assert "ok" not in reasons(bench.run(0.9 * CLUTTER_RELEASE_TIME_S, (bead, SKIN)))
+    shown = bench.run(0.1 * CLUTTER_RELEASE_TIME_S + 2.0 * SOLE_CANDIDATE_TIME_S, (bead, SKIN))
     assert shown[-1][0] == "ok"
     assert all_at(shown, bead, bench)
 

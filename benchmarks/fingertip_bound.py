@@ -28,7 +28,7 @@ STEP_PX = 0.02
 ROUNDING_VARIANCE = 1.0 / 12.0
 FULL_LEVEL = 255.0
 NUISANCES = 4
-WORST_CONDITION = 1e10
+MAX_CONDITION = 1e10
 """Of the information with its diagonal scaled to one; beyond it, something cannot be told."""
 
 
@@ -70,30 +70,32 @@ def fingertip_bound(
         lower, upper = drawn(less), drawn(more)
         return (upper[0] - lower[0]) / span, (upper[1] - lower[1]) / span
 
-    sensor, radius_m, offset_m = camera.sensor, camera.mark_radius_m, camera.mark_offset_m
+    sensor, radius_m, offset_m = camera.sensor, camera.marker_radius_m, camera.marker_offset_m
     left_eye = camera.eyes[0]
     step_m = STEP_PX * left_eye.see(position(0.0))[1] / left_eye.lens.fx_px
     if step_m <= 0:
         raise BoundError("the fingertip is behind the camera")
     by_place = [
         slope(
-            camera.altered(mark_offset_m=offset_m - step_m * axis),
-            camera.altered(mark_offset_m=offset_m + step_m * axis),
+            camera.with_changes(marker_offset_m=offset_m - step_m * axis),
+            camera.with_changes(marker_offset_m=offset_m + step_m * axis),
             2.0 * step_m,
         )
         for axis in np.eye(3)
     ]
     by_level = slope(
-        camera, camera.altered(sensor=replace(sensor, mark_level=sensor.mark_level + 1.0)), 1.0
+        camera,
+        camera.with_changes(sensor=replace(sensor, marker_level=sensor.marker_level + 1.0)),
+        1.0,
     )
     by_radius = slope(
-        camera.altered(mark_radius_m=radius_m - step_m),
-        camera.altered(mark_radius_m=radius_m + step_m),
+        camera.with_changes(marker_radius_m=radius_m - step_m),
+        camera.with_changes(marker_radius_m=radius_m + step_m),
         2.0 * step_m,
     )
     by_blur = slope(
-        camera.altered(sensor=replace(sensor, blur_px=sensor.blur_px - STEP_PX)),
-        camera.altered(sensor=replace(sensor, blur_px=sensor.blur_px + STEP_PX)),
+        camera.with_changes(sensor=replace(sensor, blur_px=sensor.blur_px - STEP_PX)),
+        camera.with_changes(sensor=replace(sensor, blur_px=sensor.blur_px + STEP_PX)),
         2.0 * STEP_PX,
     )
     seen = drawn(camera)
@@ -143,13 +145,13 @@ def _about_the_mark(
     """The part of a picture that the mark lights during the exposure, and the margin round it."""
     pixels, reach_px = [], 0.0
     for share in (-0.5, 0.0, 0.5):
-        tip = position(share * exposure_s) + camera.mark_offset_m
+        tip = position(share * exposure_s) + camera.marker_offset_m
         pixel, depth = eye.see(tip)
         if depth <= 0:
             raise BoundError(f"the mark is behind the {eye.side} camera")
         pixels.append((float(pixel[0]), float(pixel[1])))
         x, y, z = (eye.camera_from_world[:3, :3] @ tip + eye.camera_from_world[:3, 3]).tolist()
-        radius_px = pixels_per_slope(eye.lens, x / z, y / z) * camera.mark_radius_m / z
+        radius_px = pixels_per_slope(eye.lens, x / z, y / z) * camera.marker_radius_m / z
         spread_px = camera.sensor.spread_px(z, eye.lens.fx_px)
         reach_px = max(reach_px, radius_px + 3.0 * spread_px + margin_px)
     window = eye.window(pixels, reach_px)
@@ -174,6 +176,6 @@ def _covariance(information: Floats, views: str) -> Floats:
     if not (scale > 0).all():
         raise BoundError(f"{views} view: no pixel tells the mark's place, size or level")
     scaled = information / np.outer(scale, scale)
-    if np.linalg.cond(scaled) > WORST_CONDITION:
+    if np.linalg.cond(scaled) > MAX_CONDITION:
         raise BoundError(f"{views} view: the pixels do not tell the mark's place from its looks")
     return np.asarray(np.linalg.inv(scaled) / np.outer(scale, scale))

@@ -18,14 +18,14 @@ from ruamel.yaml import YAML
 from messages.scene import Scene
 from nodes.methods import measure as measure_trial
 from nodes.triangulator import families
-from nodes.triangulator.families import MARK, DrawnDisc, centre_bound_px, noisy
-from nodes.triangulator.mark import (
-    MARK_METHODS,
-    Mark,
-    MarkLooks,
-    Spot,
-    find_spots,
-    overexposed,
+from nodes.triangulator.families import MARKER, DrawnDisc, centre_bound_px, noisy
+from nodes.triangulator.marker import (
+    MARKER_METHODS,
+    Blob,
+    BlobFilter,
+    Marker,
+    detect_blobs,
+    is_overexposed,
     window_around,
 )
 from nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
@@ -33,8 +33,8 @@ from nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-LOOKS, SENSOR = MarkLooks(), PixelNoise()
-METHODS = sorted(MARK_METHODS)
+LOOKS, SENSOR = BlobFilter(), PixelNoise()
+METHODS = sorted(MARKER_METHODS)
 
 
 def disc(
@@ -54,13 +54,13 @@ def disc(
     return np.clip(np.rint(ground + share * (level - ground)), 0, 255).astype(np.uint8)
 
 
-def marks_in(image: Image, name: str = "subpixel_fit") -> list[Mark]:
-    spots = find_spots(image, LOOKS)
-    return MARK_METHODS[name]([image] * len(spots), spots, LOOKS, SENSOR)
+def markers_in(image: Image, name: str = "subpixel_fit") -> list[Marker]:
+    blobs = detect_blobs(image, LOOKS)
+    return MARKER_METHODS[name]([image] * len(blobs), blobs, LOOKS, SENSOR)
 
 
-def sound_marks_in(image: Image) -> list[Mark]:
-    return [mark for mark in marks_in(image) if mark.flaw is None]
+def sound_marks_in(image: Image) -> list[Marker]:
+    return [marker for marker in markers_in(image) if marker.rejection_reason is None]
 
 
 @given(x=st.floats(20, 100), y=st.floats(20, 80), radius=st.floats(2.5, 8))
@@ -73,18 +73,18 @@ def test_centres_are_exact_to_a_fraction_of_a_pixel(x: float, y: float, radius: 
         ("weighted_centroid", 0.06),
         ("subpixel_fit", 0.04),
     ):
-        marks = marks_in(image, name)
-        assert len(marks) == 1
-        assert np.linalg.norm(marks[0].centre - [x, y]) < limit_px
+        markers = markers_in(image, name)
+        assert len(markers) == 1
+        assert np.linalg.norm(markers[0].centre - [x, y]) < limit_px
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_a_window_gives_the_same_mark_as_the_whole_picture(name: str) -> None:
     image = disc((61.3, 40.7), blur_px=0.7)
     window = window_around(np.array([65.0, 45.0]), image.shape, LOOKS.window_half_px)
-    whole, near = find_spots(image, LOOKS), find_spots(image, LOOKS, window)
-    refine = MARK_METHODS[name]
-    a, b = (refine([image], spots, LOOKS, SENSOR)[0] for spots in (whole, near))
+    whole, near = detect_blobs(image, LOOKS), detect_blobs(image, LOOKS, window)
+    refine = MARKER_METHODS[name]
+    a, b = (refine([image], blobs, LOOKS, SENSOR)[0] for blobs in (whole, near))
     assert np.array_equal(a.centre, b.centre)
     assert np.array_equal(a.covariance, b.covariance)
 
@@ -116,15 +116,15 @@ def test_what_is_no_mark_is_not_found(image: Image) -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (200, 2)])
 def test_pictures_too_small_for_a_mark_have_none(shape: tuple[int, int]) -> None:
-    assert find_spots(np.full(shape, 200, np.uint8), LOOKS) == []
+    assert detect_blobs(np.full(shape, 200, np.uint8), LOOKS) == []
 
 
 def test_only_a_white_picture_is_overexposed() -> None:
-    assert overexposed(np.full((50, 50), 255, np.uint8))
-    assert not overexposed(np.full((50, 50), 240, np.uint8))
+    assert is_overexposed(np.full((50, 50), 255, np.uint8))
+    assert not is_overexposed(np.full((50, 50), 240, np.uint8))
     image = disc((60, 40), level=255)
-    assert not overexposed(image)
-    assert overexposed(image, (slice(37, 44), slice(57, 64)))
+    assert not is_overexposed(image)
+    assert is_overexposed(image, (slice(37, 44), slice(57, 64)))
 
 
 def test_a_mark_on_a_bright_finger_and_beside_a_brighter_light_is_found() -> None:
@@ -132,7 +132,7 @@ def test_a_mark_on_a_bright_finger_and_beside_a_brighter_light_is_found() -> Non
     image[60:, 30:50] = 110  # the finger, up to the mark and under it
     image[36:60, 30:50] = np.maximum(image[36:60, 30:50], 110)
     cv2.circle(image, (75, 40), 14, 255, -1)
-    near = [spot for spot in find_spots(image, LOOKS) if math.dist(spot.centre, (40, 40)) < 1.0]
+    near = [blob for blob in detect_blobs(image, LOOKS) if math.dist(blob.centre, (40, 40)) < 1.0]
     assert len(near) == 1
 
 
@@ -158,12 +158,12 @@ def test_the_fit_is_near_the_bound_and_says_so(radius_px: float, motion_px: floa
     bound_px = np.mean([centre_bound_px(one, SENSOR) for one, _ in discs[:3]])
     errors, normalised = [], []
     for one, image in discs:
-        (mark,) = marks_in(image)
-        error = mark.centre - one.centre
+        (marker,) = markers_in(image)
+        error = marker.centre - one.centre
         errors.append(error)
-        normalised.append(error @ np.linalg.solve(mark.covariance, error))
-        assert mark.flaw is None
-        assert mark.radius == pytest.approx(radius_px, rel=0.05 + 0.15 / radius_px)
+        normalised.append(error @ np.linalg.solve(marker.covariance, error))
+        assert marker.rejection_reason is None
+        assert marker.radius == pytest.approx(radius_px, rel=0.05 + 0.15 / radius_px)
     assert np.sqrt(np.mean(np.square(errors))) < 1.35 * bound_px
     assert 0.4 < np.mean(normalised) < 2.6
 
@@ -171,10 +171,10 @@ def test_the_fit_is_near_the_bound_and_says_so(radius_px: float, motion_px: floa
 def test_a_mark_drawn_out_by_motion_is_less_certain_along_it() -> None:
     ratios = []
     for one, image in drawn(10, 3.2, 6.0, seed=6):
-        (mark,) = marks_in(image)
+        (marker,) = markers_in(image)
         along = one.motion / np.linalg.norm(one.motion)
         across = np.array([-along[1], along[0]])
-        ratios.append(along @ mark.covariance @ along / (across @ mark.covariance @ across))
+        ratios.append(along @ marker.covariance @ along / (across @ marker.covariance @ across))
     assert np.mean(ratios) > 1.1
 
 
@@ -183,20 +183,20 @@ def test_more_noise_than_the_sensor_should_have_is_stated() -> None:
     loud = PixelNoise(4.0 * SENSOR.read_levels, SENSOR.photons_per_level / 16.0)
     normalised = []
     for one, image in drawn(100, 3.2, 0.0, seed=7, noise=loud):
-        (mark,) = marks_in(image)
-        error = mark.centre - one.centre
-        normalised.append(error @ np.linalg.solve(mark.covariance, error))
+        (marker,) = markers_in(image)
+        error = marker.centre - one.centre
+        normalised.append(error @ np.linalg.solve(marker.covariance, error))
     assert 1.2 < np.mean(normalised) < 3.0
 
 
 def test_an_overexposed_mark_keeps_its_centre_and_its_honesty() -> None:
     errors, normalised = [], []
     for one, _ in drawn(60, 3.2, 0.0, seed=8):
-        image = noisy(replace(one, mark=400.0).levels(), SENSOR, np.random.default_rng(1))
-        (mark,) = marks_in(image)
-        error = mark.centre - one.centre
+        image = noisy(replace(one, marker=400.0).levels(), SENSOR, np.random.default_rng(1))
+        (marker,) = markers_in(image)
+        error = marker.centre - one.centre
         errors.append(error)
-        normalised.append(error @ np.linalg.solve(mark.covariance, error))
+        normalised.append(error @ np.linalg.solve(marker.covariance, error))
     assert np.sqrt(np.mean(np.square(errors))) < 0.03
     assert np.mean(normalised) < 3.0
 
@@ -210,8 +210,8 @@ def test_a_mark_out_of_focus_is_said_to_be() -> None:
         )
         for blur_px in (1.5, 3.6)
     )
-    assert [mark.flaw for mark in marks_in(sharp)] == [None]
-    assert [mark.flaw for mark in marks_in(soft)] == ["blurred"]
+    assert [marker.rejection_reason for marker in markers_in(sharp)] == [None]
+    assert [marker.rejection_reason for marker in markers_in(soft)] == ["blurred"]
 
 
 @pytest.mark.parametrize("gap_px", [3.0, 4.0, 5.5])
@@ -219,16 +219,16 @@ def test_a_mark_that_runs_into_a_light_is_no_sound_one(gap_px: float) -> None:
     """Two lights in one spot: never a mark that is sound, of its size, and lies between them."""
     image = np.maximum(disc((50.0, 40.0), radius=3.2), disc((50.0 + gap_px, 41.0), radius=2.5))
     image = np.maximum(image, disc((50.0 + gap_px, 41.0), radius=2.5, level=255.0))
-    for mark in sound_marks_in(np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7))):
-        wrong_px = np.linalg.norm(mark.centre - [50.0, 40.0])
-        assert wrong_px < 0.3 or abs(math.log(mark.radius / 3.2)) > 0.15
+    for marker in sound_marks_in(np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7))):
+        wrong_px = np.linalg.norm(marker.centre - [50.0, 40.0])
+        assert wrong_px < 0.3 or abs(math.log(marker.radius / 3.2)) > 0.15
 
 
 def test_half_a_mark_is_no_sound_mark() -> None:
     image = disc((50.0, 40.0), radius=3.2, blur_px=0.7)
     image[:, 51:] = 30
-    for mark in sound_marks_in(image):
-        assert mark.radius < 0.8 * 3.2
+    for marker in sound_marks_in(image):
+        assert marker.radius < 0.8 * 3.2
 
 
 def test_a_fit_that_starts_beside_the_disc_or_on_nothing_does_not_settle() -> None:
@@ -238,9 +238,9 @@ def test_a_fit_that_starts_beside_the_disc_or_on_nothing_does_not_settle() -> No
     outside = DiscStart((-3.0, 50.0), 4.0, 0.8, 200.0, 30.0, (0.0, 0.0))
     good = DiscStart((50.3, 39.8), 3.5, 0.9, 210.0, 40.0, (0.0, 0.0))
     fits = fit_discs([image] * 4, [astray, nothing, outside, good], SENSOR)
-    assert [fit.settled for fit in fits[:3]] == [False] * 3
+    assert [fit.converged for fit in fits[:3]] == [False] * 3
     alone = fit_discs([image], [good], SENSOR)[0]
-    assert alone.settled
+    assert alone.converged
     assert np.allclose(alone.centre, [50.0, 40.0], atol=0.01)
     assert fit_discs([], [], SENSOR) == []
     for fit in fits:
@@ -257,21 +257,21 @@ def test_no_picture_breaks_the_search(seed: int) -> None:
     image = 127.0 + (image - image.mean()) * float(random.uniform(1.0, 20.0))
     picture = np.clip(image, 0, 255).astype(np.uint8)
     for name in METHODS:
-        for mark in marks_in(picture, name):
-            assert np.isfinite(mark.centre).all()
-            assert np.linalg.eigvalsh(mark.covariance).min() > 0
+        for marker in markers_in(picture, name):
+            assert np.isfinite(marker.centre).all()
+            assert np.linalg.eigvalsh(marker.covariance).min() > 0
 
 
 def test_the_mark_family_tells_the_methods_apart() -> None:
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
-    points = [measure_trial(trial, repeats=1) for trial in MARK.trials(scene)]
+    points = [measure_trial(trial, repeats=1) for trial in MARKER.trials(scene)]
     worst = {
         name: max(point.error for point in points if point.in_range and point.method == name)
-        for name in MARK.methods
+        for name in MARKER.methods
     }
     # Ground that slopes under the mark shifts a centroid; the fit allows for it.
-    assert worst["subpixel_fit"] < 0.5 * MARK.tolerance(scene)
-    assert MARK.tolerance(scene) < worst["weighted_centroid"] < worst["moments"]
+    assert worst["subpixel_fit"] < 0.5 * MARKER.tolerance(scene)
+    assert MARKER.tolerance(scene) < worst["weighted_centroid"] < worst["moments"]
     for point in points:
         assert point.error > 0.7 * float(point.params["bound_px"])
 
@@ -283,14 +283,14 @@ def test_mark_methods_are_judged_with_the_noise_that_the_node_tells_them(
     believed: list[PixelNoise] = []
 
     def spy(
-        images: Sequence[Image], spots: Sequence[Spot], looks: MarkLooks, noise: PixelNoise
-    ) -> list[Mark]:
+        images: Sequence[Image], blobs: Sequence[Blob], appearance: BlobFilter, noise: PixelNoise
+    ) -> list[Marker]:
         believed.append(noise)
         return []
 
-    monkeypatch.setattr(families, "MARK_METHODS", {"moments": spy})
+    monkeypatch.setattr(families, "MARKER_METHODS", {"moments": spy})
     loud = {"read_noise_levels": 4.0, "photons_per_level": 10.0}
     camera = scene.camera.model_copy(update=loud)
-    trial = next(iter(MARK.trials(scene.model_copy(update={"camera": camera}))))
+    trial = next(iter(MARKER.trials(scene.model_copy(update={"camera": camera}))))
     trial.run()
     assert believed == [PixelNoise(4.0, 10.0)]

@@ -18,18 +18,18 @@ from messages.scene import Scene
 from messages.types import FingertipReason
 from nodes.models import rigid
 from nodes.triangulator.families import DrawnDisc, noisy
-from nodes.triangulator.fingertip import Eyesight, locate
-from nodes.triangulator.mark import MARK_METHODS, MarkLooks
+from nodes.triangulator.fingertip import DetectorConfig, detect
+from nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from nodes.triangulator.subpixel import PixelNoise
-from nodes.triangulator.tracking import Expected
-from nodes.triangulator.triangulation import Measured, StereoGeometry, dlt
+from nodes.triangulator.tracking import Gate
+from nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint, dlt
 from nodes.twin.clutter import (
     CLUTTER,
     Clutter,
+    FixedPoint,
     Highlight,
-    Still,
     covered,
-    second_mark,
+    second_marker,
     together,
     touching_highlight,
 )
@@ -47,27 +47,27 @@ REACH_M = 0.009
 LAB = CLUTTER["lab"]
 
 
-def eyesight(name: str = "subpixel_fit", **changes: object) -> Eyesight:
-    sight = Eyesight(MarkLooks(), MARK_METHODS[name], dlt, max_reprojection_px=1.5)
-    return replace(sight, **changes)
+def config(name: str = "subpixel_fit", **changes: object) -> DetectorConfig:
+    inputs = DetectorConfig(BlobFilter(), MARKER_METHODS[name], dlt, max_reprojection_px=1.5)
+    return replace(inputs, **changes)
 
 
-def look(
+def detect_in(
     pictures: Pictures,
     *,
     expected: Floats | None = None,
-    reach_m: float = REACH_M,
+    radius_m: float = REACH_M,
     name: str = "subpixel_fit",
     volume: tuple[Floats, Floats] = VOLUME,
     geometry: StereoGeometry = GEOMETRY,
     **changes: object,
-) -> tuple[FingertipReason, Measured | None]:
-    return locate(
+) -> tuple[FingertipReason, TriangulatedPoint | None]:
+    return detect(
         *pictures,
         geometry=geometry,
-        eyesight=eyesight(name, **changes),
+        config=config(name, **changes),
         volume=volume,
-        expected=None if expected is None else Expected(expected, reach_m),
+        gate=None if expected is None else Gate(expected, radius_m),
     )
 
 
@@ -87,7 +87,7 @@ def pictures(
     return camera.picture(lambda t: tip + t * np.array(velocity), exposure_s=0.004)
 
 
-def error_m(measured: Measured | None, tip: Floats = HERE) -> float:
+def error_m(measured: TriangulatedPoint | None, tip: Floats = HERE) -> float:
     assert measured is not None
     return float(np.linalg.norm(measured.point_world - tip))
 
@@ -114,14 +114,14 @@ def test_a_point_is_drawn_and_found_again(
         )
         views.append(image)
         origins.append(corner)
-    for expected in (None, Expected(truth + 0.002, REACH_M)):
-        reason, measured = locate(
+    for expected in (None, Gate(truth + 0.002, REACH_M)):
+        reason, measured = detect(
             views[0],
             views[1],
             geometry=GEOMETRY,
-            eyesight=eyesight(),
+            config=config(),
             volume=VOLUME,
-            expected=expected,
+            gate=expected,
             left_origin_px=origins[0],
             right_origin_px=origins[1],
         )
@@ -129,7 +129,7 @@ def test_a_point_is_drawn_and_found_again(
         assert error_m(measured, truth) < 4e-4
 
 
-@pytest.mark.parametrize("name", sorted(MARK_METHODS))
+@pytest.mark.parametrize("name", sorted(MARKER_METHODS))
 @pytest.mark.parametrize("speed_m_per_s", [0.0, 1.0])
 def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
     name: str, speed_m_per_s: float
@@ -141,7 +141,7 @@ def test_in_the_lab_every_pair_is_found_and_its_covariance_is_honest(
         tip = random.uniform([-0.08, -0.08, -0.03], [0.08, 0.08, 0.08])
         way = random.standard_normal(3)
         velocity = speed_m_per_s * way / np.linalg.norm(way)
-        reason, measured = look(
+        reason, measured = detect_in(
             pictures(camera, tip, velocity),
             expected=tip + random.normal(0.0, 0.001, 3),
             name=name,
@@ -162,14 +162,14 @@ def test_without_an_expected_place_the_mark_is_found_as_well() -> None:
     camera, random = twin(), np.random.default_rng(5)
     for _ in range(20):
         tip = random.uniform([-0.08, -0.08, -0.03], [0.08, 0.08, 0.08])
-        reason, measured = look(pictures(camera, tip))
+        reason, measured = detect_in(pictures(camera, tip))
         assert reason == "ok"
         assert error_m(measured, tip) < 5e-4
 
 
 def test_a_region_of_interest_gives_what_the_whole_picture_gives() -> None:
     views = pictures(twin())
-    whole, near = look(views), look(views, expected=HERE + 0.003)
+    whole, near = detect_in(views), detect_in(views, expected=HERE + 0.003)
     assert whole[0] == near[0] == "ok"
     assert whole[1] is not None
     assert near[1] is not None
@@ -178,15 +178,15 @@ def test_a_region_of_interest_gives_what_the_whole_picture_gives() -> None:
 
 def test_pictures_of_regions_say_where_they_begin() -> None:
     views = pictures(twin())
-    full = look(views)[1]
+    full = detect_in(views)[1]
     cut = tuple(np.ascontiguousarray(view[180:320, 200:470]) for view in views)
-    reason, measured = locate(
+    reason, measured = detect(
         cut[0],
         cut[1],
         geometry=GEOMETRY,
-        eyesight=eyesight(),
+        config=config(),
         volume=VOLUME,
-        expected=Expected(HERE, REACH_M),
+        gate=Gate(HERE, REACH_M),
         left_origin_px=(200, 180),
         right_origin_px=(200, 180),
     )
@@ -199,42 +199,46 @@ def test_pictures_of_regions_say_where_they_begin() -> None:
 def test_an_expected_place_that_is_no_place_is_no_hindrance() -> None:
     views = pictures(twin())
     behind = rigid.apply(GEOMETRY.world_from_left, np.array([0.0, 0.0, -0.3]))
-    assert look(views, expected=np.full(3, np.nan))[0] == "ok"
+    assert detect_in(views, expected=np.full(3, np.nan))[0] == "ok"
     for nowhere in (behind, np.array([9.0, 0.0, 0.0])):
-        assert look(views, expected=nowhere)[0] == "too_fast"
-        assert look(views, expected=nowhere, reach_m=20.0)[0] == "ok"
+        assert detect_in(views, expected=nowhere)[0] == "too_fast"
+        assert detect_in(views, expected=nowhere, radius_m=20.0)[0] == "ok"
 
 
 def test_no_mark_and_a_mark_in_one_view() -> None:
-    empty = twin().picture(lambda _: HERE, exposure_s=0.004, mark=False)
+    empty = twin().picture(lambda _: HERE, exposure_s=0.004, marker=False)
     views = pictures(twin())
     for expected in (None, HERE):
-        assert look(empty, expected=expected)[0] in ("no_mark", "mark_in_one_view", "inconsistent")
-        reason, measured = look((views[0], np.full_like(views[1], 40)), expected=expected)
-        assert (reason, measured) == ("mark_in_one_view", None)
-    plain = twin(Clutter()).picture(lambda _: HERE, exposure_s=0.004, mark=False)
-    assert look(plain) == ("no_mark", None)
+        assert detect_in(empty, expected=expected)[0] in (
+            "no_marker",
+            "marker_in_one_view",
+            "inconsistent",
+        )
+        reason, measured = detect_in((views[0], np.full_like(views[1], 40)), expected=expected)
+        assert (reason, measured) == ("marker_in_one_view", None)
+    plain = twin(Clutter()).picture(lambda _: HERE, exposure_s=0.004, marker=False)
+    assert detect_in(plain) == ("no_marker", None)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_a_mark_that_one_camera_does_not_see(side: str) -> None:
     hidden = covered(1.0, views="left" if side == "left" else "right")
     for expected in (None, HERE):
-        reason, _ = look(pictures(twin(together(LAB, hidden))), expected=expected)
-        assert reason in ("mark_in_one_view", "inconsistent")
+        reason, _ = detect_in(pictures(twin(together(LAB, hidden))), expected=expected)
+        assert reason in ("marker_in_one_view", "inconsistent")
 
 
 def test_two_marks_are_one_too_many_unless_one_is_expected() -> None:
-    views = pictures(twin(together(LAB, second_mark((0.03, 0.0, 0.0)))))
-    assert look(views)[0] == "two_marks"
+    views = pictures(twin(together(LAB, second_marker((0.03, 0.0, 0.0)))))
+    assert detect_in(views)[0] == "two_markers"
     for there in (HERE, HERE + np.array([0.03, 0.0, 0.0])):
-        reason, measured = look(views, expected=there)
+        reason, measured = detect_in(views, expected=there)
         assert reason == "ok"
         assert error_m(measured, there) < 4e-4
-    beside = pictures(twin(together(LAB, second_mark((0.012, 0.0, 0.0)))))
-    reason, _ = look(beside, expected=HERE + np.array([0.006, 0, 0]), reach_m=0.015)
-    assert reason == "two_marks"
-    assert look(beside, expected=HERE, reach_m=0.005)[0] == "ok"
+    beside = pictures(twin(together(LAB, second_marker((0.012, 0.0, 0.0)))))
+    reason, _ = detect_in(beside, expected=HERE + np.array([0.006, 0, 0]), radius_m=0.015)
+    assert reason == "two_markers"
+    assert detect_in(beside, expected=HERE, radius_m=0.005)[0] == "ok"
 
 
 @pytest.mark.parametrize(
@@ -242,10 +246,10 @@ def test_two_marks_are_one_too_many_unless_one_is_expected() -> None:
 )
 def test_a_light_that_is_no_mark_does_not_count(radius_m: float, views: str) -> None:
     """Too small or too large for its depth, or in one view only."""
-    spot = Highlight(Still((0.05, 0.04, 0.02)), radius_m, 200.0, views=views)  # type: ignore[arg-type]  # a parameter of pytest is any str
+    blob = Highlight(FixedPoint((0.05, 0.04, 0.02)), radius_m, 200.0, views=views)  # type: ignore[arg-type]  # a parameter of pytest is any str
     for expected in (None, HERE):
-        reason, measured = look(
-            pictures(twin(together(LAB, Clutter(highlights=(spot,))))), expected=expected
+        reason, measured = detect_in(
+            pictures(twin(together(LAB, Clutter(highlights=(blob,))))), expected=expected
         )
         assert reason == "ok"
         assert error_m(measured) < 4e-4
@@ -253,7 +257,7 @@ def test_a_light_that_is_no_mark_does_not_count(radius_m: float, views: str) -> 
 
 def test_lights_that_do_not_belong_together_are_inconsistent() -> None:
     views = pictures(twin())
-    reason, measured = look((views[0], np.roll(views[1], 12, axis=0)))
+    reason, measured = detect_in((views[0], np.roll(views[1], 12, axis=0)))
     assert reason == "inconsistent"
     assert measured is None or measured.reprojection_px > 1.5
 
@@ -263,8 +267,8 @@ def test_a_mark_that_a_light_touches_is_right_or_refused(overlap: float) -> None
     camera, random = twin(together(LAB, touching_highlight(overlap))), np.random.default_rng(2)
     for _ in range(8):
         tip = random.uniform([-0.05, -0.05, 0.0], [0.05, 0.05, 0.05])
-        reason, measured = look(pictures(camera, tip), expected=tip)
-        assert reason in ("ok", "merged", "blurred", "inconsistent", "two_marks")
+        reason, measured = detect_in(pictures(camera, tip), expected=tip)
+        assert reason in ("ok", "merged", "blurred", "inconsistent", "two_markers")
         if reason == "ok":
             assert error_m(measured, tip) < 5e-4
 
@@ -274,8 +278,8 @@ def test_a_mark_that_is_partly_hidden_is_right_or_refused(share: float) -> None:
     camera, random = twin(together(LAB, covered(share))), np.random.default_rng(2)
     for _ in range(8):
         tip = random.uniform([-0.05, -0.05, 0.0], [0.05, 0.05, 0.05])
-        reason, measured = look(pictures(camera, tip), expected=tip)
-        assert reason in ("ok", "merged", "inconsistent", "no_mark", "mark_in_one_view")
+        reason, measured = detect_in(pictures(camera, tip), expected=tip)
+        assert reason in ("ok", "merged", "inconsistent", "no_marker", "marker_in_one_view")
         if reason == "ok":
             assert error_m(measured, tip) < 8e-4
 
@@ -284,8 +288,8 @@ def test_a_mark_that_is_partly_hidden_is_right_or_refused(share: float) -> None:
 def test_a_mark_out_of_focus_is_honest_or_refused(defocus_px: float) -> None:
     sensor = Sensor(aperture_m=0.05).out_of_focus(defocus_px, 0.48, 540.0)
     camera = twin(aperture_m=sensor.aperture_m, focus_m=sensor.focus_m)
-    reason, measured = look(pictures(camera), expected=HERE)
-    assert reason in ("ok", "blurred", "merged", "no_mark", "mark_in_one_view", "inconsistent")
+    reason, measured = detect_in(pictures(camera), expected=HERE)
+    assert reason in ("ok", "blurred", "merged", "no_marker", "marker_in_one_view", "inconsistent")
     if defocus_px <= 0.5:
         assert reason == "ok"
     if defocus_px >= 3.0:
@@ -297,28 +301,30 @@ def test_a_mark_out_of_focus_is_honest_or_refused(defocus_px: float) -> None:
 def test_a_picture_too_bright_to_tell_is_saturated() -> None:
     white = np.full((480, 640), 255, np.uint8)
     views = pictures(twin())
-    assert look((white, white))[0] == "saturated"
-    assert look((views[0], white), expected=HERE)[0] == "saturated"
-    assert look(pictures(twin(exposure=6.0)), expected=HERE)[0] == "saturated"
+    assert detect_in((white, white))[0] == "saturated"
+    assert detect_in((views[0], white), expected=HERE)[0] == "saturated"
+    assert detect_in(pictures(twin(exposure=6.0)), expected=HERE)[0] == "saturated"
     black = np.zeros_like(white)
-    assert look((black, black)) == ("no_mark", None)
+    assert detect_in((black, black)) == ("no_marker", None)
 
 
 @pytest.mark.parametrize("exposure", [0.6, 1.3])
 def test_a_wrong_exposure_is_borne(exposure: float) -> None:
-    reason, measured = look(pictures(twin(exposure=exposure)), expected=HERE)
+    reason, measured = detect_in(pictures(twin(exposure=exposure)), expected=HERE)
     assert reason == "ok"
     assert error_m(measured) < 4e-4
 
 
 def test_beyond_the_volume_and_beyond_what_can_be_known() -> None:
     outside = np.array([0.0, 0.0, -0.16])
-    reason, measured = look(pictures(twin(Clutter()), outside))
+    reason, measured = detect_in(pictures(twin(Clutter()), outside))
     assert reason == "outside_volume"
     assert error_m(measured, outside) < 2e-3
     everywhere = (np.full(3, -1e9), np.full(3, 1e9))
-    assert look(pictures(twin(Clutter()), outside), volume=everywhere)[0] == "ok"
-    uncertain, measured = look(pictures(twin(Clutter())), volume=everywhere, max_deviation_m=1e-5)
+    assert detect_in(pictures(twin(Clutter()), outside), volume=everywhere)[0] == "ok"
+    uncertain, measured = detect_in(
+        pictures(twin(Clutter())), volume=everywhere, max_deviation_m=1e-5
+    )
     assert uncertain == "inconsistent"
     assert error_m(measured) < 4e-4
 
@@ -330,7 +336,9 @@ def test_a_baseline_too_short_for_the_depth_is_refused_not_guessed() -> None:
     rig = SCENE.camera.model_copy(update={"right_from_left": short})
     camera = TwinCamera(rig, finger_radius_m=SCENE.finger.radius_m, seed=4)
     everywhere = (np.full(3, -1e9), np.full(3, 1e9))
-    reason, measured = look(pictures(camera), geometry=StereoGeometry.of(rig), volume=everywhere)
+    reason, measured = detect_in(
+        pictures(camera), geometry=StereoGeometry.of(rig), volume=everywhere
+    )
     assert reason == "inconsistent"
     if measured is not None:
         assert measured.deviation_m > 0.002
@@ -339,7 +347,7 @@ def test_a_baseline_too_short_for_the_depth_is_refused_not_guessed() -> None:
 
 def test_noise_that_is_given_replaces_what_the_method_states() -> None:
     views = pictures(twin())
-    own, given = look(views)[1], look(views, noise_px=0.5)[1]
+    own, given = detect_in(views)[1], detect_in(views, noise_px=0.5)[1]
     assert own is not None
     assert given is not None
     assert np.array_equal(own.point_world, given.point_world)
@@ -353,7 +361,7 @@ def test_a_crowd_of_lights_never_makes_a_wrong_fingertip() -> None:
         tip = random.uniform([-0.06, -0.06, -0.03], [0.06, 0.06, 0.06])
         time_s = float(random.uniform(0.0, 60.0))
         views = camera.picture(lambda _, tip=tip: tip, exposure_s=0.004, time_s=time_s)
-        reason, measured = look(views, expected=tip + random.normal(0.0, 0.001, 3))
+        reason, measured = detect_in(views, expected=tip + random.normal(0.0, 0.001, 3))
         reasons[reason] += 1
         if reason == "ok":
             assert error_m(measured, tip) < 8e-4

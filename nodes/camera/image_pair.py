@@ -1,8 +1,7 @@
-"""What every reader of stereo pictures gives: grey pairs with their time, and the errors.
+"""Define what every reader of stereo images returns: grey pairs with their time, and the errors.
 
-A reader is opened, read from in a thread that may block, and closed.  What goes wrong with a
-device is a `DeviceError`, which may pass when it is tried again; pictures that run out end with
-`None`.
+A reader is opened, read from in a thread that may block, and closed.  A `DeviceError` is a failure
+that may disappear at the next attempt; the end of the images is `None`.
 """
 
 from __future__ import annotations
@@ -24,11 +23,11 @@ Now = Callable[[], int]
 
 
 class DeviceError(RuntimeError):
-    """A device or file that cannot be read; the message names it and what to do."""
+    """Raised for a device or file that cannot be read; the message names it and what to do."""
 
 
 class Region(NamedTuple):
-    """A part of the sensor, in pixels; column and row of its first pixel count from zero."""
+    """Hold a part of the sensor, in pixels; column and row of its first pixel count from zero."""
 
     column: Annotated[int, Field(ge=0)]
     row: Annotated[int, Field(ge=0)]
@@ -48,18 +47,19 @@ class Region(NamedTuple):
 
 
 Regions = tuple[Region, Region]
-"""Of the left view and of the right."""
+"""Regions of the left view and of the right."""
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
-    """A pair and when it was taken: the middle between the middles of both exposures.
+class ImagePair:
+    """Hold a pair and its time: the mean of the middles of both exposures.
 
-    exposure_ns: by the clock that the reader was given; of a paced reader (files), by the file's
-    own time from its beginning.  exposure_s: as the device has it; None: not known.
-    skew_s: exposure of the right picture minus that of the left.
-    regions: parts of the sensors that the pictures show; None: all.
-    notes: how they were taken, for people.
+    exposure_ns: on the clock that the reader was given; of a paced reader (files), the file's own
+        time from its beginning.
+    exposure_s: as reported by the device; None: not known.
+    skew_s: exposure of the right image minus that of the left.
+    regions: parts of the sensors that the images show; None: all.
+    notes: how they were taken, for display.
     """
 
     left: Image
@@ -72,29 +72,33 @@ class Pictures:
 
 
 class Reader(Protocol):
-    """paced: the pictures come as fast as they are read, and are to be shown by their own time.
+    """Define what a reader of image pairs offers.
 
-    rate_hz: of a device, what its frames are counted against; files have none.
-    warnings: what the device does not do as the scene asks; known once it is open.
+    paced: images come as fast as they are read, and are to be shown by their own time.
+    rate_hz: of a device, for counting lost frames; files have none.
+    warnings: settings that the device does not accept; known once it is open.
     """
 
     paced: bool
     rate_hz: float | None
     warnings: tuple[str, ...]
 
-    def read(self) -> Pictures | None:
-        """The next pair, waiting for it; None when there are no more.  Raises DeviceError."""
+    def read(self) -> ImagePair | None:
+        """Wait for the next pair and return it; None at the end.  Raises DeviceError."""
         ...
 
     def interrupt(self) -> None:
-        """From any thread: a `read` that waits, and each that follows, returns None soon."""
+        """Make a waiting `read`, and each that follows, return None soon; callable from any
+        thread."""
         ...
 
     def close(self) -> None: ...
 
 
-def pair_of(pictures: Pictures, device: str, exposure_s: float, dropped_frames: int) -> StereoPair:
-    """The message that tells of the pictures; exposure_s: where the device does not tell it."""
+def make_stereo_message(
+    pictures: ImagePair, device: str, exposure_s: float, dropped_frames: int
+) -> StereoPair:
+    """Make the message of an image pair; exposure_s: used where the device does not report it."""
     origins = [(region.column, region.row) for region in pictures.regions or ()] or [(0, 0)] * 2
     return StereoPair(
         device=device,
@@ -108,14 +112,14 @@ def pair_of(pictures: Pictures, device: str, exposure_s: float, dropped_frames: 
     )
 
 
-def pictures_of(pair: StereoPair, exposure_ns: int) -> Pictures:
-    """The pictures of a published pair."""
+def make_image_pair(pair: StereoPair, exposure_ns: int) -> ImagePair:
+    """Make the image pair of a published message."""
     origins = (pair.left_origin_px, pair.right_origin_px)
     left, right = (
         Region(*origin, image.shape[1], image.shape[0])
         for origin, image in zip(origins, (pair.left, pair.right), strict=True)
     )
-    return Pictures(
+    return ImagePair(
         pair.left,
         pair.right,
         exposure_ns,
@@ -125,8 +129,8 @@ def pictures_of(pair: StereoPair, exposure_ns: int) -> Pictures:
     )
 
 
-def too_skewed(skew_s: float, limit_s: float) -> str:
-    """What to tell people of a pair that was refused."""
+def skew_reason(skew_s: float, limit_s: float) -> str:
+    """Describe why a pair was rejected for its skew."""
     return (
         f"skew {1e3 * skew_s:.1f} ms, at most {1e3 * limit_s:g} ms wanted; cameras that run freely "
         "keep their skew until they are started anew, a common trigger has none"
@@ -134,14 +138,15 @@ def too_skewed(skew_s: float, limit_s: float) -> str:
 
 
 def gray(image: NDArray[Any]) -> Image:
-    """A decoded picture as grey (h, w): grey or luma first (h, w, 1 or 2), or blue-green-red."""
+    """Convert a decoded image to grey (h, w): grey or luma first (h, w, 1 or 2), or
+    blue-green-red."""
     if image.ndim == 3:
         image = image[:, :, 0] if image.shape[2] < 3 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     return np.ascontiguousarray(image, dtype=np.uint8)
 
 
 def halves(image: Image, name: object) -> tuple[Image, Image]:
-    """Both views of a side-by-side picture (h, 2w); raises DeviceError for an odd width."""
+    """Split a side-by-side image (h, 2w) into both views; raises DeviceError for an odd width."""
     if image.shape[1] % 2:
         raise DeviceError(
             f"{name}: side-by-side picture of odd width {image.shape[1]}; name the right device too"
@@ -150,8 +155,8 @@ def halves(image: Image, name: object) -> tuple[Image, Image]:
     return np.ascontiguousarray(image[:, :middle]), np.ascontiguousarray(image[:, middle:])
 
 
-def check_size(pictures: Pictures, camera: StereoCamera, name: object) -> None:
-    """Raises DeviceError unless each view has the size of its region, or of the scene's camera."""
+def check_size(pictures: ImagePair, camera: StereoCamera, name: object) -> None:
+    """Raise DeviceError unless each view has the size of its region, or of the scene's camera."""
     whole = Region(0, 0, camera.width_px, camera.height_px)
     regions = pictures.regions or (whole, whole)
     views = (("left", pictures.left, regions[0]), ("right", pictures.right, regions[1]))
@@ -168,10 +173,10 @@ def check_size(pictures: Pictures, camera: StereoCamera, name: object) -> None:
             )
 
 
-def cut(pictures: Pictures, wanted: Regions) -> Pictures:
-    """The wanted regions of pictures that `check_size` has passed.
+def cut(pictures: ImagePair, wanted: Regions) -> ImagePair:
+    """Cut the wanted regions out of images that `check_size` has passed.
 
-    Raises DeviceError where the pictures do not show all of them.
+    Raises DeviceError where the images do not show all of them.
     """
     if pictures.regions == wanted:
         return pictures

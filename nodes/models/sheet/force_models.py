@@ -1,11 +1,12 @@
-"""How the sheet pushes back: interchangeable laws behind one signature.
+"""Compute the force of the pushed sheet: interchangeable models behind one signature.
 
-A law says, for a stretch ratio, depths of a fingertip below the flat sheet, the place on the
-stretched sheet (x, y from its centre, m) and the fingertip's radius, which force along the sheet's
-normal answers, how it grows with the depth, and how hard the sheet then pulls at its clamps.
+A model takes a stretch ratio, depths of a fingertip below the flat sheet, the position on the
+stretched sheet (x, y from its centre, m) and the fingertip's radius.  It returns the force along
+the sheet's normal, its derivative over the depth, and the force on the clamps.
 
-From cheap to dear: `LinearLaw`, `CubicLaw`, `ScaledLaw`, `nodes.models.sheet.table.TableLaw`,
-`MembraneLaw`.  Each says by `outside` where it must not be trusted.
+By increasing cost: `LinearSheetModel`, `ScaledSheetModel`,
+    `nodes.models.sheet.tabulated.TabulatedSheetModel`, `MembraneSheetModel`.  `invalid_reason` of
+    each tells where it does not hold.
 """
 
 from __future__ import annotations
@@ -28,16 +29,17 @@ CENTRE: Place = (0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Pressed:
-    """A law's answer at each depth (n,): N, N/m, and N on each clamp."""
+class SheetForce:
+    """Hold a model's result at each depth (n,): force N, stiffness N/m, and force on each clamp
+    N."""
 
     force_n: Floats
     stiffness_n_per_m: Floats
     edge_force_n: Floats
 
 
-class SheetLaw(Protocol):
-    """What every law of the family offers."""
+class SheetForceModel(Protocol):
+    """Define what every force model of the sheet offers."""
 
     @property
     def name(self) -> str: ...
@@ -45,37 +47,38 @@ class SheetLaw(Protocol):
     @property
     def rubber(self) -> Rubber: ...
 
-    def press(
+    def evaluate(
         self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
-    ) -> Pressed:
-        """Answers at depths (n,), m; a depth of zero or less presses nothing.
+    ) -> SheetForce:
+        """Return the forces at depths (n,), m; a depth of zero or less gives no force.
 
-        ValueError for what is not finite.
+        Raises ValueError for values that are not finite.
         """
         ...
 
-    def outside(
+    def invalid_reason(
         self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
     ) -> str:
-        """Why the law does not hold there; empty where it does."""
+        """Return why the model does not hold there; empty where it does."""
         ...
 
 
 def strain_measure(stretch_ratio: float, mooney_share: float = 0.0) -> float:
-    """Nominal stress of simple tension over E: (s - s^-2)/3, for Mooney's rubber times
-    1 - m + m/s; 0 when slack."""
+    """Return the nominal stress of simple tension over E: (s - s^-2)/3, for Mooney rubber times 1 -
+    m + m/s; 0 when slack."""
     s = max(stretch_ratio, 1.0)
     return (s - s**-2) / 3.0 * (1.0 - mooney_share + mooney_share / s)
 
 
-CLAMP_SHARE, CLAMP_BY_HEIGHT = 1.004, 0.0735
-"""Edge force over that of simple tension: grows with height over width, since the clamps keep the
-sheet from narrowing.  Within 0.3 % of membrane FE from 0.5 to 1.5, stretch to 1.12."""
+CLAMP_FACTOR, CLAMP_BY_HEIGHT = 1.004, 0.0735
+"""Edge force over that of simple tension.  It grows with height over width, since the clamps
+prevent the sheet from narrowing.  It is within 0.3 % of membrane FE for ratios from 0.5 to 1.5 and
+stretch to 1.12."""
 
 
 def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
-    """Force (N) on each clamp of the unpushed sheet."""
-    clamped = CLAMP_SHARE + CLAMP_BY_HEIGHT * rubber.height_m / rubber.width_m
+    """Return the force (N) on each clamp of the unpushed sheet."""
+    clamped = CLAMP_FACTOR + CLAMP_BY_HEIGHT * rubber.height_m / rubber.width_m
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.height_m
     return clamped * modulus * strain_measure(stretch_ratio, rubber.mooney_share)
 
@@ -83,7 +86,8 @@ def flat_edge_force_n(rubber: Rubber, stretch_ratio: float) -> float:
 def _checked(
     stretch_ratio: float, depths_m: Floats, place_m: Place, finger_radius_m: float
 ) -> Floats:
-    """The depths, none below 0; ValueError unless all is finite, stretch and radius above 0."""
+    """Return the depths, at least 0; ValueError unless all is finite and stretch and radius are
+    positive."""
     depths = np.asarray(depths_m, dtype=np.float64)
     numbers = (stretch_ratio, *place_m, finger_radius_m)
     if not (np.isfinite(numbers).all() and np.isfinite(depths).all()):
@@ -96,37 +100,38 @@ def _checked(
     return np.maximum(depths, 0.0)
 
 
-def relative_place(rubber: Rubber, stretch_ratio: float, place_m: Place) -> tuple[float, float]:
-    """(|x|, |y|) of a place on the stretched sheet: 0 in the middle, 1 at clamp and free edge."""
+def relative_position(rubber: Rubber, stretch_ratio: float, place_m: Place) -> tuple[float, float]:
+    """Return (|x|, |y|) of a position on the stretched sheet: 0 at the centre, 1 at clamp and free
+    edge."""
     half_width = 0.5 * rubber.width_m * max(stretch_ratio, 1.0)
     return abs(place_m[0]) / half_width, abs(place_m[1]) / (0.5 * rubber.height_m)
 
 
-NEAREST_CLAMP = 0.98
-"""Relative x at which the closed forms stop growing: at the clamp they are infinite."""
+MAX_RELATIVE_X = 0.98
+"""Relative x beyond which the closed forms stay constant: at the clamp they are infinite."""
 
 
 @dataclass(frozen=True, slots=True)
-class LinearLaw:
-    """Force in proportion to tension and depth: F = 0.95 T0/W d, as a string's, in place x too.
+class LinearSheetModel:
+    """Compute a force proportional to tension and depth: F = 0.95 T0/W d, in x like a string's.
 
-    The figure is of a 10 mm disc; a fingertip makes its contact only as it goes in, so that the
-    line cuts the true curve, which starts flatter and ends steeper.
+    The factor holds for a disc of 10 mm.  The contact of a fingertip grows with the depth, so that
+    the line crosses the true curve, which starts flatter and ends steeper.
     """
 
     rubber: Rubber
     name: str = "linear"
 
-    def press(
+    def evaluate(
         self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
-    ) -> Pressed:
+    ) -> SheetForce:
         depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
         edge = flat_edge_force_n(self.rubber, stretch_ratio)
-        x, _ = relative_place(self.rubber, stretch_ratio, place_m)
-        slope = PUSH_FACTOR * edge / self.rubber.width_m / (1.0 - min(x, NEAREST_CLAMP) ** 2)
-        return Pressed(slope * depths, np.full(depths.shape, slope), np.full(depths.shape, edge))
+        x, _ = relative_position(self.rubber, stretch_ratio, place_m)
+        slope = PUSH_FACTOR * edge / self.rubber.width_m / (1.0 - min(x, MAX_RELATIVE_X) ** 2)
+        return SheetForce(slope * depths, np.full(depths.shape, slope), np.full(depths.shape, edge))
 
-    def outside(
+    def invalid_reason(
         self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
     ) -> str:
         scaled = scaled_depth(self.rubber, stretch_ratio, depth_m)
@@ -134,29 +139,22 @@ class LinearLaw:
             return "a slack sheet is not linear at all"
         if not LINEAR_FROM <= scaled <= LINEAR_TO:
             return "the line meets the curve of a fingertip at middle depths only"
-        return _outside_simple(self.rubber, stretch_ratio, place_m, finger_radius_m)
+        x, y = relative_position(self.rubber, stretch_ratio, place_m)
+        if max(x, y) > 0.34:
+            return "too near to an edge"
+        if stretch_ratio > MAX_STRETCH_RATIO:
+            return f"stretch {stretch_ratio:.3f} is more than {MAX_STRETCH_RATIO:g}"
+        return _invalid_sizes(self.rubber, finger_radius_m)
 
 
 LINEAR_FROM, LINEAR_TO = 0.15, 0.33
 """Scaled depths between which the line is within 25 % of the membrane."""
 
 
-def _outside_simple(
-    rubber: Rubber, stretch_ratio: float, place_m: Place, finger_radius_m: float
-) -> str:
-    """What the linear and the cubic law ask alike: about the middle of a square sheet."""
-    x, y = relative_place(rubber, stretch_ratio, place_m)
-    if max(x, y) > 0.34:
-        return "too near to an edge"
-    if stretch_ratio > LARGEST_STRETCH:
-        return f"stretch {stretch_ratio:.3f} is more than {LARGEST_STRETCH:g}"
-    return _outside_sizes(rubber, finger_radius_m)
+MAX_STRETCH_RATIO = 1.13
 
 
-LARGEST_STRETCH = 1.13
-
-
-def _outside_sizes(rubber: Rubber, finger_radius_m: float) -> str:
+def _invalid_sizes(rubber: Rubber, finger_radius_m: float) -> str:
     if not 0.9 <= rubber.height_m / rubber.width_m <= 1.1:
         return "the sheet is not about square"
     if not 0.02 <= finger_radius_m / rubber.width_m <= 0.043:
@@ -169,53 +167,15 @@ CUBIC_FACTOR = 2.43
 
 
 def scaled_depth(rubber: Rubber, stretch_ratio: float, depth_m: float) -> float:
-    """Depth over width and over the root of the strain: sheets of equal scaled depth are alike."""
+    """Return depth over width and over the root of the strain: sheets of equal scaled depth are
+    similar."""
     strain = strain_measure(stretch_ratio, rubber.mooney_share)
     return depth_m / rubber.width_m / sqrt(max(strain, 1e-12))
 
 
-@dataclass(frozen=True, slots=True)
-class CubicLaw:
-    """The linear law and a term that the tension the push itself makes adds: + c E t W (d/W)^3."""
-
-    rubber: Rubber
-    name: str = "cubic"
-
-    def press(
-        self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
-    ) -> Pressed:
-        line = LinearLaw(self.rubber).press(
-            stretch_ratio, depths_m, place_m=place_m, finger_radius_m=finger_radius_m
-        )
-        depths = np.maximum(np.asarray(depths_m, dtype=np.float64), 0.0)
-        rubber = self.rubber
-        x, y = relative_place(rubber, stretch_ratio, place_m)
-        factor = (
-            CUBIC_FACTOR
-            * (rubber.young_modulus_pa * rubber.thickness_m / rubber.width_m**2)
-            * _slack_place(x, y)
-            * max(stretch_ratio, 1.0) ** -_CUBIC_STRETCH
-        )
-        return Pressed(
-            line.force_n + factor * depths**3,
-            line.stiffness_n_per_m + 3.0 * factor * depths**2,
-            line.edge_force_n + _push_tension(rubber, stretch_ratio, depths, (x, y))[0],
-        )
-
-    def outside(
-        self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
-    ) -> str:
-        if scaled_depth(self.rubber, stretch_ratio, depth_m) < CUBIC_FROM:
-            return "shallower than where the fingertip has made its contact"
-        return _outside_simple(self.rubber, stretch_ratio, place_m, finger_radius_m)
-
-
-CUBIC_FROM = 0.16
-"""Scaled depth from which the cubic law is within 25 % of the membrane."""
-
-# Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet: stretch 1
-# to 1.12, fingertips of 5 to 10 mm on 240 mm, depths of 2 to 50 mm, places to half way to a clamp
-# and three quarters of the way to a free edge; 3.6 % rms.  See docs/sheet.md.
+# Fitted by least squares of the logarithms to `push_path` of a square neo-Hookean sheet.  Stretch 1
+# to 1.12, fingertips of 5 to 10 mm on 240 mm, depths of 2 to 50 mm.  Positions up to half way to a
+# clamp and three quarters of the way to a free edge; 3.6 % rms.  See docs/sheet.md.
 _TAUT_FACTOR, _TAUT_POWER, _TAUT_STRETCH, _TAUT_RADIUS = 1.781, 1.414, 0.762, 0.067
 _KNEE, _KNEE_SHARPNESS, _KNEE_POWER = 1.149, 5.0, 0.567
 _CUBIC_STRETCH, _CUBIC_RADIUS = 5.582, 0.062
@@ -227,7 +187,7 @@ _FITTED_RADIUS = 0.007 / 0.24
 
 
 def _slack_place(x: float, y: float) -> float:
-    near = 1.0 - min(x, NEAREST_CLAMP) ** 2
+    near = 1.0 - min(x, MAX_RELATIVE_X) ** 2
     sideways = 1.0 - _SLACK_Y * min(y, 1.0) ** _SLACK_Y_POWER
     return float(sideways * near**-_SLACK_X)
 
@@ -235,11 +195,11 @@ def _slack_place(x: float, y: float) -> float:
 def _push_tension(
     rubber: Rubber, stretch_ratio: float, depths: Floats, place: tuple[float, float]
 ) -> tuple[Floats, float]:
-    """What a push adds to the force on each clamp (n,), N, at a relative place; and E t W."""
+    """Return the force (n,), N, that a push adds on each clamp, and E t W."""
     modulus = rubber.young_modulus_pa * rubber.thickness_m * rubber.width_m
     share = depths / rubber.width_m
     scaled = share / max(strain_measure(stretch_ratio, rubber.mooney_share), 1e-12) ** 0.5
-    near = 1.0 - min(place[0], NEAREST_CLAMP) ** 2
+    near = 1.0 - min(place[0], MAX_RELATIVE_X) ** 2
     where = near**-_PULL_X * (1.0 - _PULL_Y * min(place[1], 1.0) ** 2)
     taut = max(stretch_ratio, 1.0) ** -_PULL_STRETCH
     added = _PULL * modulus * taut * where * share**2 * np.sqrt(scaled / (scaled + _PULL_KNEE))
@@ -247,17 +207,19 @@ def _push_tension(
 
 
 @dataclass(frozen=True, slots=True)
-class ScaledLaw:
-    """One curve for all tensions: a taut part, a power of the scaled depth, and a cubic part.
+class ScaledSheetModel:
+    """Compute one curve for all tensions: a power of the scaled depth for tension, plus a cubic
+    part.
 
     With e the strain measure, w = d/W and u = w/sqrt(e) (a membrane's equations keep their form
     under this scaling while strains are small):
 
         F = E t W (e^3/2 s^a A u^p / (1 + (u/b)^q)^(r/q)  +  c s^-g w^3),
 
-    each part with its own dependence on place, fingertip radius and height.  cubic_ratio: the
-    second part over that of ideal rubber, and stretch_scale: the true stretch over the one that is
-    asked for, where the slack sheet is not as wide as thought; both from calibration.
+    where each part has its own dependence on position, fingertip radius and height.
+
+    cubic_ratio: cubic part over that of ideal rubber, from calibration.
+    stretch_scale: true over nominal stretch, which corrects the slack width, from calibration.
     """
 
     rubber: Rubber
@@ -265,12 +227,12 @@ class ScaledLaw:
     stretch_scale: float = 1.0
     name: str = "scaled"
 
-    def press(
+    def evaluate(
         self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
-    ) -> Pressed:
+    ) -> SheetForce:
         depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
         rubber, s = self.rubber, max(self.stretch_scale * stretch_ratio, 1.0)
-        x, y = relative_place(rubber, s, place_m)
+        x, y = relative_position(rubber, s, place_m)
         tension, modulus = _push_tension(rubber, s, depths, (x, y))
         strain = strain_measure(s, rubber.mooney_share)
         share = depths / rubber.width_m
@@ -287,7 +249,7 @@ class ScaledLaw:
         force = cubic * share**3
         slope = 3.0 * cubic * share**2
         if strain > 0.0:
-            near = 1.0 - min(x, NEAREST_CLAMP) ** 2
+            near = 1.0 - min(x, MAX_RELATIVE_X) ** 2
             taut = (
                 _TAUT_FACTOR
                 * s**_TAUT_STRETCH
@@ -302,39 +264,39 @@ class ScaledLaw:
             force = force + taut * strain**1.5 * curve * u
             power = _TAUT_POWER - _KNEE_POWER * bend / (1.0 + bend)
             slope = slope + taut * strain * curve * power
-        return Pressed(
+        return SheetForce(
             modulus * force,
             modulus / rubber.width_m * slope,
             flat_edge_force_n(rubber, s) + tension,
         )
 
-    def outside(
+    def invalid_reason(
         self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
     ) -> str:
         rubber, stretch_ratio = self.rubber, self.stretch_scale * stretch_ratio
-        if not 1.0 <= stretch_ratio <= LARGEST_STRETCH:
-            return f"stretch {stretch_ratio:.3f} is not from 1 to {LARGEST_STRETCH:g}"
+        if not 1.0 <= stretch_ratio <= MAX_STRETCH_RATIO:
+            return f"stretch {stretch_ratio:.3f} is not from 1 to {MAX_STRETCH_RATIO:g}"
         if not 0.008 <= depth_m / rubber.width_m <= 0.21:
             return "the depth is not 0.8 to 21 % of the sheet's width"
-        x, y = relative_place(rubber, stretch_ratio, place_m)
+        x, y = relative_position(rubber, stretch_ratio, place_m)
         if x > 0.5 or y > 0.76:
             return "too near to an edge"
-        return _outside_sizes(rubber, finger_radius_m)
+        return _invalid_sizes(rubber, finger_radius_m)
 
 
 @dataclass(frozen=True, slots=True)
-class MembraneLaw:
-    """Finite elements, solved anew for every question: exact, and seconds slow."""
+class MembraneSheetModel:
+    """Solve the membrane's finite elements at each call: accurate, but it takes seconds."""
 
     rubber: Rubber
     cells: int = CELLS
     name: str = "membrane"
 
-    def press(
+    def evaluate(
         self, stretch_ratio: float, depths_m: Floats, *, place_m: Place, finger_radius_m: float
-    ) -> Pressed:
+    ) -> SheetForce:
         depths = _checked(stretch_ratio, depths_m, place_m, finger_radius_m)
-        wanted = np.unique(np.concatenate([depths, _SLOPE_SHARE * depths]))
+        wanted = np.unique(np.concatenate([depths, _SLOPE_FRACTION * depths]))
         path = push_path(
             self.rubber,
             stretch_ratio=stretch_ratio,
@@ -344,26 +306,26 @@ class MembraneLaw:
             cells=self.cells,
         )
         at = np.searchsorted(wanted, depths)
-        shallower = path.forces_n[np.searchsorted(wanted, _SLOPE_SHARE * depths)]
+        shallower = path.forces_n[np.searchsorted(wanted, _SLOPE_FRACTION * depths)]
         rise = path.forces_n[at] - shallower
-        run = np.where(depths > 0.0, (1.0 - _SLOPE_SHARE) * depths, 1.0)
-        return Pressed(path.forces_n[at], rise / run, path.edge_forces_n[at])
+        run = np.where(depths > 0.0, (1.0 - _SLOPE_FRACTION) * depths, 1.0)
+        return SheetForce(path.forces_n[at], rise / run, path.edge_forces_n[at])
 
-    def outside(
+    def invalid_reason(
         self, stretch_ratio: float, depth_m: float, *, place_m: Place, finger_radius_m: float
     ) -> str:
         if depth_m < 0.2 * finger_radius_m:
             return "the contact is smaller than the mesh"
-        x, y = relative_place(self.rubber, stretch_ratio, place_m)
+        x, y = relative_position(self.rubber, stretch_ratio, place_m)
         return "" if x <= 0.8 and y <= 0.9 else "the fingertip reaches over an edge"
 
 
-_SLOPE_SHARE = 0.96
-"""A force at this share of the depth gives the slope there."""
+_SLOPE_FRACTION = 0.96
+"""The force at this fraction of the depth gives the slope there."""
 
 
 def depth_for_force(
-    law: SheetLaw,
+    law: SheetForceModel,
     stretch_ratio: float,
     forces_n: Floats,
     *,
@@ -371,13 +333,13 @@ def depth_for_force(
     place_m: Place,
     finger_radius_m: float,
 ) -> Floats:
-    """Depths (n,) at which the law answers with these forces; no deeper than `deepest_m`.
+    """Return the depths (n,) at which the model gives these forces, at most `deepest_m`.
 
-    One question to the law, at depths that lie denser near 0, and straight lines between them (of
-    log force over log depth, which is nearly straight): within 1e-3 of the depth.
+    One call of the model at depths that are denser near 0, and linear interpolation of log force
+    over log depth, which is nearly straight: within 1e-3 of the depth.
     """
     grid = deepest_m * _INVERSE_GRID
-    pressed = law.press(
+    pressed = law.evaluate(
         stretch_ratio, grid, place_m=place_m, finger_radius_m=finger_radius_m
     ).force_n
     return interpolated_inverse(grid, pressed, np.asarray(forces_n, dtype=np.float64))
@@ -387,9 +349,9 @@ _INVERSE_GRID = np.geomspace(1e-3, 1.0, 160)
 
 
 def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats:
-    """Where a rising function reaches `wanted`, from its values at `grid` (both above 0).
+    """Return where a rising function reaches `wanted`, from its values at `grid` (both positive).
 
-    Before the grid it goes as the first interval's power; beyond, it stays at the end.
+    Before the grid it follows the first interval's power; beyond, it stays at the end.
     """
     logs = np.log(np.maximum(np.maximum.accumulate(values), 1e-300))
     keep = np.concatenate([[True], np.diff(logs) > 1e-12])

@@ -1,0 +1,419 @@
+"""Associate the markers of each image pair with the finger and with clutter.
+
+A marker outside the finger's gate is clutter.  Clutter has a track of its own, so that it is not
+taken for the finger while the finger is occluded, or after both were merged in the images.  The
+most likely assignment of markers to tracks, by position and brightness, is a global nearest
+neighbour (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation).
+Where another assignment is about as likely, a marker is ambiguous and no fingertip is reported.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from messages.types import FingertipReason
+from nodes.triangulator.fingertip import Candidate, StereoDetection
+from nodes.triangulator.tracking import Tracker
+from nodes.triangulator.triangulation import TriangulatedPoint
+
+Floats = NDArray[np.float64]
+TrackStatus = Literal["tentative", "ambiguous", "clutter"]
+"""Status of a track that is not the finger's: it may be the finger; it may be the finger or
+clutter; it is clutter."""
+
+POSITION_SIGMA_M = 0.0005
+ACCELERATION_SIGMA_M_PER_S2 = 1.0
+STUDENT_T_DOF = 2.0
+"""Scales of a marker's residual from constant velocity, per axis: of its position and acceleration.
+Residuals are heavy-tailed: Student's t with STUDENT_T_DOF degrees of freedom."""
+
+MERGE_DISTANCE_M = 0.002
+"""Markers closer than this are one marker, detected twice."""
+
+MAX_POSITION_SIGMA_M = 0.1
+"""Bound of the predicted position error: a marker unseen for long may be anywhere in the volume."""
+
+MIN_APPEARANCE_SIGMA = np.array([0.01, 0.02])
+INITIAL_APPEARANCE_SIGMA = np.array([0.04, 0.08])
+POPULATION_APPEARANCE_SIGMA = np.array([0.2, 0.4])
+"""Standard deviations of appearance, relative to the level of a marker and of its surroundings.
+The minimum holds from image to image, the initial value for a new track, and the population value
+between different markers.  The surroundings vary more: the finger's marker always has skin around
+it, other markers have not."""
+
+APPEARANCE_TIME_CONSTANT_S = 0.2
+APPEARANCE_VARIANCE_TIME_CONSTANT_S = 3.0
+"""Time constants of a marker's mean appearance, and of its squared deviations from that mean."""
+
+NEW_TRACK_COST = 6.0 * math.log(MAX_POSITION_SIGMA_M) + 2.0 * float(
+    np.log(POPULATION_APPEARANCE_SIGMA).sum()
+)
+INFEASIBLE_COST = 1e9
+"""Costs of a new track, see `_association_cost`, and of an infeasible assignment."""
+
+AMBIGUITY_MARGIN = 9.0
+"""Difference in cost below which two assignments are ambiguous: 3 sigma."""
+
+MAX_APPEARANCE_DIST_SQ = 16.0
+"""Squared appearance distance beyond which markers differ; a larger one carries no more
+information: 4 sigma."""
+
+VELOCITY_TIME_CONSTANT_S = 0.05
+"""Time constant of a clutter track's velocity."""
+
+CLUTTER_SEARCH_PERIOD_S = 0.1
+"""Period of the search of the whole images while the finger is tracked."""
+
+LATE_GATE_M = 0.03
+"""A lone marker in a late image belongs to the finger if it is this close to the finger."""
+
+STATIONARY_RADIUS_M = 3e-4
+STATIONARY_TIME_S = 1.5
+"""A finger never stays within STATIONARY_RADIUS_M for this long."""
+
+TRACK_TIMEOUT_S = 1.0
+STATIONARY_TRACK_TIMEOUT_S = 10.0
+"""Times after which an unseen track is deleted: a moving one and a stationary one."""
+
+MIN_HITS = 3
+TENTATIVE_TRACK_TIMEOUT_S = 0.1
+"""A tentative track with fewer hits than MIN_HITS is deleted sooner."""
+
+SOLE_CANDIDATE_TIME_S = 1.0
+"""An ambiguous marker that is the only one in view for this long is the finger's."""
+
+CLUTTER_RELEASE_TIME_S = 5.0
+"""After the finger was unseen for this long, moving clutter becomes ambiguous."""
+
+
+@dataclass(slots=True)
+class Track:
+    """Hold a marker's last state: position (3,) m, velocity (3,) m/s, appearance (2,) and its
+    variance."""
+
+    point: Floats
+    velocity: Floats
+    appearance: Floats
+    appearance_variance: Floats
+    at_ns: int
+
+    def predict(self, at_ns: int) -> tuple[Floats, float]:
+        """Predict the position (3,) m and the scale of its error per axis, m."""
+        since_s = (at_ns - self.at_ns) * 1e-9
+        sigma_m = POSITION_SIGMA_M + 0.5 * ACCELERATION_SIGMA_M_PER_S2 * since_s**2
+        return self.point + since_s * self.velocity, min(sigma_m, MAX_POSITION_SIGMA_M)
+
+    def appearance_distance_sq(self, appearance: Floats) -> float:
+        """Return the squared Mahalanobis distance between another appearance (2,) and this one."""
+        return float((np.square(appearance - self.appearance) / self.appearance_variance).sum())
+
+    def update_appearance(self, appearance: Floats, at_ns: int) -> None:
+        """Average a new appearance (2,) into the mean, and its deviation into the variance."""
+        since_s, residual = (at_ns - self.at_ns) * 1e-9, appearance - self.appearance
+        self.appearance = (
+            self.appearance - math.expm1(-since_s / APPEARANCE_TIME_CONSTANT_S) * residual
+        )
+        spread = np.maximum(residual**2, MIN_APPEARANCE_SIGMA**2) - self.appearance_variance
+        self.appearance_variance = (
+            self.appearance_variance
+            - math.expm1(-since_s / APPEARANCE_VARIANCE_TIME_CONSTANT_S) * spread
+        )
+
+
+@dataclass(slots=True)
+class ClutterTrack(Track):
+    """Hold a track that is not the finger's.
+
+    stationary_point, stationary_since_ns: the point (3,) m that the marker has stayed within
+        STATIONARY_RADIUS_M of, and since when.
+    sole_since_ns: since when it is the only marker in view.
+    """
+
+    stationary_point: Floats
+    stationary_since_ns: int
+    sole_since_ns: int
+    status: TrackStatus = "tentative"
+    hits: int = 1
+
+    @staticmethod
+    def of(marker: Candidate, at_ns: int) -> ClutterTrack:
+        variance = INITIAL_APPEARANCE_SIGMA**2
+        return ClutterTrack(
+            marker.point,
+            np.zeros(3),
+            marker.appearance,
+            variance,
+            at_ns,
+            marker.point,
+            at_ns,
+            at_ns,
+        )
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the marker was stationary when it was last seen."""
+        return (self.at_ns - self.stationary_since_ns) * 1e-9 >= STATIONARY_TIME_S
+
+    def predict(self, at_ns: int) -> tuple[Floats, float]:
+        if self.is_stationary:
+            return self.point, POSITION_SIGMA_M
+        return Track.predict(self, at_ns)
+
+    def update(self, marker: Candidate, at_ns: int, *, is_sole: bool) -> None:
+        """Add a detection, the only one of its image pair if `is_sole`."""
+        since_s = (at_ns - self.at_ns) * 1e-9
+        weight = 1.0 if self.hits == 1 else -math.expm1(-since_s / VELOCITY_TIME_CONSTANT_S)
+        velocity = (marker.point - self.point) / since_s
+        self.velocity = self.velocity + weight * (velocity - self.velocity)
+        self.update_appearance(marker.appearance, at_ns)
+        self.point, self.at_ns, self.hits = marker.point, at_ns, self.hits + 1
+        if math.dist(marker.point, self.stationary_point) > STATIONARY_RADIUS_M:
+            self.stationary_point, self.stationary_since_ns = marker.point, at_ns
+        if not is_sole:
+            self.sole_since_ns = at_ns
+
+    def is_alive(self, at_ns: int) -> bool:
+        """Whether the track has not timed out, and its last time is not in the future after a clock
+        step."""
+        timeout_s = TRACK_TIMEOUT_S
+        if self.is_stationary and self.status == "clutter":
+            timeout_s = STATIONARY_TRACK_TIMEOUT_S
+        if self.hits < MIN_HITS and self.status == "tentative":
+            timeout_s = TENTATIVE_TRACK_TIMEOUT_S
+        return 0 <= at_ns - self.at_ns <= 1e9 * timeout_s
+
+
+class DataAssociation:
+    """Decide which marker is the finger's, and track the clutter beside it."""
+
+    def __init__(self) -> None:
+        self.clutter_tracks: list[ClutterTrack] = []
+        self._finger: Track | None = None
+        self._successor: ClutterTrack | None = None
+        self._clutter_searched_ns = 0
+
+    def select_finger(
+        self, at_ns: int, detection: StereoDetection, tracker: Tracker
+    ) -> tuple[FingertipReason, TriangulatedPoint | None]:
+        """Return the reason and the point of the finger in an image pair, and update the
+        tracker."""
+        if tracker.is_late(at_ns):
+            return self._associate_late(at_ns, detection, tracker)
+        if tracker.gate(at_ns) is not None:
+            chosen = self._continue_track(at_ns, detection)
+        else:
+            chosen = self._initiate_track(at_ns, detection)
+        if not isinstance(chosen, Candidate):
+            return chosen, detection.measured
+        result = tracker.update(at_ns, chosen.point, chosen.measured.covariance)
+        if result == "ok":
+            self._update_finger(at_ns, chosen, tracker)
+        return result, chosen.measured
+
+    def _associate_late(
+        self, at_ns: int, detection: StereoDetection, tracker: Tracker
+    ) -> tuple[FingertipReason, TriangulatedPoint | None]:
+        """Select the finger in an image pair that is older than the newest one.
+
+        Clutter of that time is not stored, so that only the gate around the finger decides.
+        Several late pairs in a row restart the track, since the clock has stepped back.
+        """
+        markers = detection.markers
+        if len(markers) > 1 and self._finger is not None:
+            here = self._finger.point
+            markers = tuple(
+                marker for marker in markers if math.dist(marker.point, here) < LATE_GATE_M
+            )
+        if detection.reason not in ("ok", "two_markers") or len(markers) != 1:
+            return detection.reason, detection.measured
+        marker = markers[0]
+        result = tracker.update(at_ns, marker.point, marker.measured.covariance)
+        if result == "ok":
+            self.clutter_tracks, self._finger = [], None
+            self._update_finger(at_ns, marker, tracker)
+        return result, marker.measured
+
+    def is_clutter_search_due(self, at_ns: int) -> bool:
+        """Whether the last search is too long ago, or lies in the future after a clock step."""
+        return not 0 <= at_ns - self._clutter_searched_ns < 1e9 * CLUTTER_SEARCH_PERIOD_S
+
+    def track_clutter(self, at_ns: int, detection: StereoDetection) -> None:
+        """Update the clutter tracks from the whole images in which the finger was just found."""
+        self._clutter_searched_ns = at_ns
+        seen = [one.point for one in self.clutter_tracks if one.at_ns == at_ns]
+        if self._finger is not None:
+            seen.append(self._finger.point)
+        markers = [
+            marker
+            for marker in (*detection.markers, *detection.clutter)
+            if all(math.dist(marker.point, point) > MERGE_DISTANCE_M for point in seen)
+        ]
+        for track in self._associate(at_ns, markers, None):
+            if track is not None:
+                track.status = "clutter"
+
+    def _update_finger(self, at_ns: int, marker: Candidate, tracker: Tracker) -> None:
+        """Store the marker that the tracker has accepted as the finger's."""
+        assert tracker.estimate is not None
+        if self._finger is None:
+            self._finger = ClutterTrack.of(marker, at_ns)
+        self._finger.update_appearance(marker.appearance, at_ns)
+        self._finger.velocity = tracker.filter.moments(tracker.estimate)[1]
+        self._finger.point, self._finger.at_ns = marker.point, at_ns
+        self.clutter_tracks = [
+            track for track in self.clutter_tracks if track.point is not marker.point
+        ]
+
+    def _continue_track(
+        self, at_ns: int, detection: StereoDetection
+    ) -> Candidate | FingertipReason:
+        """Return the marker of a tracked finger, or why there is none."""
+        tracks = self._associate(at_ns, [*detection.markers, *detection.clutter], self._finger)
+        near = tracks[: len(detection.markers)]
+        finger_markers = [
+            marker for marker, track in zip(detection.markers, near, strict=True) if track is None
+        ]
+        for track in tracks if finger_markers else tracks[len(near) :]:
+            if track is not None and track.status == "tentative":
+                # While the finger is not in view, it is only known that this marker is outside the
+                # gate.
+                track.status = "clutter" if finger_markers else "ambiguous"
+        if detection.reason not in ("ok", "two_markers"):
+            return detection.reason
+        if finger_markers:
+            return finger_markers[0]
+        is_all_clutter = all(track and track.status == "clutter" for track in near)
+        return "no_marker" if is_all_clutter else "two_markers"
+
+    def _initiate_track(
+        self, at_ns: int, detection: StereoDetection
+    ) -> Candidate | FingertipReason:
+        """Return the marker that a track may begin with, or why there is none."""
+        markers = [*detection.markers, *detection.clutter]
+        succeeded = any(track is self._successor for track in self.clutter_tracks)
+        tracks = self._associate(at_ns, markers, None if succeeded else self._finger)
+        for index, marker in enumerate(markers):
+            if (
+                tracks[index] is None
+            ):  # the finger was lost here; it is one of the tracks from now on
+                self._successor = tracks[index] = ClutterTrack.of(marker, at_ns)
+                self.clutter_tracks.append(self._successor)
+        best = self._select_candidate(at_ns)
+        if detection.reason not in ("ok", "two_markers"):
+            return detection.reason
+        for marker, track in zip(detection.markers, tracks, strict=False):
+            if track is best:
+                return marker
+        is_all_clutter = all(track and track.status == "clutter" for track in tracks)
+        return "no_marker" if is_all_clutter else "two_markers"
+
+    def _select_candidate(self, at_ns: int) -> ClutterTrack | None:
+        """Return the track that takes over from the lost finger; None if that is ambiguous."""
+        finger = self._finger
+        unseen_s = math.inf if finger is None else (at_ns - finger.at_ns) * 1e-9
+        candidates: list[tuple[float, ClutterTrack]] = []
+        for track in self.clutter_tracks:
+            if (
+                track.status == "clutter"
+                and unseen_s > CLUTTER_RELEASE_TIME_S
+                and not track.is_stationary
+            ):
+                track.status = "ambiguous"
+            distance_sq = 0.0 if finger is None else finger.appearance_distance_sq(track.appearance)
+            if distance_sq > MAX_APPEARANCE_DIST_SQ and track.status == "tentative":
+                track.status = "ambiguous"
+            if track.status != "clutter" and distance_sq <= MAX_APPEARANCE_DIST_SQ:
+                candidates.append((distance_sq, track))
+        if any(not track.is_stationary for _, track in candidates):
+            candidates = [candidate for candidate in candidates if not candidate[1].is_stationary]
+        candidates.sort(key=lambda candidate: candidate[0])
+        if len(candidates) > 1 and candidates[1][0] - candidates[0][0] > AMBIGUITY_MARGIN:
+            return candidates[0][1] if candidates[0][1].hits > MIN_HITS else None
+        if len(candidates) == 1 and candidates[0][1].status == "tentative":
+            return candidates[0][1]
+        sole = [
+            track
+            for track in self.clutter_tracks
+            if track.status == "ambiguous"
+            and track.at_ns == at_ns
+            and (at_ns - track.sole_since_ns) * 1e-9 > SOLE_CANDIDATE_TIME_S
+        ]
+        return sole[0] if sole else None
+
+    def _associate(
+        self, at_ns: int, markers: Sequence[Candidate], finger: Track | None
+    ) -> list[ClutterTrack | None]:
+        """Assign the markers of an image pair to tracks; None stands for the finger."""
+        self.clutter_tracks = [track for track in self.clutter_tracks if track.is_alive(at_ns)]
+        if not markers:
+            return []
+        all_tracks = [*self.clutter_tracks, *([] if finger is None else [finger])]
+        costs = np.full((len(markers), len(all_tracks) + len(markers)), INFEASIBLE_COST)
+        for row, marker in enumerate(markers):
+            costs[row, : len(all_tracks)] = [
+                _association_cost(one, at_ns, marker) for one in all_tracks
+            ]
+            costs[row, len(all_tracks) + row] = NEW_TRACK_COST
+        columns = linear_sum_assignment(costs)[1].tolist()
+        ambiguous = (
+            set[int]() if finger is None else _ambiguous_rows(costs, columns, len(all_tracks) - 1)
+        )
+        tracks: list[ClutterTrack | None] = []
+        for row, (column, marker) in enumerate(zip(columns, markers, strict=True)):
+            if column < len(self.clutter_tracks):
+                track = self.clutter_tracks[column]
+                track.update(marker, at_ns, is_sole=len(markers) == 1)
+                if row in ambiguous and track.status == "clutter":
+                    track.status = "ambiguous"
+                tracks.append(track)
+            elif column < len(all_tracks) and row not in ambiguous:
+                tracks.append(None)
+            else:
+                track = ClutterTrack.of(marker, at_ns)
+                if row in ambiguous:
+                    track.status = "ambiguous"
+                tracks.append(track)
+        self.clutter_tracks += [
+            one for one in tracks if one and all(one is not old for old in self.clutter_tracks)
+        ]
+        return tracks
+
+
+def _association_cost(one: Track, at_ns: int, marker: Candidate) -> float:
+    """Return twice the negative log likelihood, up to a constant, that a marker belongs to a
+    track."""
+    if one.at_ns == at_ns:  # another marker of the same image pair has updated it
+        return INFEASIBLE_COST
+    point, sigma_m = one.predict(at_ns)
+    residual = math.dist(marker.point, point) / sigma_m
+    position = (STUDENT_T_DOF + 3.0) * math.log1p(residual**2 / STUDENT_T_DOF) + 6.0 * math.log(
+        sigma_m
+    )
+    appearance = min(one.appearance_distance_sq(marker.appearance), MAX_APPEARANCE_DIST_SQ)
+    return position + appearance + float(np.log(one.appearance_variance).sum())
+
+
+def _ambiguous_rows(costs: Floats, columns: Sequence[int], finger: int) -> set[int]:
+    """Return the markers (rows) that may equally belong to the finger (a column) and to another
+    track."""
+    finger_row = next((row for row, column in enumerate(columns) if column == finger), None)
+    ambiguous = set[int]()
+    for row, column in enumerate(columns):
+        if column >= finger:
+            continue
+        cost, swapped = costs[row, column], costs[row, finger]
+        if finger_row is not None:  # the two markers would swap
+            cost, swapped = (
+                cost + costs[finger_row, finger],
+                swapped + costs[finger_row, column],
+            )
+        if swapped - cost < AMBIGUITY_MARGIN:
+            ambiguous |= {row} if finger_row is None else {row, finger_row}
+    return ambiguous

@@ -1,0 +1,412 @@
+"""Detect blobs that may be the fingertip's marker, and refine their centres to subpixel accuracy.
+
+Pixel coordinates have their origin at the centre of the top left pixel, x to the right, y down.  A
+marker is a small bright disc, blurred by its motion during the exposure.  `detect_blobs` finds all
+bright blobs of about its size, then a method refines the relevant ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Window = tuple[slice, slice]
+"""Rows and columns of a part of an image."""
+
+NEIGHBOURHOOD_PX = 31
+"""Side of the square whose mean a blob is compared with."""
+
+SURROUND_PX = 3
+"""Width of the border around a blob; its outermost pixels are the surroundings."""
+
+SURROUND_RANK = 0.75
+"""Quantile of the surrounding pixels that counts as their level.  A marker on a finger has the
+finger on one side and darkness on the other, and the finger must not count as marker."""
+
+SKIRT_FRACTION = 0.1
+"""Light below this fraction of the marker's height above its surroundings is excluded as noise."""
+
+MAX_REGIONS = 64
+"""Only the largest regions of an image are searched if there are more bright ones."""
+
+WHITE_LEVEL = 250
+WHITE_FRACTION = 0.2
+"""Level of a white pixel, and the fraction of white pixels of an overexposed image."""
+
+
+@dataclass(frozen=True, slots=True)
+class BlobFilter:
+    """Hold the criteria of a marker.
+
+    min_contrast: levels of its brightest pixel above its surroundings.
+    min_area_px, max_area_px: number of pixels brighter than half that contrast.
+    window_half_px: half the side of the smallest search window around an expected position.
+    max_motion_px: maximum motion during an exposure.
+    max_blur: maximum standard deviation of the edge, as a fraction of the radius; beyond it the
+        marker is out of focus.
+    max_misfit: maximum residual of a disc, root mean square, as a fraction of the marker's height.
+    """
+
+    min_contrast: float = 60.0
+    min_area_px: int = 4
+    max_area_px: int = 1500
+    window_half_px: int = 16
+    max_motion_px: float = 9.0
+    max_blur: float = 0.5
+    max_misfit: float = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class Blob:
+    """Hold a bright blob that may be a marker, in pixels of the image that was searched.
+
+    centre: centroid of its light.
+    radius: of a disc of its area at half height.
+    motion: (x, y) displacement during the exposure, from its second moments.
+    spread: smallest second moment of its light over that of a uniform disc of its radius; 1 for a
+        sharp disc.
+    peak, surround: levels of its brightest pixel and of its surroundings.
+    window: its pixels and their surroundings.
+    """
+
+    centre: tuple[float, float]
+    radius: float
+    motion: tuple[float, float]
+    spread: float
+    peak: float
+    surround: float
+    window: Window
+
+    @property
+    def blur(self) -> float:
+        """Standard deviation of its edge, px, estimated from the spread beyond a sharp disc's."""
+        return min(max(0.5 * self.radius * math.sqrt(max(self.spread - 0.85, 0.0)), 0.6), 3.0)
+
+    @property
+    def height(self) -> float:
+        """Levels above its surroundings."""
+        return self.peak - self.surround
+
+
+MarkerRejection = Literal["merged", "blurred"]
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """Hold a refined marker: centre (2,) px with covariance (2, 2) px^2.
+
+    radius: of the disc, px.
+    radius_deviation: standard deviation of the radius by the method, as a fraction of it.
+    blur: standard deviation of its edge, px.
+    motion: (x, y) px during the exposure, or its reverse.
+    height: levels above its surroundings.
+    rejection_reason: why it is not a marker; None if it is one.
+    """
+
+    centre: Floats
+    covariance: Floats
+    radius: float
+    radius_deviation: float
+    blur: float
+    motion: tuple[float, float]
+    height: float
+    rejection_reason: MarkerRejection | None
+
+
+Refine = Callable[[Sequence[Image], Sequence[Blob], BlobFilter, PixelNoise], list[Marker]]
+"""Function that refines the i-th blob, found in the i-th image."""
+
+
+def window_around(pixel: Floats, shape: tuple[int, ...], half_px: int) -> Window | None:
+    """Return the window around a pixel in an image of `shape` (height, width); None if outside
+    it."""
+    x, y = pixel.tolist()
+    if not abs(x) + abs(y) < 1e6:  # also rejects NaN
+        return None
+    column, row = round(x), round(y)
+    rows = slice(max(row - half_px, 0), min(row + half_px + 1, shape[0]))
+    columns = slice(max(column - half_px, 0), min(column + half_px + 1, shape[1]))
+    outside = rows.start >= rows.stop or columns.start >= columns.stop
+    return None if outside else (rows, columns)
+
+
+def is_overexposed(image: Image, window: Window | None = None) -> bool:
+    """Whether too large a fraction of an image, or of a window of it, is white."""
+    part = image if window is None else image[window]
+    white = cv2.threshold(part, WHITE_LEVEL - 1, 1, cv2.THRESH_BINARY)[1]
+    return bool(cv2.countNonZero(white) > WHITE_FRACTION * part.size)
+
+
+def detect_blobs(image: Image, blob_filter: BlobFilter, window: Window | None = None) -> list[Blob]:
+    """Detect all blobs in an image, or in a window of it, that may be a marker.
+
+    Bright regions stand out from their neighbourhood's mean.  In each, a blob is what exceeds half
+    the height over the surroundings, so that a marker is found on a bright finger and beside a
+    brighter light.  A blob at the border is dropped, since its centre would be wrong, as is one too
+    small or too large.
+    """
+    top, left = (0, 0) if window is None else (window[0].start, window[1].start)
+    part = image if window is None else image[window]
+    bright = cv2.adaptiveThreshold(
+        part,
+        255,
+        cv2.ADAPTIVE_THRESH_MEAN_C,
+        cv2.THRESH_BINARY,
+        NEIGHBOURHOOD_PX,
+        -0.5 * blob_filter.min_contrast,
+    )
+    regions = cv2.findContours(bright, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]
+    if len(regions) > MAX_REGIONS:
+        regions = sorted(regions, key=len)[-MAX_REGIONS:]
+    blobs = []
+    for region in regions:
+        if _pixels_in(region) >= blob_filter.min_area_px:
+            blobs += _blobs_in(part, cv2.boundingRect(region), blob_filter, (top, left))
+    return blobs
+
+
+def _pixels_in(outline: cv2.typing.MatLike) -> float:
+    """Count the pixels within an outline of pixel centres, the outline included (Pick's
+    theorem)."""
+    return cv2.contourArea(outline) + 0.5 * len(outline) + 1.0
+
+
+def _blobs_in(
+    part: Image, box: Sequence[int], blob_filter: BlobFilter, origin: tuple[int, int]
+) -> list[Blob]:
+    """Detect the blobs in a box (x, y, width, height) of an image; `origin` is its first row,
+    column."""
+    rows, columns = _around(box)
+    cut = part[rows, columns]
+    surround, peak = _surround(cut), cv2.minMaxLoc(cut)[1]
+    if peak - surround < blob_filter.min_contrast:
+        return []
+    half = cv2.threshold(cut, 0.5 * (surround + peak), 255, cv2.THRESH_BINARY)[1]
+    blobs = []
+    for outline in cv2.findContours(half, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)[0]:
+        area = _pixels_in(outline)
+        if not blob_filter.min_area_px <= area <= blob_filter.max_area_px:
+            continue
+        x, y, width, height = cv2.boundingRect(outline)
+        x, y = x + columns.start, y + rows.start
+        if x == 0 or y == 0 or x + width == part.shape[1] or y + height == part.shape[0]:
+            continue
+        window = _around((x, y, width, height))
+        cut = part[window]
+        surround, peak = _surround(cut), cv2.minMaxLoc(cut)[1]
+        if peak - surround >= blob_filter.min_contrast:
+            blobs.append(
+                _make_blob(cut, window, area=area, surround=surround, peak=peak, origin=origin)
+            )
+    return blobs
+
+
+def _around(box: Sequence[int]) -> Window:
+    """Return rows and columns of a box (x, y, width, height) with its surroundings."""
+    x, y, width, height = box
+    return (
+        slice(max(y - SURROUND_PX, 0), y + height + SURROUND_PX),
+        slice(max(x - SURROUND_PX, 0), x + width + SURROUND_PX),
+    )
+
+
+def _surround(cut: Image) -> float:
+    """Return the level of a cut-out's outermost pixels."""
+    border = np.concatenate((cut[0], cut[-1], cut[:, 0], cut[:, -1]))
+    border.sort()
+    return float(border[int(SURROUND_RANK * border.size)])
+
+
+def _make_blob(
+    cut: Image,
+    window: Window,
+    *,
+    area: float,
+    surround: float,
+    peak: float,
+    origin: tuple[int, int],
+) -> Blob:
+    """Make the blob of `area` pixels in a window of an image part that begins at `origin`."""
+    rows, columns = window
+    found = _light_moments(cut, surround, peak)
+    light = found["m00"]
+    a, b, c = found["mu20"] / light, found["mu11"] / light, found["mu02"] / light
+    # Motion at constant speed adds a twelfth of its square to the second moment along it.
+    uneven = math.hypot(0.5 * (a - c), b)
+    angle, length = 0.5 * math.atan2(2.0 * b, a - c), math.sqrt(24.0 * uneven)
+    return Blob(
+        centre=(
+            origin[1] + columns.start + found["m10"] / light,
+            origin[0] + rows.start + found["m01"] / light,
+        ),
+        radius=math.sqrt(area / math.pi),
+        motion=(length * math.cos(angle), length * math.sin(angle)),
+        spread=(0.5 * (a + c) - uneven) * 4.0 * math.pi / area,
+        peak=peak,
+        surround=surround,
+        window=(
+            slice(origin[0] + rows.start, origin[0] + rows.stop),
+            slice(origin[1] + columns.start, origin[1] + columns.stop),
+        ),
+    )
+
+
+def _light_moments(cut: Image, surround: float, peak: float) -> dict[str, float]:
+    """Return the moments of the light above the skirt, whose weights fall to zero at its border."""
+    skirt = surround + SKIRT_FRACTION * (peak - surround)
+    return cv2.moments(np.maximum(cut - np.float32(skirt), np.float32(0.0)))
+
+
+SHARP_PX = 1.2
+"""Blur of an edge, one standard deviation, that any lens in focus may have."""
+
+MAX_SPREAD = 1.7
+"""A blob whose light spreads wider than this relative to its area is too blurred to be a disc."""
+
+
+@dataclass(frozen=True, slots=True)
+class SystematicError:
+    """Hold a method's errors apart from pixel noise, one standard deviation per axis.
+
+    still_px: error by the pixel grid and uneven ground.
+    moving: further error, as a fraction of the motion during the exposure.
+    """
+
+    still_px: float
+    moving: float
+
+    def covariance(self, motion: tuple[float, float]) -> Floats:
+        """Return the covariance (2, 2) px^2 for a marker with this motion during the exposure."""
+        variance = self.still_px**2 + (self.moving * math.hypot(*motion)) ** 2
+        return np.array([[variance, 0.0], [0.0, variance]])
+
+
+BY_MOMENTS = SystematicError(still_px=0.1, moving=0.03)
+BY_WEIGHTED_CENTROID = SystematicError(still_px=0.03, moving=0.012)
+BY_SUBPIXEL_FIT = SystematicError(still_px=0.004, moving=0.005)
+"""Chosen so that simulated errors, normalised by the stated covariance, have unit variance
+(`tests/test_marker.py`)."""
+
+
+def moments(
+    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
+) -> list[Marker]:
+    """Return the centre of the area brighter than half the marker's height, unweighted."""
+    markers = []
+    for image, blob in zip(images, blobs, strict=True):
+        level = 0.5 * (blob.surround + blob.peak)
+        bright = cv2.threshold(image[blob.window], level, 1, cv2.THRESH_BINARY)[1]
+        found = cv2.moments(bright, binaryImage=True)
+        markers.append(_marker_from_moments(blob, found, np.zeros((2, 2)), blob_filter, BY_MOMENTS))
+    return markers
+
+
+def weighted_centroid(
+    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
+) -> list[Marker]:
+    """Return the centroid of the marker's light.
+
+    A pixel on the marker's edge counts by its lit fraction, which removes most of the pixel grid's
+    error.  The weight falls to zero at the skirt, so that no pixel jumps in or out.  The noise of
+    each pixel moves the centre by its distance from it over all the light.
+    """
+    markers = []
+    for image, blob in zip(images, blobs, strict=True):
+        cut = image[blob.window]
+        found = _light_moments(cut, blob.surround, blob.peak)
+        skirt = blob.surround + SKIRT_FRACTION * (blob.peak - blob.surround)
+        variance = np.where(
+            cut > skirt, noise.read_levels**2 + cut / noise.photons_per_level, 0.0
+        ) / (found["m00"] ** 2)
+        x = np.arange(cut.shape[1]) - found["m10"] / found["m00"]
+        y = np.arange(cut.shape[0]) - found["m01"] / found["m00"]
+        across = float(y @ variance @ x)
+        covariance = np.array(
+            [
+                [variance.sum(axis=0) @ (x * x), across],
+                [across, variance.sum(axis=1) @ (y * y)],
+            ]
+        )
+        markers.append(
+            _marker_from_moments(blob, found, covariance, blob_filter, BY_WEIGHTED_CENTROID)
+        )
+    return markers
+
+
+def _marker_from_moments(
+    blob: Blob,
+    found: dict[str, float],
+    covariance: Floats,
+    blob_filter: BlobFilter,
+    systematic: SystematicError,
+) -> Marker:
+    """Make a marker from the moments of its window; only the spread of its light can reject it."""
+    rows, columns = blob.window
+    rejection_reason: MarkerRejection | None = None
+    if blob.spread > MAX_SPREAD:
+        rejection_reason = "blurred"
+    if math.hypot(*blob.motion) > blob_filter.max_motion_px:
+        rejection_reason = "merged"
+    return Marker(
+        centre=np.array(
+            [columns.start + found["m10"] / found["m00"], rows.start + found["m01"] / found["m00"]]
+        ),
+        covariance=covariance + systematic.covariance(blob.motion),
+        radius=blob.radius,
+        radius_deviation=0.1,
+        blur=blob.blur,
+        motion=blob.motion,
+        height=blob.height,
+        rejection_reason=rejection_reason,
+    )
+
+
+def subpixel_fit(
+    images: Sequence[Image], blobs: Sequence[Blob], blob_filter: BlobFilter, noise: PixelNoise
+) -> list[Marker]:
+    """Fit a motion-blurred disc by maximum likelihood, see `nodes.triangulator.subpixel`."""
+    starts = [
+        DiscStart(blob.centre, blob.radius, blob.blur, blob.peak, blob.surround, blob.motion)
+        for blob in blobs
+    ]
+    markers = []
+    for blob, fit in zip(blobs, fit_discs(images, starts, noise), strict=True):
+        rejection_reason: MarkerRejection | None = None
+        if fit.blur > max(blob_filter.max_blur * fit.radius, SHARP_PX):
+            rejection_reason = "blurred"
+        if (
+            not fit.converged
+            or fit.misfit > blob_filter.max_misfit
+            or math.hypot(*fit.motion) > blob_filter.max_motion_px
+        ):
+            rejection_reason = "merged"
+        markers.append(
+            Marker(
+                centre=fit.centre,
+                covariance=fit.covariance + BY_SUBPIXEL_FIT.covariance(fit.motion),
+                radius=fit.radius,
+                radius_deviation=0.02,
+                blur=fit.blur,
+                motion=fit.motion,
+                height=blob.height,
+                rejection_reason=rejection_reason,
+            )
+        )
+    return markers
+
+
+MARKER_METHODS: dict[str, Refine] = {
+    "moments": moments,
+    "weighted_centroid": weighted_centroid,
+    "subpixel_fit": subpixel_fit,
+}

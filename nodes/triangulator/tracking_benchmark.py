@@ -1,0 +1,158 @@
+"""Benchmark the tracking methods: the error of the predicted finger at the time of its use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from messages.scene import Scene
+from nodes.methods import Case, Family, Trial
+from nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter
+from nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+
+Floats = NDArray[np.float64]
+TruePath = Callable[[float], Floats]
+"""True fingertip (3,) m in the world at a time (s)."""
+
+MARKER_NOISE_PX = 0.01
+"""Noise of a marker's centre by the subpixel fit, at half a metre (`flexsheet chart marker`)."""
+
+HORIZONS_S = (0.0, 0.02, 0.05)
+"""Prediction horizons: at the exposure, for the image, and for the arms with their servo lag."""
+
+WARM_UP_S = 0.4
+SPEED_STEP_S = 0.02
+SPEED_MARGIN = 1.5
+"""Factor over the scene's speed, which allows for unsteadiness and starts."""
+WITHOUT_VELOCITY = ("none",)
+"""Methods whose range is a resting finger; without a horizon they also hold for a moving one."""
+
+
+@dataclass(frozen=True, slots=True)
+class TruePathCase:
+    """Hold a finger's true path from time 0 on, and whether it rests apart from its
+    unsteadiness."""
+
+    path: TruePath
+    duration_s: float
+    resting: bool
+
+    @property
+    def speed_m_per_s(self) -> float:
+        """Speed (m/s) that the path exceeds for a tenth of the time."""
+        times = np.arange(WARM_UP_S, self.duration_s, SPEED_STEP_S)
+        points = np.array([self.path(float(time)) for time in times])
+        distances = np.linalg.norm(np.diff(points, axis=0), axis=1)
+        return float(np.quantile(distances, 0.9)) / SPEED_STEP_S
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredPath:
+    """Hold times (n,) ns, measured points (n, 3), covariances (n, 3, 3) and the truth (n, 3) by
+    horizon."""
+
+    times_ns: NDArray[np.int64]
+    points: Floats
+    covariances: Floats
+    truth: Mapping[float, Floats]
+
+
+def measured(scene: Scene, motion: TruePathCase, *, seed: int) -> MeasuredPath:
+    """Measure a path with the scene's rig: triangulate markers with noise."""
+    geometry, random = StereoGeometry.of(scene.camera), np.random.default_rng(seed)
+    times = np.arange(0.0, motion.duration_s, 1.0 / scene.camera.rate_hz)
+    covariance_px = MARKER_NOISE_PX**2 * np.eye(2)
+    points, covariances, measured_at = [], [], []
+    for time in times:
+        left, right = geometry.project(motion.path(float(time)))
+        found = measure(
+            geometry,
+            left + MARKER_NOISE_PX * random.standard_normal(2),
+            right + MARKER_NOISE_PX * random.standard_normal(2),
+            method=dlt,
+            left_covariance=covariance_px,
+            right_covariance=covariance_px,
+        )
+        if found is not None:
+            points.append(found.point_world)
+            covariances.append(found.covariance)
+            measured_at.append(time)
+    at = np.array(measured_at)
+    truth = {
+        horizon: np.array([motion.path(float(t) + horizon) for t in at]) for horizon in HORIZONS_S
+    }
+    return MeasuredPath(
+        np.round(at * 1e9).astype(np.int64), np.array(points), np.array(covariances), truth
+    )
+
+
+def predict_path(filter_: Filter, seen: MeasuredPath, horizon_s: float) -> Floats:
+    """Return, after each measurement, the filter's prediction at the horizon."""
+    horizons, predicted = np.array([horizon_s]), np.empty_like(seen.points)
+    estimate: Estimate | None = None
+    for i, at_ns in enumerate(seen.times_ns.tolist()):
+        point, covariance = seen.points[i], seen.covariances[i]
+        estimate = (
+            filter_.initialize(at_ns, point, covariance)
+            if estimate is None
+            else filter_.update(estimate, at_ns, point, covariance)
+        )
+        predicted[i] = filter_.predict(estimate, horizons)[0]
+    return predicted
+
+
+def make_tracking_family(motions: Callable[[Scene], Mapping[str, TruePathCase]]) -> Family:
+    """Make the method family from true paths by name."""
+
+    def trials(scene: Scene) -> Iterator[Trial]:
+        for name, motion in motions(scene).items():
+            seen = measured(scene, motion, seed=1)
+            in_scene = (
+                motion.resting
+                or motion.speed_m_per_s <= SPEED_MARGIN * scene.working_range.speed_m_per_s
+            )
+            for horizon_s in HORIZONS_S:
+                for method in TRACKING_METHODS:
+                    just_measured = method == "none" and horizon_s == 0.0
+                    in_range = method not in WITHOUT_VELOCITY or motion.resting or just_measured
+                    case: Case = {"motion": name, "lead_ms": round(1e3 * horizon_s)}
+                    trial = _trial(scene, method, case, seen, horizon_s, in_range=in_range)
+                    yield replace(trial, in_scene=in_scene)
+
+    return Family(
+        name="tracking",
+        unit="mm",
+        reference="true finger at the moment of use",
+        methods=tuple(TRACKING_METHODS),
+        trials=trials,
+        tolerance=lambda scene: 1e3 * scene.tolerances.sheet_position_m,
+    )
+
+
+def _trial(
+    scene: Scene, method: str, case: Case, seen: MeasuredPath, horizon_s: float, *, in_range: bool
+) -> Trial:
+    """Make a trial that times one update with its prediction, and rates the path after its
+    warm-up."""
+    filter_ = TRACKING_METHODS[method](scene.finger.max_speed_m_per_s)
+    middle = len(seen.times_ns) // 2
+    before = filter_.initialize(
+        int(seen.times_ns[middle - 1]), seen.points[middle - 1], seen.covariances[middle - 1]
+    )
+    horizons = np.array([horizon_s])
+
+    def run() -> Floats:
+        after = filter_.update(
+            before, int(seen.times_ns[middle]), seen.points[middle], seen.covariances[middle]
+        )
+        return filter_.predict(after, horizons)
+
+    def error_mm(_: Floats) -> float:
+        is_warm = seen.times_ns >= WARM_UP_S * 1e9
+        off = (predict_path(filter_, seen, horizon_s) - seen.truth[horizon_s])[is_warm]
+        return 1e3 * float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+    return Trial(method=method, case=case, run=run, error=error_mm, in_range=in_range)

@@ -1,0 +1,64 @@
+"""Queue the frames that the simulated eye renders: one per label and correction."""
+
+from __future__ import annotations
+
+from typing import Generic, TypeVar
+
+Key = tuple[str, str]
+"""Label and correction of a frame."""
+
+J = TypeVar("J")
+
+
+class RenderQueue(Generic[J]):
+    """Hold the jobs that wait, and tell which frames are rendered.
+
+    max_length: number of jobs that may wait.
+    min_interval_s: time before the same key is rendered again.
+    """
+
+    def __init__(self, max_length: int, min_interval_s: float) -> None:
+        self._max_length, self._min_interval_s = max_length, min_interval_s
+        self._jobs: dict[Key, J] = {}
+        self._last: tuple[Key, int] | None = None
+        self._rejected: set[Key] = set()
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no further job may wait."""
+        return len(self._jobs) >= self._max_length
+
+    def is_known(self, key: Key, now_ns: int) -> bool:
+        """Whether a job of the key waits, or was the last one and is still recent."""
+        if key in self._jobs:
+            return True
+        if self._last is None or self._last[0] != key:
+            return False
+        return now_ns - self._last[1] < self._min_interval_s * 1e9
+
+    def reject(self, key: Key) -> bool:
+        """Reject a key while the queue is full; True the first time, which is to be reported."""
+        is_new = key not in self._rejected
+        self._rejected.add(key)
+        return is_new
+
+    def add(self, key: Key, job: J) -> None:
+        """Append a job, or replace the one of the same key."""
+        self._jobs[key] = job
+
+    def next(self) -> tuple[Key, J]:
+        """Return the oldest job, which stays in the queue until `finish`."""
+        return next(iter(self._jobs.items()))
+
+    def finish(self, key: Key, now_ns: int) -> None:
+        """Remove a rendered job."""
+        self._jobs.pop(key, None)
+        self._rejected.discard(key)
+        self._last = (key, now_ns)
+
+    def clear(self) -> None:
+        """Drop all jobs that wait."""
+        self._jobs.clear()
