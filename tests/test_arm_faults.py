@@ -175,8 +175,8 @@ async def test_a_status_that_is_repeated_makes_no_arm_leap(
         stroke.cut.repeats = repeats
         await until(lambda: words in stroke.reasons())
         await until(lambda: stroke.modes() <= {"idle", "fault"})
-        await stroke.lasts(150)
-        assert stroke.modes() <= {"idle", "fault"}
+        states = await stroke.lasts(150)
+        assert {state.mode for state in states} <= {"idle", "fault", "relax"}
         steps = [
             np.abs(np.diff([state.joints_commanded_rad for state, _ in states], axis=0)).max()
             for states in stroke.rig.states.values()
@@ -220,7 +220,9 @@ async def test_a_frozen_arm_is_a_fault_of_it_until_somebody_resets_it() -> None:
         assert "fault" in stroke.modes()
         stroke.suffer("none")
         states = await stroke.lasts(40)
-        assert {state.mode for state in states} <= {"idle", "fault"}
+        # Standing still for a while, it may let the sheet go; it follows nothing.
+        assert {state.mode for state in states} <= {"idle", "fault", "relax"}
+        await until(lambda: stroke.modes() <= {"idle", "fault"})
         for side in ("left", "right"):
             message = EStop(engaged=False, reason="seen to")
             header = stroke.rig.header(stroke.rig.clock.now_ns())

@@ -16,7 +16,7 @@ from messages.clock_table import MAX_STAMP_AHEAD_NS
 from messages.types import Arming, ArmMode, ArmState, EStop
 from nodes.arm_bridge.geometry import ArmGeometry
 from nodes.arm_bridge.goal import Goal, pace, slowed
-from nodes.arm_bridge.kinematics import UnreachableError
+from nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
 from nodes.arm_bridge.limiter import (
     SheetLimits,
     bounded_step,
@@ -100,6 +100,9 @@ ALIGNED_RAD = 1e-4
 MAX_FUTURE_S = 0.02
 """A state of the other arm from further in the future cannot be right.  Measured clocks are off by
 less, and a state that was believed would stay fresh for as long as it lies ahead."""
+
+MAX_BEYOND_RANGE_RAD = 0.02
+"""Measured joints further beyond the maker's ranges are not those of an arm."""
 
 LOOK_AGAIN_S = 0.5
 """How long a barred way stays barred before it is looked at again, the target having moved on."""
@@ -298,7 +301,7 @@ class ArmControl:
         if not freshness.is_believed and not self.faults:
             self.faults = (f"arm: {NOT_BELIEVED[freshness]}",)
         self.measured_rad = self.last_measured_rad
-        if not self._has_commanded:
+        if not self._has_commanded and not self._standstill.has_jumped:
             self.commanded_rad = self.measured_rad
         if arm_faults == ("watchdog: no command",):
             # The cycle came late, the arm has stopped by itself: begin again from where it stands.
@@ -820,8 +823,7 @@ class ArmControl:
 
     def _is_where_sent(self, measured: Floats) -> bool:
         """Whether the arm stands at its last command, near enough to start from the measurement."""
-        shift_m = edge_shift_m(self.commanded_rad, measured)
-        return not self._has_commanded or shift_m <= MAX_RESTART_SHIFT_M
+        return edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
 
     def _stands_still(self, measured: Floats) -> bool:
         return self._standstill.is_standing(where_sent=self._is_where_sent(measured))
@@ -833,6 +835,11 @@ class ArmControl:
         Elsewhere, either the arm has not obeyed or the measurement is wrong, which is a leap if it
         is believed.
         """
+        beyond = max(
+            float((JOINT_MIN_RAD - measured).max()), float((measured - JOINT_MAX_RAD).max())
+        )
+        if beyond > MAX_BEYOND_RANGE_RAD:
+            return f"measured joints are {np.degrees(beyond):.1f} degrees beyond their range"
         if self._is_where_sent(measured):
             return None
         monitor = self._standstill

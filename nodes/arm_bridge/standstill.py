@@ -27,7 +27,7 @@ MAX_RESTART_SHIFT_M = 0.005
 Joint servos with a lag of 15 ms or more cover 5 mm with less than 0.25 m/s."""
 
 JUMP_MARGIN_RAD = 0.002
-JUMP_SPEED_RAD_PER_S = 0.3
+JUMP_SPEED_RAD_PER_S = 0.5
 """Measurements may change by the margin, and by this speed also while no command moves the arm: it
 may be moved with its teach pendant."""
 
