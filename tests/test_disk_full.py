@@ -31,7 +31,9 @@ def fill(disk: Path) -> None:
             return
 
 
-LAUNCH = "hosts: {main: {address: 127.0.0.1}}\nnodes: {arms: {type: twin_arms, topics: {scene: null}}}\n"
+LAUNCH = (
+    "hosts: {main: {address: 127.0.0.1}}\nnodes: {arms: {type: twin_arms, topics: {scene: null}}}\n"
+)
 KEY = "rq:rM>}U?@Lns47E1%kR.o@n%FcmmsL/@{H8]yf7"
 
 COMMANDS = {
