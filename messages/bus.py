@@ -291,7 +291,7 @@ class Publisher:
     def _serve_subscribers(self) -> None:
         """Read what peers sent, a batch at a time; send a new subscriber the latched message."""
         for _ in range(BATCH):
-            if self._socket.closed or not int(self._socket.getsockopt(EVENTS)) & POLLIN:  # type: ignore[arg-type]  # an int option
+            if self._socket.closed or not int(self._socket.getsockopt(EVENTS)) & POLLIN:
                 return
             peer, *frames = self._socket.recv_multipart(NOBLOCK, copy=False)
             self._on_peer_message(peer.bytes, frames)
