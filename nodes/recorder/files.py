@@ -11,7 +11,6 @@ from pathlib import Path
 from messages.bag import BagError, BagWriter
 from messages.files import free_bytes
 
-
 __all__ = ["free_bytes", "free_path", "open_bag"]
 
 
