@@ -9,11 +9,16 @@ from typing import Any, TypeVar
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
 from messages.files import write_file
 from messages.scene import Part
 
 Calibration = TypeVar("Calibration", bound=Part)
+
+
+MAX_CALIBRATION_BYTES = 1 << 20
+MAX_CALIBRATION_DEPTH = 12
 
 
 class CalibrationFileError(ValueError):
@@ -40,6 +45,25 @@ def write_calibration(calibration: Part, path: Path, *, title: str, comment: str
     write_file(path, text.getvalue())
 
 
+def _parse(path: Path) -> Any:
+    """The values of a file; YAMLError for one that no command of ours has written."""
+    with path.open("rb") as file:
+        data = file.read(MAX_CALIBRATION_BYTES + 1)
+    if len(data) > MAX_CALIBRATION_BYTES:
+        raise YAMLError(f"more than {MAX_CALIBRATION_BYTES} bytes")
+    text = data.decode()
+    depth = 0
+    for event in YAML(typ="safe").parse(text):
+        # A few aliases can stand for any number of values.
+        if isinstance(event, AliasEvent):
+            raise YAMLError("an alias (*), which no calibration has")
+        depth += isinstance(event, CollectionStartEvent)
+        depth -= isinstance(event, CollectionEndEvent)
+        if depth > MAX_CALIBRATION_DEPTH:
+            raise YAMLError(f"more than {MAX_CALIBRATION_DEPTH} lists or mappings are nested")
+    return YAML(typ="safe").load(text)
+
+
 def read_calibration(
     kind: type[Calibration], path: Path, *, version: int, command: str
 ) -> Calibration:
@@ -49,13 +73,16 @@ def read_calibration(
     incomplete.
     """
     try:
-        content: Any = YAML(typ="safe").load(path.read_text())
+        content = _parse(path)
     except OSError as error:
         raise CalibrationFileError(
             f"{path}: cannot be read: {error.strerror}; name a file that `{command}` wrote"
         ) from error
-    except (YAMLError, UnicodeDecodeError) as error:
-        raise CalibrationFileError(f"{path}: not YAML: {error}") from error
+    # Numbers and dates that are none make the parser raise what it likes.
+    except (YAMLError, ValueError, RecursionError, TypeError) as error:
+        raise CalibrationFileError(
+            f"{path}: not YAML that `{command}` wrote: {str(error)[:200]}"
+        ) from error
     if not isinstance(content, dict) or "version" not in content:
         raise CalibrationFileError(
             f'{path}: no key "version": not a calibration; `{command}` writes one'
@@ -70,6 +97,6 @@ def read_calibration(
     except ValidationError as error:
         problems = "; ".join(
             f"{'.'.join(str(part) for part in problem['loc'])}: {problem['msg']}"
-            for problem in error.errors()
+            for problem in error.errors()[:5]
         )
         raise CalibrationFileError(f"{path}: not what `{command}` writes: {problems}") from error

@@ -28,7 +28,7 @@ from messages.scene import Plane, Sphere
 from messages.types import TwinArms, TwinFinger
 from nodes.models.rigid import apply, inverse, rotation_from_vector
 from nodes.models.shapes import CylinderShape, make_shape
-from nodes.twin.paths import over_surface
+from nodes.twin.paths import map_to_surface
 from tests import sessions
 from tests.arm_states import arm_state
 
@@ -265,7 +265,7 @@ def test_a_sheet_that_lags_on_a_curved_object_is_off_by_the_chord(name: str) -> 
     scene = load_scene(ROOT / "launch" / "scenes" / f"{name}.yaml")
     count, lag = 200, 4
     ways = np.column_stack([np.linspace(-0.02, 0.02, count), np.linspace(-0.01, 0.03, count)])
-    points = over_surface(scene, np.column_stack([ways, np.zeros(count)]))
+    points = map_to_surface(scene, np.column_stack([ways, np.zeros(count)]))
     world_from_object = stroke.object_pose(scene)
     shape = make_shape(dict(scene.object.geometry))
     foot = shape.closest(apply(inverse(world_from_object), points))

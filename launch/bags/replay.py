@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from launch.plans.documents import did_you_mean
 from launch.plans.planned import Plan, PlannedNode
@@ -32,7 +32,7 @@ from messages.clock import VirtualClock
 from messages.topics import TOPICS, Delivery, Topic
 from messages.types import Clocks, Status
 from messages.wire import decode, encode
-from nodes import node_class
+from nodes import UnknownNodeError, node_class
 from nodes.node import Node, parameters_of, timers_of
 
 REFUSALS = {
@@ -152,13 +152,19 @@ def verify(
 ) -> Verification:
     """Replay node `name` of the bag's plan twice; BagError for a bag that does not allow it."""
     reader = BagReader(bag)
-    plan = Plan.model_validate_json(reader.attachment("plan.json"))
+    plan = _plan_of(reader)
     if name not in plan.nodes:
         raise BagError(
             f'{bag}: no node "{name}" in its plan; {did_you_mean(name, list(plan.nodes))}'
         )
     node = plan.nodes[name]
-    if why := refusal(node):
+    try:
+        why = refusal(node)
+    except (ValidationError, UnknownNodeError) as error:
+        raise BagError(
+            f"{bag}: {name} is not of today's code; verify it with the code of the recording"
+        ) from error
+    if why:
         raise BagError(f"{name} is not replayed: {why}")
     _check_inputs(bag, reader, plan, node)
     first = asyncio.run(replay(bag, node, lambda done, total: progress(done, 2 * total)))
@@ -177,6 +183,16 @@ def verify(
         topics=compare(bag, node, first, tolerance),
         tolerance=tolerance,
     )
+
+
+def _plan_of(reader: BagReader) -> Plan:
+    try:
+        return Plan.model_validate_json(reader.attachment("plan.json"))
+    except ValidationError as error:
+        raise BagError(
+            f"{reader.path}: its plan.json is no plan of today's code; verify it with the code of "
+            "the recording"
+        ) from error
 
 
 def refusal(node: PlannedNode) -> str:

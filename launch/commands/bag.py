@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from launch.running.runs import Run
 
 SHOWN_EVERY_S = 0.2
+MAX_TOPICS_LISTED = 10
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Bags: recordings of topics (MCAP files)."
@@ -191,8 +192,11 @@ def export(
 
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
-    for topic in result.unreadable:
-        words.print(f"not exported: {topic} (its type has changed since)", markup=False)
+    if result.unreadable:
+        listed = ", ".join(result.unreadable[:MAX_TOPICS_LISTED])
+        more = len(result.unreadable) - MAX_TOPICS_LISTED
+        also = f" and {more} more" if more > 0 else ""
+        words.print(f"not exported: {listed}{also} (their types have changed)", markup=False)
     if as_json:
         print_json({**asdict(result), "output": str(output)})
         return

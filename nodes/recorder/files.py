@@ -9,6 +9,9 @@ from itertools import count
 from pathlib import Path
 
 from messages.bag import BagError, BagWriter
+from messages.files import free_bytes
+
+__all__ = ["free_bytes", "free_path", "open_bag"]
 
 
 def free_path(path: Path) -> Path:

@@ -10,12 +10,11 @@ from typing import Any, ClassVar
 
 from messages.bag import BagError, BagWriter
 from messages.base import Header
-from messages.files import free_bytes
 from messages.topics import Delivery, Topic, topic_named
 from messages.types import Recording
 from messages.wire import decode
 from nodes.node import Input, Node, periodic
-from nodes.recorder.files import open_bag
+from nodes.recorder.files import free_bytes, open_bag
 from nodes.recorder.parameters import RecorderParameters
 
 TRY_AGAIN_NS = 5_000_000_000

@@ -76,6 +76,9 @@ def _of_the_load(numbers: dict[str, Any], others: list[Finding]) -> Iterator[Fin
         yield Finding(gravity, f"{text}What to do: {BUSY_REMEDY}.", "bag")
 
 
+MAX_TOPICS_LISTED = 10
+
+
 def _of_the_bag(numbers: dict[str, Any]) -> Iterator[Finding]:
     bag = numbers["bag"]
     if not bag["complete"]:
@@ -86,10 +89,16 @@ def _of_the_bag(numbers: dict[str, Any]) -> Iterator[Finding]:
         yield Finding(
             "bad", f"The recorder lost {lost} messages before this bag (a full disk).", "bag"
         )
-    for name, topic in numbers["topics"].items():
-        if topic["readable"] is False:
-            text = f"{name} cannot be read: {topic['type']} has changed since the recording."
-            yield Finding("doubtful", text, "topics")
+    unreadable = [
+        f"{name} cannot be read: {topic['type']} has changed since the recording."
+        for name, topic in numbers["topics"].items()
+        if topic["readable"] is False
+    ]
+    for text in unreadable[:MAX_TOPICS_LISTED]:
+        yield Finding("doubtful", text, "topics")
+    if len(unreadable) > MAX_TOPICS_LISTED:
+        text = f"{len(unreadable) - MAX_TOPICS_LISTED} more topics cannot be read."
+        yield Finding("doubtful", text, "topics")
     if numbers["git"].get("changed"):
         text = "The code had been changed since its commit: this run cannot be repeated exactly."
         yield Finding("doubtful", text, "bag")
