@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nodes.console import panels
 from nodes.console.controls import Html
-from nodes.console.history import SERIES, WINDOW_S
+from nodes.console.history import SERIES, WINDOW_S, widen_isolated
 
 Floats = NDArray[np.float64]
 
@@ -42,4 +42,4 @@ class GraphTab:
 
     def show(self, tables: str, columns: tuple[Floats, ...]) -> None:
         self._tables.show(tables)
-        self._chart.data = columns
+        self._chart.data = widen_isolated(columns)
