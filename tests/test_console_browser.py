@@ -39,10 +39,10 @@ INKED_POINTS = """() => {
     const data = canvas.getContext("2d").getImageData(0, 0, width, height).data;
     let inked = 0;
     for (let i = 0; i < data.length; i += 4)
-        if (data[i] === 36 && data[i + 1] === 133 && data[i + 2] === 181) inked += 1;
+        if (data[i] < 90 && Math.abs(data[i + 1] - 133) < 50 && data[i + 2] > 130) inked += 1;
     return inked / ratio;
 }"""
-"""How many pixels of the chart have the first line's colour."""
+"""How many pixels of the chart have about the first line's colour."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class Findings:
     slider_boxes: dict[str, Any] = field(default_factory=dict)
     stop_boxes: dict[str, Any] = field(default_factory=dict)
     single_sample_ink: float = 0.0
-    framed: dict[str, str] = field(default_factory=dict)
+    framed: dict[str, int] = field(default_factory=dict)
 
 
 @asynccontextmanager
@@ -169,14 +169,14 @@ class Framing(BaseHTTPRequestHandler):
 
 
 async def open_in_frames(url: str, tab: BrowserTab, found: Findings) -> None:
-    """Show the console inside pages of another origin, and note what their frames hold."""
+    """Show the console inside pages of another origin, and note what it answers."""
     site = ThreadingHTTPServer(("127.0.0.1", 0), partial(Framing, url))
     Thread(target=site.serve_forever, daemon=True).start()
     try:
         for tag in ("iframe", "object", "embed"):
-            await tab.goto(f"http://localhost:{site.server_port}/{tag}", wait_until="load")
-            held = [await frame.content() for frame in tab.frames if frame != tab.main_frame]
-            found.framed[tag] = " ".join(held)
+            async with tab.expect_response(url) as answer:
+                await tab.goto(f"http://localhost:{site.server_port}/{tag}")
+            found.framed[tag] = (await answer.value).status
     finally:
         await asyncio.to_thread(site.shutdown)
         site.server_close()
@@ -228,5 +228,4 @@ def test_a_single_sample_is_a_point_of_the_chart(found: Findings) -> None:
 
 
 def test_the_console_is_not_shown_in_a_frame(found: Findings) -> None:
-    assert set(found.framed) == {"iframe", "object", "embed"}
-    assert "E-STOP" not in "".join(found.framed.values())
+    assert found.framed == {"iframe": 403, "object": 403, "embed": 403}

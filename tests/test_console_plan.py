@@ -73,3 +73,9 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
     assert facts(console=True) == on_request
     always = facts(console=True, record=tmp_path / "a.mcap")
     assert always == GraphFacts(records=True, records_on_request=False)
+
+
+def test_a_picture_that_somebody_waits_for_has_the_priority_of_a_frame() -> None:
+    """On two busy cores the first picture of the Eye tab took a minute and a half."""
+    nodes = load_plan(ROOT / "launch" / "demo.yaml").nodes
+    assert nodes["twin_eye"].nice <= nodes["renderer"].nice

@@ -12,7 +12,8 @@ from messages.types import ArmState, PortStatus, Status
 from nodes.console import banner, dress, panels
 from nodes.console.banner import BannerState, GraphState
 from nodes.console.desk import LookState
-from nodes.console.history import SERIES, WINDOW_S, History
+from nodes.console.graph_tab import max_latency_ms
+from nodes.console.history import SERIES, WINDOW_S, History, widen_isolated
 from nodes.console.page import STOP_COLOR
 from nodes.console.record_tab import RECORDING_COLOR
 from tests.arm_states import arm_state
@@ -257,3 +258,20 @@ def test_latencies_are_from_the_exposure_on() -> None:
     legend = panels.latency_table(told)
     assert ">8<" in legend
     assert "–" in legend, "nothing was drawn"
+
+
+def test_a_value_without_neighbours_becomes_a_line_of_the_chart() -> None:
+    nan = np.nan
+    times, one, none = widen_isolated((np.zeros(1), np.array([3.0]), np.array([nan])))
+    assert times.tolist() == [-0.5, 0.0]
+    assert one.tolist() == [3.0, 3.0]
+    assert np.isnan(none).all()
+    values = np.array([1.0, nan, nan, 2.0, nan, 4.0, 5.0])
+    _, shown = widen_isolated((np.arange(7.0), values))
+    np.testing.assert_array_equal(shown, [1.0, 1.0, 2.0, 2.0, nan, 4.0, 5.0])
+
+
+@pytest.mark.parametrize(("largest", "top"), [(np.nan, 1), (0.3, 1), (3, 5), (20, 20), (21, 50)])
+def test_the_chart_ends_above_all_values(largest: float, top: float) -> None:
+    columns = np.zeros(2), np.array([np.nan, largest]), np.full(2, np.nan)
+    assert max_latency_ms(columns) == pytest.approx(top)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from nodes.console import panels
 from nodes.console.controls import Html
-from nodes.console.history import SERIES, WINDOW_S
+from nodes.console.history import SERIES, WINDOW_S, widen_isolated
 
 Floats = NDArray[np.float64]
 
@@ -29,10 +29,7 @@ class GraphTab:
         self._chart = gui.add_uplot(
             (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES)),
             ({"label": "s"}, *lines),
-            scales={
-                "x": {"time": False, "range": (-WINDOW_S, 0.0)},
-                "y": {"auto": True},
-            },
+            scales=_scales(1.0),
             axes=({}, {}),
             legend={"show": False},
             height=180,
@@ -42,4 +39,23 @@ class GraphTab:
 
     def show(self, tables: str, columns: tuple[Floats, ...]) -> None:
         self._tables.show(tables)
-        self._chart.data = columns
+        # Set here, as uPlot finds no range where one of the series has no value at all.
+        scales = _scales(max_latency_ms(columns))
+        if self._chart.scales != scales:
+            self._chart.scales = scales
+        self._chart.data = widen_isolated(columns)
+
+
+def _scales(top_ms: float) -> dict[str, Any]:
+    return {
+        "x": {"time": False, "range": (-WINDOW_S, 0.0)},
+        "y": {"auto": False, "range": (0.0, top_ms)},
+    }
+
+
+def max_latency_ms(columns: tuple[Floats, ...]) -> float:
+    """Return the end of the chart's scale: the next of 1, 2, 5, 10, ... ms above all values."""
+    values = np.concatenate(columns[1:])
+    largest = float(values[np.isfinite(values)].max(initial=1.0))
+    decade = 10.0 ** np.floor(np.log10(largest))
+    return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= largest))

@@ -13,6 +13,7 @@ from nodes.console.newest import Source
 Floats = NDArray[np.float64]
 
 WINDOW_S = 30.0
+SAMPLE_S = 0.5
 SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "frame drawn")
 
 
@@ -44,6 +45,24 @@ class History:
             known = values[np.isfinite(values)]
             found[name] = float(values[-1]), float(known.max()) if len(known) else float("nan")
         return found
+
+
+def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
+    """Return the columns so that a line is drawn of each value: one without a neighbour is repeated
+    at the sample beside it, and a single sample half a second earlier."""
+    times, *series = columns
+    if len(times) == 1:
+        times = np.array([times[0] - SAMPLE_S, times[0]])
+        series = [np.repeat(values, 2) for values in series]
+    widened = []
+    for values in series:
+        known = np.isfinite(values)
+        lonely = known & ~np.r_[False, known[:-1]] & ~np.r_[known[1:], False]
+        beside = np.flatnonzero(lonely)
+        filled = values.copy()
+        filled[np.where(beside > 0, beside - 1, 1)] = values[beside]
+        widened.append(filled)
+    return (times, *widened)
 
 
 def latencies_ms(source: Source) -> tuple[float, ...]:

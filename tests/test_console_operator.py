@@ -1,0 +1,162 @@
+"""What the page shows agrees with what the node holds, whatever was asked for."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from messages.base import Message
+from messages.types import FingerPath, Recording
+from nodes.console.desk import SETTLE_S, Desk, Files
+from nodes.console.finger import Finger
+from nodes.console.graph_facts import GraphFacts
+from nodes.console.guard import Guard, start_server
+from nodes.console.newest import Newest
+from nodes.console.operator import Operator
+from nodes.console.touch_tab import LIFT, LOWER
+from tests.console_parts import cylinder
+
+EYE = np.array([0.1, 0.05, 0.5])
+TICK_S = 0.04
+
+
+@dataclass
+class Bench:
+    """A page without a viewer, and what its node sent."""
+
+    operator: Operator
+    bags: Path
+    sent: list[Message] = field(default_factory=list)
+    now_s: float = 0.0
+
+    @property
+    def touch(self) -> Any:
+        return self.operator._page.touch
+
+    @property
+    def bag(self) -> Any:
+        return self.operator._page.record._bag
+
+    def run(self, seconds: float = 20.0) -> None:
+        """Let time pass as the node does."""
+        end_s = self.now_s + seconds
+        while self.now_s < end_s:
+            self.now_s += TICK_S
+            self.operator.advance(self.now_s, looking=True)
+        self.operator.tell(self.now_s)
+
+    async def change_scene(self, name: str, value: float) -> None:
+        """Move one of the scene's sliders, and wait until the new object is known."""
+        self.operator.heed("slide", name, value)
+        self.run(2.0 * SETTLE_S)
+        await self.know_object()
+
+    async def know_object(self) -> None:
+        task = self.operator.desk.scenes._making_aim
+        assert task is not None
+        await task
+
+    def depth_m(self) -> float:
+        """How deep the finger is in the cylinder's side, along its path."""
+        tips = [one.positions_world_m[0] for one in self.sent if isinstance(one, FingerPath)]
+        solid = self.operator.desk.scenes.scene.object
+        away = (tips[-1] - solid.world_from_object.position_m)[1:]
+        return float(solid.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
+
+    def assert_agreement(self) -> None:
+        intent = self.operator.desk.finger.intent
+        assert self.touch._depth.value == pytest.approx(1e3 * intent.depth_m, abs=0.05)
+        shown = self.touch._across.value, self.touch._up.value
+        wanted = 1e3 * np.array(self.operator.desk.finger.position_m)
+        assert shown == pytest.approx(wanted, abs=0.51)
+        assert self.touch._lift.label == (LOWER if intent.lifted else LIFT)
+
+
+@pytest.fixture
+async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
+    (tmp_path / "plan.json").write_text(
+        json.dumps({"scene": json.loads(cylinder().model_dump_json())})
+    )
+    files = Files(tmp_path / "plan.json", tmp_path, tmp_path / "bags", tmp_path / "kept.json")
+    files.bags.mkdir()
+    sent: list[Message] = []
+    server = start_server("127.0.0.1", 0, Guard("127.0.0.1", None), "test")
+    finger = Finger(sent.append, speed_m_per_s=0.15)
+    desk = Desk(sent.append, files, finger, pytest.fail, GraphFacts((), True, True))
+    newest = Newest(lambda topic, error: pytest.fail(str(error)))
+    operator = Operator(server, newest, desk, pytest.fail, with_finger=True, with_eye=False)
+    bench = Bench(operator, files.bags, sent)
+    await bench.know_object()
+    yield bench
+    await desk.scenes.close()
+    server.stop()
+
+
+async def test_the_push_slider_means_what_it_shows(bench: Bench) -> None:
+    bench.run(1.0)
+    bench.assert_agreement()
+    assert bench.touch._lift.label == LOWER
+    for name, value in (("young_modulus_pa", 9e3), ("stretch_ratio", 1.04), ("size_ratio", 1.1)):
+        bench.touch._depth.value = 18.0
+        bench.operator.heed("push", 0.018)
+        bench.run()
+        assert bench.depth_m() == pytest.approx(0.018, abs=3e-4)
+        await bench.change_scene(name, value)
+        bench.touch._depth.value = 8.0
+        bench.operator.heed("push", 0.008)
+        bench.run()
+        assert bench.depth_m() == pytest.approx(0.008, abs=3e-4)
+        bench.assert_agreement()
+
+
+async def test_lifted_the_finger_comes_down_where_the_sliders_are(bench: Bench) -> None:
+    bench.operator.heed("touch", EYE, np.array([0.02, 0.01, 0.0]) - EYE)
+    bench.run()
+    bench.assert_agreement()
+    assert bench.touch._across.value == 20.0
+    bench.operator.heed("lift")
+    bench.touch._across.value, bench.touch._up.value = -10.0, 0.0
+    bench.operator.heed("place", -0.010, 0.0)
+    bench.run()
+    assert bench.depth_m() < -0.02
+    bench.assert_agreement()
+    bench.touch._depth.value = 6.0
+    bench.operator.heed("push", 0.006)
+    bench.run()
+    assert bench.depth_m() == pytest.approx(0.006, abs=3e-4)
+    assert bench.sent[-1].positions_world_m[0, 0] == pytest.approx(-0.010)  # type: ignore[attr-defined]  # a path
+    bench.assert_agreement()
+
+
+async def test_after_a_refused_command_the_page_shows_what_holds(bench: Bench) -> None:
+    bench.operator.heed("push", 0.006)
+    bench.touch._depth.value = 30.0
+    bench.operator.heed("push", float("nan"))
+    bench.assert_agreement()
+    assert bench.touch._depth.value == 6.0
+
+
+async def test_the_bag_that_was_recorded_is_chosen(bench: Bench) -> None:
+    old = bench.bags / "old.mcap"
+    old.write_bytes(b"")
+    bench.run(1.0)
+    assert bench.bag.value == "old.mcap"
+    bench.operator.heed("record")
+    assert bench.sent[-1] == Recording(running=True)
+    bench.run(10.0)
+    bench.operator.heed("record")
+    assert bench.bag.value == "old.mcap", "the recorder has not made its bag yet"
+    (bench.bags / "new.mcap").write_bytes(b"")
+    os.utime(old)
+    bench.run(1.0)
+    assert bench.bag.value == "new.mcap"
+    bench.bag.value = "old.mcap"
+    bench.run(10.0)
+    assert bench.bag.value == "old.mcap", "what a viewer chose stays chosen"
