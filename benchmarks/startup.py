@@ -34,7 +34,7 @@ FLOOR = "python -c pass"
 COMMANDS = {
     FLOOR: [sys.executable, "-c", "pass"],
     **{
-        f"flexsheet {words}": [sys.executable, str(ROOT / "flexsheet.py"), *words.split()]
+        f"flexsheet {words}": [sys.executable, "-m", "flexsheet", *words.split()]
         for words in ("--help", "topic list", "topic echo twin/finger --once")
     },
 }

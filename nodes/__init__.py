@@ -37,15 +37,18 @@ class UnknownNodeError(KeyError):
 
 
 def node_class(name: str) -> type[Node]:
-    """The class of node type `name`; a "module:Class" outside the table is imported as it is.
+    """Import the class of a node type: a name of the table, or "module:Class".
 
-    UnknownNodeError for a name that is neither, ImportError or AttributeError for one that is not
-    there.
+    Launch files and bags written before the package was named `flexsheet` name modules as
+    "nodes.planner.node"; these are found too.  Raises UnknownNodeError for a name that is neither,
+    ImportError or AttributeError for a module or class that does not exist.
     """
     path = NODES.get(name, name)
     module_name, _, class_name = path.partition(":")
     if class_name and not all(map(str.isidentifier, (*module_name.split("."), class_name))):
         raise UnknownNodeError(f'"{name}" is no node: write "package.module:Class"')
+    if module_name.startswith("nodes."):
+        module_name = f"{__package__}.{module_name.removeprefix('nodes.')}"
     if not class_name:
         near = get_close_matches(name, NODES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(NODES)}"

@@ -1,5 +1,6 @@
 """Settings for all tests."""
 
+
 from __future__ import annotations
 
 import os
@@ -7,6 +8,12 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Node processes import test nodes ("tests.launch_nodes:Beacon") from the repository's root.
+ROOT = Path(__file__).resolve().parent.parent
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    filter(None, (str(ROOT), os.environ.get("PYTHONPATH", "")))
+)
 
 # A deadline would assert wall-clock time, and fail on a busy machine.  The examples are the same in
 # each run, so that a failure is due to a change: `--hypothesis-profile random` draws others.

@@ -218,7 +218,7 @@ class Lab:
         }
 
     def command(self, host: str, *arguments: str) -> list[str]:
-        flexsheet = [sys.executable, str(ROOT / "flexsheet.py")]
+        flexsheet = [sys.executable, "-m", "flexsheet"]
         return ["ip", "netns", "exec", self.network.space(host), *flexsheet, *arguments]
 
     def start(self, *hosts: str, launch_file: Path | None = None) -> None:

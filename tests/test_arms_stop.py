@@ -25,7 +25,7 @@ from nodes import stop_socket
 from nodes.stop_socket import MAX_CONNECTIONS, StopSocket
 
 ROOT = Path(__file__).resolve().parent.parent
-FLEXSHEET = [sys.executable, str(ROOT / "flexsheet.py")]
+FLEXSHEET = [sys.executable, "-m", "flexsheet"]
 DEADLINE_S = 60.0
 REASON = "a hand in the sheet"
 

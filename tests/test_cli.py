@@ -90,7 +90,7 @@ class Launched:
 
     def __init__(self, path: Path, *options: object) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, str(ROOT / "flexsheet.py"), "launch", str(path), *map(str, options)],
+            [sys.executable, "-m", "flexsheet", "launch", str(path), *map(str, options)],
             stderr=subprocess.PIPE,
             text=True,
         )
@@ -224,7 +224,7 @@ def test_a_node_that_fails_for_good_is_exit_code_one(tmp_path: Path, runs_root: 
     beacon = {"type": "tests.launch_nodes:Beacon", "parameters": {"exit_code": 3}}
     path = write(tmp_path, {"nodes": {"beacon": {**beacon, "restart": {"policy": "never"}}}})
     done = subprocess.run(
-        [sys.executable, str(ROOT / "flexsheet.py"), "launch", str(path)],
+        [sys.executable, "-m", "flexsheet", "launch", str(path)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 1

@@ -270,9 +270,8 @@ def runs_folder() -> Iterator[Path]:
 
 
 def start(runs: Path, *arguments: str) -> subprocess.Popen[str]:
-    root = Path(__file__).resolve().parent.parent
     return subprocess.Popen(
-        [sys.executable, str(root / "flexsheet.py"), *arguments],
+        [sys.executable, "-m", "flexsheet", *arguments],
         cwd=runs,
         env={**os.environ, "FLEXSHEET_RUNS": str(runs)},
         stdout=subprocess.DEVNULL,

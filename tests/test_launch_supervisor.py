@@ -35,7 +35,7 @@ from tests.waiting import DEADLINE_S, wait_until
 pytestmark = pytest.mark.alone
 
 ROOT = Path(__file__).resolve().parent.parent
-FLEXSHEET = [sys.executable, str(ROOT / "flexsheet.py")]
+FLEXSHEET = [sys.executable, "-m", "flexsheet"]
 
 
 @pytest.fixture(autouse=True)
@@ -600,7 +600,7 @@ def test_foreign_packages_on_the_path_do_not_win(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").write_text("raise RuntimeError('the foreign one')\n")
     path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
     done = subprocess.run(
         [*FLEXSHEET, "launch", str(path), "--duration", "0.1"],
         env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,

@@ -8,7 +8,7 @@ import subprocess
 from pathlib import Path
 
 COMMIT_VARIABLE = "FLEXSHEET_COMMIT"
-SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "flexsheet.py", "pyproject.toml")
+SOURCE_PATHS = ("messages", "nodes", "launch", "flexsheet", "pyproject.toml")
 """Paths of the repository that hold what a run executes; the rest cannot change a run."""
 
 SOURCE_SUFFIXES = {".py", ".glsl", ".css", ".js"}

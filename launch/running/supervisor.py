@@ -54,7 +54,7 @@ from messages.topics import topic_named
 from messages.types import NodeProcess
 from nodes.runner import NodeConfig, PortConfig
 
-ENTRY = Path(__file__).resolve().parents[2] / "flexsheet.py"
+SOFTWARE = Path(__file__).resolve().parents[2]
 STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
 LIVENESS_TURN_S = 0.5
@@ -100,7 +100,7 @@ class Child:
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, str(ENTRY), "--node", str(config_file)],
+                    [sys.executable, "-P", "-m", "flexsheet", "--node", str(config_file)],
                     stdin=subprocess.DEVNULL,
                     stdout=output_write,
                     stderr=output_write,
@@ -571,7 +571,7 @@ class RunningGraph:
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
-        write_file(directory / "git.json", git_state(ENTRY.parent))
+        write_file(directory / "git.json", git_state(SOFTWARE))
         if self._host is not None:
             write_file(directory / HOST_FILE, self._host)
         if any(port.topic == "scene" for node in self.nodes for port in node.outputs):

@@ -6,9 +6,13 @@ the other hosts e-stops alone.  They speak with the keys of the host where they 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import asyncio
+import itertools
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
+
+import structlog
 
 from launch.plans.planned import MAIN, Plan, tools_on
 from launch.running.runs import Run, local_endpoints, local_sources, ring_file
@@ -21,6 +25,7 @@ from messages.types import HostStatus, Status
 
 if TYPE_CHECKING:
     from launch.plans.documents import BadInputError
+    from launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
 """Readers look for a writer that was not there at most every half second."""
@@ -72,6 +77,30 @@ def subscriber_to(
         # Who does not run our plan must be seen most of all.
         plan=None if wanted.message in (Status, HostStatus) else plan.hash,
     )
+
+
+async def read_topic(
+    graph: RunningGraph, topic: str, count: int | None = None
+) -> AsyncIterator[tuple[Message, Header]]:
+    """Yield the messages of a topic of a running graph with their headers, as they arrive.
+
+    count: how many; None: until the caller stops.  On a slow reader messages queue up.
+    Raises KeyError for a topic that does not exist.
+    """
+    arrived: asyncio.Queue[tuple[Message, Header]] = asyncio.Queue()
+    subscriber = subscriber_to(
+        topic,
+        graph.plan,
+        graph.run,
+        lambda message, header: arrived.put_nowait((message, header)),
+        on_problem=structlog.get_logger().warning,
+    )
+    subscriber.start()
+    try:
+        for _ in itertools.count() if count is None else range(count):
+            yield await arrived.get()
+    finally:
+        subscriber.close()
 
 
 class ToolsWriter:

@@ -1,13 +1,10 @@
-"""Entry of the `flexsheet` command and of every node's process.
+"""Entry point of the `flexsheet` command and, with `--node CONFIG`, of a node's process.
 
 The first statements give SIGINT its default action, which ends a process without a trace of it.
 Python's own handler raises an exception in whatever runs: as a traceback in an import, or ignored
 in a callback of the garbage collector.  Commands that clean up get it back in `launch.cli`; graphs
 and nodes handle SIGINT in their event loop (`nodes.signals`).  A SIGINT that is ignored or blocked
 by inheritance is taken like any other: docs/launch-files.md says why.
-
-ROS 2 has a Python package named `launch` too.  With foreign packages named `launch`, `nodes` or
-`messages` on PYTHONPATH ours must win; so our folder is put first.
 """
 
 from __future__ import annotations
@@ -24,13 +21,9 @@ import gc
 import os
 import sys
 
-_HERE = os.path.dirname(os.path.abspath(__file__))
-if sys.path[:1] != [_HERE]:
-    sys.path.insert(0, _HERE)
-
 NODE_FLAG = "--node"
 
-# Nobody waits while all installed packages are asked for plugins of pydantic: ours has none.
+# Pydantic would ask every installed package for plugins; none is used.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
@@ -44,7 +37,7 @@ def main() -> None:
         from nodes.runner import main as run_node
 
         sys.exit(run_node(sys.argv[2]))
-    _start_and_end_quickly()
+    _avoid_garbage_collection()
     if sys.argv[1:3] == ["arms", "stop"]:
         # The command line takes several times as long to import as the stop to arrive.
         from launch.running.stopping import send_early
@@ -55,9 +48,8 @@ def main() -> None:
     run_command()
 
 
-def _start_and_end_quickly() -> None:
-    """A command imports thousands of objects that stay; nobody should wait while they are searched
-    for garbage: hardly ever while it starts, and not at all when it ends (a sixth of its time)."""
+def _avoid_garbage_collection() -> None:
+    """Collect rarely during imports and not at exit, where it takes a sixth of a command's time."""
     gc.set_threshold(100_000)
     atexit.register(gc.freeze)
 
