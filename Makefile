@@ -15,7 +15,7 @@ SITE_STAMP := $(SITE_VENV)/.installed
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
 setup: $(STAMP)
-	@$(BIN)/python -m launch.health.system
+	@$(BIN)/python -m flexsheet.launch.health.system
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -61,7 +61,7 @@ lint: $(DEV_STAMP)
 # other processes have the machine for themselves; the others share its cores.  Both parts run, even
 # if the first fails; the last lines say what was skipped in either, and why.
 test: $(DEV_STAMP) lint
-	@$(BIN)/python -m launch.health.system --tests
+	@$(BIN)/python -m flexsheet.launch.health.system --tests
 	@mkdir -p build && : > $(SKIPPED)
 	@status=0; \
 	export OPENBLAS_NUM_THREADS=1 SKIPPED_FILE=$(SKIPPED); set -x; \
@@ -112,11 +112,11 @@ limits: setup $(DEV_STAMP)
 
 # What is written from the code; after a change of a message, parameter, command or error.
 pages: setup
-	$(BIN)/python -m messages.reference > docs/messages.md
-	$(BIN)/python -m launch.reference.cli > docs/cli.md
-	$(BIN)/python -m launch.reference.parameters > docs/parameters.md
-	$(BIN)/python -m launch.reference.errors > docs/errors.md
-	$(BIN)/python -m launch.reference.registers
+	$(BIN)/python -m flexsheet.messages.reference > docs/messages.md
+	$(BIN)/python -m flexsheet.launch.reference.cli > docs/cli.md
+	$(BIN)/python -m flexsheet.launch.reference.parameters > docs/parameters.md
+	$(BIN)/python -m flexsheet.launch.reference.errors > docs/errors.md
+	$(BIN)/python -m flexsheet.launch.reference.registers
 
 # docs/charts: every method of every family, on this machine; half an hour.
 charts: setup

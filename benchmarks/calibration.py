@@ -20,21 +20,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from launch.plans.plan import load_scene
-from messages.calibration import Board
-from nodes.camera.bundle import fit_rig, linearize, pose_transform
-from nodes.camera.check import (
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.calibration import Board
+from flexsheet.nodes.camera.bundle import fit_rig, linearize, pose_transform
+from flexsheet.nodes.camera.check import (
     Rig,
     calibrate_plain_opencv,
     find_plain_corners,
     measure_board,
     triangulated,
 )
-from nodes.camera.corners import BoardPair, CornerFinder, board_points, find_pairs
-from nodes.camera.selection import fit_pairs
-from nodes.models import rigid
-from nodes.twin.board import TwinBoard
-from nodes.twin.rig import make_true_camera
+from flexsheet.nodes.camera.corners import BoardPair, CornerFinder, board_points, find_pairs
+from flexsheet.nodes.camera.selection import fit_pairs
+from flexsheet.nodes.models import rigid
+from flexsheet.nodes.twin.board import TwinBoard
+from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

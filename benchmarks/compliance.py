@@ -21,12 +21,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.bench.twin_sheet import twin_force
-from launch.health.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from nodes.models.sheet.force_models import CENTRE, Place, SheetForceModel
-from nodes.planner.compliance import (
+from flexsheet.launch.bench.twin_sheet import twin_force
+from flexsheet.launch.health.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.sheet.force_models import CENTRE, Place, SheetForceModel
+from flexsheet.nodes.planner.compliance import (
     FELT_N,
     GOOD_RATIO,
     WEBER_RATIO,
@@ -35,7 +35,7 @@ from nodes.planner.compliance import (
     compliance_for,
     unsureness,
 )
-from nodes.planner.sheet_force import law_for, membrane_table, rubber_of
+from flexsheet.nodes.planner.sheet_force import law_for, membrane_table, rubber_of
 
 Floats = NDArray[np.float64]
 

@@ -26,16 +26,16 @@ import viser
 import websockets
 from playwright.async_api import Page, WebSocket, async_playwright
 
-from launch.methods.machine import machine_name
-from launch.plans.plan import load_plan
-from launch.running.prepare import prepare_plan
-from launch.running.runs import local_endpoints
-from launch.running.supervisor import RunningGraph
-from messages.base import Header
-from messages.bus import Subscriber
-from messages.topics import topic_named
-from messages.types import Status
-from nodes.node import PortCounts
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.prepare import prepare_plan
+from flexsheet.launch.running.runs import local_endpoints
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import Status
+from flexsheet.nodes.node import PortCounts
 
 DEMO = Path(__file__).resolve().parent.parent / "launch" / "demo.yaml"
 CHROMIUM = Path("/usr/bin/chromium")

@@ -29,11 +29,11 @@ from pathlib import Path
 
 import numpy as np
 
-from launch.running.runs import root as runs_root
-from messages.bag import BagReader
-from messages.scene import Scene
-from messages.types import ArmState, SheetTarget, TwinFinger
-from nodes.models.rigid import transform_from_rpy
+from flexsheet.launch.running.runs import root as runs_root
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import ArmState, SheetTarget, TwinFinger
+from flexsheet.nodes.models.rigid import transform_from_rpy
 from tests.lab import ROOT, Network, missing
 
 PAGE = ROOT / "docs" / "deploy.md"

@@ -22,21 +22,21 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from nodes.fem_solver.benchmarks import (
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.fem_solver.benchmarks import (
     LINEAR_DEPTH_M,
     MAX_DEPTH_M,
     ReferenceSet,
     SoftBodyBenchmark,
     make_benchmark,
 )
-from nodes.fem_solver.body import SceneBody
-from nodes.fem_solver.closest_contact import ContactQuery
-from nodes.fem_solver.contact import LinearSoftBody, saturate_depth
-from nodes.fem_solver.elasticity import quadrature, stiffness_matrix
-from nodes.fem_solver.mesh import EDGES, SolidMesh, build_mesh
-from nodes.methods import Trial, measure
+from flexsheet.nodes.fem_solver.body import SceneBody
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.contact import LinearSoftBody, saturate_depth
+from flexsheet.nodes.fem_solver.elasticity import quadrature, stiffness_matrix
+from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, build_mesh
+from flexsheet.nodes.methods import Trial, measure
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

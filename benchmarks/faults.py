@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
-from messages.types import ArmState
+from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, LIGHT, Lab, missing
 from tests.lab_bags import Arm, Floats, Gap, Times, gaps, held, read_arm, wanted
 

@@ -23,14 +23,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.fingertip_bound import fingertip_bound
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from nodes.triangulator.fingertip import DetectorConfig, detect
-from nodes.triangulator.marker import MARKER_METHODS, BlobFilter
-from nodes.triangulator.tracking import Gate
-from nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
-from nodes.twin.clutter import CLUTTER
-from nodes.twin.pixels import TwinCamera
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.tracking import Gate
+from flexsheet.nodes.triangulator.triangulation import TRIANGULATION_METHODS, StereoGeometry
+from flexsheet.nodes.twin.clutter import CLUTTER
+from flexsheet.nodes.twin.pixels import TwinCamera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

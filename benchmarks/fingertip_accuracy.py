@@ -38,12 +38,12 @@ from benchmarks.tracking_bench import (
     bench_scene,
     twin_camera,
 )
-from messages.calibration import load_calibration, save_calibration
-from messages.scene import Scene
-from nodes.twin.clutter import CLUTTER
-from nodes.twin.finger import TREMOR_BAND_HZ, SineSum
-from nodes.twin.gestures import TREMOR_HAND_M
-from nodes.twin.rig import make_true_camera
+from flexsheet.messages.calibration import load_calibration, save_calibration
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.twin.clutter import CLUTTER
+from flexsheet.nodes.twin.finger import TREMOR_BAND_HZ, SineSum
+from flexsheet.nodes.twin.gestures import TREMOR_HAND_M
+from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 

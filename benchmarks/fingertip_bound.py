@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
-from nodes.twin.pixels import Eye, Position, Sensor, TwinCamera, Window
-from nodes.twin.rig import pixels_per_slope
+from flexsheet.nodes.twin.pixels import Eye, Position, Sensor, TwinCamera, Window
+from flexsheet.nodes.twin.rig import pixels_per_slope
 
 Floats = NDArray[np.float64]
 

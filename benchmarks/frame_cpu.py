@@ -24,16 +24,16 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from messages.types import Display, Skin, SoftBody
-from nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
-from nodes.models.rigid import apply
-from nodes.models.sheet import edge_poses
-from nodes.renderer import deflection_cache
-from nodes.renderer.gl import headless_context
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Display, Skin, SoftBody
+from flexsheet.nodes.fem_solver.mesh.from_scene import mesh_scene, world_from_mesh
+from flexsheet.nodes.models.rigid import apply
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer import deflection_cache
+from flexsheet.nodes.renderer.gl import headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 
 Floats = NDArray[np.float64]
 

@@ -29,18 +29,18 @@ FOUND = ("crash", "oom", "timeout")
 LONGEST_BYTES = 1 << 20
 TARGETS = ("wire", "bag", "launch", "scene", "mesh", "modbus", "mxt")
 MODULES = {
-    "wire": ("messages.wire", "messages.bus", "messages.arrays"),
-    "bag": ("messages.bag", "messages.migrations", "messages.wire"),
-    "launch": ("launch.plans.documents", "launch.plans.plan"),
+    "wire": ("flexsheet.messages.wire", "flexsheet.messages.bus", "flexsheet.messages.arrays"),
+    "bag": ("flexsheet.messages.bag", "flexsheet.messages.migrations", "flexsheet.messages.wire"),
+    "launch": ("flexsheet.launch.plans.documents", "flexsheet.launch.plans.plan"),
     "scene": (
-        "launch.plans.documents",
-        "launch.objects.meshes",
-        "launch.objects.textures",
-        "messages.scene",
+        "flexsheet.launch.plans.documents",
+        "flexsheet.launch.objects.meshes",
+        "flexsheet.launch.objects.textures",
+        "flexsheet.messages.scene",
     ),
-    "mesh": ("launch.objects.meshes", "nodes.models.shapes.triangles"),
-    "modbus": ("nodes.arm_bridge.modbus", "nodes.twin.arms", "pymodbus"),
-    "mxt": ("nodes.arm_bridge.mxt", "nodes.twin.mxt_controller"),
+    "mesh": ("flexsheet.launch.objects.meshes", "flexsheet.nodes.models.shapes.triangles"),
+    "modbus": ("flexsheet.nodes.arm_bridge.modbus", "flexsheet.nodes.twin.arms", "pymodbus"),
+    "mxt": ("flexsheet.nodes.arm_bridge.mxt", "flexsheet.nodes.twin.mxt_controller"),
 }
 """Whose branches are to be reached, by the target."""
 

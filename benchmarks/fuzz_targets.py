@@ -35,27 +35,33 @@ import zstandard
 from pydantic import BaseModel
 from ruamel.yaml import YAML
 
-import launch
-from launch.objects.meshes import read_mesh
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan, load_scene
-from messages.arrays import ArraySpec
-from messages.bag import BagError, BagReader, BagWriter, join_frames, recover, split_frames
-from messages.base import Header, Message
-from messages.bus import Subscriber
-from messages.topics import TOPICS
-from messages.wire import WireError, decode, encode
-from nodes import NODES, node_class
-from nodes.arm_bridge.link import ArmAnswerError, ArmLinkError, ArmRefusedError
-from nodes.arm_bridge.modbus import STATUS_ADDRESS, ModbusLink, decode_status
-from nodes.arm_bridge.mxt import PACKET_BYTES, decode_answer
-from nodes.arm_bridge.mxt import encode as encode_mxt
-from nodes.models.shapes import MeshError
-from nodes.node import PortCounts
-from nodes.twin.arms import RANGE_RAD, Controller
-from nodes.twin.mxt_controller import FILTER_S, MxtController
+from flexsheet.launch.objects.meshes import read_mesh
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.messages.arrays import ArraySpec
+from flexsheet.messages.bag import (
+    BagError,
+    BagReader,
+    BagWriter,
+    join_frames,
+    recover,
+    split_frames,
+)
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.wire import WireError, decode, encode
+from flexsheet.nodes import NODES, node_class
+from flexsheet.nodes.arm_bridge.link import ArmAnswerError, ArmLinkError, ArmRefusedError
+from flexsheet.nodes.arm_bridge.modbus import STATUS_ADDRESS, ModbusLink, decode_status
+from flexsheet.nodes.arm_bridge.mxt import PACKET_BYTES, decode_answer
+from flexsheet.nodes.arm_bridge.mxt import encode as encode_mxt
+from flexsheet.nodes.models.shapes import MeshError
+from flexsheet.nodes.node import PortCounts
+from flexsheet.nodes.twin.arms import RANGE_RAD, Controller
+from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController
 
-LAUNCH = Path(launch.__file__).parent
+LAUNCH = Path(flexsheet.launch.__file__).parent
 AT_REST_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 MEMORY_BYTES = 256 << 20
 """What one input may take beside what is there before."""

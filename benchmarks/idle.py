@@ -31,10 +31,10 @@ from rich.console import Console
 from rich.table import Table
 from ruamel.yaml import YAML
 
-from launch.experiments.run import DEMO_FILE
-from launch.methods.machine import machine_name
-from launch.plans.plan import load_plan
-from launch.running.supervisor import RunningGraph
+from flexsheet.launch.experiments.run import DEMO_FILE
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.supervisor import RunningGraph
 
 LEFT_OUT = ("twin_finger", "twin_eye")
 OUTSIDE = "twin_arms"

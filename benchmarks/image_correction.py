@@ -22,14 +22,14 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.bench.twin_sheet import true_sheet
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from messages.types import Correction, Display
-from nodes.models.rigid import rotation_from_vector, transform
-from nodes.models.sheet import edge_poses
-from nodes.renderer import deflection_cache
-from nodes.renderer.benchmarks import (
+from flexsheet.launch.bench.twin_sheet import true_sheet
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Correction, Display
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer import deflection_cache
+from flexsheet.nodes.renderer.benchmarks import (
     METHODS,
     SIZES_PX,
     draw_coordinate_ramps,
@@ -37,13 +37,13 @@ from nodes.renderer.benchmarks import (
     roll_sheet,
     scale_projector,
 )
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet import SheetPose, estimate_sheet
-from nodes.twin.error_map import ErrorMap, error_map
-from nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen, tilt_sizes
-from nodes.twin.membrane import DeformedSheet, NotConvergedError
-from nodes.twin.true_object import TrueBody
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.nodes.twin.error_map import ErrorMap, error_map
+from flexsheet.nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen, tilt_sizes
+from flexsheet.nodes.twin.membrane import DeformedSheet, NotConvergedError
+from flexsheet.nodes.twin.true_object import TrueBody
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -28,12 +28,12 @@ import uvloop
 
 from benchmarks import messaging
 from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Sender, percentile_us
-from launch.methods.machine import machine_name
-from messages.base import Header
-from messages.bus import Publisher, Source, Subscriber
-from messages.security import KeyRing, new_key_pair, write_ring, write_secret
-from messages.topics import Topic
-from messages.wire import encode, read_envelope
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Publisher, Source, Subscriber
+from flexsheet.messages.security import KeyRing, new_key_pair, write_ring, write_secret
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.wire import encode, read_envelope
 
 T = TypeVar("T")
 RING_VARIABLE = "FLEXSHEET_BENCHMARK_RING"

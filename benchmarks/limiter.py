@@ -35,17 +35,17 @@ from hypothesis import HealthCheck, Phase, given, settings, target
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from messages.types import EStop, Side
-from nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.goal import Goal
-from nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, limited, within_range
-from nodes.arm_bridge.link import Freshness
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import transform, transform_from_rpy
-from nodes.twin.arms import (
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import EStop, Side
+from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.goal import Goal
+from flexsheet.nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, limited, within_range
+from flexsheet.nodes.arm_bridge.link import Freshness
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import transform, transform_from_rpy
+from flexsheet.nodes.twin.arms import (
     ACCELERATION_RAD_PER_S2,
     RANGE_RAD,
     SPEED_RAD_PER_S,

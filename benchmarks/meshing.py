@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.objects.meshes import read_mesh
-from launch.plans.plan import load_scene
-from messages.scene import (
+from flexsheet.launch.objects.meshes import read_mesh
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import (
     Cylinder,
     Ellipsoid,
     Geometry,
@@ -32,11 +32,11 @@ from messages.scene import (
     Scene,
     Sphere,
 )
-from nodes.fem_solver.elasticity import quadrature, shape_gradients
-from nodes.fem_solver.mesh import SolidMesh, build_mesh, mesh_budget, mesh_spec
-from nodes.fem_solver.mesh.quality import min_jacobian_ratios, radius_ratios
-from nodes.models.shapes import make_shape
-from nodes.models.shapes.triangles import volume_m3
+from flexsheet.nodes.fem_solver.elasticity import quadrature, shape_gradients
+from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh, mesh_budget, mesh_spec
+from flexsheet.nodes.fem_solver.mesh.quality import min_jacobian_ratios, radius_ratios
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.shapes.triangles import volume_m3
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SPACINGS_M = (0.004, 0.0028, 0.002)

@@ -38,12 +38,12 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from launch.methods.machine import machine_name
-from messages.base import Header, Message
-from messages.bus import Publisher, Subscriber
-from messages.topics import TOPICS, Topic
-from messages.types import Fingertip, StereoPair
-from messages.wire import INLINE_BYTES, decode, encode, size_of
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Publisher, Subscriber
+from flexsheet.messages.topics import TOPICS, Topic
+from flexsheet.messages.types import Fingertip, StereoPair
+from flexsheet.messages.wire import INLINE_BYTES, decode, encode, size_of
 
 FLOOR = "blocking"
 NODES_USE = "flexsheet uvloop"
@@ -71,7 +71,7 @@ class Payload:
 class Design:
     """A way to receive.  `typed` ones hand over validated messages, the others bytes.
 
-    open: makes its sending end; None: a publisher of `messages.bus`.
+    open: makes its sending end; None: a publisher of `flexsheet.messages.bus`.
     """
 
     name: str
@@ -191,7 +191,9 @@ DESIGNS = (
     Design(
         "zmq.asyncio typed", "await recv_multipart(), decoded, validated", True, zmq_asyncio_typed
     ),
-    Design("flexsheet asyncio", "messages.bus, decoded, validated", True, flexsheet_asyncio),
+    Design(
+        "flexsheet asyncio", "flexsheet.messages.bus, decoded, validated", True, flexsheet_asyncio
+    ),
     Design(NODES_USE, "the same on uvloop: what nodes use", True, flexsheet_uvloop),
     Design(
         "flexsheet, all frames", "the same, each array its own frame", True, flexsheet_uvloop, 0

@@ -40,10 +40,10 @@ from rich.progress import Progress
 
 from benchmarks import keys, messaging, peers
 from benchmarks.messaging import FLOOR, NODES_USE, PAYLOADS, BusLine, Design, Line, Payload, Sender
-from launch.methods.machine import machine_name
-from messages.bus import Publisher
-from messages.security import KeyRing
-from messages.topics import Topic
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.messages.bus import Publisher
+from flexsheet.messages.security import KeyRing
+from flexsheet.messages.topics import Topic
 
 CLONE_NEWNET = 0x40000000
 ADDRESSES = ("10.78.0.1", "10.78.0.2")

@@ -28,9 +28,9 @@ import numpy as np
 import zmq
 
 from benchmarks.messaging import EPOCH, Payload, header_of
-from messages.topics import Topic
-from messages.types import Fingertip, StereoPair
-from messages.wire import encode
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import Fingertip, StereoPair
+from flexsheet.messages.wire import encode
 
 Arrived = Callable[[int, int], bool]
 PICTURE_BYTES = 480 * 640
@@ -44,7 +44,7 @@ def raw_bytes(payload: Payload) -> bytearray:
 
 
 class ZmqLine:
-    """Plain ZeroMQ: the floor, where a publisher of `messages.bus` would ask for keys."""
+    """Plain ZeroMQ: the floor, where a publisher of `flexsheet.messages.bus` would ask for keys."""
 
     def __init__(self, payload: Payload, place: str) -> None:
         self._frames = [bytearray(one) for one in encode(payload.make(0), header_of(0, 0))]

@@ -37,9 +37,9 @@ import numpy as np
 import psutil
 
 from benchmarks.faults import LONGEST_M, Result, Span, kill, kill_launcher, tried
-from launch.running.runs import FINISHED_RUNS_KEPT, RUN_VARIABLE
-from launch.running.tools import READER_RECONNECT_S
-from messages.bag import FLUSH_PERIOD_S
+from flexsheet.launch.running.runs import FINISHED_RUNS_KEPT, RUN_VARIABLE
+from flexsheet.launch.running.tools import READER_RECONNECT_S
+from flexsheet.messages.bag import FLUSH_PERIOD_S
 from tests.lab import HOSTS, LIGHT, Lab
 from tests.lab_bags import Arm, Gap, bags, gaps, read_arm
 

@@ -17,14 +17,14 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from launch.experiments import stroke
-from launch.experiments.driver import Driver
-from launch.experiments.run import DEMO_FILE
-from launch.plans.plan import load_plan
-from launch.running.supervisor import RunningGraph
-from messages.bag import BagReader
-from messages.clock import SystemClock
-from messages.types import ArmState, TwinFinger
+from flexsheet.launch.experiments import stroke
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.run import DEMO_FILE
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.types import ArmState, TwinFinger
 
 STROKE_S = 8.0
 KILLED = "triangulator"

@@ -46,20 +46,28 @@ import psutil
 from numpy.typing import NDArray
 from scipy.stats import theilslopes
 
-from launch.experiments import image
-from launch.experiments.driver import Driver
-from launch.experiments.gestures import gesture_path
-from launch.experiments.run import DEMO_FILE, new_folder
-from launch.methods.machine import machine_name
-from launch.plans.plan import load_plan
-from launch.running.prepare import prepare_plan
-from launch.running.supervisor import NodeFailedError, RunningGraph
-from launch.running.tools import ToolsWriter, subscriber_to
-from messages.bag import BagError, BagReader, info
-from messages.base import Header
-from messages.scene import Scene
-from messages.topics import TOPICS, Delivery
-from messages.types import ArmMode, ArmState, FingerPath, Fingertip, Frame, Recording, Status
+from flexsheet.launch.experiments import image
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.gestures import gesture_path
+from flexsheet.launch.experiments.run import DEMO_FILE, new_folder
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.prepare import prepare_plan
+from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
+from flexsheet.launch.running.tools import ToolsWriter, subscriber_to
+from flexsheet.messages.bag import BagError, BagReader, info
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS, Delivery
+from flexsheet.messages.types import (
+    ArmMode,
+    ArmState,
+    FingerPath,
+    Fingertip,
+    Frame,
+    Recording,
+    Status,
+)
 
 Floats = NDArray[np.float64]
 

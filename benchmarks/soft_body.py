@@ -25,15 +25,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.scene import Scene, cylinder_of
-from nodes.cache import default_cache_dir
-from nodes.fem_solver import body, precompute, snapshots
-from nodes.fem_solver.closest_contact import ContactQuery, locate
-from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.snapshot_interpolator import SurfaceLocator
-from nodes.fem_solver.soft_body_factory import SoftBodyFactory
-from nodes.fem_solver.table import TableSoftBody
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.nodes.cache import default_cache_dir
+from flexsheet.nodes.fem_solver import body, precompute, snapshots
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery, locate
+from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
+from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.fem_solver.table import TableSoftBody
 
 Floats = NDArray[np.float64]
 

@@ -18,20 +18,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
-from nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
-from nodes.fem_solver.contact import LinearSoftBody
-from nodes.fem_solver.elasticity import element_stiffness
-from nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.mesh.quality import min_jacobian_ratios
-from nodes.fem_solver.multifrontal import NestedDissection
-from nodes.fem_solver.precompute import SoftBodyModel, compute
-from nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob, solve_snapshot
-from nodes.fem_solver.table import END_SPAN_M
-from nodes.models import rigid
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
+from flexsheet.nodes.fem_solver.contact import LinearSoftBody
+from flexsheet.nodes.fem_solver.elasticity import element_stiffness
+from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
+from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.mesh.quality import min_jacobian_ratios
+from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, compute
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob, solve_snapshot
+from flexsheet.nodes.fem_solver.table import END_SPAN_M
+from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]
 

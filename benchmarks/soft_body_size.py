@@ -26,19 +26,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.methods.charts import ROOT
-from launch.methods.machine import machine_name
-from launch.methods.svg import COLOURS, drawn_for_pages, save_svg
-from launch.plans.plan import load_scene
-from launch.running.code_state import git_state
-from messages.scene import Scene, cylinder_of
-from nodes.fem_solver.body import make_soft_body_spec
-from nodes.fem_solver.closest_contact import ContactQuery
-from nodes.fem_solver.contact import LinearSoftBody, SkinResponse
-from nodes.fem_solver.mesh import SolidMesh, build_mesh
-from nodes.fem_solver.snapshots import DEPTHS_M
-from nodes.fem_solver.table import LINEAR_DEPTHS_M, Table, TableSoftBody, table_bytes
-from nodes.models.shapes import Shape, make_shape
+from flexsheet.launch.methods.charts import ROOT
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.svg import COLOURS, drawn_for_pages, save_svg
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.launch.running.code_state import git_state
+from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.nodes.fem_solver.body import make_soft_body_spec
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.contact import LinearSoftBody, SkinResponse
+from flexsheet.nodes.fem_solver.mesh import SolidMesh, build_mesh
+from flexsheet.nodes.fem_solver.snapshots import DEPTHS_M
+from flexsheet.nodes.fem_solver.table import LINEAR_DEPTHS_M, Table, TableSoftBody, table_bytes
+from flexsheet.nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

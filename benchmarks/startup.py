@@ -23,10 +23,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from launch.methods.machine import machine_name
-from launch.plans.plan import load_plan
-from launch.running.runs import ROOT_VARIABLE
-from launch.running.supervisor import RunningGraph
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.runs import ROOT_VARIABLE
+from flexsheet.launch.running.supervisor import RunningGraph
 
 ROOT = Path(__file__).resolve().parent.parent
 GRAPH = "scene: {scene}\nnodes:\n  twin_finger: {{type: twin_finger}}\n"

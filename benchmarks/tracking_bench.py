@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.base import Header, Message
-from messages.calibration import load_calibration
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import FingerPath, Fingertip, StereoPair
-from nodes.models.rigid import rotation_from_rpy
-from nodes.triangulator.node import Triangulator
-from nodes.triangulator.parameters import TriangulatorParameters
-from nodes.twin.clutter import Clutter
-from nodes.twin.finger import FingerMotion
-from nodes.twin.pixels import Sensor, TwinCamera
-from nodes.twin.rig import make_true_camera
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import FingerPath, Fingertip, StereoPair
+from flexsheet.nodes.models.rigid import rotation_from_rpy
+from flexsheet.nodes.triangulator.node import Triangulator
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.nodes.twin.clutter import Clutter
+from flexsheet.nodes.twin.finger import FingerMotion
+from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 TruePathCase = Callable[[float], Floats]

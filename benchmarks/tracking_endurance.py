@@ -46,10 +46,10 @@ from benchmarks.tracking_bench import (
     paths_motion,
     twin_camera,
 )
-from messages.scene import Scene
-from messages.types import FingerPath
-from nodes.models.rigid import apply
-from nodes.twin.clutter import (
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.models.rigid import apply
+from flexsheet.nodes.twin.clutter import (
     CLAMPS,
     CLUTTER,
     HAND,
@@ -65,8 +65,8 @@ from nodes.twin.clutter import (
     Trajectory,
     together,
 )
-from nodes.twin.gestures import GESTURES
-from nodes.twin.pixels import Eye, TwinCamera
+from flexsheet.nodes.twin.gestures import GESTURES
+from flexsheet.nodes.twin.pixels import Eye, TwinCamera
 
 Floats = NDArray[np.float64]
 

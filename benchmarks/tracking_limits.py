@@ -41,8 +41,8 @@ from benchmarks.tracking_bench import (
     sigmas,
     twin_camera,
 )
-from messages.scene import Scene
-from nodes.twin.clutter import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.twin.clutter import (
     CLUTTER,
     MARKER_RADIUS_M,
     Clutter,
@@ -52,9 +52,9 @@ from nodes.twin.clutter import (
     together,
     touching_highlight,
 )
-from nodes.twin.finger import smoothstep
-from nodes.twin.gestures import circle, hover, reach
-from nodes.twin.pixels import Sensor, TwinCamera
+from flexsheet.nodes.twin.finger import smoothstep
+from flexsheet.nodes.twin.gestures import circle, hover, reach
+from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 
 Floats = NDArray[np.float64]
 

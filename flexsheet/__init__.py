@@ -9,52 +9,80 @@ from __future__ import annotations
 # Importing `typing` would lengthen the time in which an interrupt meets Python's own handler.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from launch.experiments import ExperimentError
-    from launch.experiments.driver import Driver
-    from launch.experiments.run import run_experiment
-    from launch.plans.documents import BadInputError
-    from launch.plans.plan import load_plan, load_scene
-    from launch.plans.planned import Plan
-    from launch.running.supervisor import NodeFailedError, RunningGraph
-    from launch.running.tools import ToolsWriter, read_topic
-    from messages.bag import BagError, BagReader, BagWriter, recover
-    from messages.base import Header, Message
-    from messages.clock import SystemClock, VirtualClock
-    from messages.scene import Scene
-    from messages.topics import TOPICS, topic_named
-    from nodes.node import Input, Node, NodeParameters, Output, periodic
+    from flexsheet.launch.experiments import ExperimentError
+    from flexsheet.launch.experiments.driver import Driver
+    from flexsheet.launch.experiments.run import run_experiment
+    from flexsheet.launch.plans.documents import BadInputError
+    from flexsheet.launch.plans.plan import load_plan, load_scene
+    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
+    from flexsheet.launch.running.tools import ToolsWriter, read_topic
+    from flexsheet.messages.bag import BagError, BagReader, BagWriter, recover
+    from flexsheet.messages.base import Header, Message
+    from flexsheet.messages.clock import SystemClock, VirtualClock
+    from flexsheet.messages.scene import Scene
+    from flexsheet.messages.topics import TOPICS, topic_named
+    from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 _MODULES = {
-    "BadInputError": "launch.plans.documents",
-    "BagError": "messages.bag",
-    "BagReader": "messages.bag",
-    "BagWriter": "messages.bag",
-    "Driver": "launch.experiments.driver",
-    "ExperimentError": "launch.experiments",
-    "ToolsWriter": "launch.running.tools",
-    "Header": "messages.base",
-    "Input": "nodes.node",
-    "Message": "messages.base",
-    "Node": "nodes.node",
-    "NodeFailedError": "launch.running.supervisor",
-    "NodeParameters": "nodes.node",
-    "Output": "nodes.node",
-    "Plan": "launch.plans.planned",
-    "RunningGraph": "launch.running.supervisor",
-    "Scene": "messages.scene",
-    "SystemClock": "messages.clock",
-    "TOPICS": "messages.topics",
-    "VirtualClock": "messages.clock",
-    "load_plan": "launch.plans.plan",
-    "load_scene": "launch.plans.plan",
-    "periodic": "nodes.node",
-    "read_topic": "launch.running.tools",
-    "recover": "messages.bag",
-    "run_experiment": "launch.experiments.run",
-    "topic_named": "messages.topics",
+    "BadInputError": "flexsheet.launch.plans.documents",
+    "BagError": "flexsheet.messages.bag",
+    "BagReader": "flexsheet.messages.bag",
+    "BagWriter": "flexsheet.messages.bag",
+    "Driver": "flexsheet.launch.experiments.driver",
+    "ExperimentError": "flexsheet.launch.experiments",
+    "ToolsWriter": "flexsheet.launch.running.tools",
+    "Header": "flexsheet.messages.base",
+    "Input": "flexsheet.nodes.node",
+    "Message": "flexsheet.messages.base",
+    "Node": "flexsheet.nodes.node",
+    "NodeFailedError": "flexsheet.launch.running.supervisor",
+    "NodeParameters": "flexsheet.nodes.node",
+    "Output": "flexsheet.nodes.node",
+    "Plan": "flexsheet.launch.plans.planned",
+    "RunningGraph": "flexsheet.launch.running.supervisor",
+    "Scene": "flexsheet.messages.scene",
+    "SystemClock": "flexsheet.messages.clock",
+    "TOPICS": "flexsheet.messages.topics",
+    "VirtualClock": "flexsheet.messages.clock",
+    "load_plan": "flexsheet.launch.plans.plan",
+    "load_scene": "flexsheet.launch.plans.plan",
+    "periodic": "flexsheet.nodes.node",
+    "read_topic": "flexsheet.launch.running.tools",
+    "recover": "flexsheet.messages.bag",
+    "run_experiment": "flexsheet.launch.experiments.run",
+    "topic_named": "flexsheet.messages.topics",
 }
 
-__all__ = list(_MODULES)
+__all__ = [
+    "TOPICS",
+    "BadInputError",
+    "BagError",
+    "BagReader",
+    "BagWriter",
+    "Driver",
+    "ExperimentError",
+    "Header",
+    "Input",
+    "Message",
+    "Node",
+    "NodeFailedError",
+    "NodeParameters",
+    "Output",
+    "Plan",
+    "RunningGraph",
+    "Scene",
+    "SystemClock",
+    "ToolsWriter",
+    "VirtualClock",
+    "load_plan",
+    "load_scene",
+    "periodic",
+    "read_topic",
+    "recover",
+    "run_experiment",
+    "topic_named",
+]
 
 
 def __getattr__(name: str) -> object:

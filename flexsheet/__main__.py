@@ -30,20 +30,20 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 def main() -> None:
     """Run the command, or with `--node CONFIG` one node (the launcher starts those)."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
-        from launch.running.child import follow_launcher, give_way
+        from flexsheet.launch.running.child import follow_launcher, give_way
 
         follow_launcher()
         give_way()
-        from nodes.runner import main as run_node
+        from flexsheet.nodes.runner import main as run_node
 
         sys.exit(run_node(sys.argv[2]))
     _avoid_garbage_collection()
     if sys.argv[1:3] == ["arms", "stop"]:
         # The command line takes several times as long to import as the stop to arrive.
-        from launch.running.stopping import send_early
+        from flexsheet.launch.running.stopping import send_early
 
         send_early(sys.argv[3:])
-    from launch.cli import main as run_command
+    from flexsheet.launch.cli import main as run_command
 
     run_command()
 

@@ -18,7 +18,7 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from launch.commands.output import CommandError, examples, words
+from flexsheet.launch.commands.output import CommandError, examples, words
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "launch": ("launching",),
@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
     "explain": ("explain",),
 }
-"""Modules of `launch.commands` by name of command, in the order of `--help`.
+"""Modules of `flexsheet.launch.commands` by name of command, in the order of `--help`.
 
 The first one has the typer app `app`, of one command or of many; the others have `register(app)`
 and add to it.
@@ -48,7 +48,9 @@ and add to it.
 @cache
 def load_command(name: str) -> Any:
     """The click command of a name in `COMMANDS`."""
-    first, *further = (import_module(f"launch.commands.{module}") for module in COMMANDS[name])
+    first, *further = (
+        import_module(f"flexsheet.launch.commands.{module}") for module in COMMANDS[name]
+    )
     for module in further:
         module.register(first.app)
     command = get_command(first.app)
@@ -120,7 +122,7 @@ def main() -> None:
 
 def error_text(error: Exception) -> str:
     """The sentence about an error; for one of the disk, with path and remedy."""
-    from messages.files import FileWriteError, write_error
+    from flexsheet.messages.files import FileWriteError, write_error
 
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
@@ -130,7 +132,7 @@ def error_text(error: Exception) -> str:
 def explained_by(error: Exception) -> str | None:
     """The command that says more about an error; None where its sentence has the remedy in it."""
     # Imported only now: a command that goes well should not wait for it.
-    from launch.commands.failures import FAILURES
+    from flexsheet.launch.commands.failures import FAILURES
 
     if not isinstance(error, FAILURES) or isinstance(error.__cause__, FileNotFoundError):
         return None
@@ -142,8 +144,8 @@ def exit_code(error: Exception) -> int | None:
     if isinstance(error, CommandError):
         return error.code
     # Imported only now: a command that goes well should not wait for these.
-    from launch.commands.failures import BAD_INPUTS, is_failure
-    from launch.commands.output import BAD_INPUT, FAILED
+    from flexsheet.launch.commands.failures import BAD_INPUTS, is_failure
+    from flexsheet.launch.commands.output import BAD_INPUT, FAILED
 
     if isinstance(error, BAD_INPUTS):
         return BAD_INPUT

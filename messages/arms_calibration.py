@@ -7,9 +7,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from messages.calibration import Board, Covariance
-from messages.calibration_file import read_calibration, write_calibration
-from messages.scene import NonNegative, Part, Pose
+from flexsheet.messages.calibration import Board, Covariance
+from flexsheet.messages.calibration_file import read_calibration, write_calibration
+from flexsheet.messages.scene import NonNegative, Part, Pose
 
 ARMS_CALIBRATION_VERSION = 1
 

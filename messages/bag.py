@@ -38,11 +38,11 @@ from mcap.opcode import Opcode
 from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from messages.base import Header, Message, schema_fingerprint
-from messages.files import write_error
-from messages.migrations import Migration, migration_for
-from messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
-from messages.wire import PROTOCOL, WireError, encode, read_envelope
+from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.files import write_error
+from flexsheet.messages.migrations import Migration, migration_for
+from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
+from flexsheet.messages.wire import PROTOCOL, WireError, encode, read_envelope
 
 PROFILE = "flexsheet"
 CHUNK_BYTES = 1 << 20

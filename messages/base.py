@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict
 class Message(BaseModel):
     """A typed, immutable message.
 
-    Subclasses declare fields; `messages.arrays` has the array types.
+    Subclasses declare fields; `flexsheet.messages.arrays` has the array types.
 
     Numbers are SI and radians; a field whose unit or frame a reader could doubt carries it in its
     name (`age_s`, `world_from_sheet`).

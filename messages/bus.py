@@ -7,7 +7,7 @@ of the designs in `benchmarks/messaging.py` this has the least latency, and ther
 
 A subscriber has one socket per host that it hears, so that it knows from where each message comes:
 a host is believed only what its own writers say.  Beyond loopback nothing is bound or connected
-without keys (`messages.security`).
+without keys (`flexsheet.messages.security`).
 
 ZeroMQ's file descriptor is edge-triggered: it tells that something changed, not that something is
 there, and any call on the socket may swallow the news.  So each callback reads until nothing is
@@ -32,10 +32,10 @@ from typing import Any, Protocol
 import zmq
 from zmq.utils.monitor import parse_monitor_message
 
-from messages.base import Header, Message
-from messages.security import Gatekeeper, KeyChange, KeyRing
-from messages.topics import Delivery, Topic
-from messages.wire import Envelope, WireError, encode, read_envelope
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.security import Gatekeeper, KeyChange, KeyRing
+from flexsheet.messages.topics import Delivery, Topic
+from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
 
 Handler = Callable[[Any, Header], None]
 Problem = Callable[[str], None]

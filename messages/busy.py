@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from messages.types import CpuPressure, HostStatus
+from flexsheet.messages.types import CpuPressure, HostStatus
 
 MAX_LOAD_RATIO = 1.5
 """Processes that want to run per core; for computers that cannot measure their nodes' waiting."""

@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from messages.arrays import ArraySpec, Transform
-from messages.calibration_file import (
+from flexsheet.messages.arrays import ArraySpec, Transform
+from flexsheet.messages.calibration_file import (
     CalibrationMismatchError,
     read_calibration,
     write_calibration,
 )
-from messages.scene import Lens, NonNegative, Part, Positive, StereoCamera
+from flexsheet.messages.scene import Lens, NonNegative, Part, Positive, StereoCamera
 
 CALIBRATION_VERSION = 2
 

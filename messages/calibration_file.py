@@ -11,8 +11,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
-from messages.files import write_file
-from messages.scene import Part
+from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import Part
 
 Calibration = TypeVar("Calibration", bound=Part)
 

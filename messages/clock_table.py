@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypeVar
 
-from messages.base import Header, Message
-from messages.types import ClockOffset, Clocks
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.types import ClockOffset, Clocks
 
 M = TypeVar("M", bound=Message)
 

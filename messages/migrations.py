@@ -17,7 +17,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel
 
-from messages.base import Message, schema_fingerprint
+from flexsheet.messages.base import Message, schema_fingerprint
 
 Fields = dict[str, Any]
 Migration = Callable[[Fields], Fields]

@@ -1,6 +1,6 @@
 """Writes docs/messages.md from the topic table and the message types.
 
-python -m messages.reference > docs/messages.md
+python -m flexsheet.messages.reference > docs/messages.md
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from messages.arrays import ArraySpec
-from messages.base import Header
-from messages.topics import TOPICS, Topic
+from flexsheet.messages.arrays import ArraySpec
+from flexsheet.messages.base import Header
+from flexsheet.messages.topics import TOPICS, Topic
 
 INTRODUCTION = """\
 # Messages
 
-<!-- Written by `python -m messages.reference > docs/messages.md`; a test compares. -->
+<!-- Written by `python -m flexsheet.messages.reference > docs/messages.md`; a test compares. -->
 
 What nodes say to one another.  Numbers are SI and radians; positions and directions are in the
 world frame (origin at the centre of the imaginary screen, x right, y up, z towards the user) unless

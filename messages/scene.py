@@ -13,10 +13,10 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from messages.arrays import ColorImage, Transform, Triangles, Vector3, Vertices
-from messages.base import Message, MessagePart
-from messages.limits import LimitedModel
-from messages.methods import Methods
+from flexsheet.messages.arrays import ColorImage, Transform, Triangles, Vector3, Vertices
+from flexsheet.messages.base import Message, MessagePart
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.methods import Methods
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]

@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import zmq
 from zmq.utils import z85
 
-from messages.files import write_error, write_file
+from flexsheet.messages.files import write_error, write_file
 
 KEY_LENGTH = 40
 ZAP_ENDPOINT = "inproc://zeromq.zap.01"

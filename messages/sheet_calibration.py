@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from messages.arrays import ArraySpec
-from messages.calibration_file import (
+from flexsheet.messages.arrays import ArraySpec
+from flexsheet.messages.calibration_file import (
     CalibrationMismatchError,
     read_calibration,
     write_calibration,
 )
-from messages.scene import NonNegative, Part, Positive, SheetSpec
+from flexsheet.messages.scene import NonNegative, Part, Positive, SheetSpec
 
 SHEET_CALIBRATION_VERSION = 1
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from enum import StrEnum
 
-from messages import scene, types
-from messages.base import Message
+from flexsheet.messages import scene, types
+from flexsheet.messages.base import Message
 
 
 class Delivery(StrEnum):

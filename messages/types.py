@@ -1,4 +1,4 @@
-"""The message of every topic but the scene (`messages.scene`).
+"""The message of every topic but the scene (`flexsheet.messages.scene`).
 
 Positions and directions are in the world frame unless the name says otherwise.  When a quantity is
 not known the message says so by a field; an array never holds NaN.
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from messages import methods
-from messages.arrays import (
+from flexsheet.messages import methods
+from flexsheet.messages.arrays import (
     ArraySpec,
     ColorImage,
     EyePair,
@@ -26,8 +26,8 @@ from messages.arrays import (
     Vector3,
     Vector6,
 )
-from messages.base import Message, MessagePart
-from messages.scene import Finite, NonNegative, Positive
+from flexsheet.messages.base import Message, MessagePart
+from flexsheet.messages.scene import Finite, NonNegative, Positive
 
 Correction = methods.Correction
 Side = Literal["left", "right"]

@@ -4,7 +4,7 @@ The header frame is one msgpack array of eleven elements:
 
     protocol     "flexsheet/2"
     type         name of the message's class
-    fingerprint  8 bytes of its JSON Schema's hash, see `messages.base.schema_fingerprint`
+    fingerprint  8 bytes of its JSON Schema's hash, see `flexsheet.messages.base.schema_fingerprint`
     sequence, source_ns, publish_ns, clock_id, writer, epoch, plan      see `messages.base.Header`
     fields       a map; parts are maps, tuples are arrays, numpy arrays are extension types:
                  type 1  dtype and shape, then the elements (an array of at most 1 KiB)
@@ -35,8 +35,8 @@ from numpy import ndarray
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from messages.base import Header, Message, schema_fingerprint
-from messages.topics import Topic
+from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.topics import Topic
 
 Buffer: TypeAlias = bytes | memoryview
 M = TypeVar("M", bound=Message)

@@ -11,21 +11,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from nodes.node import Node
+    from flexsheet.nodes.node import Node
 
 NODES: dict[str, str] = {
-    "camera": "nodes.camera.node:Camera",
-    "triangulator": "nodes.triangulator.node:Triangulator",
-    "planner": "nodes.planner.node:Planner",
-    "arm_bridge": "nodes.arm_bridge.node:ArmBridge",
-    "fem_solver": "nodes.fem_solver.node:FemSolver",
-    "renderer": "nodes.renderer.node:Renderer",
-    "clock": "nodes.clock.node:ClockNode",
-    "recorder": "nodes.recorder.node:Recorder",
-    "console": "nodes.console.node:Console",
-    "twin_finger": "nodes.twin.finger_node:TwinFingerNode",
-    "twin_arms": "nodes.twin.arms_node:TwinArmsNode",
-    "twin_eye": "nodes.twin.eye_node:TwinEyeNode",
+    "camera": "flexsheet.nodes.camera.node:Camera",
+    "triangulator": "flexsheet.nodes.triangulator.node:Triangulator",
+    "planner": "flexsheet.nodes.planner.node:Planner",
+    "arm_bridge": "flexsheet.nodes.arm_bridge.node:ArmBridge",
+    "fem_solver": "flexsheet.nodes.fem_solver.node:FemSolver",
+    "renderer": "flexsheet.nodes.renderer.node:Renderer",
+    "clock": "flexsheet.nodes.clock.node:ClockNode",
+    "recorder": "flexsheet.nodes.recorder.node:Recorder",
+    "console": "flexsheet.nodes.console.node:Console",
+    "twin_finger": "flexsheet.nodes.twin.finger_node:TwinFingerNode",
+    "twin_arms": "flexsheet.nodes.twin.arms_node:TwinArmsNode",
+    "twin_eye": "flexsheet.nodes.twin.eye_node:TwinEyeNode",
 }
 
 

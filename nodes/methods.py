@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from messages.scene import Scene
+from flexsheet.messages.scene import Scene
 
 MAX_TRIAL_S, MIN_REPEATS = 3.0, 3
 """A trial is repeated until this total time has passed, but at least this often."""

@@ -31,12 +31,12 @@ import structlog
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from messages.base import Header, Message
-from messages.clock import Clock
-from messages.clock_table import ClockTable
-from messages.limits import LimitedModel
-from messages.topics import Delivery, Topic, topic_named
-from messages.types import PortStatus, Status
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import Clock
+from flexsheet.messages.clock_table import ClockTable
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.types import PortStatus, Status
 
 M = TypeVar("M", bound=Message)
 Send = Callable[[Topic, Message, Header], None]
@@ -94,7 +94,7 @@ class PortCounts:
 class Steps:
     """What a node handled, in order, until its status has told it; a replay goes by that.
 
-    Rows are those of `messages.types.Status.taken`.
+    Rows are those of `flexsheet.messages.types.Status.taken`.
     """
 
     def __init__(self, clock: Clock) -> None:

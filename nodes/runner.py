@@ -22,17 +22,17 @@ import structlog
 import uvloop
 from pydantic import BaseModel, ConfigDict
 
-from messages.base import Header, Message
-from messages.bus import Objection, Publisher, Source, Subscriber
-from messages.clock import SystemClock
-from messages.security import KeyRing, SecurityError
-from messages.topics import Delivery, Topic, topic_named
-from messages.types import Arming, EStop, HostStatus, Status
-from nodes import node_class
-from nodes.log_limit import RepeatLimiter
-from nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
-from nodes.signals import handle_signals
-from nodes.stop_socket import StopSocket
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Objection, Publisher, Source, Subscriber
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.security import KeyRing, SecurityError
+from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.types import Arming, EStop, HostStatus, Status
+from flexsheet.nodes import node_class
+from flexsheet.nodes.log_limit import RepeatLimiter
+from flexsheet.nodes.node import Node, PortCounts, Timer, parameters_of, timers_of
+from flexsheet.nodes.signals import handle_signals
+from flexsheet.nodes.stop_socket import StopSocket
 
 STATUS_PERIOD_S = 1.0
 CANCEL_AGAIN_S = 0.2

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from messages.types import SheetTarget
-from nodes.models.rigid import transform_from_rpy
-from nodes.node import Node, NodeParameters, Output, periodic
-from nodes.runner import NodeConfig, run_node
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import SheetTarget
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.node import Node, NodeParameters, Output, periodic
+from flexsheet.nodes.runner import NodeConfig, run_node
 
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 LEAN_RAD, PERIOD_S = 0.3, 4.0

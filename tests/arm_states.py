@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from messages.types import ArmState
+from flexsheet.messages.types import ArmState
 
 
 def arm_state(side: str, **changes: Any) -> ArmState:

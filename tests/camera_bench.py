@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import Clock, SystemClock
-from messages.scene import Lens, Scene
-from messages.topics import Topic
-from messages.types import StereoPair
-from nodes.camera.node import Camera, CameraParameters
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import Clock, SystemClock
+from flexsheet.messages.scene import Lens, Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.camera.node import Camera, CameraParameters
 from tests.waiting import until
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"

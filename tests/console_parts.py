@@ -7,9 +7,9 @@ from typing import Any
 
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.scene import Scene
-from messages.wire import encode
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.wire import encode
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from messages.types import Skin, SoftBody
-from nodes.models.sheet import edge_poses
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Skin, SoftBody
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 
 Floats = NDArray[np.float64]
 

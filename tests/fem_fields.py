@@ -14,8 +14,8 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 from scipy.special import roots_jacobi
 
-from nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
+from flexsheet.nodes.fem_solver.mesh import EDGES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

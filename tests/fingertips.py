@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import Fingertip, FingertipReason
+from flexsheet.messages.types import Fingertip, FingertipReason
 
 Floats = NDArray[np.float64]
 STEP_S = 0.01

@@ -18,13 +18,13 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.scene import Appearance, Scene
-from messages.types import Display, StereoMode
-from nodes.models.rigid import rotation_from_vector, transform
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet import SheetPose
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Appearance, Scene
+from flexsheet.messages.types import Display, StereoMode
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose
 from tests.drawing import dent, follow, sheet_at
 from tests.indentation_bases import few_dents
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
-from nodes.fem_solver.mesh.grading import longest_edges
-from nodes.fem_solver.mesh.solid import add_midside_nodes, orient_tetrahedra
+from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
+from flexsheet.nodes.fem_solver.mesh.grading import longest_edges
+from flexsheet.nodes.fem_solver.mesh.solid import add_midside_nodes, orient_tetrahedra
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from messages.security import (
+from flexsheet.messages.security import (
     KeyRing,
     new_key_pair,
     public_of,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from functools import cache
 
-from nodes.models.sheet.indentation import (
+from flexsheet.nodes.models.sheet.indentation import (
     IndentationBasis,
     IndentationRange,
     solve_indentation_basis,
 )
-from nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.rubber import Rubber
 
 RUBBER = Rubber(0.24, 0.24, 0.001, 1e6)
 RADIUS_M = 0.007

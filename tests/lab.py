@@ -23,21 +23,21 @@ import pytest
 from ruamel.yaml import YAML
 from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
-from launch.experiments.stroke import STROKE_ANGLE_RAD, TREMOR_M, WANDER_M, object_pose
-from launch.plans.plan import load_plan
-from launch.plans.planned import Plan
-from launch.running.estop_file import STATE_VARIABLE
-from launch.running.keys import KEYS_VARIABLE
-from launch.running.runs import ROOT_VARIABLE, Run
-from launch.running.tools import ToolsWriter
-from messages.base import Header, Message
-from messages.bus import Subscriber
-from messages.scene import Scene, cylinder_of
-from messages.security import new_key_pair, write_secret
-from messages.topics import topic_named
-from messages.types import ArmState, FingerPath, HostStatus, TwinFinger
-from nodes.models.rigid import apply
-from nodes.node import PortCounts
+from flexsheet.launch.experiments.stroke import STROKE_ANGLE_RAD, TREMOR_M, WANDER_M, object_pose
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.running.estop_file import STATE_VARIABLE
+from flexsheet.launch.running.keys import KEYS_VARIABLE
+from flexsheet.launch.running.runs import ROOT_VARIABLE, Run
+from flexsheet.launch.running.tools import ToolsWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.messages.security import new_key_pair, write_secret
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import ArmState, FingerPath, HostStatus, TwinFinger
+from flexsheet.nodes.models.rigid import apply
+from flexsheet.nodes.node import PortCounts
 from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent

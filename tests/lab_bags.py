@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.bag import BagReader
-from messages.base import Header, Message
-from messages.scene import Scene
-from messages.types import ArmState, SheetTarget, TwinArms
-from nodes.models.rigid import transform_from_rpy
-from nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import ArmState, SheetTarget, TwinArms
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

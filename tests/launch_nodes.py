@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 from typing import ClassVar
 
-from messages.base import Header
-from messages.types import ArmState, EStop, Side, TwinFinger
-from nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.messages.base import Header
+from flexsheet.messages.types import ArmState, EStop, Side, TwinFinger
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 from tests.arm_states import arm_state
 
 

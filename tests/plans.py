@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.planner.motion import Plan, Planned
-from nodes.planner.parameters import PlannerParameters
-from nodes.planner.sheet_force import law_for
-from nodes.planner.yielding import Yielding
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.planner.motion import Plan, Planned
+from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.sheet_force import law_for
+from flexsheet.nodes.planner.yielding import Yielding
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]

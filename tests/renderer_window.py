@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from messages.base import Header
-from messages.types import Display, Frame, StereoMode
-from nodes.renderer.monitors import WindowError, find_monitor, start_glfw
-from nodes.renderer.output import pack
-from nodes.renderer.output_window import CLOSED, ProjectorWindow
+from flexsheet.messages.base import Header
+from flexsheet.messages.types import Display, Frame, StereoMode
+from flexsheet.nodes.renderer.monitors import WindowError, find_monitor, start_glfw
+from flexsheet.nodes.renderer.output import pack
+from flexsheet.nodes.renderer.output_window import CLOSED, ProjectorWindow
 from tests.test_renderer import Bench
 from tests.waiting import until
 

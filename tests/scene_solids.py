@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from nodes.fem_solver.mesh import SolidMesh, mesh_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.fem_solver.mesh import SolidMesh, mesh_scene
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SPACINGS_M = {"plane": 0.0075}

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.experiments.stroke import stroke_label, stroke_window_s
-from launch.plans.plan import load_scene
-from messages.bag import BagWriter
-from messages.base import Header, Message
-from messages.scene import Scene
-from messages.topics import TOPICS
-from messages.types import (
+from flexsheet.launch.experiments.stroke import stroke_label, stroke_window_s
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import (
     ArmState,
     EStop,
     Frame,
@@ -30,7 +30,12 @@ from messages.types import (
     TwinEye,
     TwinFinger,
 )
-from nodes.models.rigid import inverse, rotation_from_vector, transform, transform_from_rpy
+from flexsheet.nodes.models.rigid import (
+    inverse,
+    rotation_from_vector,
+    transform,
+    transform_from_rpy,
+)
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from messages.scene import Cylinder, StripSupport
-from nodes.fem_solver.mesh import MeshSpec
-from nodes.fem_solver.precompute import SoftBodySpec
+from flexsheet.messages.scene import Cylinder, StripSupport
+from flexsheet.nodes.fem_solver.mesh import MeshSpec
+from flexsheet.nodes.fem_solver.precompute import SoftBodySpec
 
 
 def cylinder_spec(

@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 
-from messages.clock import VirtualClock
-from messages.methods import KinematicsMethod
-from messages.scene import Scene
-from messages.types import ArmState, EStop, Side
-from nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.goal import Goal, goal_ahead, pace
-from nodes.arm_bridge.kinematics import KINEMATICS, STEPS, forward, next_joints
-from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
-from nodes.arm_bridge.standstill import STANDSTILL_COUNT
-from nodes.methods import measure
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import transform_from_rpy, vector_from_rotation
-from nodes.models.sheet import edge_poses
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.methods import KinematicsMethod
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import ArmState, EStop, Side
+from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.goal import Goal, goal_ahead, pace
+from flexsheet.nodes.arm_bridge.kinematics import KINEMATICS, STEPS, forward, next_joints
+from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from flexsheet.nodes.arm_bridge.standstill import STANDSTILL_COUNT
+from flexsheet.nodes.methods import measure
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation
+from flexsheet.nodes.models.sheet import edge_poses
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messages.base import Header, Message
-from messages.types import ArmState, EStop
-from nodes.arm_bridge.link_drivers import link_for
-from nodes.arm_bridge.modbus import MAGIC
-from nodes.twin import arms as twin_arms
-from nodes.twin.arms import SPEED_RAD_PER_S, STATE_FAULT, Fault, Servo, forward
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.types import ArmState, EStop
+from flexsheet.nodes.arm_bridge.link_drivers import link_for
+from flexsheet.nodes.arm_bridge.modbus import MAGIC
+from flexsheet.nodes.twin import arms as twin_arms
+from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, STATE_FAULT, Fault, Servo, forward
 from tests.network import Cut
 from tests.test_arm_loop import (
     AT_FRONT,

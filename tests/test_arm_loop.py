@@ -15,18 +15,18 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import SystemClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import ArmState, EStop, Fingertip, SheetTarget
-from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
-from nodes.models.rigid import inverse, transform_from_rpy
-from nodes.models.sheet import sheet_from_edges
-from nodes.planner.node import Planner
-from nodes.planner.parameters import PlannerParameters
-from nodes.twin.arms import STATE_MOVING, STATE_STOPPED
-from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import ArmState, EStop, Fingertip, SheetTarget
+from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from flexsheet.nodes.models.rigid import inverse, transform_from_rpy
+from flexsheet.nodes.models.sheet import sheet_from_edges
+from flexsheet.nodes.planner.node import Planner
+from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.twin.arms import STATE_MOVING, STATE_STOPPED
+from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from tests.fingertips import fingertip
 from tests.waiting import until
 

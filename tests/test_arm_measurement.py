@@ -14,22 +14,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.types import Side
-from nodes.arm_bridge.control import ArmControl, Command, OtherArm
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.goal import Goal
-from nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
-from nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, bounded_step
-from nodes.arm_bridge.link import MAX_UNCHANGED_S, CounterMonitor, Freshness
-from nodes.arm_bridge.standstill import (
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.goal import Goal
+from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
+from flexsheet.nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, bounded_step
+from flexsheet.nodes.arm_bridge.link import MAX_UNCHANGED_S, CounterMonitor, Freshness
+from flexsheet.nodes.arm_bridge.standstill import (
     JOINT_LEVER_M,
     MAX_RESTART_SHIFT_M,
     STANDSTILL_COUNT,
     StandstillMonitor,
     edge_shift_m,
 )
-from nodes.models.rigid import transform_from_rpy
-from nodes.twin.arms import SPEED_RAD_PER_S, Servo, forward
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, Servo, forward
 from tests.test_arm_control import GUESS, HOME, PATIENCE, SCENE, STEP_S, on_time, sheet_at
 
 Floats = NDArray[np.float64]
@@ -424,8 +424,8 @@ def test_no_decision_commands_a_leap(leap: float, monkeypatch: pytest.MonkeyPatc
     control, geometry = arms[0].control, arms[0].geometry
     monkeypatch.setattr(control, "_limited", lambda *_: np.full(6, leap / STEP_S))
     monkeypatch.setattr(geometry, "sheet_limits", replace(geometry.sheet_limits))
-    monkeypatch.setattr("nodes.arm_bridge.control.place_trouble", lambda *_, **__: None)
-    monkeypatch.setattr("nodes.arm_bridge.control.sheet_trouble", lambda *_, **__: None)
+    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.place_trouble", lambda *_, **__: None)
+    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.sheet_trouble", lambda *_, **__: None)
     before = arms[0].command.joints_rad
     arms[0].cycle(stroke_goal(time_s), arms[1].as_other())
     assert control.faults == ("commanded: a step beyond the joint or tool speed",)

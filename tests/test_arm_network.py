@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messages.base import Header
-from messages.bus import Source, Subscriber
-from messages.topics import topic_named
-from messages.types import ArmState, Clocks, Status
-from nodes.node import PortCounts
-from nodes.runner import NodeConfig, PortConfig
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Source, Subscriber
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import ArmState, Clocks, Status
+from flexsheet.nodes.node import PortCounts
+from flexsheet.nodes.runner import NodeConfig, PortConfig
 from tests.hosts import hosts
 from tests.network import Computers
 from tests.waiting import until

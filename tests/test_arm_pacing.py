@@ -7,7 +7,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.arm_bridge.pacing import Pace
+from flexsheet.nodes.arm_bridge.pacing import Pace
 
 PACE = Pace(period_s=1 / 140, target_period_s=1 / 60, resting_period_s=1 / 40)
 MS = 1_000_000

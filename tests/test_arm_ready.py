@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from launch.plans.plan import load_plan, load_scene
-from messages.base import Header
-from messages.clock import VirtualClock
-from messages.types import Arming, EStop
-from nodes.arm_bridge.control import LET_GO_AFTER_S, OLDEST_ARMING_S, READY_TOGETHER_S
-from nodes.arm_bridge.goal import Goal
-from nodes.arm_bridge.link import ArmStatus, Floats
-from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.messages.base import Header
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.types import Arming, EStop
+from flexsheet.nodes.arm_bridge.control import LET_GO_AFTER_S, OLDEST_ARMING_S, READY_TOGETHER_S
+from flexsheet.nodes.arm_bridge.goal import Goal
+from flexsheet.nodes.arm_bridge.link import ArmStatus, Floats
+from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from tests.arm_states import arm_state
 from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
 from tests.test_arm_loop import SCENE_FILE

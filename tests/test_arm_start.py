@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nodes.arm_bridge.control import ArmControl, Patience
+from flexsheet.nodes.arm_bridge.control import ArmControl, Patience
 from tests.test_arm_control import HOME, Arm, on_time, pair
 
 

@@ -12,15 +12,15 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.base import Header
-from messages.clock import VirtualClock
-from messages.types import SheetTarget, Side
-from nodes.arm_bridge import way as way_module
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
-from nodes.arm_bridge.way import Lookout, Way, rehearsed, trouble_on_way
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import transform_from_rpy
+from flexsheet.messages.base import Header
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.types import SheetTarget, Side
+from flexsheet.nodes.arm_bridge import way as way_module
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from flexsheet.nodes.arm_bridge.way import Lookout, Way, rehearsed, trouble_on_way
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import transform_from_rpy
 from tests.test_arm_control import (
     HOME,
     SCENE,

@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from nodes.arm_bridge.control import ArmControl
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.kinematics import UnreachableError
-from nodes.arm_bridge.reach import PathError, path_through
-from nodes.arm_bridge.standstill import SETTLED_COUNT
-from nodes.arm_bridge.way import Alignment, Way, check_way, rehearsed
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.arm_bridge.control import ArmControl
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
+from flexsheet.nodes.arm_bridge.reach import PathError, path_through
+from flexsheet.nodes.arm_bridge.standstill import SETTLED_COUNT
+from flexsheet.nodes.arm_bridge.way import Alignment, Way, check_way, rehearsed
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import transform_from_rpy
 from tests.test_arm_control import (
     GUESS,
     HOME,

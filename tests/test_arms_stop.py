@@ -19,10 +19,16 @@ from typing import Any
 
 import pytest
 
-from launch.running import runs, stopping
-from launch.running.stopping import KILL_AFTER_S, StopAttempt, StopOutcome, StopPath, stop_arms
-from nodes import stop_socket
-from nodes.stop_socket import MAX_CONNECTIONS, StopSocket
+from flexsheet.launch.running import runs, stopping
+from flexsheet.launch.running.stopping import (
+    KILL_AFTER_S,
+    StopAttempt,
+    StopOutcome,
+    StopPath,
+    stop_arms,
+)
+from flexsheet.nodes import stop_socket
+from flexsheet.nodes.stop_socket import MAX_CONNECTIONS, StopSocket
 
 ROOT = Path(__file__).resolve().parent.parent
 FLEXSHEET = [sys.executable, "-m", "flexsheet"]
@@ -307,7 +313,7 @@ def test_a_stop_is_sent_before_the_command_line_is_imported(
 
 
 def test_a_stop_imports_next_to_nothing() -> None:
-    code = "import launch.running.stopping, launch.running.runs, sys; print(*sys.modules)"
+    code = "import sys\nfrom flexsheet.launch.running import runs, stopping\nprint(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},

@@ -6,8 +6,8 @@ import os
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
-from nodes.background import MAX_NICE, enter_background
-from nodes.fem_solver.precompute_table import local_processes
+from flexsheet.nodes.background import MAX_NICE, enter_background
+from flexsheet.nodes.fem_solver.precompute_table import local_processes
 
 
 def priority() -> tuple[int, int]:

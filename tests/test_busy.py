@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from launch.running.cpu import MAX_WAIT_RATIO, WINDOW_S, CpuWatch
-from messages.busy import describe_busy, is_busy
-from messages.types import CpuPressure, HostStatus, ProgramCpu
+from flexsheet.launch.running.cpu import MAX_WAIT_RATIO, WINDOW_S, CpuWatch
+from flexsheet.messages.busy import describe_busy, is_busy
+from flexsheet.messages.types import CpuPressure, HostStatus, ProgramCpu
 
 TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 

@@ -13,21 +13,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.calibration import Board, StereoCalibration, load_calibration, save_calibration
-from messages.calibration_file import CalibrationFileError
-from messages.scene import Lens
-from nodes.camera.calibration import calibrate_stereo
-from nodes.camera.check import check_stereo, cross_check, rigid_fit_residuals
-from nodes.camera.corners import (
+from flexsheet.messages.calibration import (
+    Board,
+    StereoCalibration,
+    load_calibration,
+    save_calibration,
+)
+from flexsheet.messages.calibration_file import CalibrationFileError
+from flexsheet.messages.scene import Lens
+from flexsheet.nodes.camera.calibration import calibrate_stereo
+from flexsheet.nodes.camera.check import check_stereo, cross_check, rigid_fit_residuals
+from flexsheet.nodes.camera.corners import (
     BoardPair,
     CalibrationError,
     board_points,
     find_pairs,
     same_order,
 )
-from nodes.camera.selection import fit_pairs
-from nodes.camera.uncertainty import position_slopes, view_of_work
-from nodes.models import camera, rigid
+from flexsheet.nodes.camera.selection import fit_pairs
+from flexsheet.nodes.camera.uncertainty import position_slopes, view_of_work
+from flexsheet.nodes.models import camera, rigid
 
 Floats = NDArray[np.float64]
 REAL = Path(__file__).resolve().parent.parent.parent / "shared" / "data" / "stereo"

@@ -15,27 +15,27 @@ from numpy.typing import NDArray
 from rich.console import Console
 from ruamel.yaml import YAML
 
-from launch import cli
-from launch.commands.capture import coverage_view, take_pairs
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan
-from messages.calibration import Board, load_calibration
-from messages.scene import Scene, StereoCamera
-from nodes.camera.bundle import pose_vector
-from nodes.camera.calibration import calibrate_stereo
-from nodes.camera.capture import TILTS, Bin, Capture, classify_tilt, needed, place
-from nodes.camera.check import check_stereo
-from nodes.camera.corners import (
+from flexsheet.launch import cli
+from flexsheet.launch.commands.capture import coverage_view, take_pairs
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.messages.calibration import Board, load_calibration
+from flexsheet.messages.scene import Scene, StereoCamera
+from flexsheet.nodes.camera.bundle import pose_vector
+from flexsheet.nodes.camera.calibration import calibrate_stereo
+from flexsheet.nodes.camera.capture import TILTS, Bin, Capture, classify_tilt, needed, place
+from flexsheet.nodes.camera.check import check_stereo
+from flexsheet.nodes.camera.corners import (
     BoardPair,
     CalibrationError,
     CornerFinder,
     board_points,
     match_views,
 )
-from nodes.camera.printing import raster, svg, write_board
-from nodes.models import rigid
-from nodes.twin.board import TwinBoard
-from nodes.twin.rig import make_true_camera
+from flexsheet.nodes.camera.printing import raster, svg, write_board
+from flexsheet.nodes.models import rigid
+from flexsheet.nodes.twin.board import TwinBoard
+from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

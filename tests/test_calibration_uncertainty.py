@@ -12,23 +12,23 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
-from launch.plans.plan import load_plan
-from messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
-from messages.scene import Lens, Scene, StereoCamera
-from nodes.camera import bundle
-from nodes.camera.calibration import state_uncertainty
-from nodes.camera.check import Rig, triangulated
-from nodes.camera.corners import BoardPair, CornerFinder, View, board_points, match_views
-from nodes.camera.selection import Selection, fit_pairs, fit_selection
-from nodes.camera.uncertainty import (
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
+from flexsheet.messages.scene import Lens, Scene, StereoCamera
+from flexsheet.nodes.camera import bundle
+from flexsheet.nodes.camera.calibration import state_uncertainty
+from flexsheet.nodes.camera.check import Rig, triangulated
+from flexsheet.nodes.camera.corners import BoardPair, CornerFinder, View, board_points, match_views
+from flexsheet.nodes.camera.selection import Selection, fit_pairs, fit_selection
+from flexsheet.nodes.camera.uncertainty import (
     jackknife_covariance,
     position_slopes,
     position_spread,
     view_of_work,
 )
-from nodes.models import rigid
-from nodes.twin.board import TwinBoard
-from nodes.twin.rig import make_true_camera
+from flexsheet.nodes.models import rigid
+from flexsheet.nodes.twin.board import TwinBoard
+from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 ROOT = Path(__file__).resolve().parent.parent

@@ -22,13 +22,13 @@ from camera_bench import (
 )
 from pydantic import ValidationError
 
-from messages.base import Header
-from messages.scene import Scene
-from messages.types import StereoPair
-from nodes.camera.devices import ReaderThread, open_reader
-from nodes.camera.image_pair import DeviceError, ImagePair, halves
-from nodes.camera.node import CameraParameters
-from nodes.camera.sources import ImagesSource, OpenCvSource, VideoSource
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.camera.devices import ReaderThread, open_reader
+from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, halves
+from flexsheet.nodes.camera.node import CameraParameters
+from flexsheet.nodes.camera.sources import ImagesSource, OpenCvSource, VideoSource
 
 
 @pytest.fixture(scope="module")

@@ -21,11 +21,11 @@ from camera_bench import (
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from messages.scene import Scene
-from nodes.camera.devices import ReaderThread, open_reader
-from nodes.camera.files import read_times
-from nodes.camera.image_pair import DeviceError, ImagePair, Reader
-from nodes.camera.sources import AnySource, ImagesSource, VideoSource
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.camera.devices import ReaderThread, open_reader
+from flexsheet.nodes.camera.files import read_times
+from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, Reader
+from flexsheet.nodes.camera.sources import AnySource, ImagesSource, VideoSource
 
 MS = 1_000_000
 UNEVEN_MS = [0, 20, 40, 90, 100, 133]

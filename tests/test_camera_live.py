@@ -27,12 +27,12 @@ from camera_bench import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from messages.scene import Scene
-from nodes.camera import live
-from nodes.camera.image_pair import DeviceError, ImagePair, Region, Regions
-from nodes.camera.live import CameraReader
-from nodes.camera.sources import OpenCvSource
-from nodes.camera.stamps import LAPSES, SLACK, Pairing, StampJudge
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.camera import live
+from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, Region, Regions
+from flexsheet.nodes.camera.live import CameraReader
+from flexsheet.nodes.camera.sources import OpenCvSource
+from flexsheet.nodes.camera.stamps import LAPSES, SLACK, Pairing, StampJudge
 
 pytestmark = pytest.mark.alone
 

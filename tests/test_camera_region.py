@@ -10,18 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from messages.base import Header
-from messages.scene import Lens, Pose, Scene
-from messages.types import StereoPair
-from nodes.camera.image_pair import DeviceError, ImagePair, Region, check_size, cut
-from nodes.camera.node import CameraParameters
-from nodes.camera.region import (
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Lens, Pose, Scene
+from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, Region, check_size, cut
+from flexsheet.nodes.camera.node import CameraParameters
+from flexsheet.nodes.camera.region import (
     ExplicitRegions,
     find_finger_regions,
     find_visible_region,
     resolve_regions,
 )
-from nodes.models import rigid
+from flexsheet.nodes.models import rigid
 
 WIDE, HIGH = 640, 480
 SCENE = load_scene(WIDE, HIGH)

@@ -17,13 +17,13 @@ from typing import Any
 
 import pytest
 
-from launch import cli
-from launch.running import runs
-from messages.bag import BagReader, BagWriter
-from messages.base import Header
-from messages.topics import TOPICS
-from messages.types import Display, EStop, Status
-from nodes import NODES
+from flexsheet.launch import cli
+from flexsheet.launch.running import runs
+from flexsheet.messages.bag import BagReader, BagWriter
+from flexsheet.messages.base import Header
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import Display, EStop, Status
+from flexsheet.nodes import NODES
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -16,20 +16,20 @@ import pytest
 import structlog
 from typer.main import get_command
 
-from launch import cli
-from launch.commands import complete
-from launch.commands.experiment import DEMO_FILE
-from launch.commands.failures import LATE
-from launch.commands.output import (
+from flexsheet.launch import cli
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.experiment import DEMO_FILE
+from flexsheet.launch.commands.failures import LATE
+from flexsheet.launch.commands.output import (
     FAILED,
     examples_in,
     logs_on_stderr,
     print_json,
     print_json_line,
 )
-from launch.plans.plan import load_plan
-from launch.reference.cli import commands
-from launch.reference.errors import explained, undocumented
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.reference.cli import commands
+from flexsheet.launch.reference.errors import explained, undocumented
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -102,8 +102,8 @@ def test_what_cannot_be_worked_with_is_a_failure_and_no_error_of_ours(module: st
 @pytest.mark.parametrize("page", ["cli", "errors", "parameters"])
 def test_the_generated_pages_are_up_to_date(page: str) -> None:
     written = (ROOT / "docs" / f"{page}.md").read_text()
-    made = import_module(f"launch.reference.{page}").reference()
-    assert written == made, f"python -m launch.reference.{page} > docs/{page}.md"
+    made = import_module(f"flexsheet.launch.reference.{page}").reference()
+    assert written == made, f"python -m flexsheet.launch.reference.{page} > docs/{page}.md"
 
 
 def test_every_kind_of_error_has_a_remedy_and_no_remedy_is_of_nothing() -> None:
@@ -136,14 +136,16 @@ def test_looking_into_a_graph_loads_little() -> None:
     """What `topic echo` needs until it is subscribed: no YAML, no linear algebra, no supervisor."""
     code = (
         "import json, sys\n"
-        "import launch.cli, launch.commands.topic, launch.running.tools\n"
+        "from flexsheet.launch import cli\n"
+        "from flexsheet.launch.commands import topic\n"
+        "from flexsheet.launch.running import tools\n"
         "print(json.dumps(sorted(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, check=True)
     heavy = {
         "cv2", "scipy", "matplotlib", "mcap", "moderngl", "pymodbus", "rich", "ruamel.yaml",
-        "structlog", "psutil", "launch.plans.plan", "launch.running.supervisor", "nodes.node",
-        "uvloop",
+        "psutil", "flexsheet.launch.plans.plan", "flexsheet.launch.running.supervisor",
+        "flexsheet.nodes.node", "structlog", "uvloop",
     }  # fmt: skip
     assert heavy & set(json.loads(done.stdout)) == set()
 
@@ -207,7 +209,7 @@ def test_a_slip_is_answered_with_what_was_meant(
 
 def test_colours_are_for_terminals_and_no_color_takes_them_away() -> None:
     """The same words in a pseudo-terminal with NO_COLOR, without it, and into a pipe."""
-    code = "from launch.commands.output import words; words.print('[red]so[/]')"
+    code = "from flexsheet.launch.commands.output import words; words.print('[red]so[/]')"
 
     def said(terminal: bool, **more: str) -> bytes:
         ours, theirs = os.openpty() if terminal else os.pipe()

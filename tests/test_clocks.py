@@ -13,17 +13,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.clock_table import ClockTable
-from messages.topics import Topic
-from messages.types import ClockOffset, ClockPing, Clocks, EStop, Fingertip
-from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
-from nodes.clock.node import ClockNode, ClockParameters
-from nodes.clock.offset import OtherClock, Sample, bounds, make_sample
-from nodes.node import Input, Node, NodeParameters, Output
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.clock_table import ClockTable
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import ClockOffset, ClockPing, Clocks, EStop, Fingertip
+from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from flexsheet.nodes.clock.node import ClockNode, ClockParameters
+from flexsheet.nodes.clock.offset import OtherClock, Sample, bounds, make_sample
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output
 from tests.test_launch_supervisor import LISTENER, beacon, write
 from tests.test_messages_wire import HEADER as SOME_HEADER
 from tests.test_security import target

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from launch.running.code_state import git_state
+from flexsheet.launch.running.code_state import git_state
 
 
 @pytest.fixture

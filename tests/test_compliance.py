@@ -13,15 +13,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from launch.bench.twin_sheet import twin_push
-from launch.cli import app
-from launch.commands.output import CommandError
-from launch.plans.plan import load_scene
-from messages.types import SoftBody
-from nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
-from nodes.models.sheet.tabulated import TabulatedSheetModel
-from nodes.planner import sheet_force
-from nodes.planner.compliance import (
+from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.launch.cli import app
+from flexsheet.launch.commands.output import CommandError
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
+from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
+from flexsheet.nodes.planner import sheet_force
+from flexsheet.nodes.planner.compliance import (
     ADVANCE_PER_DEPTH,
     GOOD_RATIO,
     RESERVE,
@@ -35,7 +35,7 @@ from nodes.planner.compliance import (
     pull_of,
     unsureness,
 )
-from nodes.planner.sheet_force import law_for
+from flexsheet.nodes.planner.sheet_force import law_for
 
 Floats = NDArray[np.float64]
 
@@ -271,7 +271,7 @@ def test_the_doctor_says_whether_a_scenes_object_can_be_presented(
 ) -> None:
     curve = soft_curve(scale)
     rows = np.column_stack([curve.depths_m, curve.forces_n])
-    monkeypatch.setattr("launch.health.compliance.front_curve", lambda scene: rows)
+    monkeypatch.setattr("flexsheet.launch.health.compliance.front_curve", lambda scene: rows)
     command = ["doctor", "compliance", str(SCENE_FILE)]
     result = CliRunner().invoke(app, [*command, "--json"])
     assert result.exit_code == code, result.output

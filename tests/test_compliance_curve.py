@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
-from nodes.fem_solver.closest_contact import ContactQuery
-from nodes.fem_solver.contact import CURVE_FRACTIONS, curve_depths
-from nodes.fem_solver.precompute import compute
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.contact import CURVE_FRACTIONS, curve_depths
+from flexsheet.nodes.fem_solver.precompute import compute
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"

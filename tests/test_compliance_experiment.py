@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.bench.twin_sheet import twin_force
-from launch.experiments import ExperimentError
-from launch.experiments.compliance import (
+from flexsheet.launch.bench.twin_sheet import twin_force
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.compliance import (
     DEPTH_SHARES,
     HOLD_S,
     JUDGED_S,
@@ -22,12 +22,12 @@ from launch.experiments.compliance import (
     presses,
     read_bag,
 )
-from launch.experiments.pictures import draw_compliance
-from launch.experiments.stroke import Track
-from launch.plans.plan import load_scene
-from messages.bag import BagWriter
-from nodes.models.rigid import inverse, transform, transform_from_rpy
-from nodes.planner.compliance import FELT_N
+from flexsheet.launch.experiments.pictures import draw_compliance
+from flexsheet.launch.experiments.stroke import Track
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.bag import BagWriter
+from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
+from flexsheet.nodes.planner.compliance import FELT_N
 
 Floats = NDArray[np.float64]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")

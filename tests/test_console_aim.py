@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.base import Message
-from messages.scene import Scene
-from messages.types import (
+from flexsheet.messages.base import Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import (
     FingerPath,
 )
-from nodes.console.aim import HOVER_M, Aim
-from nodes.console.desk import SceneDesk
-from nodes.console.finger import Finger, FingerIntent, Ray
+from flexsheet.nodes.console.aim import HOVER_M, Aim
+from flexsheet.nodes.console.desk import SceneDesk
+from flexsheet.nodes.console.finger import Finger, FingerIntent, Ray
 from tests.console_parts import cylinder
 from tests.plans import scene_with
 from tests.waiting import DEADLINE_S

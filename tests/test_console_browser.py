@@ -16,13 +16,13 @@ import pytest
 from playwright.async_api import Page as BrowserTab
 from playwright.async_api import async_playwright, expect
 
-from messages.types import FingertipReason
-from nodes.console import panels
-from nodes.console.banner import GraphState
-from nodes.console.desk import Sliders
-from nodes.console.guard import Guard, start_server
-from nodes.console.history import History
-from nodes.console.page import Page
+from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.console import panels
+from flexsheet.nodes.console.banner import GraphState
+from flexsheet.nodes.console.desk import Sliders
+from flexsheet.nodes.console.guard import Guard, start_server
+from flexsheet.nodes.console.history import History
+from flexsheet.nodes.console.page import Page
 from tests.arm_states import arm_state
 from tests.browser import BROWSER_MARKS, CHROMIUM, DEADLINE_S, DRAWN_WITHOUT_GPU, TWO_FRAMES
 from tests.console_parts import Shelf, cylinder

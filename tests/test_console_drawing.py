@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.arm_bridge import kinematics
-from nodes.console.arms import PIECES, link_poses, rounded_box
-from nodes.console.creases import split_creases
-from nodes.console.picture import picture_of, ray_vertices, rays
-from nodes.console.sheet import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arm_bridge import kinematics
+from flexsheet.nodes.console.arms import PIECES, link_poses, rounded_box
+from flexsheet.nodes.console.creases import split_creases
+from flexsheet.nodes.console.picture import picture_of, ray_vertices, rays
+from flexsheet.nodes.console.sheet import (
     COLUMNS,
     ROWS,
     film,
@@ -23,14 +23,14 @@ from nodes.console.sheet import (
     sheet_points,
     sheet_triangles,
 )
-from nodes.console.view import (
+from flexsheet.nodes.console.view import (
     LINES_LIFT_M,
     SHEET_LIFT_M,
     finger_mesh,
     lift_sheet,
     line_segments,
 )
-from nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from tests.arm_states import arm_state
 from tests.console_parts import Shelf, cylinder
 from tests.fingertips import fingertip

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from messages.base import Message
-from messages.methods import Methods
-from messages.scene import Scene
-from messages.types import (
+from flexsheet.messages.base import Message
+from flexsheet.messages.methods import Methods
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import (
     Correction,
     Display,
     Frame,
     TwinEye,
 )
-from nodes.console import panels
-from nodes.console.desk import CAPTURE_S, MAX_TRACING_S, Desk, Files, Look, LookState
-from nodes.console.finger import Finger
+from flexsheet.nodes.console import panels
+from flexsheet.nodes.console.desk import CAPTURE_S, MAX_TRACING_S, Desk, Files, Look, LookState
+from flexsheet.nodes.console.finger import Finger
 from tests.console_parts import cylinder
 
 Floats = NDArray[np.float64]

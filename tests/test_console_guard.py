@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from nodes.console.dress import dressed
-from nodes.console.guard import (
+from flexsheet.nodes.console.dress import dressed
+from flexsheet.nodes.console.guard import (
     COOKIE,
     ConsoleError,
     Guard,
@@ -26,7 +26,7 @@ from nodes.console.guard import (
     read_token,
     start_server,
 )
-from nodes.console.node import ConsoleParameters
+from flexsheet.nodes.console.node import ConsoleParameters
 
 Floats = NDArray[np.float64]
 TOKEN = "0123456789abcdef0123"

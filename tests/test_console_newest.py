@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from messages.topics import Topic
-from messages.types import (
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import (
     EStop,
     Moment,
 )
-from messages.wire import WireError
-from nodes.console.newest import Newest
+from flexsheet.messages.wire import WireError
+from flexsheet.nodes.console.newest import Newest
 from tests.console_parts import frames_of
 
 Floats = NDArray[np.float64]

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messages.base import Message
-from messages.types import FingerPath, Recording
-from nodes.console.desk import SETTLE_S, Desk, Files
-from nodes.console.finger import Finger
-from nodes.console.graph_facts import GraphFacts
-from nodes.console.guard import Guard, start_server
-from nodes.console.newest import Newest
-from nodes.console.operator import Operator
-from nodes.console.touch_tab import LIFT, LOWER
+from flexsheet.messages.base import Message
+from flexsheet.messages.types import FingerPath, Recording
+from flexsheet.nodes.console.desk import SETTLE_S, Desk, Files
+from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.graph_facts import GraphFacts
+from flexsheet.nodes.console.guard import Guard, start_server
+from flexsheet.nodes.console.newest import Newest
+from flexsheet.nodes.console.operator import Operator
+from flexsheet.nodes.console.touch_tab import LIFT, LOWER
 from tests.console_parts import cylinder
 
 EYE = np.array([0.1, 0.05, 0.5])

@@ -17,16 +17,16 @@ import pytest
 import websockets
 from playwright.async_api import Page, async_playwright, expect
 
-from launch.plans.plan import load_plan
-from launch.running import runs
-from launch.running.runs import Run, local_endpoints
-from launch.running.supervisor import RunningGraph
-from messages.bag import BagReader, BagWriter
-from messages.base import Header, Message
-from messages.bus import Subscriber
-from messages.topics import topic_named
-from messages.types import EStop, FingerPath, Moment, Recording, TwinFinger
-from nodes.node import PortCounts
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running import runs
+from flexsheet.launch.running.runs import Run, local_endpoints
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.bag import BagReader, BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import EStop, FingerPath, Moment, Recording, TwinFinger
+from flexsheet.nodes.node import PortCounts
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
 from tests.fingertips import fingertip
 from tests.waiting import DEADLINE_S

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan
-from nodes.console.graph_facts import GraphFacts
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.nodes.console.graph_facts import GraphFacts
 from tests.console_parts import ROOT
 
 Floats = NDArray[np.float64]

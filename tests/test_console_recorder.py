@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.bag import BagReader
-from messages.clock import VirtualClock
-from messages.types import (
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.types import (
     Display,
     EStop,
     Recording,
 )
-from nodes.recorder.node import Recorder, RecorderParameters
+from flexsheet.nodes.recorder.node import Recorder, RecorderParameters
 from tests.console_parts import frames_of
 
 Floats = NDArray[np.float64]

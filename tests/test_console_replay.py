@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from messages.bag import BagError, BagWriter
-from messages.base import Header, Message
-from messages.scene import Scene
-from messages.topics import TOPICS
-from messages.types import (
+from flexsheet.messages.bag import BagError, BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import (
     ArmState,
     EStop,
     Fingertip,
     Moment,
 )
-from nodes.console.desk import Replay
-from nodes.console.replay import Timeline, bags_in
+from flexsheet.nodes.console.desk import Replay
+from flexsheet.nodes.console.replay import Timeline, bags_in
 from tests.console_parts import cylinder
 from tests.fingertips import fingertip
 

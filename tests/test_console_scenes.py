@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.base import Message
-from messages.scene import Scene
-from messages.types import (
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.base import Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import (
     Recording,
 )
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.limiter import sheet_trouble
-from nodes.console import scenes
-from nodes.console.aim import Aim
-from nodes.console.desk import SETTLE_S, Desk, Files, SceneDesk
-from nodes.console.finger import Finger, FingerIntent
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.limiter import sheet_trouble
+from flexsheet.nodes.console import scenes
+from flexsheet.nodes.console.aim import Aim
+from flexsheet.nodes.console.desk import SETTLE_S, Desk, Files, SceneDesk
+from flexsheet.nodes.console.finger import Finger, FingerIntent
 from tests.console_parts import ROOT, cylinder
 from tests.plans import scene_with
 

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from messages.types import ArmState, PortStatus, Status
-from nodes.console import banner, dress, panels
-from nodes.console.banner import BannerState, GraphState
-from nodes.console.desk import LookState
-from nodes.console.graph_tab import max_latency_ms
-from nodes.console.history import SERIES, WINDOW_S, History, widen_isolated
-from nodes.console.page import STOP_COLOR
-from nodes.console.record_tab import RECORDING_COLOR
+from flexsheet.messages.types import ArmState, PortStatus, Status
+from flexsheet.nodes.console import banner, dress, panels
+from flexsheet.nodes.console.banner import BannerState, GraphState
+from flexsheet.nodes.console.desk import LookState
+from flexsheet.nodes.console.graph_tab import max_latency_ms
+from flexsheet.nodes.console.history import SERIES, WINDOW_S, History, widen_isolated
+from flexsheet.nodes.console.page import STOP_COLOR
+from flexsheet.nodes.console.record_tab import RECORDING_COLOR
 from tests.arm_states import arm_state
 from tests.colours import luminance
 from tests.console_parts import Shelf

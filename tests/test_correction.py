@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.models.rigid import rotation_from_vector
-from nodes.renderer.correction import (
+from flexsheet.nodes.models.rigid import rotation_from_vector
+from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
     MIN_PUSH_M,
     ScreenPlane,

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.triangulator.data_association import (
+from flexsheet.nodes.triangulator.data_association import (
     CLUTTER_RELEASE_TIME_S,
     SOLE_CANDIDATE_TIME_S,
     DataAssociation,
 )
-from nodes.triangulator.filters import TRACKING_METHODS
-from nodes.triangulator.fingertip import Candidate, StereoDetection
-from nodes.triangulator.tracking import Tracker, TrackingSettings
-from nodes.triangulator.triangulation import TriangulatedPoint
+from flexsheet.nodes.triangulator.filters import TRACKING_METHODS
+from flexsheet.nodes.triangulator.fingertip import Candidate, StereoDetection
+from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
 Floats = NDArray[np.float64]
 Place = Callable[[float], Floats]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from benchmarks.deploy_trial import HOSTS, PAGE, Stroke, judge_stroke, steps
-from launch.commands.service import install
-from messages.bag import BagWriter
+from flexsheet.launch.commands.service import install
+from flexsheet.messages.bag import BagWriter
 from tests.doc_pages import ROOT
 
 LAB = ROOT / "launch" / "lab.yaml"

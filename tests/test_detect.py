@@ -14,16 +14,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from messages.types import FingertipReason
-from nodes.models import rigid
-from nodes.triangulator.families import DrawnDisc, noisy
-from nodes.triangulator.fingertip import DetectorConfig, detect
-from nodes.triangulator.marker import MARKER_METHODS, BlobFilter
-from nodes.triangulator.subpixel import PixelNoise
-from nodes.triangulator.tracking import Gate
-from nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint, dlt
-from nodes.twin.clutter import (
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.models import rigid
+from flexsheet.nodes.triangulator.families import DrawnDisc, noisy
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
+from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.subpixel import PixelNoise
+from flexsheet.nodes.triangulator.tracking import Gate
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint, dlt
+from flexsheet.nodes.twin.clutter import (
     CLUTTER,
     Clutter,
     FixedPoint,
@@ -33,7 +33,7 @@ from nodes.twin.clutter import (
     together,
     touching_highlight,
 )
-from nodes.twin.pixels import Sensor, TwinCamera
+from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from messages.bag import BagError, BagWriter
-from messages.files import FileWriteError, free_bytes, write_file
+from flexsheet.messages.bag import BagError, BagWriter
+from flexsheet.messages.files import FileWriteError, free_bytes, write_file
 from tests.sessions import write_session
 from tests.test_cli import Command
 from tests.test_recorder import small_disk

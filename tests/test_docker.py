@@ -13,9 +13,9 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from launch.cli import app
-from launch.plans.plan import load_plan
-from launch.running.service import files_of
+from flexsheet.launch.cli import app
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.service import files_of
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCKER = ROOT / "docker"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_plan
 from tests.doc_pages import DOCS, ROOT, anchors, headings, links, name, nav_pages, pages, site_pages
 from website.finish import NetworkError, finish
 from website.graph import LAB, PICTURES, TWIN, Picture, svg

@@ -22,13 +22,13 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from launch import cli
-from launch.plans.documents import read_document, validate
-from launch.plans.launch_file import LaunchFile
-from launch.plans.plan import load_plan, load_scene
-from messages.scene import Scene
-from nodes import node_class
-from nodes.node import parameters_of
+from flexsheet.launch import cli
+from flexsheet.launch.plans.documents import read_document, validate
+from flexsheet.launch.plans.launch_file import LaunchFile
+from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes import node_class
+from flexsheet.nodes.node import parameters_of
 from tests.doc_pages import ROOT, Block, blocks, code_spans, name, pages
 from tests.test_cli_help import parse
 
@@ -95,8 +95,8 @@ def test_python_runs(page: Path, clone: Path, monkeypatch: pytest.MonkeyPatch) -
     module = types.ModuleType(f"page_{page.stem.replace('-', '_')}")
     monkeypatch.setitem(sys.modules, module.__name__, module)
     with (
-        patch.dict("nodes.models.shapes.SHAPES"),
-        patch.dict("nodes.triangulator.triangulation.TRIANGULATION_METHODS"),
+        patch.dict("flexsheet.nodes.models.shapes.SHAPES"),
+        patch.dict("flexsheet.nodes.triangulator.triangulation.TRIANGULATION_METHODS"),
     ):
         for block in with_language("python")[page]:
             # Its lines count as the page's, for the trace of what fails.

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 import zmq
 
-from launch.commands.doctor_hosts import examine, host_here
-from launch.commands.output import CommandError
-from launch.health import visits
-from launch.health.doctor_hosts import (
+from flexsheet.launch.commands.doctor_hosts import examine, host_here
+from flexsheet.launch.commands.output import CommandError
+from flexsheet.launch.health import visits
+from flexsheet.launch.health.doctor_hosts import (
     SILENCES,
     WAYS,
     HostFinding,
@@ -27,16 +27,16 @@ from launch.health.doctor_hosts import (
     own_key_problem,
     rate_problem,
 )
-from launch.health.visits import Reach, Visit, way_to
-from launch.plans.plan import load_plan
-from launch.plans.planned import MAIN, Plan
-from launch.running import runs
-from launch.running.keys import KEYS_VARIABLE, secret_file
-from launch.running.supervisor import RunningGraph
-from messages.bus import HANDSHAKE_FAILED, Publisher
-from messages.security import new_key_pair, write_secret
-from messages.topics import TOPICS
-from messages.types import (
+from flexsheet.launch.health.visits import Reach, Visit, way_to
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import MAIN, Plan
+from flexsheet.launch.running import runs
+from flexsheet.launch.running.keys import KEYS_VARIABLE, secret_file
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.bus import HANDSHAKE_FAILED, Publisher
+from flexsheet.messages.security import new_key_pair, write_secret
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import (
     ArmState,
     ClockOffset,
     Clocks,
@@ -353,7 +353,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
 def test_own_keys_and_address_are_looked_at_before_the_start(
     folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")
+    monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")
     assert "there is no key" in (own_key_problem(three, "main") or "")
     public, secret = new_key_pair()
     write_secret(secret_file("main"), secret)
@@ -369,10 +369,10 @@ def test_own_keys_and_address_are_looked_at_before_the_start(
 
 def test_which_host_this_is(folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
     two = plan_of(folder)
-    monkeypatch.setattr("launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
+    monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
     assert host_here(two, None, None) == "left"
     monkeypatch.setattr(
-        "launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.1", f"{NET}.2"}
+        "flexsheet.launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.1", f"{NET}.2"}
     )
     assert host_here(two, None, None) == MAIN
     assert host_here(two, None, "left") == "left"

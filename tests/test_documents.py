@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from launch.plans import documents
-from launch.plans.documents import MAX_VALUES, BadInputError, read_document
-from launch.plans.plan import load_plan
+from flexsheet.launch.plans import documents
+from flexsheet.launch.plans.documents import MAX_VALUES, BadInputError, read_document
+from flexsheet.launch.plans.plan import load_plan
 
 MAX_TOKENS = 20 * MAX_VALUES
 

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
-from nodes.models.rigid import is_rigid, transform, transform_from_rpy
-from nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
+from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
+from flexsheet.nodes.models.rigid import is_rigid, transform, transform_from_rpy
+from flexsheet.nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.types import Display
-from nodes.models.rigid import transform
-from nodes.models.sheet import edge_poses
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.twin.error_map import PERIOD_M, RANGE_M, RIM_PX, error_map
-from nodes.twin.eye import seen
-from nodes.twin.membrane import Rubber, solve
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.types import Display
+from flexsheet.nodes.models.rigid import transform
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.twin.error_map import PERIOD_M, RANGE_M, RIM_PX, error_map
+from flexsheet.nodes.twin.eye import seen
+from flexsheet.nodes.twin.membrane import Rubber, solve
 
 Image = NDArray[np.uint8]
 SCENE = load_scene(Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml")

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from launch.reference.errors import explained
+from flexsheet.launch.reference.errors import explained
 from tests.doc_pages import DOCS
 
 QUOTING = ("troubleshooting", "security", "deploy", "clocks")

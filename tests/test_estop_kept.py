@@ -15,18 +15,18 @@ from typing import Self
 
 import pytest
 
-from launch.plans.plan import load_plan
-from launch.plans.planned import RUN_DIRECTORY, Plan
-from launch.running.estop_file import STATE_VARIABLE, EStopFile
-from launch.running.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
-from messages.base import Header
-from messages.bus import Publisher, Source, Subscriber
-from messages.clock import SystemClock
-from messages.clock_table import MAX_STAMP_AHEAD_NS
-from messages.topics import topic_named
-from messages.types import EStop
-from nodes.arm_bridge.control import ArmControl, Patience
-from nodes.node import PortCounts
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import RUN_DIRECTORY, Plan
+from flexsheet.launch.running.estop_file import STATE_VARIABLE, EStopFile
+from flexsheet.launch.running.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Publisher, Source, Subscriber
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import EStop
+from flexsheet.nodes.arm_bridge.control import ArmControl, Patience
+from flexsheet.nodes.node import PortCounts
 from tests.arm_states import arm_state
 from tests.waiting import DEADLINE_S, NOTHING_COMES_S, until
 
@@ -169,7 +169,7 @@ async def test_a_stop_outlives_all_launchers_until_it_is_reset(
         await until(lambda: sum("e-stop kept: arm_left" in line for line in second.said) == 2)
         assert len(files(folder)) == 2
         modes["left"] = "idle"
-        monkeypatch.setattr("launch.running.host.RESET_WITHIN_S", DEADLINE_S)
+        monkeypatch.setattr("flexsheet.launch.running.host.RESET_WITHIN_S", DEADLINE_S)
         second.say(RESET)
         await until(lambda: files(folder) == [], second.said)
         assert await second.heard_late(None) == set()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nodes.cache import EtaEstimator
+from flexsheet.nodes.cache import EtaEstimator
 
 
 def test_time_left_is_reckoned_from_what_steps_took() -> None:

@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from launch.cli import app
-from launch.experiments import ExperimentError, image, stroke
-from launch.methods.charts import (
+from flexsheet.launch.cli import app
+from flexsheet.launch.experiments import ExperimentError, image, stroke
+from flexsheet.launch.methods.charts import (
     FAMILIES,
     UnknownFamilyError,
     chart_result,
@@ -26,8 +26,8 @@ from launch.methods.charts import (
     measure_family,
     write_chart,
 )
-from launch.methods.svg import INK
-from messages.methods import (
+from flexsheet.launch.methods.svg import INK
+from flexsheet.messages.methods import (
     Correction,
     KinematicsMethod,
     MarkerMethod,
@@ -37,8 +37,8 @@ from messages.methods import (
     TrackingMethod,
     TriangulationMethod,
 )
-from messages.scene import Scene
-from nodes.methods import Family, Point, Trial, measure, pareto_front
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import Family, Point, Trial, measure, pareto_front
 
 ROOT = Path(__file__).resolve().parent.parent
 CHARTS = ROOT / "docs" / "charts"

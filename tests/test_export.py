@@ -14,14 +14,14 @@ import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
-from launch.bags.export import ExportError, export
-from launch.cli import main
-from launch.plans.plan import load_scene
-from messages.bag import BagWriter
-from messages.base import Header, Message
-from messages.topics import TOPICS
-from messages.types import ArmState, EStop, Skin, SoftBody, StereoPair
-from nodes.models.rigid import transform
+from flexsheet.launch.bags.export import ExportError, export
+from flexsheet.launch.cli import main
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import ArmState, EStop, Skin, SoftBody, StereoPair
+from flexsheet.nodes.models.rigid import transform
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 

@@ -10,16 +10,16 @@ import pytest
 from ruamel.yaml import YAML
 
 from benchmarks.image_correction import Bench
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import Correction, Display, Frame, TwinArms, TwinEye
-from nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
-from nodes.models.sheet import edge_poses, flange_pose
-from nodes.renderer.benchmarks import roll_sheet
-from nodes.renderer.sheet import SheetPose
-from nodes.twin.eye import (
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import Correction, Display, Frame, TwinArms, TwinEye
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform, transform_from_rpy
+from flexsheet.nodes.models.sheet import edge_poses, flange_pose
+from flexsheet.nodes.renderer.benchmarks import roll_sheet
+from flexsheet.nodes.renderer.sheet import SheetPose
+from flexsheet.nodes.twin.eye import (
     METRES_PER_PX,
     Image,
     NotMeasurableError,
@@ -31,9 +31,9 @@ from nodes.twin.eye import (
     seen,
     tilt_sizes,
 )
-from nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
-from nodes.twin.membrane import DeformedSheet
-from nodes.twin.true_object import TrueBody
+from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
+from flexsheet.nodes.twin.membrane import DeformedSheet
+from flexsheet.nodes.twin.true_object import TrueBody
 
 ROOT = Path(__file__).parents[1]
 EYE = np.array([0.0, 0.0, 0.4])

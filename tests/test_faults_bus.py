@@ -13,10 +13,10 @@ import pytest
 import zmq
 
 from benchmarks.fuzz_targets import TARGETS, wire_frames, wire_seeds
-from messages.bus import queue_length
-from messages.topics import TOPICS, Delivery
-from messages.types import StereoPair
-from messages.wire import decode, encode
+from flexsheet.messages.bus import queue_length
+from flexsheet.messages.topics import TOPICS, Delivery
+from flexsheet.messages.types import StereoPair
+from flexsheet.messages.wire import decode, encode
 from tests.test_messages_bus import Room, connected, finger, header, room
 from tests.waiting import until
 

@@ -12,13 +12,13 @@ from pathlib import Path
 import pytest
 import zmq
 
-from messages import bus
-from messages.base import Header
-from messages.bus import Publisher, Source, Subscriber
-from messages.security import KeyRing
-from messages.topics import TOPICS
-from messages.types import TwinFinger
-from nodes.node import PortCounts
+from flexsheet.messages import bus
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Publisher, Source, Subscriber
+from flexsheet.messages.security import KeyRing
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import TwinFinger
+from flexsheet.nodes.node import PortCounts
 from tests.hosts import hosts
 from tests.network import Computers
 from tests.test_messages_bus import Room, connected, finger, header, pictures, room, stop

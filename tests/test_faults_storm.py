@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.topics import Topic
-from messages.types import ArmState, SheetTarget, Side
-from nodes.arm_bridge import node as bridge_node
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.link import CounterMonitor
-from nodes.arm_bridge.modbus import ModbusStatus, decode_status, encode_command
-from nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
-from nodes.models.rigid import transform_from_rpy
-from nodes.twin.arms import SPEED_RAD_PER_S
-from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import ArmState, SheetTarget, Side
+from flexsheet.nodes.arm_bridge import node as bridge_node
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.link import CounterMonitor
+from flexsheet.nodes.arm_bridge.modbus import ModbusStatus, decode_status, encode_command
+from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S
+from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
 from tests.test_arm_loop import paper_scene
 
 Floats = NDArray[np.float64]

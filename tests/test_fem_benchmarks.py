@@ -12,22 +12,22 @@ import pytest
 from ruamel.yaml import YAML
 
 from benchmarks import external_solvers
-from launch.health.compliance import SKIN_SPACING_M, front_curve
-from launch.methods.charts import write_overview
-from messages.scene import Scene
-from nodes.cache import load_cached, save_cached
-from nodes.fem_solver import precompute, reference, snapshots
-from nodes.fem_solver.benchmarks import (
+from flexsheet.launch.health.compliance import SKIN_SPACING_M, front_curve
+from flexsheet.launch.methods.charts import write_overview
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.cache import load_cached, save_cached
+from flexsheet.nodes.fem_solver import precompute, reference, snapshots
+from flexsheet.nodes.fem_solver.benchmarks import (
     FORCE,
     MAX_DISPLACEMENT,
     NEWTON,
     SOFT_BODY,
     SoftBodyBenchmark,
 )
-from nodes.fem_solver.body import make_soft_body_spec, make_table_spec
-from nodes.fem_solver.precompute_table import table_cache
-from nodes.fem_solver.table import Table
-from nodes.methods import measure
+from flexsheet.nodes.fem_solver.body import make_soft_body_spec, make_table_spec
+from flexsheet.nodes.fem_solver.precompute_table import table_cache
+from flexsheet.nodes.fem_solver.table import Table
+from flexsheet.nodes.methods import measure
 from tests.soft_bodies import Here
 
 SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"

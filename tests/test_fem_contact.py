@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery, locate
-from nodes.fem_solver.contact import (
+from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery, locate
+from flexsheet.nodes.fem_solver.contact import (
     LinearSoftBody,
     Response,
     SphereContact,
@@ -20,8 +20,8 @@ from nodes.fem_solver.contact import (
     saturate_depth,
     solve_penalty_contact,
 )
-from nodes.fem_solver.precompute import SoftBodyModel, compute
-from nodes.models.shapes import CylinderShape
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, compute
+from flexsheet.nodes.models.shapes import CylinderShape
 from tests.soft_bodies import cylinder_spec
 
 Floats = NDArray[np.float64]

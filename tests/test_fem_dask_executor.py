@@ -16,11 +16,11 @@ import numpy as np
 import psutil
 import pytest
 
-from nodes.cache import CheckpointStore
-from nodes.fem_solver.dask_executor import SchedulerError, connect_workers
-from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.precompute_table import LostWorkersError, solve_all
-from nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
+from flexsheet.nodes.cache import CheckpointStore
+from flexsheet.nodes.fem_solver.dask_executor import SchedulerError, connect_workers
+from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.precompute_table import LostWorkersError, solve_all
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.solids import box
 from tests.waiting import DEADLINE_S
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from nodes.fem_solver.deadline_fallback import LATE_STEPS, RETRY_STEPS, DeadlineFallback
+from flexsheet.nodes.fem_solver.deadline_fallback import LATE_STEPS, RETRY_STEPS, DeadlineFallback
 
 
 def test_in_time_the_best_stays() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from nodes.fem_solver.elasticity import (
+from flexsheet.nodes.fem_solver.elasticity import (
     SolidMeshError,
     degrees_of_freedom,
     quadrature,
@@ -20,7 +20,7 @@ from nodes.fem_solver.elasticity import (
     solve,
     stiffness_matrix,
 )
-from nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces, cylinder_mesh
+from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces, cylinder_mesh
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,18 +8,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.cache import load_cached, save_cached
-from nodes.fem_solver.closest_contact import (
+from flexsheet.nodes.cache import load_cached, save_cached
+from flexsheet.nodes.fem_solver.closest_contact import (
     ContactAnchor,
     ContactQuery,
     locate_sticking,
     slide_anchor,
 )
-from nodes.fem_solver.contact import LinearSoftBody
-from nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
-from nodes.fem_solver.mesh import build_mesh
-from nodes.fem_solver.precompute import SoftBodyModel, compute, make_tangents, response_cache
-from nodes.models.shapes import CylinderShape
+from flexsheet.nodes.fem_solver.contact import LinearSoftBody
+from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
+from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.precompute import (
+    SoftBodyModel,
+    compute,
+    make_tangents,
+    response_cache,
+)
+from flexsheet.nodes.models.shapes import CylinderShape
 from tests.soft_bodies import cylinder_spec
 
 Floats = NDArray[np.float64]

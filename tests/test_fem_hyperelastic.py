@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from nodes.fem_solver.elasticity import (
+from flexsheet.nodes.fem_solver.elasticity import (
     SolidMeshError,
     degrees_of_freedom,
     element_stiffness,
     solve,
     stiffness_matrix,
 )
-from nodes.fem_solver.hyperelastic import InvertedElementError, NeoHookeanSolid
-from nodes.fem_solver.mesh import EDGES, boundary_faces
-from nodes.fem_solver.multifrontal import IndefiniteError, NestedDissection
+from flexsheet.nodes.fem_solver.hyperelastic import InvertedElementError, NeoHookeanSolid
+from flexsheet.nodes.fem_solver.mesh import EDGES, boundary_faces
+from flexsheet.nodes.fem_solver.multifrontal import IndefiniteError, NestedDissection
 from tests.solids import box, distorted
 
 Floats = NDArray[np.float64]
@@ -144,7 +144,7 @@ def their_basis(nodes: Floats, elements: Ints) -> tuple[Any, Ints]:
     import skfem
     from scipy.spatial import cKDTree
 
-    from nodes.fem_solver.elasticity import quadrature
+    from flexsheet.nodes.fem_solver.elasticity import quadrature
 
     corners = np.unique(elements[:, :4])
     mesh = skfem.MeshTet(nodes[corners].T, np.searchsorted(corners, elements[:, :4]).T)

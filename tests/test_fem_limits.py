@@ -16,8 +16,8 @@ from benchmarks.soft_body_limits import (
     scene_of,
     site_of,
 )
-from nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
-from nodes.models import rigid
+from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor, ContactQuery
+from flexsheet.nodes.models import rigid
 
 ENDS = {"kind": "box_patch", "min_m": [-1, -0.008, -0.008], "max_m": [1, 0.008, 0.008]}
 

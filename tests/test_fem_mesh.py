@@ -17,9 +17,9 @@ from ruamel.yaml import YAML
 from scipy.spatial import cKDTree
 
 from benchmarks.meshing import min_dihedral_rad
-from launch.objects.meshes import read_mesh
-from messages.scene import Mesh, Scene
-from nodes.fem_solver.elasticity import (
+from flexsheet.launch.objects.meshes import read_mesh
+from flexsheet.messages.scene import Mesh, Scene
+from flexsheet.nodes.fem_solver.elasticity import (
     degrees_of_freedom,
     jacobians,
     quadrature,
@@ -28,7 +28,7 @@ from nodes.fem_solver.elasticity import (
     solve,
     stiffness_matrix,
 )
-from nodes.fem_solver.mesh import (
+from flexsheet.nodes.fem_solver.mesh import (
     Focus,
     MeshSpec,
     SolidMesh,
@@ -41,18 +41,18 @@ from nodes.fem_solver.mesh import (
     mesh_spec,
     world_from_mesh,
 )
-from nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
-from nodes.fem_solver.mesh.fitted import _find_pinches, _remove_pinches, hull_faces
-from nodes.fem_solver.mesh.quality import (
+from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
+from flexsheet.nodes.fem_solver.mesh.fitted import _find_pinches, _remove_pinches, hull_faces
+from flexsheet.nodes.fem_solver.mesh.quality import (
     MIN_JACOBIAN_RATIO,
     MIN_RADIUS_RATIO,
     min_jacobian_ratios,
     radius_ratios,
     signed_volumes,
 )
-from nodes.fem_solver.mesh.smoothing import _distortion
-from nodes.fem_solver.mesh.solid import SUBTRIANGLES, add_midside_nodes, orient_tetrahedra
-from nodes.models.shapes import make_shape
+from flexsheet.nodes.fem_solver.mesh.smoothing import _distortion
+from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, add_midside_nodes, orient_tetrahedra
+from flexsheet.nodes.models.shapes import make_shape
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

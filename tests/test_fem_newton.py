@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.newton import (
+from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.newton import (
     NO_STICK,
     EquilibriumState,
     Friction,
@@ -18,7 +18,7 @@ from nodes.fem_solver.newton import (
     NewtonNotConvergedError,
     SphereObstacle,
 )
-from nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob, solve_snapshot
 from tests.solids import box
 
 Floats = NDArray[np.float64]

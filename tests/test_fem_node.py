@@ -15,15 +15,15 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver import precompute, snapshots
-from nodes.fem_solver.body import SceneBody
-from nodes.fem_solver.node import FemSolver
-from nodes.fem_solver.parameters import FemSolverParameters
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import Fingertip, Skin, SoftBody
+from flexsheet.nodes.fem_solver import precompute, snapshots
+from flexsheet.nodes.fem_solver.body import SceneBody
+from flexsheet.nodes.fem_solver.node import FemSolver
+from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
 
 SCENES = Path(__file__).parents[1] / "launch" / "scenes"

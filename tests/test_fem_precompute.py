@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from nodes.cache import CheckpointStore, default_cache_dir, load_cached, save_cached
-from nodes.fem_solver import precompute
-from nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
-from nodes.fem_solver.mesh import build_mesh
-from nodes.fem_solver.multifrontal import NestedDissection
-from nodes.fem_solver.precompute import (
+from flexsheet.nodes.cache import CheckpointStore, default_cache_dir, load_cached, save_cached
+from flexsheet.nodes.fem_solver import precompute
+from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, solve, stiffness_matrix
+from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
+from flexsheet.nodes.fem_solver.precompute import (
     Interrupted,
     ResponseBudget,
     SoftBodyModel,
@@ -237,7 +237,7 @@ def test_the_cache_is_where_the_desktop_wants_it(
 def test_the_node_module_is_light_to_import() -> None:
     """No part of scipy is loaded before a scene needs it: processes must start quickly."""
     code = (
-        "import sys, json, nodes.fem_solver.node;"
+        "import sys, json, flexsheet.nodes.fem_solver.node;"
         "print(json.dumps([m for m in sys.modules if m.split('.')[0] in ('scipy', 'matplotlib')]))"
     )
     root = Path(__file__).parents[1]

@@ -12,17 +12,17 @@ import trimesh
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import Skin, SoftBody
-from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
-from nodes.fem_solver.contact import Response
-from nodes.fem_solver.node import FemSolver
-from nodes.fem_solver.parameters import FemSolverParameters
-from nodes.fem_solver.precompute import compute, estimate_budget
-from nodes.models import rigid
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import Skin, SoftBody
+from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from flexsheet.nodes.fem_solver.contact import Response
+from flexsheet.nodes.fem_solver.node import FemSolver
+from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
+from flexsheet.nodes.fem_solver.precompute import compute, estimate_budget
+from flexsheet.nodes.models import rigid
 from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]

@@ -14,22 +14,22 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.cache import load_cached, save_cached
-from nodes.fem_solver import precompute_table, snapshots
-from nodes.fem_solver.closest_contact import ContactQuery
-from nodes.fem_solver.contact import CURVE_FRACTIONS, Response, SkinResponse
-from nodes.fem_solver.mesh import build_mesh, cylinder
-from nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
-from nodes.fem_solver.precompute_table import (
+from flexsheet.nodes.cache import load_cached, save_cached
+from flexsheet.nodes.fem_solver import precompute_table, snapshots
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.contact import CURVE_FRACTIONS, Response, SkinResponse
+from flexsheet.nodes.fem_solver.mesh import build_mesh, cylinder
+from flexsheet.nodes.fem_solver.precompute import Interrupted, SoftBodyModel, compute
+from flexsheet.nodes.fem_solver.precompute_table import (
     TableSpec,
     compute_table,
     local_processes,
     solve_all,
     table_cache,
 )
-from nodes.fem_solver.snapshot_interpolator import SurfaceLocator, minimal_rotation
-from nodes.fem_solver.snapshots import SamplePoint, Snapshot, solve_snapshot
-from nodes.fem_solver.table import (
+from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator, minimal_rotation
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, solve_snapshot
+from flexsheet.nodes.fem_solver.table import (
     END_SPAN_M,
     CubicInterpolator,
     Table,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.fem_solver import newton
-from nodes.fem_solver.elasticity import solve, stiffness_matrix
-from nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver import newton
+from flexsheet.nodes.fem_solver.elasticity import solve, stiffness_matrix
+from flexsheet.nodes.fem_solver.mesh import boundary_faces
 from tests.fem_fields import dofs_of
 from tests.fem_verification import Record, at_most, between, near
 from tests.half_space import half_space

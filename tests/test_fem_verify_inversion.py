@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.mesh.quality import min_jacobian_ratios
-from nodes.fem_solver.newton import EquilibriumState, Friction, NeoHookeanBody, winding_number
+from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
+from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.mesh.quality import min_jacobian_ratios
+from flexsheet.nodes.fem_solver.newton import (
+    EquilibriumState,
+    Friction,
+    NeoHookeanBody,
+    winding_number,
+)
 from tests.fem_verification import Record, at_most, between
 from tests.solids import box
 

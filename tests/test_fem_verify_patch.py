@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.fem_solver.elasticity import SolidMeshError, solve, stiffness_matrix
-from nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces
-from nodes.fem_solver.mesh.quality import radius_ratios
+from flexsheet.nodes.fem_solver.elasticity import SolidMeshError, solve, stiffness_matrix
+from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
+from flexsheet.nodes.fem_solver.mesh import EDGES, SolidMesh, boundary_faces
+from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
 from tests.fem_fields import body_loads, dofs_of, equilibrium, lame, surface_loads
 from tests.fem_verification import Record, at_most
 from tests.scene_solids import SHAPES, scene_solid

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.elasticity import element_stiffness
-from nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.multifrontal import NestedDissection
+from flexsheet.nodes.fem_solver.elasticity import element_stiffness
+from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
+from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
 from tests.fem_fields import body_loads, lame, rate, relative_errors
 from tests.fem_verification import Record, at_most, between
 from tests.solids import box, distorted

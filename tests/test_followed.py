@@ -13,22 +13,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.bags.report.findings import findings_of
-from launch.bags.report.followed import FollowedFinger
-from launch.bags.report.page import page_of
-from launch.bags.report.session import read_session
-from launch.bags.report.strokes import read_followed
-from launch.bags.report.write import result_of
-from launch.commands.experiment import print_followed
-from launch.experiments import ExperimentError, stroke
-from launch.experiments.demo import followed_on
-from launch.plans.plan import load_scene
-from messages.bag import BagWriter
-from messages.scene import Plane, Sphere
-from messages.types import TwinArms, TwinFinger
-from nodes.models.rigid import apply, inverse, rotation_from_vector
-from nodes.models.shapes import CylinderShape, make_shape
-from nodes.twin.paths import map_to_surface
+from flexsheet.launch.bags.report.findings import findings_of
+from flexsheet.launch.bags.report.followed import FollowedFinger
+from flexsheet.launch.bags.report.page import page_of
+from flexsheet.launch.bags.report.session import read_session
+from flexsheet.launch.bags.report.strokes import read_followed
+from flexsheet.launch.bags.report.write import result_of
+from flexsheet.launch.commands.experiment import print_followed
+from flexsheet.launch.experiments import ExperimentError, stroke
+from flexsheet.launch.experiments.demo import followed_on
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.scene import Plane, Sphere
+from flexsheet.messages.types import TwinArms, TwinFinger
+from flexsheet.nodes.models.rigid import apply, inverse, rotation_from_vector
+from flexsheet.nodes.models.shapes import CylinderShape, make_shape
+from flexsheet.nodes.twin.paths import map_to_surface
 from tests import sessions
 from tests.arm_states import arm_state
 

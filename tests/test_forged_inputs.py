@@ -17,15 +17,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.base import Header, Message
-from messages.topics import Topic
-from messages.types import ArmState, EStop, Fingertip, SheetTarget
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.way import Alignment, Lookout, Way, check_way
-from nodes.models.rigid import transform_from_rpy
-from nodes.planner.node import Planner
-from nodes.planner.parameters import PlannerParameters
-from nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S, forward
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import ArmState, EStop, Fingertip, SheetTarget
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.way import Alignment, Lookout, Way, check_way
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.planner.node import Planner
+from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.twin.arms import RANGE_RAD, SPEED_RAD_PER_S, forward
 from tests.fingertips import fingertip
 from tests.test_arm_loop import paper_scene
 from tests.test_faults_storm import LONGEST_M, SIDES, Bench

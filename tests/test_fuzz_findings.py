@@ -18,18 +18,18 @@ from ruamel.yaml.error import YAMLError
 
 from benchmarks import fuzz
 from benchmarks.fuzz_targets import MAGIC, Record, example, joined, records_of
-from launch.objects.meshes import read_mesh
-from launch.plans.documents import BadInputError, parse_value, read_document
-from messages import wire
-from messages.bag import BagError, BagReader, BagWriter
-from messages.base import Header
-from messages.bus import Subscriber
-from messages.migrations import fits
-from messages.topics import TOPICS
-from messages.types import EStop, Fingertip
-from messages.wire import WireError, decode, encode
-from nodes.models.shapes import MeshError
-from nodes.node import PortCounts
+from flexsheet.launch.objects.meshes import read_mesh
+from flexsheet.launch.plans.documents import BadInputError, parse_value, read_document
+from flexsheet.messages import wire
+from flexsheet.messages.bag import BagError, BagReader, BagWriter
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.migrations import fits
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import EStop, Fingertip
+from flexsheet.messages.wire import WireError, decode, encode
+from flexsheet.nodes.models.shapes import MeshError
+from flexsheet.nodes.node import PortCounts
 
 
 def test_what_an_earlier_run_has_found_is_not_found_again(

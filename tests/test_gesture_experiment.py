@@ -12,14 +12,14 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from launch import cli
-from launch.experiments import ExperimentError, gestures
-from messages.bag import BagWriter
-from messages.base import Header, Message
-from messages.scene import Scene
-from messages.topics import topic_named
-from messages.types import Fingertip, TwinFinger
-from nodes.twin.finger import FingerMotion
+from flexsheet.launch import cli
+from flexsheet.launch.experiments import ExperimentError, gestures
+from flexsheet.messages.bag import BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import Fingertip, TwinFinger
+from flexsheet.nodes.twin.finger import FingerMotion
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE = Scene.model_validate(

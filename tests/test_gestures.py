@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from messages.types import FingerPath, PathJoin
-from nodes.twin.finger import FingerMotion, FingerPathError, smoothstep, validate_path
-from nodes.twin.gestures import (
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath, PathJoin
+from flexsheet.nodes.twin.finger import FingerMotion, FingerPathError, smoothstep, validate_path
+from flexsheet.nodes.twin.gestures import (
     GESTURES,
     SAMPLE_S,
     TREMOR_ARM_M,
@@ -27,7 +27,7 @@ from nodes.twin.gestures import (
     tap,
     tap_fast,
 )
-from nodes.twin.paths import map_to_surface, recorded_path
+from flexsheet.nodes.twin.paths import map_to_surface, recorded_path
 
 ROOT = Path(__file__).resolve().parent.parent
 Floats = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from nodes.renderer import gl
-from nodes.renderer.gl import headless_context
+from flexsheet.nodes.renderer import gl
+from flexsheet.nodes.renderer.gl import headless_context
 from tests.golden_pictures import CASES, FOLDER
 
 Image = NDArray[np.uint8]

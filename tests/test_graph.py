@@ -19,15 +19,15 @@ import numpy as np
 import psutil
 import pytest
 
-from launch.experiments import stroke
-from launch.experiments.driver import Driver
-from launch.experiments.run import DEMO_FILE
-from launch.plans.plan import load_plan
-from launch.running.runs import RUN_VARIABLE
-from launch.running.supervisor import RunningGraph
-from messages.bag import BagReader
-from messages.topics import TOPICS
-from messages.types import ArmState, Fingertip, Frame, SheetTarget, Status, TwinFinger
+from flexsheet.launch.experiments import stroke
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.run import DEMO_FILE
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.runs import RUN_VARIABLE
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, Status, TwinFinger
 from tests.waiting import DEADLINE_S
 
 pytestmark = [pytest.mark.alone, pytest.mark.timeout(300)]

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from launch import cli
-from launch.bench.arm_places import (
+from flexsheet.launch import cli
+from flexsheet.launch.bench.arm_places import (
     STILL_S,
     TABLE,
     PlacesError,
@@ -27,19 +27,19 @@ from launch.bench.arm_places import (
     rig_of,
     true_base,
 )
-from launch.plans.plan import load_scene
-from messages.arms_calibration import load_arms_calibration
-from messages.calibration import Board
-from messages.calibration_file import CalibrationFileError
-from messages.types import Side
-from nodes.arm_bridge.hand_eye import (
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.arms_calibration import load_arms_calibration
+from flexsheet.messages.calibration import Board
+from flexsheet.messages.calibration_file import CalibrationFileError
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.hand_eye import (
     BaseFit,
     HandEyeError,
     Sighting,
     View,
     calibrate_base,
 )
-from nodes.models.rigid import (
+from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
     rotation_from_rpy,
@@ -48,10 +48,10 @@ from nodes.models.rigid import (
     transform,
     vector_from_rotation,
 )
-from nodes.twin.arms import forward as twin_forward
-from nodes.twin.arms import solve_inverse_kinematics
-from nodes.twin.board import TwinBoard
-from nodes.twin.rig import pixels_of
+from flexsheet.nodes.twin.arms import forward as twin_forward
+from flexsheet.nodes.twin.arms import solve_inverse_kinematics
+from flexsheet.nodes.twin.board import TwinBoard
+from flexsheet.nodes.twin.rig import pixels_of
 
 Floats = NDArray[np.float64]
 

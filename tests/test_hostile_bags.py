@@ -12,10 +12,10 @@ import pytest
 import zstandard
 from mcap.writer import CompressionType, Writer
 
-from messages.bag import PROFILE, BagReader
-from messages.base import schema_fingerprint
-from messages.types import EStop
-from messages.wire import PROTOCOL
+from flexsheet.messages.bag import PROFILE, BagReader
+from flexsheet.messages.base import schema_fingerprint
+from flexsheet.messages.types import EStop
+from flexsheet.messages.wire import PROTOCOL
 from tests.sessions import write_session
 from tests.test_cli import Command
 

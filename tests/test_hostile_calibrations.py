@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from messages.arms_calibration import load_arms_calibration
-from messages.calibration import load_calibration
-from messages.calibration_file import CalibrationFileError
-from messages.sheet_calibration import load_sheet_calibration
+from flexsheet.messages.arms_calibration import load_arms_calibration
+from flexsheet.messages.calibration import load_calibration
+from flexsheet.messages.calibration_file import CalibrationFileError
+from flexsheet.messages.sheet_calibration import load_sheet_calibration
 
 ROOT = Path(__file__).resolve().parent.parent
 WHOLE = next((ROOT / "launch" / "calibrations").glob("*.yaml")).read_text()

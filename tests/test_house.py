@@ -11,9 +11,18 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 FLOORS = ("messages", "nodes", "launch")
 SHARED_ROOMS = {
-    "nodes.node", "nodes.methods", "nodes.cache", "nodes.background", "nodes.models", "nodes",
-}  # fmt: skip
-TWIN_MAY_SHARE = {"nodes.models.rigid", "nodes.models.shapes", "nodes.models"}
+    "flexsheet.nodes",
+    "flexsheet.nodes.background",
+    "flexsheet.nodes.cache",
+    "flexsheet.nodes.methods",
+    "flexsheet.nodes.models",
+    "flexsheet.nodes.node",
+}
+TWIN_MAY_SHARE = {
+    "flexsheet.nodes.models.rigid",
+    "flexsheet.nodes.models.shapes",
+    "flexsheet.nodes.models",
+}
 
 
 def modules(floor: str) -> Iterator[Path]:
@@ -33,7 +42,8 @@ def imports_of(path: Path) -> set[str]:
 
 
 def floor_of(name: str) -> str:
-    return name.split(".", maxsplit=1)[0]
+    """The top-level folder of a module of the project; the first part of any other name."""
+    return name.removeprefix("flexsheet.").split(".", maxsplit=1)[0]
 
 
 @pytest.mark.parametrize("floor", FLOORS)
@@ -49,14 +59,14 @@ def test_no_node_imports_another_node() -> None:
         parts = path.relative_to(ROOT).parts
         if len(parts) < 3 or parts[1] == "models":
             continue
-        own = f"nodes.{parts[1]}"
+        own = f"flexsheet.nodes.{parts[1]}"
         foreign = {
             name
             for name in imports_of(path)
-            if name.startswith("nodes.")
-            and not any(name == room or name.startswith(f"{room}.") for room in [own])
+            if name.startswith("flexsheet.nodes.")
             and not any(
-                name == room or name.startswith(f"{room}.") for room in SHARED_ROOMS - {"nodes"}
+                name == room or name.startswith(f"{room}.")
+                for room in {own, *SHARED_ROOMS} - {"flexsheet.nodes"}
             )
         }
         assert not foreign, f"{path.relative_to(ROOT)} imports {foreign}"
@@ -74,7 +84,7 @@ def test_the_twin_shares_nothing_with_what_it_judges() -> None:
         shared = {
             name
             for name in imports_of(path)
-            if name.startswith("nodes.models")
+            if name.startswith("flexsheet.nodes.models")
             and not any(name == room or name.startswith(f"{room}.") for room in TWIN_MAY_SHARE)
         }
         assert not shared, f"{path.relative_to(ROOT)} imports {shared}"

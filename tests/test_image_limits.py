@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.bench.twin_sheet import true_sheet
-from launch.plans.plan import load_scene
-from messages.types import Display
-from nodes.models.rigid import rotation_from_vector, transform
-from nodes.models.sheet import edge_poses
-from nodes.renderer.benchmarks import (
+from flexsheet.launch.bench.twin_sheet import true_sheet
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.types import Display
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer.benchmarks import (
     COORDINATE_RAMPS,
     draw_coordinate_ramps,
     draw_stereo,
     roll_sheet,
 )
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet import SheetPose, estimate_sheet
-from nodes.renderer.sheet_mesh import SheetMesh
-from nodes.twin.error_map import error_map
-from nodes.twin.eye import seen
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
+from flexsheet.nodes.twin.error_map import error_map
+from flexsheet.nodes.twin.eye import seen
 from tests.indentation_bases import DEEPEST_M, few_dents
 
 Floats = NDArray[np.float64]

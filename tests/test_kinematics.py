@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from nodes.arm_bridge.kinematics import (
+from flexsheet.nodes.arm_bridge.kinematics import (
     BRANCHES,
     CENTRE_RAD,
     ELBOW_ANGLE_RAD,
@@ -36,8 +36,8 @@ from nodes.arm_bridge.kinematics import (
     next_joints,
     singularities,
 )
-from nodes.models.rigid import rotation_from_rpy, rotation_from_vector, transform
-from nodes.twin.arms import forward as twin_forward
+from flexsheet.nodes.models.rigid import rotation_from_rpy, rotation_from_vector, transform
+from flexsheet.nodes.twin.arms import forward as twin_forward
 
 Floats = NDArray[np.float64]
 

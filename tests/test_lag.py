@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.experiments.lag import lag_s
+from flexsheet.launch.experiments.lag import lag_s
 
 Floats = NDArray[np.float64]
 RATE_HZ = 60.0

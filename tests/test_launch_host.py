@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from launch.plans.hosts import launcher_on
-from launch.plans.plan import load_plan
-from launch.plans.planned import TOOLS, Plan
-from launch.running import runs
-from launch.running.host import devices_of
-from launch.running.supervisor import RunningGraph
-from launch.running.tools import ToolsWriter, subscriber_to
-from messages.types import EStop, HostStatus
+from flexsheet.launch.plans.hosts import launcher_on
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import TOOLS, Plan
+from flexsheet.launch.running import runs
+from flexsheet.launch.running.host import devices_of
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.launch.running.tools import ToolsWriter, subscriber_to
+from flexsheet.messages.types import EStop, HostStatus
 from tests.waiting import DEADLINE_S, NOTHING_COMES_S, until
 
 BEACON = {"type": "tests.launch_nodes:Beacon"}

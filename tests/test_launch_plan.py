@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from launch.plans.documents import BadInputError, parse_value
-from launch.plans.plan import load_plan
-from launch.plans.planned import Plan
-from launch.plans.wires import FIRST_PORT, PORTS, _ports
+from flexsheet.launch.plans.documents import BadInputError, parse_value
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.wires import FIRST_PORT, PORTS, _ports
 
 ROOT = Path(__file__).resolve().parent.parent
 BEACON = "tests.launch_nodes:Beacon"

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from launch.bags.player import shifted
-from launch.bags.replay import field_differences, replay, verify
-from launch.plans.plan import load_plan
-from messages.bag import BagError, BagWriter
-from messages.base import Header
-from messages.topics import TOPICS
-from messages.types import EStop, SheetTarget, TwinFinger
-from messages.wire import decode
+from flexsheet.launch.bags.player import shifted
+from flexsheet.launch.bags.replay import field_differences, replay, verify
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.messages.bag import BagError, BagWriter
+from flexsheet.messages.base import Header
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import EStop, SheetTarget, TwinFinger
+from flexsheet.messages.wire import decode
 
 MS = 1_000_000
 

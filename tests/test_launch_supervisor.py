@@ -22,14 +22,14 @@ import psutil
 import pytest
 import zmq
 
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan
-from launch.plans.planned import Plan
-from launch.running import runs, supervisor
-from launch.running.priority import min_nice_step
-from launch.running.starvation import ProcessorTime, starved_s
-from launch.running.supervisor import NodeFailedError, RunningGraph
-from messages.bag import BagReader
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.running import runs, supervisor
+from flexsheet.launch.running.priority import min_nice_step
+from flexsheet.launch.running.starvation import ProcessorTime, starved_s
+from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
+from flexsheet.messages.bag import BagReader
 from tests.waiting import DEADLINE_S, wait_until
 
 pytestmark = pytest.mark.alone

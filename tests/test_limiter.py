@@ -10,13 +10,13 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from benchmarks.limiter import run
-from nodes.arm_bridge.kinematics import (
+from flexsheet.nodes.arm_bridge.kinematics import (
     JOINT_MAX_RAD,
     JOINT_MIN_RAD,
     JOINT_SPEED_RAD_PER_S,
     forward,
 )
-from nodes.arm_bridge.limiter import (
+from flexsheet.nodes.arm_bridge.limiter import (
     EVEN_STEP_S,
     JointLimits,
     SheetLimits,
@@ -28,7 +28,7 @@ from nodes.arm_bridge.limiter import (
     towards,
     within_range,
 )
-from nodes.models.rigid import transform, transform_from_rpy
+from flexsheet.nodes.models.rigid import transform, transform_from_rpy
 
 Floats = NDArray[np.float64]
 

@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 from ruamel.yaml import YAML
 
-from launch.plans.documents import BadInputError, read_document, validate
-from launch.plans.launch_file import LaunchFile
-from launch.plans.plan import load_plan, load_scene
-from messages.calibration import StereoCalibration
-from messages.limits import LimitedModel, max_of
-from messages.scene import Scene
-from nodes import NODES, node_class
-from nodes.node import NodeParameters, parameters_of
+from flexsheet.launch.plans.documents import BadInputError, read_document, validate
+from flexsheet.launch.plans.launch_file import LaunchFile
+from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.messages.calibration import StereoCalibration
+from flexsheet.messages.limits import LimitedModel, max_of
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes import NODES, node_class
+from flexsheet.nodes.node import NodeParameters, parameters_of
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENES = sorted((ROOT / "launch" / "scenes").glob("*.yaml"))

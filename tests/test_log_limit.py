@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import structlog
 
-from nodes.log_limit import MAX_DISTINCT, REPORT_PERIOD_S, RepeatLimiter
+from flexsheet.nodes.log_limit import MAX_DISTINCT, REPORT_PERIOD_S, RepeatLimiter
 
 
 class Log:

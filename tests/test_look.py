@@ -11,14 +11,14 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_scene
-from messages.scene import Appearance, Scene
-from messages.types import Correction, Display
-from nodes.models.rigid import rotation_from_vector, transform
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet import SheetPose
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Appearance, Scene
+from flexsheet.messages.types import Correction, Display
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose
 from tests.drawing import dent, follow, sheet_at
 
 Floats = NDArray[np.float64]

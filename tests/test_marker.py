@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from nodes.methods import measure as measure_trial
-from nodes.triangulator import families
-from nodes.triangulator.families import MARKER, DrawnDisc, centre_bound_px, noisy
-from nodes.triangulator.marker import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import measure as measure_trial
+from flexsheet.nodes.triangulator import families
+from flexsheet.nodes.triangulator.families import MARKER, DrawnDisc, centre_bound_px, noisy
+from flexsheet.nodes.triangulator.marker import (
     MARKER_METHODS,
     Blob,
     BlobFilter,
@@ -28,7 +28,7 @@ from nodes.triangulator.marker import (
     is_overexposed,
     window_around,
 )
-from nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
+from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nodes.models.rigid import apply, rotation_from_vector, transform
-from nodes.twin import membrane
-from nodes.twin.membrane import Rubber, graded_axis, relaxed_energy, relaxed_stress, solve
+from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
+from flexsheet.nodes.twin import membrane
+from flexsheet.nodes.twin.membrane import Rubber, graded_axis, relaxed_energy, relaxed_stress, solve
 
 RUBBER = Rubber(width_m=0.24, height_m=0.24, thickness_m=0.001, young_modulus_pa=1e6)
 

@@ -18,13 +18,21 @@ from mcap.records import Chunk as ChunkRecord
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from messages import bag as bag_module
-from messages.bag import BagError, BagReader, BagWriter, info, join_frames, recover, split_frames
-from messages.base import Header
-from messages.migrations import migration_for
-from messages.topics import TOPICS
-from messages.types import EStop, StereoPair, TwinFinger
-from messages.wire import WireError, encode
+from flexsheet.messages import bag as bag_module
+from flexsheet.messages.bag import (
+    BagError,
+    BagReader,
+    BagWriter,
+    info,
+    join_frames,
+    recover,
+    split_frames,
+)
+from flexsheet.messages.base import Header
+from flexsheet.messages.migrations import migration_for
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import EStop, StereoPair, TwinFinger
+from flexsheet.messages.wire import WireError, encode
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parent.parent
@@ -423,7 +431,7 @@ def test_recover_leaves_out_a_damaged_chunk_only(whole: Path, tmp_path: Path) ->
 WRITE_FOREVER = """
 import sys
 sys.path.insert(0, sys.argv[2])
-from messages.bag import BagWriter
+from flexsheet.messages.bag import BagWriter
 from tests.test_messages_bag import TOPICS, finger, header
 writer = BagWriter(sys.argv[1])
 writer.add_attachment("launch.yaml", b"a", "text/plain")

@@ -16,12 +16,12 @@ import pytest
 import pytest_asyncio
 import zmq
 
-from messages.bag import BagReader, BagWriter
-from messages.base import Header, Message
-from messages.bus import BusError, Publisher, Subscriber, queue_length
-from messages.topics import TOPICS, Delivery, Topic
-from messages.types import EStop, StereoPair, TwinArms, TwinFinger
-from messages.wire import WireError, encode
+from flexsheet.messages.bag import BagReader, BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import BusError, Publisher, Subscriber, queue_length
+from flexsheet.messages.topics import TOPICS, Delivery, Topic
+from flexsheet.messages.types import EStop, StereoPair, TwinArms, TwinFinger
+from flexsheet.messages.wire import WireError, encode
 from tests.waiting import until
 
 
@@ -188,7 +188,7 @@ async def test_what_has_just_left_its_writer_waits_for_no_newer(
     ear = room.ear(topic)
     start = await connected(publisher, ear, pictures) + 1
     now = SimpleNamespace(monotonic_ns=lambda: header(start).publish_ns)
-    monkeypatch.setattr("messages.bus.time", now)
+    monkeypatch.setattr("flexsheet.messages.bus.time", now)
     for number in range(start, start + 40):
         publisher.send(pictures(number % 250), header(number))
     await until(lambda: ear.heard and ear.sequences[-1] == start + 39)

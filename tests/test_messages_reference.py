@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from messages.base import Header
-from messages.reference import reference
-from messages.topics import TOPICS
+from flexsheet.messages.base import Header
+from flexsheet.messages.reference import reference
+from flexsheet.messages.topics import TOPICS
 
 PAGE = Path(__file__).parent.parent / "docs" / "messages.md"
 
 
 def test_page_is_up_to_date() -> None:
-    assert PAGE.read_text() == reference(), "run: python -m messages.reference > docs/messages.md"
+    assert PAGE.read_text() == reference(), "run: make pages"
 
 
 def test_page_names_every_topic_type_and_field() -> None:

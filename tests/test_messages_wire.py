@@ -16,12 +16,12 @@ from hypothesis.extra import numpy as npst
 from pydantic import BaseModel, Field, create_model
 from ruamel.yaml import YAML
 
-from messages.arrays import ArraySpec
-from messages.base import Header, Message, schema_fingerprint
-from messages.scene import Scene
-from messages.topics import TOPICS, Topic
-from messages.types import EStop, Fingertip, Frame, PortStatus, Skin, Status, StereoPair
-from messages.wire import PROTOCOL, WireError, codec_of, decode, encode, size_of
+from flexsheet.messages.arrays import ArraySpec
+from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS, Topic
+from flexsheet.messages.types import EStop, Fingertip, Frame, PortStatus, Skin, Status, StereoPair
+from flexsheet.messages.wire import PROTOCOL, WireError, codec_of, decode, encode, size_of
 from tests.fingertips import fingertip
 
 HEADER = Header(3, 1_000, 2_000, "host-1234abcd", "triangulator", 77)

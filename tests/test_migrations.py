@@ -12,13 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from messages import migrations
-from messages.bag import BagError, BagReader, BagWriter, info
-from messages.base import Header, Message, schema_fingerprint
-from messages.migrations import fits, migration_for
-from messages.scene import Scene
-from messages.topics import TOPICS, Delivery, Topic
-from messages.types import Fingertip, Frame
+from flexsheet.messages import migrations
+from flexsheet.messages.bag import BagError, BagReader, BagWriter, info
+from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.migrations import fits, migration_for
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS, Delivery, Topic
+from flexsheet.messages.types import Fingertip, Frame
 
 OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
 HEADER = Header(1, 10, 11, "clock", "node", 5, "plan")

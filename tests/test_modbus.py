@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
-from launch.reference import registers
-from nodes.arm_bridge.link import ArmAnswerError, ArmRefusedError, ArmSilentError
-from nodes.arm_bridge.modbus import (
+from flexsheet.launch.reference import registers
+from flexsheet.nodes.arm_bridge.link import ArmAnswerError, ArmRefusedError, ArmSilentError
+from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
     STATUS,
@@ -28,8 +28,8 @@ from nodes.arm_bridge.modbus import (
     encode_command,
     register_count,
 )
-from nodes.twin import arms as twin_arms
-from nodes.twin.arms import ArmServer, Controller, Fault
+from flexsheet.nodes.twin import arms as twin_arms
+from flexsheet.nodes.twin.arms import ArmServer, Controller, Fault
 from tests.network import Cut
 from tests.waiting import DEADLINE_S
 
@@ -38,7 +38,7 @@ JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 def test_the_document_has_the_map_of_the_code() -> None:
     text = registers.PAGE.read_text()
-    assert registers.page(text) == text, "run: python -m launch.reference.registers"
+    assert registers.page(text) == text, "run: python -m flexsheet.launch.reference.registers"
     assert "| 8–19 | `joints_rad` | float32 × 6 |" in text
     assert registers.page(text.replace("| 16 | servo |", "| 16 | motor |")) == text
     with pytest.raises(ValueError, match="needs the marks"):

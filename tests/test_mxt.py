@@ -17,10 +17,15 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
-from messages.clock import SystemClock
-from nodes.arm_bridge import kinematics
-from nodes.arm_bridge.link import ArmAnswerError, ArmLinkError, ArmRefusedError, ArmSilentError
-from nodes.arm_bridge.mxt import (
+from flexsheet.messages.clock import SystemClock
+from flexsheet.nodes.arm_bridge import kinematics
+from flexsheet.nodes.arm_bridge.link import (
+    ArmAnswerError,
+    ArmLinkError,
+    ArmRefusedError,
+    ArmSilentError,
+)
+from flexsheet.nodes.arm_bridge.mxt import (
     COMMAND_END,
     COMMAND_MOVE,
     COMMAND_NONE,
@@ -36,8 +41,8 @@ from nodes.arm_bridge.mxt import (
     joints_packet,
     pose_packet,
 )
-from nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault, forward
-from nodes.twin.mxt_controller import MxtController, MxtServer, numbers_of, pose_from
+from flexsheet.nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault, forward
+from flexsheet.nodes.twin.mxt_controller import MxtController, MxtServer, numbers_of, pose_from
 
 Floats = NDArray[np.float64]
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])

@@ -9,12 +9,12 @@ import psutil
 import pytest
 from pydantic import ValidationError
 
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.topics import Topic, UnknownTopicError
-from messages.types import EStop, FingerPath, Fingertip, SheetTarget
-from nodes import NODES, UnknownNodeError, node_class
-from nodes.node import (
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.topics import Topic, UnknownTopicError
+from flexsheet.messages.types import EStop, FingerPath, Fingertip, SheetTarget
+from flexsheet.nodes import NODES, UnknownNodeError, node_class
+from flexsheet.nodes.node import (
     Input,
     Node,
     NodeParameters,
@@ -24,7 +24,7 @@ from nodes.node import (
     ports_of,
     timers_of,
 )
-from nodes.runner import end_tasks, status_of
+from flexsheet.nodes.runner import end_tasks, status_of
 from tests.fingertips import fingertip as even_fingertip
 from tests.waiting import DEADLINE_S
 

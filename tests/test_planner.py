@@ -14,18 +14,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import FingertipReason, SheetTarget, SoftBody
-from nodes.models.rigid import inverse, moved, transform, transform_from_rpy
-from nodes.models.shapes import CylinderShape
-from nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
-from nodes.planner.compliance import RESERVE, compliance_for, stretch_range
-from nodes.planner.encounter import Encounter, Presentation, Reach
-from nodes.planner.node import Planner
-from nodes.planner.parameters import PlannerParameters
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import FingertipReason, SheetTarget, SoftBody
+from flexsheet.nodes.models.rigid import inverse, moved, transform, transform_from_rpy
+from flexsheet.nodes.models.shapes import CylinderShape
+from flexsheet.nodes.models.sheet import edge_force_n, push_stiffness_n_per_m
+from flexsheet.nodes.planner.compliance import RESERVE, compliance_for, stretch_range
+from flexsheet.nodes.planner.encounter import Encounter, Presentation, Reach
+from flexsheet.nodes.planner.node import Planner
+from flexsheet.nodes.planner.parameters import PlannerParameters
 from tests.fingertips import fingertip
 from tests.twists import twist_between
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from nodes.models.motion import (
+from flexsheet.nodes.models.motion import (
     EdgeBound,
     SheetBounds,
     SheetMotion,
@@ -20,7 +20,7 @@ from nodes.models.motion import (
     follow,
     follow_sheet,
 )
-from nodes.models.rigid import is_rigid, transform_from_rpy
+from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]

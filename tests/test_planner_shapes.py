@@ -18,14 +18,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.objects.meshes import read_mesh
-from messages.scene import Mesh
-from nodes.models.rigid import angle_between
-from nodes.models.shapes import EllipsoidShape, MeshError, Shape, SmoothMeshShape, make_shape
-from nodes.planner import encounter
-from nodes.planner.encounter import Encounter, Presentation, Reach, UnpresentableError
-from nodes.planner.families import ellipsoid_mesh
-from nodes.planner.motion import Planned
+from flexsheet.launch.objects.meshes import read_mesh
+from flexsheet.messages.scene import Mesh
+from flexsheet.nodes.models.rigid import angle_between
+from flexsheet.nodes.models.shapes import (
+    EllipsoidShape,
+    MeshError,
+    Shape,
+    SmoothMeshShape,
+    make_shape,
+)
+from flexsheet.nodes.planner import encounter
+from flexsheet.nodes.planner.encounter import Encounter, Presentation, Reach, UnpresentableError
+from flexsheet.nodes.planner.families import ellipsoid_mesh
+from flexsheet.nodes.planner.motion import Planned
 from tests.plans import STEP_S, STILL, Desk, scene_with
 
 Floats = NDArray[np.float64]

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.arm_bridge.goal import goal_ahead
-from nodes.models.motion import SheetMotion
-from nodes.planner.lead import next_lead_s
-from nodes.planner.order import STEPPED_AFTER, Order
+from flexsheet.nodes.arm_bridge.goal import goal_ahead
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.planner.lead import next_lead_s
+from flexsheet.nodes.planner.order import STEPPED_AFTER, Order
 
 FRAME_NS = 16_666_667
 

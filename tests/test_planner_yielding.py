@@ -10,17 +10,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.bench.twin_sheet import twin_push
-from messages.types import SheetTarget, SoftBody
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import moved
-from nodes.models.sheet.fit import make_model
-from nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel, SheetForceModel
-from nodes.models.sheet.rubber import Rubber
-from nodes.planner.compliance import GOOD_RATIO, UnfitCurveError
-from nodes.planner.motion import withdrawn
-from nodes.planner.sheet_force import law_for, rubber_of
-from nodes.planner.yielding import Yielding
+from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.messages.types import SheetTarget, SoftBody
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import moved
+from flexsheet.nodes.models.sheet.fit import make_model
+from flexsheet.nodes.models.sheet.force_models import (
+    LinearSheetModel,
+    ScaledSheetModel,
+    SheetForceModel,
+)
+from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.planner.compliance import GOOD_RATIO, UnfitCurveError
+from flexsheet.nodes.planner.motion import withdrawn
+from flexsheet.nodes.planner.sheet_force import law_for, rubber_of
+from flexsheet.nodes.planner.yielding import Yielding
 from tests.test_planner import FRAME_NS, SCENE, Table, in_world, on_cylinder, table
 from tests.twists import twist_between
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from launch import cli
-from launch.plans.plan import load_scene
-from nodes.fem_solver import body, precompute_table, snapshots
-from nodes.fem_solver.mesh import cylinder
+from flexsheet.launch import cli
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.nodes.fem_solver import body, precompute_table, snapshots
+from flexsheet.nodes.fem_solver.mesh import cylinder
 from tests.soft_bodies import Here
 
 SCENE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
@@ -30,7 +30,7 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
     monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
     monkeypatch.setattr(
-        "launch.running.prepare.prepare_dents", lambda scene, cache, progress: cache
+        "flexsheet.launch.running.prepare.prepare_dents", lambda scene, cache, progress: cache
     )
     # other processes take seconds to start
     monkeypatch.setattr(precompute_table, "local_processes", lambda count: nullcontext(Here()))

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from launch.plans.plan import load_plan
-from launch.running import priority
-from launch.running.priority import MIN_NICE, min_nice_step, precedence_problem
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running import priority
+from flexsheet.launch.running.priority import MIN_NICE, min_nice_step, precedence_problem
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = load_plan(ROOT / "launch" / "demo.yaml")

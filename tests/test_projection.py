@@ -11,21 +11,21 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-from launch.bench.twin_sheet import twin_points
-from launch.plans.plan import load_scene
-from messages.types import Correction, Display
-from nodes.cache import load_cached
-from nodes.models.rigid import apply, rotation_from_vector, transform
-from nodes.models.sheet import edge_poses
-from nodes.renderer import deflection_cache
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.scene_renderer import NO_SHAPES_NOTE, SceneRenderer
-from nodes.renderer.sheet import SheetPose, estimate_sheet
-from nodes.renderer.sheet_mesh import deflected_mesh, flat_mesh, pyramid_mesh
-from nodes.renderer.sheet_shape_benchmark import sheet_shape_family
-from nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen
-from nodes.twin.membrane import DeformedSheet, Rubber, solve
-from nodes.twin.true_object import TrueBody
+from flexsheet.launch.bench.twin_sheet import twin_points
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.types import Correction, Display
+from flexsheet.nodes.cache import load_cached
+from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer import deflection_cache
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.scene_renderer import NO_SHAPES_NOTE, SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.nodes.renderer.sheet_mesh import deflected_mesh, flat_mesh, pyramid_mesh
+from flexsheet.nodes.renderer.sheet_shape_benchmark import sheet_shape_family
+from flexsheet.nodes.twin.eye import METRES_PER_PX, push_sizes, render_expected, seen
+from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
+from flexsheet.nodes.twin.true_object import TrueBody
 from tests.indentation_bases import few_dents
 
 Floats = NDArray[np.float64]

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from launch.cli import app
-from launch.commands.calibrate_projector import write_scene
-from launch.plans.plan import load_scene
-from messages.scene import Lens, Projector, Scene, StereoCamera
-from nodes.renderer.gray_code import (
+from flexsheet.launch.cli import app
+from flexsheet.launch.commands.calibrate_projector import write_scene
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Lens, Projector, Scene, StereoCamera
+from flexsheet.nodes.renderer.gray_code import (
     MIN_STRIPE_PX,
     DecodeError,
     decode_patterns,
     find_pixels,
     patterns,
 )
-from nodes.renderer.projector_calibration import (
+from flexsheet.nodes.renderer.projector_calibration import (
     ProjectorError,
     ProjectorPoints,
     calibrate_projector,
@@ -28,15 +28,15 @@ from nodes.renderer.projector_calibration import (
     measure_points,
     project_points,
 )
-from nodes.twin.eye import TrueProjector
-from nodes.twin.projector import (
+from flexsheet.nodes.twin.eye import TrueProjector
+from flexsheet.nodes.twin.projector import (
     LitSheet,
     errors_at_eye,
     make_true_projector,
     pixels_lighting,
     sheet_poses,
 )
-from nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.rig import make_true_camera
 
 SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"
 

@@ -13,8 +13,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch import cli
-from launch.health.layout import (
+from flexsheet.launch import cli
+from flexsheet.launch.health.layout import (
     Layout,
     check_layout,
     draw_layout,
@@ -23,11 +23,17 @@ from launch.health.layout import (
     touches,
     with_base_moved,
 )
-from launch.plans.plan import load_scene
-from messages.scene import Scene, cylinder_of
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.kinematics import CENTRE_RAD, WRIST_NEAR_RAD, branch_of, jacobian, next_joints
-from nodes.arm_bridge.reach import (
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.kinematics import (
+    CENTRE_RAD,
+    WRIST_NEAR_RAD,
+    branch_of,
+    jacobian,
+    next_joints,
+)
+from flexsheet.nodes.arm_bridge.reach import (
     LARGEST_STEP_RAD,
     LIMITS,
     SPEED_LIMITS,
@@ -38,9 +44,9 @@ from nodes.arm_bridge.reach import (
     coordinated_path,
     flange_poses,
 )
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import is_rigid, transform_from_rpy
-from nodes.twin.arms import forward as twin_forward
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy
+from flexsheet.nodes.twin.arms import forward as twin_forward
 
 Floats = NDArray[np.float64]
 

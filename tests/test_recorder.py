@@ -19,18 +19,18 @@ from typing import Any
 
 import pytest
 
-from launch.plans.plan import load_plan
-from launch.running import runs
-from launch.running.supervisor import RunningGraph
-from messages.bag import FLUSH_PERIOD_S, BagError, BagReader, BagWriter
-from messages.base import Header
-from messages.clock import VirtualClock
-from messages.topics import TOPICS
-from messages.types import EStop
-from messages.wire import encode, read_envelope
-from nodes.recorder.files import free_path
-from nodes.recorder.node import TRY_AGAIN_NS, Recorder
-from nodes.recorder.parameters import RecorderParameters
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running import runs
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.bag import FLUSH_PERIOD_S, BagError, BagReader, BagWriter
+from flexsheet.messages.base import Header
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import EStop
+from flexsheet.messages.wire import encode, read_envelope
+from flexsheet.nodes.recorder.files import free_path
+from flexsheet.nodes.recorder.node import TRY_AGAIN_NS, Recorder
+from flexsheet.nodes.recorder.parameters import RecorderParameters
 from tests.waiting import DEADLINE_S
 
 pytestmark = pytest.mark.alone
@@ -289,11 +289,11 @@ async def test_killed_it_loses_at_most_what_came_since_the_last_flush(tmp_path: 
 FLOODED = """
 import asyncio, time
 import numpy as np
-from messages.base import Header
-from messages.bus import Publisher, Subscriber
-from messages.topics import topic_named
-from messages.types import StereoPair
-from nodes.node import PortCounts
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Publisher, Subscriber
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.node import PortCounts
 
 async def main():
     topic, endpoint = topic_named("stereo"), ["ipc://" + sys.argv[1]]

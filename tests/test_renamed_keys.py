@@ -8,16 +8,16 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from launch.plans import renamed_keys
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan, load_scene
-from messages import migrations
-from messages.bag import BagReader
-from messages.base import Message
-from messages.scene import Scene
-from messages.types import Display, Frame, SoftBody
-from nodes import node_class
-from nodes.node import parameters_of
+from flexsheet.launch.plans import renamed_keys
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.messages import migrations
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.base import Message
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Display, Frame, SoftBody
+from flexsheet.nodes import node_class
+from flexsheet.nodes.node import parameters_of
 
 OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
 SCENE_FILE = Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml"

@@ -10,21 +10,26 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import Display, Frame, SheetTarget, Skin, SoftBody
-from nodes.models.rigid import rotation_from_vector, transform
-from nodes.models.sheet import edge_poses, flange_pose
-from nodes.renderer import gl
-from nodes.renderer.correction import ScreenPlane, correct, make_flat_screen, make_pushed_screen
-from nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
-from nodes.renderer.node import Renderer, RendererParameters
-from nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
-from nodes.renderer.output import pack
-from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
-from nodes.renderer.sheet import estimate_sheet
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import Display, Frame, SheetTarget, Skin, SoftBody
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.sheet import edge_poses, flange_pose
+from flexsheet.nodes.renderer import gl
+from flexsheet.nodes.renderer.correction import (
+    ScreenPlane,
+    correct,
+    make_flat_screen,
+    make_pushed_screen,
+)
+from flexsheet.nodes.renderer.gl import Canvas, DrawStyle, EyeView, NoOpenGLError, headless_context
+from flexsheet.nodes.renderer.node import Renderer, RendererParameters
+from flexsheet.nodes.renderer.object_surface import VertexNormals, cylinder_surface, transfer_matrix
+from flexsheet.nodes.renderer.output import pack
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.renderer.sheet import estimate_sheet
 from tests.arm_states import arm_state
 from tests.fingertips import fingertip
 
@@ -395,7 +400,8 @@ async def test_a_frame_says_how_much_of_the_sheet_gets_no_light(
 ) -> None:
     """Of a folded sheet, whose share the stage finds (tests/test_renderer_failures.py)."""
     monkeypatch.setattr(
-        "nodes.renderer.scene_renderer.occluded_fraction", lambda mesh, eye, projector: 0.25
+        "flexsheet.nodes.renderer.scene_renderer.occluded_fraction",
+        lambda mesh, eye, projector: 0.25,
     )
     await bench.step("scene", bench.scene)
     await bench.arms(np.eye(4))

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from launch.bench.twin_sheet import twin_errors
-from launch.plans.plan import load_scene
-from nodes.methods import Point, measure, pareto_front
-from nodes.renderer import benchmarks, deflection_cache
-from nodes.renderer.benchmarks import correction_family, is_in_range, scale_projector
-from nodes.renderer.scene_renderer import projector_homography
+from flexsheet.launch.bench.twin_sheet import twin_errors
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.nodes.methods import Point, measure, pareto_front
+from flexsheet.nodes.renderer import benchmarks, deflection_cache
+from flexsheet.nodes.renderer.benchmarks import correction_family, is_in_range, scale_projector
+from flexsheet.nodes.renderer.scene_renderer import projector_homography
 from tests.indentation_bases import few_dents
 
 SCENE = load_scene(Path(__file__).parents[1] / "launch" / "scenes" / "cylinder.yaml")

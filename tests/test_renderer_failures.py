@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from messages.types import Correction, Display
-from nodes.models.rigid import transform
-from nodes.models.sheet import edge_poses
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet import SheetPose
-from nodes.renderer.sheet_mesh import SheetMesh, occluded_fraction, pyramid_mesh
-from nodes.twin.eye import render_expected, seen
-from nodes.twin.membrane import Rubber, solve
-from nodes.twin.true_object import TrueBody
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Correction, Display
+from flexsheet.nodes.models.rigid import transform
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet import SheetPose
+from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, occluded_fraction, pyramid_mesh
+from flexsheet.nodes.twin.eye import render_expected, seen
+from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.true_object import TrueBody
 from tests.drawing import body_of, dent, follow, sheet_at
 
 Floats = NDArray[np.float64]

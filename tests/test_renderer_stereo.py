@@ -13,15 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from messages.base import Header
-from messages.scene import Lens, Pose
-from messages.types import Correction, Display, Eye, Frame, SoftBody, StereoMode
-from nodes.renderer.display_latency import DisplayLatencyEstimator
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.lens import clip_lens
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet_mesh import flat_mesh, refine_mesh
-from nodes.renderer.skin_extrapolator import SkinExtrapolator
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Lens, Pose
+from flexsheet.messages.types import Correction, Display, Eye, Frame, SoftBody, StereoMode
+from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.lens import clip_lens
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet_mesh import flat_mesh, refine_mesh
+from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
 from tests.test_renderer import MS, Bench, load_scene, skin_and_body
 
 Image = NDArray[np.uint8]

@@ -18,20 +18,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from launch.bags.report.album import MARKED_MOST, Album
-from launch.bags.report.charts import mark_isolated, stretches_of
-from launch.bags.report.findings import findings_of
-from launch.bags.report.numbers import methods_of, numbers_of
-from launch.bags.report.page import COLOURS, MARK, SECTIONS, page_of
-from launch.bags.report.series import Events, Grid, Moments, Range, Spread, States
-from launch.bags.report.session import Port, read_session
-from launch.bags.report.strokes import seconds_of
-from launch.bags.report.write import report, result_of
-from launch.cli import main
-from launch.experiments.stroke import read_recording, stroke_errors, summary
-from messages.bag import BagError, BagWriter
-from messages.methods import Methods
-from messages.types import CpuPressure, HostStatus, PortStatus, ProgramCpu
+from flexsheet.launch.bags.report.album import MARKED_MOST, Album
+from flexsheet.launch.bags.report.charts import mark_isolated, stretches_of
+from flexsheet.launch.bags.report.findings import findings_of
+from flexsheet.launch.bags.report.numbers import methods_of, numbers_of
+from flexsheet.launch.bags.report.page import COLOURS, MARK, SECTIONS, page_of
+from flexsheet.launch.bags.report.series import Events, Grid, Moments, Range, Spread, States
+from flexsheet.launch.bags.report.session import Port, read_session
+from flexsheet.launch.bags.report.strokes import seconds_of
+from flexsheet.launch.bags.report.write import report, result_of
+from flexsheet.launch.cli import main
+from flexsheet.launch.experiments.stroke import read_recording, stroke_errors, summary
+from flexsheet.messages.bag import BagError, BagWriter
+from flexsheet.messages.methods import Methods
+from flexsheet.messages.types import CpuPressure, HostStatus, PortStatus, ProgramCpu
 from tests import sessions
 from tests.arm_states import arm_state
 from tests.colours import luminance
@@ -351,7 +351,7 @@ def test_a_bag_may_lack_any_topic(
     # The charts are drawn once, elsewhere: here only from what they are drawn.
     path = sessions.write_session(tmp_path / "a.mcap", leave_out=leave_out)
     session = read_session(path)
-    monkeypatch.setattr("launch.bags.report.page.charts_of", lambda session: {})
+    monkeypatch.setattr("flexsheet.launch.bags.report.page.charts_of", lambda session: {})
     text = page_of(session)
     assert all(f'id="{key}"' in text for key in SECTIONS)
     json.dumps(result_of(session), allow_nan=False)
@@ -386,7 +386,7 @@ def test_where_no_page_can_be_written_the_bag_is_not_read(
     bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "launch.bags.report.write.read_session", lambda *_: pytest.fail("it was read")
+        "flexsheet.launch.bags.report.write.read_session", lambda *_: pytest.fail("it was read")
     )
     with pytest.raises(BagError, match="name a file with -o in a folder that is there"):
         report(bag, tmp_path / "none" / "a.html", lambda done, whole: None)
@@ -402,7 +402,7 @@ def test_the_command_writes_beside_the_bag_and_over_reports_only(
 ) -> None:
     copy = tmp_path / "b.mcap"
     copy.write_bytes(bag.read_bytes())
-    monkeypatch.setattr("launch.bags.report.page.charts_of", lambda session: {})
+    monkeypatch.setattr("flexsheet.launch.bags.report.page.charts_of", lambda session: {})
     for _ in range(2):
         report(copy, copy.with_suffix(".html"), lambda done, whole: None)
     assert MARK in copy.with_suffix(".html").read_text()

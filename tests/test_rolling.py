@@ -11,8 +11,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from nodes.models.rigid import angle_between, moved
-from nodes.models.shapes import (
+from flexsheet.nodes.models.rigid import angle_between, moved
+from flexsheet.nodes.models.shapes import (
     Convex,
     CylinderShape,
     EllipsoidShape,
@@ -21,8 +21,8 @@ from nodes.models.shapes import (
     Shape,
     SphereShape,
 )
-from nodes.planner.encounter import BEYOND_SPIN, Encounter, Reach
-from nodes.planner.rolling import (
+from flexsheet.nodes.planner.encounter import BEYOND_SPIN, Encounter, Reach
+from flexsheet.nodes.planner.rolling import (
     Contact,
     rim_lift_m,
     rolled,

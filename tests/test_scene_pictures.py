@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.plans.plan import load_scene
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import Display, Frame, Shading, Skin, SoftBody, TwinArms, TwinEye
-from nodes.models.rigid import inverse
-from nodes.models.sheet import edge_poses
-from nodes.renderer.gl import headless_context
-from nodes.renderer.node import Renderer, RendererParameters
-from nodes.renderer.object_surface import DeformationTransfer, VertexNormals
-from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
-from nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
-from nodes.twin.true_object import TrueBody
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import Display, Frame, Shading, Skin, SoftBody, TwinArms, TwinEye
+from flexsheet.nodes.models.rigid import inverse
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer.gl import headless_context
+from flexsheet.nodes.renderer.node import Renderer, RendererParameters
+from flexsheet.nodes.renderer.object_surface import DeformationTransfer, VertexNormals
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.twin.eye_node import TwinEyeNode, TwinEyeParameters
+from flexsheet.nodes.twin.true_object import TrueBody
 from tests.fingertips import fingertip
 
 Floats = NDArray[np.float64]

@@ -9,19 +9,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.experiments import ExperimentError
-from launch.experiments.gestures import gesture_path
-from launch.health.layout import check_layout
-from launch.objects.organ import obj_text, organ_mesh
-from launch.plans.plan import load_scene
-from messages.scene import Scene
-from nodes.models.rigid import angle_between, apply, inverse, transform_from_rpy
-from nodes.models.shapes import make_shape
-from nodes.planner.encounter import BEYOND_SPIN
-from nodes.planner.node import Planner
-from nodes.twin.finger import FingerPathError, SmoothPath
-from nodes.twin.gestures import GESTURES
-from nodes.twin.paths import map_to_surface, touchable
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.gestures import gesture_path
+from flexsheet.launch.health.layout import check_layout
+from flexsheet.launch.objects.organ import obj_text, organ_mesh
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.rigid import angle_between, apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner.encounter import BEYOND_SPIN
+from flexsheet.nodes.planner.node import Planner
+from flexsheet.nodes.twin.finger import FingerPathError, SmoothPath
+from flexsheet.nodes.twin.gestures import GESTURES
+from flexsheet.nodes.twin.paths import map_to_surface, touchable
 from tests import test_arm_loop as arm_loop
 from tests.plans import STEP_S, Desk, scene_with
 

@@ -19,15 +19,15 @@ import psutil
 import pytest
 import pytest_asyncio
 
-from messages import bus
-from messages.base import Header, Message
-from messages.bus import BusError, Publisher, Source, Subscriber
-from messages.security import KeyChange, KeyRing, SecurityError
-from messages.topics import TOPICS, Topic
-from messages.types import EStop, SheetTarget
-from messages.wire import encode
-from nodes.node import PortCounts
-from nodes.runner import Links, NodeConfig
+from flexsheet.messages import bus
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import BusError, Publisher, Source, Subscriber
+from flexsheet.messages.security import KeyChange, KeyRing, SecurityError
+from flexsheet.messages.topics import TOPICS, Topic
+from flexsheet.messages.types import EStop, SheetTarget
+from flexsheet.messages.wire import encode
+from flexsheet.nodes.node import PortCounts
+from flexsheet.nodes.runner import Links, NodeConfig
 from tests.hosts import Hosts, hosts
 from tests.network import Cut
 from tests.test_messages_bus import ForeignPublisher, finger, pictures, stop

@@ -13,14 +13,14 @@ from typing import Any
 import pytest
 import zmq
 
-from launch.plans.documents import BadInputError, read_document
-from launch.plans.plan import load_plan
-from launch.plans.planned import Plan
-from launch.running import runs
-from launch.running.keys import KEYS_VARIABLE, install
-from launch.running.supervisor import RunningGraph
-from launch.running.tools import subscriber_to
-from messages.security import (
+from flexsheet.launch.plans.documents import BadInputError, read_document
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.running import runs
+from flexsheet.launch.running.keys import KEYS_VARIABLE, install
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.launch.running.tools import subscriber_to
+from flexsheet.messages.security import (
     SecurityError,
     is_key,
     new_key_pair,
@@ -28,7 +28,7 @@ from messages.security import (
     read_secret,
     write_secret,
 )
-from messages.types import TwinFinger
+from flexsheet.messages.types import TwinFinger
 from tests.test_cli import Command
 from tests.test_launch_supervisor import LISTENER, beacon, write
 from tests.waiting import DEADLINE_S, until

@@ -14,23 +14,23 @@ import pytest
 import structlog
 from ruamel.yaml import YAML
 
-from launch.plans.plan import load_plan
-from launch.plans.planned import Plan
-from launch.running import runs
-from launch.running.keys import KEYS_VARIABLE, make_rings
-from launch.running.supervisor import node_config
-from messages import bus
-from messages.base import Header, Message
-from messages.bus import Publisher, Source
-from messages.clock import SystemClock
-from messages.security import new_key_pair, write_secret
-from messages.topics import TOPICS
-from messages.types import Arming, EStop
-from nodes import node_class
-from nodes.console.desk import Desk, Files, Finger, ReleaseError
-from nodes.console.graph_facts import GraphFacts
-from nodes.node import Node, NodeParameters, Output, parameters_of
-from nodes.runner import Links
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.running import runs
+from flexsheet.launch.running.keys import KEYS_VARIABLE, make_rings
+from flexsheet.launch.running.supervisor import node_config
+from flexsheet.messages import bus
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Publisher, Source
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.security import new_key_pair, write_secret
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import Arming, EStop
+from flexsheet.nodes import node_class
+from flexsheet.nodes.console.desk import Desk, Files, Finger, ReleaseError
+from flexsheet.nodes.console.graph_facts import GraphFacts
+from flexsheet.nodes.node import Node, NodeParameters, Output, parameters_of
+from flexsheet.nodes.runner import Links
 from tests.arm_states import arm_state
 from tests.test_security import target
 from tests.waiting import until

@@ -17,8 +17,8 @@ from typing import Any
 import pytest
 import zmq
 
-from messages import bus
-from messages.bus import Publisher
+from flexsheet.messages import bus
+from flexsheet.messages.bus import Publisher
 from tests.test_messages_bus import Room, connected, finger, header, room, until
 from tests.test_security import FINGER, Street, street
 
@@ -32,10 +32,10 @@ MAX_GROWTH_KB = 48_000
 PUBLISHER = """
 import asyncio, json, sys
 from pathlib import Path
-from messages.base import Header
-from messages.bus import Publisher
-from messages.security import KeyRing
-from messages.topics import TOPICS
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Publisher
+from flexsheet.messages.security import KeyRing
+from flexsheet.messages.topics import TOPICS
 from tests.test_messages_bus import finger, stop
 
 def peak_kb():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
-from nodes.models.shapes import (
+from flexsheet.nodes.models.shapes import (
     SHAPES,
     CylinderShape,
     EllipsoidShape,

@@ -10,14 +10,14 @@ import pytest
 import trimesh
 from ruamel.yaml import YAML
 
-from launch.objects.meshes import MOST_BYTES, read_mesh
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan, load_scene
-from messages.base import Header
-from messages.scene import Mesh, Scene, UnfitGeometryError, cylinder_of
-from messages.topics import TOPICS
-from messages.wire import decode, encode
-from nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape, make_shape
+from flexsheet.launch.objects.meshes import MOST_BYTES, read_mesh
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Mesh, Scene, UnfitGeometryError, cylinder_of
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.wire import decode, encode
+from flexsheet.nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape, make_shape
 
 ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"

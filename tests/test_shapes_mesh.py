@@ -14,16 +14,16 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
 
-from launch.objects.meshes import read_mesh
-from nodes.models.shapes import (
+from flexsheet.launch.objects.meshes import read_mesh
+from flexsheet.nodes.models.shapes import (
     EllipsoidShape,
     MeshError,
     SmoothMeshShape,
     make_shape,
     principal_curvatures,
 )
-from nodes.models.shapes.smooth_mesh import EDGE, MAX_CURVATURE_RATIO, default_smoothing_m
-from nodes.models.shapes.triangles import (
+from flexsheet.nodes.models.shapes.smooth_mesh import EDGE, MAX_CURVATURE_RATIO, default_smoothing_m
+from flexsheet.nodes.models.shapes.triangles import (
     Facets,
     check_mesh,
     count_intersections,

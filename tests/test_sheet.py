@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from nodes.models.rigid import is_rigid, rotation_from_rpy, transform, transform_from_rpy
-from nodes.models.sheet import (
+from flexsheet.nodes.models.rigid import is_rigid, rotation_from_rpy, transform, transform_from_rpy
+from flexsheet.nodes.models.sheet import (
     corners,
     edge_force_for_stiffness,
     edge_force_n,

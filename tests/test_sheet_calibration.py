@@ -12,29 +12,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from launch.bench.sheet_rows import read_rows, twin_rows
-from launch.bench.twin_sheet import twin_force
-from launch.cli import app
-from launch.commands.calibrate_sheet import fitted
-from launch.commands.output import CommandError
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_scene
-from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-from messages.sheet_calibration import (
+from flexsheet.launch.bench.sheet_rows import read_rows, twin_rows
+from flexsheet.launch.bench.twin_sheet import twin_force
+from flexsheet.launch.cli import app
+from flexsheet.launch.commands.calibrate_sheet import fitted
+from flexsheet.launch.commands.output import CommandError
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+from flexsheet.messages.sheet_calibration import (
     SheetCalibration,
     load_sheet_calibration,
     save_sheet_calibration,
 )
-from nodes.models.sheet.fit import (
+from flexsheet.nodes.models.sheet.fit import (
     MeasuredPush,
     SheetModelFitError,
     fit_sheet_model,
     make_model,
     tabulate_pushes,
 )
-from nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
-from nodes.models.sheet.tabulated import TabulatedSheetModel
-from nodes.planner.sheet_force import law_for, rubber_of
+from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
+from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
+from flexsheet.nodes.planner.sheet_force import law_for, rubber_of
 
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(SCENE_FILE)

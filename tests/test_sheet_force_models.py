@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.bench.twin_sheet import twin_push
-from messages.scene import SheetSpec
-from nodes.models.sheet.force_models import (
+from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
     LinearSheetModel,
     MembraneSheetModel,
@@ -23,8 +23,8 @@ from nodes.models.sheet.force_models import (
     flat_edge_force_n,
     interpolated_inverse,
 )
-from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
+from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
 
 Floats = NDArray[np.float64]
 

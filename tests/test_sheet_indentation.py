@@ -10,8 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from nodes.models.sheet import indentation
-from nodes.models.sheet.indentation import IndentationBasis, IndentationCase, solve_indentation
+from flexsheet.nodes.models.sheet import indentation
+from flexsheet.nodes.models.sheet.indentation import (
+    IndentationBasis,
+    IndentationCase,
+    solve_indentation,
+)
 from tests.indentation_bases import (
     DEEPEST_M,
     ELEMENT_CELLS,

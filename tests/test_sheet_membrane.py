@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from launch.bench.twin_sheet import twin_push
-from messages.scene import SheetSpec
-from nodes.models.sheet import membrane
-from nodes.models.sheet.force_models import MembraneSheetModel
-from nodes.models.sheet.membrane import (
+from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.models.sheet import membrane
+from flexsheet.nodes.models.sheet.force_models import MembraneSheetModel
+from flexsheet.nodes.models.sheet.membrane import (
     NoEquilibriumError,
     graded,
     principal,
@@ -20,7 +20,7 @@ from nodes.models.sheet.membrane import (
     relaxed,
     stress_and_tangent,
 )
-from nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
 

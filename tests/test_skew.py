@@ -12,11 +12,16 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
 from benchmarks.tracking_bench import Observer, bench_scene, twin_camera
-from messages.scene import Scene
-from messages.types import StereoPair
-from nodes.triangulator.skew import compensate_skew
-from nodes.triangulator.triangulation import StereoGeometry, TriangulatedPoint, dlt, measure
-from nodes.twin.clutter import CLUTTER
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.triangulator.skew import compensate_skew
+from flexsheet.nodes.triangulator.triangulation import (
+    StereoGeometry,
+    TriangulatedPoint,
+    dlt,
+    measure,
+)
+from flexsheet.nodes.twin.clutter import CLUTTER
 
 Floats = NDArray[np.float64]
 SCENE_FILE = Path(__file__).parent.parent / "launch" / "scenes" / "cylinder.yaml"

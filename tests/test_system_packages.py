@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from launch.health import system
+from flexsheet.launch.health import system
 
 
 class Apt:

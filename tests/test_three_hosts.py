@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from launch.plans.plan import load_plan
-from messages.types import ArmState
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, Lab
 from tests.lab_bags import Span, gaps, held, read_arm, wanted
 

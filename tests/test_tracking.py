@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.scene import Scene
-from nodes.methods import measure as measure_trial
-from nodes.models.prediction import path_at
-from nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter, Kalman, Tremor
-from nodes.triangulator.tracking import Tracker, TrackingSettings
-from nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import measure as measure_trial
+from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter, Kalman, Tremor
+from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
 
 Floats = NDArray[np.float64]
 Path = Callable[[float], Floats]

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
-from messages.calibration import Board, StereoCalibration
-from messages.calibration_file import CalibrationMismatchError
-from messages.scene import Scene
-from nodes.methods import measure as measure_trial
-from nodes.models import camera, rigid
-from nodes.triangulator.families import TRIANGULATION
-from nodes.triangulator.triangulation import (
+from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.messages.calibration_file import CalibrationMismatchError
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import measure as measure_trial
+from flexsheet.nodes.models import camera, rigid
+from flexsheet.nodes.triangulator.families import TRIANGULATION
+from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     ClosestApproach,
     StereoGeometry,

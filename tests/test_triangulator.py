@@ -11,19 +11,19 @@ import pytest
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.calibration import Board, StereoCalibration, save_calibration
-from messages.calibration_file import CalibrationFileError
-from messages.clock import VirtualClock
-from messages.scene import Scene, StereoCamera
-from messages.topics import Topic
-from messages.types import FingerPath, Fingertip, StereoPair, TwinFinger
-from nodes.triangulator.node import Triangulator
-from nodes.triangulator.parameters import TriangulatorParameters
-from nodes.twin.clutter import touching_highlight
-from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
-from nodes.twin.pixels import Sensor, TwinCamera
-from nodes.twin.rig import make_true_camera
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.calibration import Board, StereoCalibration, save_calibration
+from flexsheet.messages.calibration_file import CalibrationFileError
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene, StereoCamera
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import FingerPath, Fingertip, StereoPair, TwinFinger
+from flexsheet.nodes.triangulator.node import Triangulator
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.nodes.twin.clutter import touching_highlight
+from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
+from flexsheet.nodes.twin.pixels import Sensor, TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -12,25 +12,32 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
-from launch.cli import app
-from launch.commands.output import CommandError
-from launch.commands.tune import NOT_MET
-from launch.methods import tune
-from launch.methods.machine import busy_words
-from launch.methods.tune import Tunable, choose, tunables_named, verdicts, write_choices, written
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_scene
-from messages.base import Header
-from messages.clock import VirtualClock
-from messages.methods import Methods, SoftBodyChoice
-from messages.scene import Scene
-from nodes.arm_bridge.kinematics import KINEMATICS
-from nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
-from nodes.methods import Case, Family, Point, Trial
-from nodes.planner.force_table import law_by
-from nodes.triangulator.families import TRIANGULATION
-from nodes.triangulator.node import Triangulator
-from nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.launch.cli import app
+from flexsheet.launch.commands.output import CommandError
+from flexsheet.launch.commands.tune import NOT_MET
+from flexsheet.launch.methods import tune
+from flexsheet.launch.methods.machine import busy_words
+from flexsheet.launch.methods.tune import (
+    Tunable,
+    choose,
+    tunables_named,
+    verdicts,
+    write_choices,
+    written,
+)
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.base import Header
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.methods import Methods, SoftBodyChoice
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.arm_bridge.kinematics import KINEMATICS
+from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
+from flexsheet.nodes.methods import Case, Family, Point, Trial
+from flexsheet.nodes.planner.force_table import law_by
+from flexsheet.nodes.triangulator.families import TRIANGULATION
+from flexsheet.nodes.triangulator.node import Triangulator
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 
 SCENES = Path(__file__).resolve().parent.parent / "launch" / "scenes"
 SCENE = load_scene(SCENES / "cylinder.yaml")
@@ -178,13 +185,13 @@ def test_a_miss_is_said_with_how_far_it_misses() -> None:
 
 def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     there = {
-        "launch.methods.families:QUICK_SHAPE": family(
+        "flexsheet.launch.methods.families:QUICK_SHAPE": family(
             "sheet-shape", ["four_triangles", "reduced_order"]
         ),
-        "launch.methods.families:QUICK_CORRECTION": family(
+        "flexsheet.launch.methods.families:QUICK_CORRECTION": family(
             "correction", ["one_plane", "two_pass_triangles"]
         ),
-        "launch.methods.families:CORRECTION": family("correction", ["two_pass"]),
+        "flexsheet.launch.methods.families:CORRECTION": family("correction", ["two_pass"]),
     }
     monkeypatch.setattr(tune, "family_at", there.__getitem__)
     errors = {"four_triangles": 0.2, "reduced_order": 0.1, "one_plane": 9.0}

@@ -14,13 +14,13 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.scene import Scene
-from messages.topics import Topic
-from messages.types import TwinArms
-from nodes.models.rigid import transform_from_rpy
-from nodes.twin.arms import (
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import TwinArms
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.twin.arms import (
     ACCELERATION_RAD_PER_S2,
     CONTROLLER_CYCLE_S,
     FAULT_FINITE,
@@ -38,8 +38,8 @@ from nodes.twin.arms import (
     forward,
     solve_inverse_kinematics,
 )
-from nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
-from nodes.twin.mxt_controller import MxtServer
+from flexsheet.nodes.twin.arms_node import TwinArmsNode, TwinArmsParameters
+from flexsheet.nodes.twin.mxt_controller import MxtServer
 
 Floats = NDArray[np.float64]
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])

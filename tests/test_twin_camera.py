@@ -15,11 +15,11 @@ from scipy.optimize import least_squares
 from scipy.special import erf, ndtr
 
 from benchmarks.fingertip_bound import BoundError, fingertip_bound, pixel_information
-from messages.calibration import Board
-from messages.scene import Lens, Scene, StereoCamera
-from nodes.models.rigid import transform, vector_from_rotation
-from nodes.twin.board import BoardError, TwinBoard
-from nodes.twin.clutter import (
+from flexsheet.messages.calibration import Board
+from flexsheet.messages.scene import Lens, Scene, StereoCamera
+from flexsheet.nodes.models.rigid import transform, vector_from_rotation
+from flexsheet.nodes.twin.board import BoardError, TwinBoard
+from flexsheet.nodes.twin.clutter import (
     CLUTTER,
     Clutter,
     FixedPoint,
@@ -34,8 +34,8 @@ from nodes.twin.clutter import (
     together,
     touching_highlight,
 )
-from nodes.twin.pixels import Image, Sensor, TwinCamera, Window, disjoint
-from nodes.twin.rig import make_true_camera, pixels_of, slopes_of
+from flexsheet.nodes.twin.pixels import Image, Sensor, TwinCamera, Window, disjoint
+from flexsheet.nodes.twin.rig import make_true_camera, pixels_of, slopes_of
 
 ROOT = Path(__file__).resolve().parent.parent
 Floats = NDArray[np.float64]

@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 
-from messages.base import Header, Message
-from messages.clock import SystemClock, VirtualClock
-from messages.scene import Lens, Scene
-from messages.topics import Topic
-from messages.types import FingerPath, StereoPair, TwinFinger
-from nodes.twin.finger import FingerMotion, FingerPathError
-from nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
-from nodes.twin.paths import recorded_path
-from nodes.twin.pixels import TwinCamera
-from nodes.twin.rig import make_true_camera
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import SystemClock, VirtualClock
+from flexsheet.messages.scene import Lens, Scene
+from flexsheet.messages.topics import Topic
+from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
+from flexsheet.nodes.twin.finger import FingerMotion, FingerPathError
+from flexsheet.nodes.twin.finger_node import TwinFingerNode, TwinFingerParameters
+from flexsheet.nodes.twin.paths import recorded_path
+from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORDING = ROOT.parent / "shared" / "data" / "finger" / "reach_and_grip.csv"

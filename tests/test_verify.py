@@ -10,19 +10,19 @@ import numpy as np
 import psutil
 import pytest
 
-from launch.bags.replay import Verification, refusal, verify
-from launch.plans.plan import load_plan
-from launch.plans.planned import Plan
-from messages.bag import BagError, BagReader, BagWriter
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.topics import TOPICS, Topic
-from messages.types import ClockEcho, ClockPing, Status, StereoPair
-from nodes import node_class
-from nodes.node import Node, parameters_of, timers_of
-from nodes.runner import status_of
-from nodes.twin.pixels import TwinCamera
-from nodes.twin.rig import make_true_camera
+from flexsheet.launch.bags.replay import Verification, refusal, verify
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.messages.bag import BagError, BagReader, BagWriter
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.topics import TOPICS, Topic
+from flexsheet.messages.types import ClockEcho, ClockPing, Status, StereoPair
+from flexsheet.nodes import node_class
+from flexsheet.nodes.node import Node, parameters_of, timers_of
+from flexsheet.nodes.runner import status_of
+from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
 
 ROOT = Path(__file__).resolve().parent.parent
 START_NS = 10**13

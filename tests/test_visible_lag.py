@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from launch.experiments import stroke
-from launch.plans.plan import load_scene
-from messages.types import Frame
+from flexsheet.launch.experiments import stroke
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.types import Frame
 
 Floats = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import vector_from_rotation
+from flexsheet.nodes.models.rigid import vector_from_rotation
 
 Floats = NDArray[np.float64]
 

@@ -29,11 +29,11 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 from scipy.spatial.transform import Rotation
 
-from messages.bag import BagReader
-from messages.base import Message
-from messages.files import free_bytes, write_error
-from messages.scene import Scene
-from messages.types import (
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.base import Message
+from flexsheet.messages.files import free_bytes, write_error
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import (
     ArmState,
     EStop,
     Fingertip,
@@ -44,7 +44,7 @@ from messages.types import (
     StereoPair,
     TwinEye,
 )
-from nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.models.rigid import transform_from_rpy
 
 PLOTTED = 64
 """Arrays of up to so many values are exported as numbers."""

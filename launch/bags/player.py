@@ -7,14 +7,14 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from launch.plans.planned import Plan
-from launch.running.runs import Run
-from launch.running.tools import READER_RECONNECT_S, ToolsWriter, topics_for_tools
-from messages.bag import BagError, BagReader
-from messages.base import Header, Message
-from messages.clock import SystemClock
-from messages.clock_table import shifted
-from messages.topics import Delivery, topic_named
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.running.runs import Run
+from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter, topics_for_tools
+from flexsheet.messages.bag import BagError, BagReader
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.clock_table import shifted
+from flexsheet.messages.topics import Delivery, topic_named
 
 Progress = Callable[[float, float], None]
 """Called with (seconds of the bag played, seconds in all)."""

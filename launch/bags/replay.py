@@ -24,16 +24,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
-from launch.plans.documents import did_you_mean
-from launch.plans.planned import Plan, PlannedNode
-from messages.bag import BagError, BagReader
-from messages.base import Header, Message
-from messages.clock import VirtualClock
-from messages.topics import TOPICS, Delivery, Topic
-from messages.types import Clocks, Status
-from messages.wire import decode, encode
-from nodes import UnknownNodeError, node_class
-from nodes.node import Node, parameters_of, timers_of
+from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.planned import Plan, PlannedNode
+from flexsheet.messages.bag import BagError, BagReader
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.clock import VirtualClock
+from flexsheet.messages.topics import TOPICS, Delivery, Topic
+from flexsheet.messages.types import Clocks, Status
+from flexsheet.messages.wire import decode, encode
+from flexsheet.nodes import UnknownNodeError, node_class
+from flexsheet.nodes.node import Node, parameters_of, timers_of
 
 REFUSALS = {
     "camera": "it reads a device, which is not in the bag; with stereo recorded, "

@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.calibration import Board, StereoCalibration
-from messages.files import write_file
-from messages.scene import Lens as SceneLens
-from messages.scene import Pose, Scene
-from messages.types import Side
-from nodes.arm_bridge.hand_eye import Lens, Rig, Sighting, View
-from nodes.camera.corners import (
+from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import Lens as SceneLens
+from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.hand_eye import Lens, Rig, Sighting, View
+from flexsheet.nodes.camera.corners import (
     BoardPair,
     CornerFinder,
     Progress,
@@ -33,9 +33,9 @@ from nodes.camera.corners import (
     find_pairs,
     match_views,
 )
-from nodes.camera.image_pair import encode_png
-from nodes.models.camera import camera_matrix, project
-from nodes.models.rigid import (
+from flexsheet.nodes.camera.image_pair import encode_png
+from flexsheet.nodes.models.camera import camera_matrix, project
+from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
     rotation_from_vector,
@@ -43,10 +43,10 @@ from nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from nodes.twin.arms import RANGE_RAD, solve_inverse_kinematics
-from nodes.twin.arms import forward as twin_forward
-from nodes.twin.board import TwinBoard
-from nodes.twin.rig import make_true_camera
+from flexsheet.nodes.twin.arms import RANGE_RAD, solve_inverse_kinematics
+from flexsheet.nodes.twin.arms import forward as twin_forward
+from flexsheet.nodes.twin.board import TwinBoard
+from flexsheet.nodes.twin.rig import make_true_camera
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene, SheetSpec
-from nodes.models.rigid import transform
-from nodes.twin.error_map import error_map
-from nodes.twin.eye import METRES_PER_PX, seen
-from nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, Rubber, solve
+from flexsheet.messages.scene import Scene, SheetSpec
+from flexsheet.nodes.models.rigid import transform
+from flexsheet.nodes.twin.error_map import error_map
+from flexsheet.nodes.twin.eye import METRES_PER_PX, seen
+from flexsheet.nodes.twin.membrane import CELLS, SLACK_TENSION, DeformedSheet, Rubber, solve
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
-from launch.commands.output import (
+from flexsheet.launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
@@ -22,13 +22,13 @@ from launch.commands.output import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from launch.plans.planned import Plan
-    from launch.running.runs import Run
-    from launch.running.stopping import StopAttempt
-    from launch.running.tools import ToolsWriter
-    from messages.base import Message
-    from messages.bus import Subscriber
-    from messages.types import ArmState, EStop
+    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.running.runs import Run
+    from flexsheet.launch.running.stopping import StopAttempt
+    from flexsheet.launch.running.tools import ToolsWriter
+    from flexsheet.messages.base import Message
+    from flexsheet.messages.bus import Subscriber
+    from flexsheet.messages.types import ArmState, EStop
 
 app = typer.Typer(
     add_completion=False,
@@ -56,7 +56,7 @@ def ready(run: RunOption = None, as_json: JsonOption = False) -> None:
 
     Exit code 1 when an arm refuses; its reason is shown.
     """
-    from messages.types import Arming
+    from flexsheet.messages.types import Arming
 
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and all(arm.ready for arm in arms.values())
@@ -72,7 +72,7 @@ def stand_down(
     reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
     """Bring both arms to rest in order, and let the sheet go slack; `ready` ends it."""
-    from messages.types import Arming
+    from flexsheet.messages.types import Arming
 
     message = Arming(ready=False, reason=reason)
 
@@ -92,8 +92,8 @@ def stop(
 
     Exit code 0 when a launcher or a bridge has confirmed it, or both arms show it.
     """
-    from launch.running.runs import live_runs
-    from launch.running.stopping import sent_early, stop_arms
+    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.launch.running.stopping import sent_early, stop_arms
 
     if sent_early:
         attempts = sent_early.pop()
@@ -106,8 +106,8 @@ async def _confirm_stop(
     run_directory: Path | None, reason: str, attempts: list[StopAttempt], as_json: bool
 ) -> int:
     """Publish the stop too where no launcher has confirmed it; show how the arms are then."""
-    from launch.running.stopping import StopOutcome, StopPath
-    from messages.types import EStop
+    from flexsheet.launch.running.stopping import StopOutcome, StopPath
+    from flexsheet.messages.types import EStop
 
     plan, run = running_graph(run_directory)
     latched = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
@@ -143,7 +143,7 @@ def reset(
     Arms that wait for `arms ready` stay where they are.  Arms with `arming: by_itself`, which are
     simulated, follow at once when there is a target.
     """
-    from messages.types import EStop
+    from flexsheet.messages.types import EStop
 
     message = EStop(engaged=False, reason=reason)
 
@@ -189,7 +189,7 @@ class _Arms:
         self.problems: list[str] = []
 
     async def __aenter__(self) -> Self:
-        from launch.running.tools import subscriber_to
+        from flexsheet.launch.running.tools import subscriber_to
 
         for topic in TOPICS:
             self._subscribers.append(
@@ -211,7 +211,7 @@ class _Arms:
 
     async def publish(self, topic: str, message: Message) -> None:
         """Send it once readers have connected, and once only: a person means now."""
-        from launch.running.tools import READER_RECONNECT_S, ToolsWriter
+        from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter
 
         self._writer = ToolsWriter(self._plan, self._run, [topic])
         await asyncio.sleep(READER_RECONNECT_S)
@@ -219,9 +219,9 @@ class _Arms:
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
         """Send it at once: it is latched, and readers get it as they connect."""
-        from launch.running.stopping import StopAttempt, StopOutcome, StopPath
-        from launch.running.tools import READER_RECONNECT_S, ToolsWriter
-        from messages.bus import BusError
+        from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
+        from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter
+        from flexsheet.messages.bus import BusError
 
         begun_s, outcome = self._loop.time(), StopOutcome.PUBLISHED
         try:
@@ -252,7 +252,7 @@ async def _say(
     as_json: bool,
 ) -> int:
     """Say a word to both arms and wait until it holds; show how they are then."""
-    from launch.running.tools import host_of
+    from flexsheet.launch.running.tools import host_of
 
     plan, run = running_graph(run_directory)
     _refuse_reset_from_elsewhere(plan, host_of(run), word)
@@ -269,8 +269,8 @@ async def _say(
 
 
 def _refuse_reset_from_elsewhere(plan: Plan, host: str, word: tuple[str, Message] | None) -> None:
-    from launch.plans.planned import tools_on
-    from messages.types import EStop
+    from flexsheet.launch.plans.planned import tools_on
+    from flexsheet.messages.types import EStop
 
     if word is None or not isinstance(word[1], EStop) or word[1].engaged:
         return

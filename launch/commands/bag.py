@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption, RunOption, run_interruptible, running_graph
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     OTHER_THAN_LIVE,
@@ -26,9 +26,9 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.bags.replay import Verification
-    from launch.plans.planned import Plan
-    from launch.running.runs import Run
+    from flexsheet.launch.bags.replay import Verification
+    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.running.runs import Run
 
 SHOWN_EVERY_S = 0.2
 MAX_TOPICS_LISTED = 10
@@ -120,7 +120,7 @@ def play(
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
 def info(bag: BagArgument, as_json: JsonOption = False) -> None:
     """What a bag holds; a bag that was cut off by a crash is read as far as it goes."""
-    from messages.bag import info as bag_info
+    from flexsheet.messages.bag import info as bag_info
 
     summary = bag_info(bag)
     if as_json:
@@ -154,7 +154,7 @@ def recover(
     as_json: JsonOption = False,
 ) -> None:
     """Write a whole bag from what can be read of a cut or damaged one; the original stays."""
-    from messages.bag import recover as recover_bag
+    from flexsheet.messages.bag import recover as recover_bag
 
     with progress_bar(f"recovering {bag.name}") as progress:
         report = recover_bag(bag, output, progress=progress)
@@ -188,7 +188,7 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write what a bag holds for other tools: Foxglove and rerun open the file."""
-    from launch.bags.export import export as export_bag
+    from flexsheet.launch.bags.export import export as export_bag
 
     with progress_bar(f"exporting {bag.name}") as progress:
         result = export_bag(bag, output, topics=topics, progress=progress)
@@ -229,7 +229,7 @@ def verify(
     Exit code 3: they gave the same, but other numbers than the node published live: as from a node
     that reads the clock by itself, or from a bag of code that did not say what its nodes took.
     """
-    from launch.bags.replay import verify as verify_node
+    from flexsheet.launch.bags.replay import verify as verify_node
 
     logs_on_stderr()
     with progress_bar(f"stepping {node} through {bag.name}, twice") as progress:
@@ -265,8 +265,8 @@ def report(
     The page needs no network.  With --json the numbers are printed, and a page is written only
     where one is named.  A bag that was cut off is read as far as it goes.
     """
-    from launch.bags.report.write import default_output
-    from launch.bags.report.write import report as report_on
+    from flexsheet.launch.bags.report.write import default_output
+    from flexsheet.launch.bags.report.write import report as report_on
 
     page = output if as_json else output or default_output(bag)
     with progress_bar(f"reading {bag.name}") as progress:
@@ -346,13 +346,13 @@ async def _record(
     seconds: float | None,
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
-    from launch.plans.planned import RUN_DIRECTORY
-    from launch.running.runs import local_sources, ring_file
-    from launch.running.tools import host_of
-    from messages.topics import TOPICS
-    from nodes.recorder.node import Recorder
-    from nodes.recorder.parameters import RUN_FILES, RecorderParameters
-    from nodes.runner import NodeConfig, PortConfig, run_node
+    from flexsheet.launch.plans.planned import RUN_DIRECTORY
+    from flexsheet.launch.running.runs import local_sources, ring_file
+    from flexsheet.launch.running.tools import host_of
+    from flexsheet.messages.topics import TOPICS
+    from flexsheet.nodes.recorder.node import Recorder
+    from flexsheet.nodes.recorder.parameters import RUN_FILES, RecorderParameters
+    from flexsheet.nodes.runner import NodeConfig, PortConfig, run_node
 
     plan, run = running
     parameters = RecorderParameters(
@@ -423,8 +423,8 @@ class Playing:
 
 
 async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> int:
-    from launch.plans.plan import load_plan
-    from launch.running.supervisor import RunningGraph
+    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.running.supervisor import RunningGraph
 
     if into is None:
         plan, run = running_graph(run_directory)
@@ -437,9 +437,9 @@ async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> 
 
 
 async def _play_into(how: Playing, plan: Plan, run: Run) -> int:
-    from launch.bags.player import play as play_bag
-    from launch.bags.player import select_topics
-    from messages.bag import BagReader
+    from flexsheet.launch.bags.player import play as play_bag
+    from flexsheet.launch.bags.player import select_topics
+    from flexsheet.messages.bag import BagReader
 
     selection = select_topics(BagReader(how.bag).topics, plan, how.topics)
     for name, why in selection.left_out.items():

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch.commands.calibrate import (
+from flexsheet.launch.commands.calibrate import (
     FOUR_BITS,
     BoardOption,
     DictionaryOption,
@@ -24,8 +24,8 @@ from launch.commands.calibrate import (
     _board,
     _progress,
 )
-from launch.commands.graph import JsonOption, RunOption, run_interruptible
-from launch.commands.output import (
+from flexsheet.launch.commands.graph import JsonOption, RunOption, run_interruptible
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
@@ -33,15 +33,15 @@ from launch.commands.output import (
     print_json,
     words,
 )
-from messages.files import write_file
+from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
-    from launch.bench.arm_places import PlaceTaker
-    from messages.arms_calibration import ArmBase, ArmsCalibration
-    from messages.calibration import Board, StereoCalibration
-    from messages.scene import Scene
-    from messages.types import Side
-    from nodes.arm_bridge.hand_eye import BaseFit, Sighting
+    from flexsheet.launch.bench.arm_places import PlaceTaker
+    from flexsheet.messages.arms_calibration import ArmBase, ArmsCalibration
+    from flexsheet.messages.calibration import Board, StereoCalibration
+    from flexsheet.messages.scene import Scene
+    from flexsheet.messages.types import Side
+    from flexsheet.nodes.arm_bridge.hand_eye import BaseFit, Sighting
 
 SceneOption = Annotated[
     Path, typer.Option("--scene", metavar="SCENE", help="Scene with the camera's place.")
@@ -113,8 +113,8 @@ def arms(
     The board is fast on the flange; the arm stands still at 15 to 20 places, its flange turned to
     all sides.  Give a folder for each arm (see docs/arms.md), or --twin.
     """
-    from launch.plans.plan import load_scene
-    from messages.arms_calibration import save_arms_calibration
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.arms_calibration import save_arms_calibration
 
     if not output.resolve().parent.is_dir():
         raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
@@ -156,9 +156,9 @@ def write_scene(
     as_json: JsonOption = False,
 ) -> None:
     """Copy a scene with the bases of a calibration of the arms; all else stays as it is."""
-    from launch.plans.plan import load_scene
-    from messages.arms_calibration import load_arms_calibration
-    from messages.calibration_file import CalibrationFileError
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.arms_calibration import load_arms_calibration
+    from flexsheet.messages.calibration_file import CalibrationFileError
 
     _refuse_overwriting(output, "-o")
     load_scene(scene_file)
@@ -193,8 +193,8 @@ def capture(
     Move the arm by its teach pendant.  A place is taken when the arm rests and the board is seen
     somewhere new; Ctrl-C ends.
     """
-    from launch.bench.arm_places import PlaceTaker, rig_of
-    from launch.plans.plan import load_scene
+    from flexsheet.launch.bench.arm_places import PlaceTaker, rig_of
+    from flexsheet.launch.plans.plan import load_scene
 
     if side not in SIDES:
         raise CommandError(f"--arm {side}: left or right", BAD_INPUT)
@@ -221,8 +221,8 @@ async def _watch(
     import asyncio
     import time
 
-    from launch.commands.topic import listener
-    from messages.topics import TOPICS
+    from flexsheet.launch.commands.topic import listener
+    from flexsheet.messages.topics import TOPICS
 
     pictures: asyncio.Queue[tuple[Any, float]] = asyncio.Queue(maxsize=1)
 
@@ -265,8 +265,8 @@ def _refuse_overwriting(path: Path, option: str) -> None:
 
 
 def _optics(path: Path | None, scene: Scene) -> StereoCalibration | None:
-    from messages.calibration import load_calibration, refuse_other_camera
-    from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
+    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 
     if path is None:
         return None
@@ -284,8 +284,8 @@ def _made_up(
     scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
 ) -> Path:
     """A folder with the twin's places."""
-    from launch.bench.arm_places import twin_places
-    from nodes.twin.board import BoardError
+    from flexsheet.launch.bench.arm_places import twin_places
+    from flexsheet.nodes.twin.board import BoardError
 
     mine = folder / side
     mine.mkdir()
@@ -301,9 +301,9 @@ def _made_up(
 def _fit(
     folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
 ) -> tuple[BaseFit, list[tuple[str, str]]]:
-    from launch.bench.arm_places import PlacesError, read_sightings, rig_of
-    from nodes.arm_bridge.hand_eye import HandEyeError, calibrate_base
-    from nodes.camera.corners import CalibrationError
+    from flexsheet.launch.bench.arm_places import PlacesError, read_sightings, rig_of
+    from flexsheet.nodes.arm_bridge.hand_eye import HandEyeError, calibrate_base
+    from flexsheet.nodes.camera.corners import CalibrationError
 
     rig = rig_of(scene, optics)
     size = (scene.camera.width_px, scene.camera.height_px)
@@ -320,7 +320,7 @@ def _fit(
 
 
 def _calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsCalibration:
-    from messages.arms_calibration import ArmsCalibration
+    from flexsheet.messages.arms_calibration import ArmsCalibration
 
     return ArmsCalibration(
         date=datetime.now(UTC).isoformat(timespec="seconds"),
@@ -336,9 +336,9 @@ def _calibration(fits: dict[Side, BaseFit], scene: Scene, board: Board) -> ArmsC
 def _arm_base(fit: BaseFit) -> ArmBase:
     import numpy as np
 
-    from messages.arms_calibration import ArmBase, ArmPlace
-    from messages.scene import Pose
-    from nodes.models.rigid import rpy_from_rotation
+    from flexsheet.messages.arms_calibration import ArmBase, ArmPlace
+    from flexsheet.messages.scene import Pose
+    from flexsheet.nodes.models.rigid import rpy_from_rotation
 
     def pose(transform: Any) -> Pose:
         return Pose(
@@ -377,7 +377,7 @@ def _write_copy(scene_file: Path, found: ArmsCalibration, copy: Path) -> None:
     """Write the scene with the measured bases; comments and layout stay."""
     from ruamel.yaml import YAML
 
-    from launch.plans.plan import load_scene
+    from flexsheet.launch.plans.plan import load_scene
 
     yaml = YAML(typ="rt", pure=True)
     yaml.width = 4096
@@ -407,8 +407,8 @@ def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str,
     """How far the found base of the twin is off, at the world's origin."""
     import numpy as np
 
-    from launch.bench.arm_places import true_base
-    from nodes.models.rigid import inverse, vector_from_rotation
+    from flexsheet.launch.bench.arm_places import true_base
+    from flexsheet.nodes.models.rigid import inverse, vector_from_rotation
 
     off = true_base(scene, side, seed=seed) @ inverse(fit.world_from_base)
     return {
@@ -518,7 +518,7 @@ def _shift(base: ArmBase, scene: Scene, side: Side) -> tuple[float, float]:
     """How far the base was found from where the scene has it: m and rad."""
     import numpy as np
 
-    from nodes.models.rigid import transform_from_rpy, vector_from_rotation
+    from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation
 
     given = getattr(scene.arms, side).world_from_base
     before, now = (

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
@@ -18,12 +18,12 @@ from launch.commands.output import (
     print_json,
     words,
 )
-from messages.files import write_file
+from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
-    from messages.scene import Projector, Scene, StereoCamera
-    from nodes.renderer.gray_code import Image
-    from nodes.renderer.projector_calibration import ProjectorFit
+    from flexsheet.messages.scene import Projector, Scene, StereoCamera
+    from flexsheet.nodes.renderer.gray_code import Image
+    from flexsheet.nodes.renderer.projector_calibration import ProjectorFit
 
     Views = tuple[list[Image], list[Image]]
 
@@ -85,9 +85,9 @@ def projector(
     From pictures of Gray code on the sheet, seen by the stereo camera in three poses or more
     (--pictures), from four corners found by hand (--corners), or in the twin (--twin).
     """
-    from launch.plans.plan import load_scene
-    from nodes.renderer import gray_code
-    from nodes.renderer.projector_calibration import (
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.nodes.renderer import gray_code
+    from flexsheet.nodes.renderer.projector_calibration import (
         ProjectorError,
         calibrate_projector,
         measure_points,
@@ -115,7 +115,7 @@ def projector(
             fit = _by_corners(scene, corners, rectangle_mm)
         else:
             if twin:
-                from nodes.twin.projector import make_true_projector
+                from flexsheet.nodes.twin.projector import make_true_projector
 
                 true = make_true_projector(scene.projector, seed=seed)
                 views = list(_twin_views(scene, true, poses, seed))
@@ -134,7 +134,7 @@ def projector(
 
 
 def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
-    from nodes.camera.image_pair import encode_png
+    from flexsheet.nodes.camera.image_pair import encode_png
 
     folder.mkdir(parents=True, exist_ok=True)
     for number, pattern in enumerate(patterns):
@@ -146,7 +146,7 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
 
 
 def _read_views(folder: Path, count: int) -> Iterator[Views]:
-    from nodes.camera.corners import CalibrationError, read_gray
+    from flexsheet.nodes.camera.corners import CalibrationError, read_gray
 
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not poses:
@@ -172,9 +172,9 @@ def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterato
     """What the twin's true rig sees of the patterns on the sheet, in one pose after the other."""
     from rich.progress import track
 
-    from nodes.renderer.gray_code import patterns
-    from nodes.twin.projector import LitSheet, sheet_poses
-    from nodes.twin.rig import make_true_camera
+    from flexsheet.nodes.renderer.gray_code import patterns
+    from flexsheet.nodes.twin.projector import LitSheet, sheet_poses
+    from flexsheet.nodes.twin.rig import make_true_camera
 
     shown = patterns(scene.projector.width_px, scene.projector.height_px)
     lit = LitSheet(scene, make_true_camera(scene.camera), true, seed=seed)
@@ -185,8 +185,8 @@ def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterato
 
 def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
     """The scene's camera with the optics of a calibration file."""
-    from messages.calibration import load_calibration, refuse_other_camera
-    from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+    from flexsheet.messages.calibration import load_calibration, refuse_other_camera
+    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 
     if calibration is None:
         return scene.camera
@@ -207,7 +207,7 @@ def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
 def _by_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     import numpy as np
 
-    from nodes.renderer.projector_calibration import keystone
+    from flexsheet.nodes.renderer.projector_calibration import keystone
 
     try:
         pixels = np.array([[float(x) for x in pair.split(",")] for pair in corners.split()])
@@ -227,7 +227,7 @@ def write_scene(scene_file: Path, found: Projector, copy: Path) -> None:
     """Write the scene with this projector; comments and layout stay."""
     from ruamel.yaml import YAML
 
-    from launch.plans.plan import load_scene
+    from flexsheet.launch.plans.plan import load_scene
 
     yaml = YAML(typ="rt", pure=True)
     yaml.width = 4096
@@ -315,7 +315,7 @@ def _tell(
 
 def _eye_errors_mm(scene: Scene, found: Projector, true: Projector) -> dict[str, dict[str, float]]:
     """True errors at the eye, on sheets held about, before and after the calibration."""
-    from nodes.twin.projector import errors_at_eye, sheet_poses
+    from flexsheet.nodes.twin.projector import errors_at_eye, sheet_poses
 
     eye, planes = scene.eyes.centre_world_m, sheet_poses(7)
     result = {}

@@ -8,19 +8,19 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from launch.commands.output import BAD_INPUT, CommandError, words
-from messages.files import write_file
-from nodes.camera.image_pair import encode_png
+from flexsheet.launch.commands.output import BAD_INPUT, CommandError, words
+from flexsheet.messages.files import write_file
+from flexsheet.nodes.camera.image_pair import encode_png
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
     from rich.console import RenderableType
 
-    from messages.calibration import Board
-    from messages.scene import Scene
-    from nodes.camera.capture import Capture
-    from nodes.camera.sources import AnySource
+    from flexsheet.messages.calibration import Board
+    from flexsheet.messages.scene import Scene
+    from flexsheet.nodes.camera.capture import Capture
+    from flexsheet.nodes.camera.sources import AnySource
 
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
 
@@ -33,8 +33,8 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
     from pydantic import TypeAdapter, ValidationError
     from ruamel.yaml.error import YAMLError
 
-    from launch.plans.documents import parse_value
-    from nodes.camera.sources import AnySource
+    from flexsheet.launch.plans.documents import parse_value
+    from flexsheet.nodes.camera.sources import AnySource
 
     try:
         described: Any = TypeAdapter(AnySource).validate_python(parse_value(source))
@@ -56,8 +56,8 @@ def device_pictures(source: str, scene: Scene) -> Iterator[Views]:
 
 
 def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
-    from nodes.camera.devices import open_reader
-    from nodes.camera.image_pair import DeviceError, check_size
+    from flexsheet.nodes.camera.devices import open_reader
+    from flexsheet.nodes.camera.image_pair import DeviceError, check_size
 
     try:
         with closing(open_reader(described, scene.camera, time.monotonic_ns)) as reader:
@@ -72,8 +72,8 @@ def _read(described: AnySource, source: str, scene: Scene) -> Iterator[Views]:
 
 def twin_pictures(scene: Scene, board: Board, *, pairs: int, seed: int) -> Iterator[Views]:
     """What the twin's true rig sees of a board, in one pose after the other."""
-    from nodes.twin.board import BoardError, TwinBoard
-    from nodes.twin.rig import make_true_camera
+    from flexsheet.nodes.twin.board import BoardError, TwinBoard
+    from flexsheet.nodes.twin.rig import make_true_camera
 
     try:
         shown = TwinBoard(make_true_camera(scene.camera), board, seed=seed)
@@ -142,7 +142,7 @@ def coverage_view(capture: Capture, hint: str) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    from nodes.camera.capture import COLUMNS, DISTANCES, ROWS, TILTS, Bin
+    from flexsheet.nodes.camera.capture import COLUMNS, DISTANCES, ROWS, TILTS, Bin
 
     def count(one: Bin) -> Text:
         have, often = capture.counts[one], capture.needed.get(one, 0)

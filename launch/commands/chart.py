@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
@@ -21,7 +21,7 @@ from launch.commands.output import (
     progress_words,
     words,
 )
-from launch.methods.finite import finite
+from flexsheet.launch.methods.finite import finite
 
 app = typer.Typer(add_completion=False)
 
@@ -68,9 +68,9 @@ def chart(
     it is good for; the front has those that no other method beats in both.
     """
     logs_on_stderr()
-    from launch.methods import charts
-    from launch.methods.machine import busy_words
-    from launch.plans.plan import load_scene
+    from flexsheet.launch.methods import charts
+    from flexsheet.launch.methods.machine import busy_words
+    from flexsheet.launch.plans.plan import load_scene
 
     if redraw:
         results = charts.kept_charts(output)
@@ -110,7 +110,7 @@ def _told(progress: Callable[[str], None], family: str, text: str) -> None:
 
 
 def _print_methods(result: dict[str, Any]) -> None:
-    from launch.methods.charts import duration, methods_of
+    from flexsheet.launch.methods.charts import duration, methods_of
 
     rows = [
         (

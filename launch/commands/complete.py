@@ -12,13 +12,13 @@ import typer
 
 
 def topics(incomplete: str) -> list[str]:
-    from messages.topics import TOPICS
+    from flexsheet.messages.topics import TOPICS
 
     return _fitting(TOPICS, incomplete)
 
 
 def node_types(incomplete: str) -> list[str]:
-    from nodes import NODES
+    from flexsheet.nodes import NODES
 
     return _fitting(NODES, incomplete)
 
@@ -27,16 +27,16 @@ def replayed_nodes(incomplete: str) -> list[str]:
     """What `bag verify` steps: types, after which launch files mostly name their nodes.
 
     The shell does not say what stands behind the cursor, where the bag will be."""
-    from launch.bags.replay import REFUSALS
-    from nodes import NODES
+    from flexsheet.launch.bags.replay import REFUSALS
+    from flexsheet.nodes import NODES
 
     return _fitting((name for name in NODES if name not in REFUSALS), incomplete)
 
 
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
     """Hosts of the launch file that is named already."""
-    from launch.plans.documents import BadInputError
-    from launch.plans.plan import load_plan
+    from flexsheet.launch.plans.documents import BadInputError
+    from flexsheet.launch.plans.plan import load_plan
 
     file = next((word for word in context.args if word.endswith((".yaml", ".yml"))), None)
     try:
@@ -46,26 +46,26 @@ def hosts(context: typer.Context, incomplete: str) -> list[str]:
 
 
 def tuned_families(incomplete: str) -> list[str]:
-    from launch.methods.tune import TUNABLES
+    from flexsheet.launch.methods.tune import TUNABLES
 
     return _fitting((one.name for one in TUNABLES), incomplete)
 
 
 def gestures(incomplete: str) -> list[str]:
-    from launch.experiments.gestures import GESTURES
+    from flexsheet.launch.experiments.gestures import GESTURES
 
     return _fitting(GESTURES, incomplete) or files(".csv")(incomplete)
 
 
 def runs(incomplete: str) -> list[str]:
     """Directories of the graphs that run."""
-    from launch.running.runs import live_runs
+    from flexsheet.launch.running.runs import live_runs
 
     return _fitting((str(run.directory) for run in live_runs()), incomplete)
 
 
 def families(incomplete: str) -> list[str]:
-    from launch.methods.charts import FAMILIES
+    from flexsheet.launch.methods.charts import FAMILIES
 
     return _fitting(FAMILIES, incomplete)
 

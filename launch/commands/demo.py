@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.experiment import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.experiment import (
     DEMO_FILE,
     LaunchOption,
     OutputOption,
@@ -16,8 +16,8 @@ from launch.commands.experiment import (
     print_strokes,
     result_folder,
 )
-from launch.commands.graph import JsonOption
-from launch.commands.output import examples, print_json, progress_words, words
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import examples, print_json, progress_words, words
 
 app = typer.Typer(add_completion=False)
 
@@ -42,8 +42,8 @@ def demo(
     as_json: JsonOption = False,
 ) -> None:
     """Run the whole system on this machine: stroke, tilt and push the sheet; then pictures."""
-    from launch.experiments.demo import run_demo
-    from launch.experiments.gestures import finger_path as path_of
+    from flexsheet.launch.experiments.demo import run_demo
+    from flexsheet.launch.experiments.gestures import finger_path as path_of
 
     path = None if finger_path is None else path_of(launch_file, finger_path)
     folder = result_folder(output, "demo")

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
@@ -45,9 +45,9 @@ def doctor(
     """
     if context.invoked_subcommand is not None:
         return
-    from launch.commands.doctor_hosts import ask_running, print_findings
-    from launch.health.doctor import check_all
-    from launch.running.runs import sweep as sweep_leftovers
+    from flexsheet.launch.commands.doctor_hosts import ask_running, print_findings
+    from flexsheet.launch.health.doctor import check_all
+    from flexsheet.launch.running.runs import sweep as sweep_leftovers
 
     if sweep:
         ended = sweep_leftovers()
@@ -96,8 +96,8 @@ def check_scene(
     Every contact within the scene's tilt, pushed up to its depth, at the least and the largest
     stretch.  Also said: how fast a finger may move for the arms to follow.
     """
-    from launch.health.layout import check_layout, draw_layout, layout_result
-    from launch.plans.plan import load_scene
+    from flexsheet.launch.health.layout import check_layout, draw_layout, layout_result
+    from flexsheet.launch.plans.plan import load_scene
 
     if output is not None and not output.resolve().parent.is_dir():
         raise CommandError(

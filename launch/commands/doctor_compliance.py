@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
@@ -46,13 +46,13 @@ def compliance(
 
     Pushed in the middle, by the planner's law: presented and wanted force to the scene's depth.
     """
-    from launch.health.compliance import compliance_result, front_curve
-    from launch.plans.plan import load_scene
-    from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-    from messages.scene import UnfitGeometryError
-    from messages.sheet_calibration import load_sheet_calibration
-    from nodes.planner.compliance import ObjectCurve
-    from nodes.planner.sheet_force import law_for
+    from flexsheet.launch.health.compliance import compliance_result, front_curve
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+    from flexsheet.messages.scene import UnfitGeometryError
+    from flexsheet.messages.sheet_calibration import load_sheet_calibration
+    from flexsheet.nodes.planner.compliance import ObjectCurve
+    from flexsheet.nodes.planner.sheet_force import law_for
 
     scene = load_scene(scene_file)
     try:

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption, running_graph
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption, running_graph
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
@@ -22,9 +22,9 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.health.doctor_hosts import HostFinding
-    from launch.plans.planned import Plan
-    from launch.running.runs import Run
+    from flexsheet.launch.health.doctor_hosts import HostFinding
+    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.running.runs import Run
 
 PATIENCE_S = 4.0
 
@@ -83,8 +83,8 @@ def hosts(
 
 def ask_running(patience_s: float = PATIENCE_S) -> list[HostFinding]:
     """Findings about all hosts of the graph that runs here; none where it has one alone."""
-    from launch.running.runs import live_runs
-    from launch.running.tools import host_of
+    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.launch.running.tools import host_of
 
     if not any(run.plan_file.is_file() for run in live_runs()):
         return []
@@ -96,7 +96,7 @@ def ask_running(patience_s: float = PATIENCE_S) -> list[HostFinding]:
 
 def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
     """The plan, and the graph of that launch file that runs here."""
-    from launch.plans.plan import load_plan
+    from flexsheet.launch.plans.plan import load_plan
 
     if launch_file is None:
         return running_graph(None)
@@ -111,10 +111,10 @@ def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
 
 def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
     """Which host of the plan this computer is; CommandError where that cannot be told."""
-    from launch.health.doctor_hosts import own_addresses
-    from launch.plans.documents import did_you_mean
-    from launch.plans.planned import MAIN
-    from launch.running.tools import host_of
+    from flexsheet.launch.health.doctor_hosts import own_addresses
+    from flexsheet.launch.plans.documents import did_you_mean
+    from flexsheet.launch.plans.planned import MAIN
+    from flexsheet.launch.running.tools import host_of
 
     if wanted is not None:
         if wanted not in plan.hosts:
@@ -140,10 +140,10 @@ async def examine(plan: Plan, here: str, run: Run | None, patience_s: float) -> 
     """All findings: what this computer sees, and what the others say."""
     import tempfile
 
-    from launch.health.doctor_hosts import before_start, judge, own_key_problem
-    from launch.health.visits import visit_all
-    from launch.running.keys import secret_file
-    from messages.security import KeyRing, write_ring
+    from flexsheet.launch.health.doctor_hosts import before_start, judge, own_key_problem
+    from flexsheet.launch.health.visits import visit_all
+    from flexsheet.launch.running.keys import secret_file
+    from flexsheet.messages.security import KeyRing, write_ring
 
     key_problem = await asyncio.to_thread(own_key_problem, plan, here)
     with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:

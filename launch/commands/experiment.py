@@ -7,13 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import examples, print_json, print_table, progress_words, words
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
+    examples,
+    print_json,
+    print_table,
+    progress_words,
+    words,
+)
 
 if TYPE_CHECKING:
-    from launch.experiments.image import Series
-    from launch.experiments.run import Procedure, Progress
+    from flexsheet.launch.experiments.image import Series
+    from flexsheet.launch.experiments.run import Procedure, Progress
 
 app = typer.Typer(
     add_completion=False,
@@ -52,7 +58,7 @@ MapOption = Annotated[
 
 def result_folder(output: Path | None, name: str) -> Path:
 
-    from launch.experiments.run import new_folder
+    from flexsheet.launch.experiments.run import new_folder
 
     if output is None:
         return new_folder(name)
@@ -67,7 +73,7 @@ def _record(
     procedure: Procedure,
     progress: Progress,
 ) -> None:
-    from launch.experiments.run import run_experiment
+    from flexsheet.launch.experiments.run import run_experiment
 
     run_experiment(launch_file, settings or (), bag, procedure, progress)
     progress("reading the bag")
@@ -88,8 +94,8 @@ def stroke(
     as_json: JsonOption = False,
 ) -> None:
     """Stroke the cylinder by 60 degrees (section V, Table I)."""
-    from launch.experiments import stroke as experiment
-    from launch.experiments.run import stroke_procedure
+    from flexsheet.launch.experiments import stroke as experiment
+    from flexsheet.launch.experiments.run import stroke_procedure
 
     bag = result_folder(output, "stroke") / "stroke.mcap"
     with progress_words() as progress:
@@ -115,7 +121,7 @@ def tilt(
     as_json: JsonOption = False,
 ) -> None:
     """Errors of the picture on an inclined sheet (section VI-B, Fig. 11)."""
-    from launch.experiments.image import TILT
+    from flexsheet.launch.experiments.image import TILT
 
     bag = result_folder(output, "tilt") / "tilt.mcap"
     _photograph(TILT, bag, launch_file, settings, map_file=map_file, as_json=as_json)
@@ -147,8 +153,8 @@ def push(
     As in the paper the sheet is only tilted: it does not yield along its normal, and is dented by
     all of the push.  `--set planner.presents=curve` has it yield.
     """
-    from launch.experiments.image import pushed_at
-    from launch.experiments.run import settings_of_type
+    from flexsheet.launch.experiments.image import pushed_at
+    from flexsheet.launch.experiments.run import settings_of_type
 
     settings = [*settings_of_type(launch_file, "planner", "presents=stretch"), *(settings or ())]
     bag, series = result_folder(output, "push") / "push.mcap", pushed_at(at_mm, tilt_deg)
@@ -164,8 +170,8 @@ def compliance(
     as_json: JsonOption = False,
 ) -> None:
     """How the force that a finger meets compares with the object's, over the push."""
-    from launch.experiments import compliance as experiment
-    from launch.experiments.pictures import draw_compliance
+    from flexsheet.launch.experiments import compliance as experiment
+    from flexsheet.launch.experiments.pictures import draw_compliance
 
     folder = result_folder(output, "compliance")
     bag, picture = folder / "compliance.mcap", folder / "compliance.png"
@@ -202,9 +208,9 @@ def _photograph(
     map_file: Path | None,
     as_json: bool,
 ) -> None:
-    from launch.experiments import image
-    from launch.experiments.maps import draw_error_maps
-    from launch.experiments.run import picture_procedure
+    from flexsheet.launch.experiments import image
+    from flexsheet.launch.experiments.maps import draw_error_maps
+    from flexsheet.launch.experiments.run import picture_procedure
 
     mapped = map_file is not None
     with progress_words() as progress:
@@ -249,7 +255,7 @@ def gestures(
     as_json: JsonOption = False,
 ) -> None:
     """How well a fingertip is tracked that strokes, taps, reaches, stops and turns."""
-    from launch.experiments import gestures as experiment
+    from flexsheet.launch.experiments import gestures as experiment
 
     wanted = experiment.chosen(names)
     bag = result_folder(output, "gestures") / "gestures.mcap"
@@ -308,7 +314,7 @@ def print_followed(results: list[dict[str, Any]]) -> None:
 
 def print_strokes(results: list[dict[str, Any]]) -> None:
     """Table I of the paper beside ours, mean and standard deviation."""
-    from launch.experiments.stroke import PAPER_TABLE_1
+    from flexsheet.launch.experiments.stroke import PAPER_TABLE_1
 
     columns = ["moving time"]
     for name, unit in (("Δd", "mm"), ("Δθ", "°")):

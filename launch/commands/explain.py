@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from launch.commands.graph import JsonOption
-from launch.commands.output import CommandError, examples, print_fields, print_json
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import CommandError, examples, print_fields, print_json
 
 app = typer.Typer(add_completion=False)
 
@@ -30,7 +30,7 @@ def explain(
     as_json: JsonOption = False,
 ) -> None:
     """Say what an error message means and what to do; all of them are in docs/errors.md."""
-    from launch.reference.errors import explained
+    from flexsheet.launch.reference.errors import explained
 
     found = explained(message)[:SHOWN]
     if as_json:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import sys
 
-from launch.bags.export import ExportError
-from launch.experiments import ExperimentError
-from launch.plans.documents import BadInputError
-from launch.running.runs import RunDirectoryError
-from launch.running.supervisor import NodeFailedError
-from messages.bag import BagError
-from messages.bus import BusError
-from messages.files import DISK_ERRORS, FileWriteError
-from messages.security import SecurityError
+from flexsheet.launch.bags.export import ExportError
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.running.runs import RunDirectoryError
+from flexsheet.launch.running.supervisor import NodeFailedError
+from flexsheet.messages.bag import BagError
+from flexsheet.messages.bus import BusError
+from flexsheet.messages.files import DISK_ERRORS, FileWriteError
+from flexsheet.messages.security import SecurityError
 
 BAD_INPUTS: tuple[type[Exception], ...] = (BadInputError,)
 FAILURES: tuple[type[Exception], ...] = (
@@ -26,11 +26,11 @@ FAILURES: tuple[type[Exception], ...] = (
     FileWriteError,
 )
 LATE = {
-    "messages.scene": "UnfitGeometryError",
-    "nodes.fem_solver.mesh.solid": "UnfitMeshError",
-    "nodes.fem_solver.newton": "NewtonNotConvergedError",
-    "nodes.fem_solver.precompute_table": "WorkersError",
-    "nodes.models.sheet.membrane": "NoEquilibriumError",
+    "flexsheet.messages.scene": "UnfitGeometryError",
+    "flexsheet.nodes.fem_solver.mesh.solid": "UnfitMeshError",
+    "flexsheet.nodes.fem_solver.newton": "NewtonNotConvergedError",
+    "flexsheet.nodes.fem_solver.precompute_table": "WorkersError",
+    "flexsheet.nodes.models.sheet.membrane": "NoEquilibriumError",
 }
 """Failures of modules that take long to import; who has not imported one has not had its error."""
 

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch.commands import complete
-from launch.commands.output import BAD_INPUT, CommandError
-from nodes.signals import handle_signals
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.output import BAD_INPUT, CommandError
+from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
-    from launch.plans.planned import Plan
-    from launch.running.runs import Run
+    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.running.runs import Run
 
 RunOption = Annotated[
     Path | None,
@@ -31,8 +31,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 def running_graph(directory: Path | None) -> tuple[Plan, Run]:
     """The Plan and the Run of the graph in `directory`, or of the newest that is alive."""
-    from launch.plans.planned import Plan
-    from launch.running.runs import Run, live_runs
+    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.running.runs import Run, live_runs
 
     if directory is not None:
         run = Run(directory.resolve().name, directory.resolve())

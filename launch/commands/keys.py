@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     FAILED,
     CommandError,
@@ -55,8 +55,8 @@ def new(
     """
     import re
 
-    from launch.running.keys import secret_file
-    from messages.security import SecurityError, new_key_pair, write_secret
+    from flexsheet.launch.running.keys import secret_file
+    from flexsheet.messages.security import SecurityError, new_key_pair, write_secret
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
         raise CommandError(f'"{host}" is no name of a host: small letters, digits, _', BAD_INPUT)
@@ -82,8 +82,8 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Print the public keys whose secret halves are here; exit code 1 where one cannot be used."""
-    from launch.running.keys import directory, secret_file
-    from messages.security import SecurityError, public_of, read_secret
+    from flexsheet.launch.running.keys import directory, secret_file
+    from flexsheet.messages.security import SecurityError, public_of, read_secret
 
     files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
     if not files:
@@ -134,9 +134,9 @@ def install(
 
     A graph that runs from that file takes it over within two seconds, without a restart.
     """
-    from launch.running.keys import install as install_key
-    from launch.running.keys import secret_file
-    from messages.security import SecurityError, public_of, read_secret
+    from flexsheet.launch.running.keys import install as install_key
+    from flexsheet.launch.running.keys import secret_file
+    from flexsheet.messages.security import SecurityError, public_of, read_secret
 
     if key is None:
         try:

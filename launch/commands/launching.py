@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     FAILED,
     examples,
     print_json,
@@ -21,12 +21,12 @@ from launch.commands.output import (
     print_table,
     words,
 )
-from nodes.signals import handle_signals
+from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
-    from launch.plans.planned import Plan, PlannedNode
-    from launch.running.runs import Run
-    from launch.running.supervisor import RunningGraph
+    from flexsheet.launch.plans.planned import Plan, PlannedNode
+    from flexsheet.launch.running.runs import Run
+    from flexsheet.launch.running.supervisor import RunningGraph
 
 app = typer.Typer(add_completion=False)
 
@@ -75,7 +75,7 @@ def launch(
 
     Exit codes: 0 stopped as asked, 1 a node failed for good, 2 the input is wrong.
     """
-    from launch.plans.plan import load_plan
+    from flexsheet.launch.plans.plan import load_plan
 
     plan = load_plan(file, settings=settings or (), record=record, console=console)
     if dry_run:
@@ -106,7 +106,7 @@ async def run_graph(
     when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
     """Run the plan's nodes until a signal, or `duration_s` after they are ready; the exit code."""
-    from launch.running.supervisor import RunningGraph
+    from flexsheet.launch.running.supervisor import RunningGraph
 
     asked_to_stop = asyncio.Event()
     graph = RunningGraph(plan, host=host, report=_say)
@@ -133,8 +133,8 @@ async def _run_until(
     when_ready: Callable[[Run], None],
 ) -> int:
     """Run the graph until `asked_to_stop`, or `duration_s` after it is ready; the exit code."""
-    from launch.running.notify import keep_telling, tell
-    from launch.running.supervisor import NodeFailedError
+    from flexsheet.launch.running.notify import keep_telling, tell
+    from flexsheet.launch.running.supervisor import NodeFailedError
 
     stop = asyncio.create_task(asked_to_stop.wait())
     turning = asyncio.create_task(keep_telling())
@@ -193,8 +193,8 @@ def _settings(node: PlannedNode) -> str:
     """The parameters that are not what they would be without the launch file."""
     from pydantic_core import to_jsonable_python
 
-    from nodes import node_class
-    from nodes.node import parameters_of
+    from flexsheet.nodes import node_class
+    from flexsheet.nodes.node import parameters_of
 
     fields = parameters_of(node_class(node.type)).model_fields
     # As they are written into a plan; a default that is made anew each time is no default here.

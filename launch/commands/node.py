@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption, running_graph
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption, running_graph
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
@@ -31,8 +31,8 @@ app = typer.Typer(
 )
 def list_nodes(as_json: JsonOption = False) -> None:
     """The node types that a launch file can name, and the nodes of the graph that runs."""
-    from launch.running.runs import live_runs
-    from nodes import NODES
+    from flexsheet.launch.running.runs import live_runs
+    from flexsheet.nodes import NODES
 
     running: dict[str, list[str]] = {}
     if live_runs():
@@ -68,8 +68,8 @@ def describe(
     as_json: JsonOption = False,
 ) -> None:
     """Ports, timers and parameters of a type of node."""
-    from nodes import UnknownNodeError, node_class
-    from nodes.node import parameters_of, ports_of, timers_of
+    from flexsheet.nodes import UnknownNodeError, node_class
+    from flexsheet.nodes.node import parameters_of, ports_of, timers_of
 
     try:
         class_ = node_class(node)
@@ -102,7 +102,7 @@ def describe(
 
 
 def _parameter(name: str, field: Any) -> dict[str, Any]:
-    from messages.reference import field_type
+    from flexsheet.messages.reference import field_type
 
     # As in docs/parameters.md, without the links.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", field_type(field))

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from launch.methods.finite import finite
+from flexsheet.launch.methods.finite import finite
 
 if TYPE_CHECKING:
     from rich.console import Console

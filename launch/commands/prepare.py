@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
@@ -58,8 +58,8 @@ def prepare(
 
     Of a scene whose methods say sheet_force: table, that table as well: a minute or two.
     """
-    from launch.plans.plan import load_scene
-    from launch.running.prepare import (
+    from flexsheet.launch.plans.plan import load_scene
+    from flexsheet.launch.running.prepare import (
         NoSoftBodyError,
         prepare_dents,
         prepare_force_table,

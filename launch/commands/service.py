@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
-from messages.files import write_file
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import BAD_INPUT, CommandError, examples, print_json, words
+from flexsheet.messages.files import write_file
 
 app = typer.Typer(add_completion=False, no_args_is_help=True)
 
@@ -45,8 +45,8 @@ def install(
     as_json: JsonOption = False,
 ) -> None:
     """Write flexsheet@.service, the host's environment and settings for TCP; start nothing."""
-    from launch.plans.plan import load_plan
-    from launch.running.service import STATE, bags_of, files_of
+    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.running.service import STATE, bags_of, files_of
 
     plan = load_plan(launch_file)
     if host not in plan.hosts:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import (
     JsonOption,
     RunOption,
     run_interruptible,
     running_graph,
 )
-from launch.commands.output import (
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
@@ -29,9 +29,9 @@ from launch.commands.output import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from messages.base import Header, Message
-    from messages.bus import Handler, Subscriber
-    from messages.topics import Topic
+    from flexsheet.messages.base import Header, Message
+    from flexsheet.messages.bus import Handler, Subscriber
+    from flexsheet.messages.topics import Topic
 
 app = typer.Typer(
     add_completion=False, no_args_is_help=True, help="Topics: the table, and what is on them now."
@@ -53,7 +53,7 @@ SHORT_ARRAY = 36
 )
 def list_topics(as_json: JsonOption = False) -> None:
     """The one table of topics."""
-    from messages.topics import TOPICS
+    from flexsheet.messages.topics import TOPICS
 
     rows = [_describe(topic) for topic in TOPICS.values()]
     if as_json:
@@ -297,7 +297,7 @@ def _word(value: Any) -> str:
 
 
 def _topic(name: str) -> Topic:
-    from messages.topics import UnknownTopicError, topic_named
+    from flexsheet.messages.topics import UnknownTopicError, topic_named
 
     try:
         return topic_named(name)
@@ -329,7 +329,7 @@ def _field(message: Message, path: str | None, topic: str) -> Any:
     for name in path.split(".") if path else ():
         fields = getattr(type(value), "model_fields", {})
         if name not in fields:
-            from launch.plans.documents import did_you_mean
+            from flexsheet.launch.plans.documents import did_you_mean
 
             raise CommandError(
                 f'--field {path}: topic "{topic}" has no field "{name}" there; '
@@ -384,7 +384,7 @@ def listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, unopened: bool = False
 ) -> Subscriber:
     """A subscriber to the topic in the graph that runs; CommandError when nothing writes it."""
-    from launch.running.tools import subscriber_to
+    from flexsheet.launch.running.tools import subscriber_to
 
     plan, run = running_graph(run_directory)
     if not plan.endpoints_to_read(topic.name):
@@ -402,7 +402,7 @@ def listener(
 def _parse_message(topic: Topic, text: str) -> Message:
     from ruamel.yaml.error import YAMLError
 
-    from launch.plans.documents import Document, parse_json, parse_value, validate
+    from flexsheet.launch.plans.documents import Document, parse_json, parse_value, validate
 
     source = "MESSAGE"
     if text.startswith("@"):
@@ -434,7 +434,7 @@ async def _publish(
     times: int | None,
     told: Callable[[int], None],
 ) -> int:
-    from launch.running.tools import READER_RECONNECT_S, ToolsWriter
+    from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter
 
     plan, found = running_graph(run)
     writer = ToolsWriter(plan, found, [topic.name])

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.launching import about_run, run_graph
-from launch.commands.output import examples, print_json_line, progress_words, words
-from nodes.signals import keyboard_interrupts
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.launching import about_run, run_graph
+from flexsheet.launch.commands.output import examples, print_json_line, progress_words, words
+from flexsheet.nodes.signals import keyboard_interrupts
 
 if TYPE_CHECKING:
-    from launch.running.runs import Run
+    from flexsheet.launch.running.runs import Run
 
 app = typer.Typer(add_completion=False)
 
@@ -49,8 +49,8 @@ def try_it(
     Starts the demo's graph with a console and prints its address; Ctrl-C ends it.  From another
     computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address there.
     """
-    from launch.plans.plan import load_plan
-    from launch.running.prepare import prepare_plan
+    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.running.prepare import prepare_plan
 
     page = [f"console.page_port={port}"]
     plan = load_plan(launch_file, settings=[*page, *(settings or ())], console=True)

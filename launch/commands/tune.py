@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from launch.commands import complete
-from launch.commands.graph import JsonOption
-from launch.commands.output import (
+from flexsheet.launch.commands import complete
+from flexsheet.launch.commands.graph import JsonOption
+from flexsheet.launch.commands.output import (
     BAD_INPUT,
     CommandError,
     examples,
@@ -22,7 +22,7 @@ from launch.commands.output import (
 )
 
 if TYPE_CHECKING:
-    from launch.methods.tune import Choice
+    from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
 """Exit code: for some family no method is good enough, and the nearest miss was taken."""
@@ -73,9 +73,9 @@ def tune(
     choice up.  Exit code 3: for some family no method is good enough; the nearest miss is taken.
     """
     logs_on_stderr()
-    from launch.methods import charts, tune
-    from launch.methods.machine import busy_words, machine_name
-    from launch.plans.plan import load_scene
+    from flexsheet.launch.methods import charts, tune
+    from flexsheet.launch.methods.machine import busy_words, machine_name
+    from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
     try:
@@ -113,7 +113,7 @@ def tune(
 
 
 def _print_choices(choices: Sequence[Choice]) -> None:
-    from launch.methods.charts import duration
+    from flexsheet.launch.methods.charts import duration
 
     rows = [
         (

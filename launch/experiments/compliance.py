@@ -18,17 +18,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from launch.experiments import ExperimentError
-from launch.experiments.driver import Driver
-from launch.experiments.run import Procedure, Progress
-from launch.experiments.stroke import Track, track
-from messages.bag import BagReader
-from messages.scene import Pose, Scene
-from messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
-from nodes.models.rigid import transform_from_rpy
-from nodes.planner.compliance import FELT_N, GOOD_RATIO, WEBER_RATIO, WEBER_RATIO_BARE
-from nodes.twin.membrane import Rubber, solve
-from nodes.twin.paths import map_to_surface
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.run import Procedure, Progress
+from flexsheet.launch.experiments.stroke import Track, track
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.planner.compliance import FELT_N, GOOD_RATIO, WEBER_RATIO, WEBER_RATIO_BARE
+from flexsheet.nodes.twin.membrane import Rubber, solve
+from flexsheet.nodes.twin.paths import map_to_surface
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

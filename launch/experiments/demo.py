@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from launch.bags.report.strokes import read_followed
-from launch.experiments import ExperimentError, image, stroke
-from launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
-from launch.experiments.run import (
+from flexsheet.launch.bags.report.strokes import read_followed
+from flexsheet.launch.experiments import ExperimentError, image, stroke
+from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
+from flexsheet.launch.experiments.run import (
     Progress,
     in_turn,
     picture_procedure,
@@ -19,8 +19,8 @@ from launch.experiments.run import (
     settings_of_type,
     stroke_procedure,
 )
-from messages.files import write_file
-from messages.types import Correction, FingerPath
+from flexsheet.messages.files import write_file
+from flexsheet.messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
 """The paper's; enough to look at, and four times as quick as what the experiments measure in."""

@@ -15,13 +15,13 @@ from typing import Self
 
 import numpy as np
 
-from launch.experiments import ExperimentError
-from launch.plans.planned import TOOLS, Plan
-from launch.running.runs import Run
-from launch.running.tools import ToolsWriter, subscriber_to
-from messages.base import Header, Message
-from messages.bus import Subscriber
-from messages.types import (
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.plans.planned import TOOLS, Plan
+from flexsheet.launch.running.runs import Run
+from flexsheet.launch.running.tools import ToolsWriter, subscriber_to
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Subscriber
+from flexsheet.messages.types import (
     ArmState,
     Correction,
     Display,

@@ -13,20 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from launch.bags.report.strokes import read_followed
-from launch.experiments import ExperimentError, stroke
-from launch.experiments.driver import Driver
-from launch.experiments.lag import lag_s
-from launch.experiments.run import Procedure, Progress
-from launch.plans.documents import did_you_mean
-from launch.plans.plan import load_plan
-from messages.bag import BagReader
-from messages.scene import Scene, UnfitGeometryError
-from messages.types import FingerPath, Fingertip, TwinFinger
-from nodes.models.prediction import path_at
-from nodes.twin import gestures as twin_gestures
-from nodes.twin.finger import FingerPathError
-from nodes.twin.paths import recorded_path
+from flexsheet.launch.bags.report.strokes import read_followed
+from flexsheet.launch.experiments import ExperimentError, stroke
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.experiments.lag import lag_s
+from flexsheet.launch.experiments.run import Procedure, Progress
+from flexsheet.launch.plans.documents import did_you_mean
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.scene import Scene, UnfitGeometryError
+from flexsheet.messages.types import FingerPath, Fingertip, TwinFinger
+from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.twin import gestures as twin_gestures
+from flexsheet.nodes.twin.finger import FingerPathError
+from flexsheet.nodes.twin.paths import recorded_path
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

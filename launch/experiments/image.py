@@ -15,14 +15,14 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.experiments import ExperimentError
-from launch.experiments.stroke import object_pose
-from messages.bag import BagReader
-from messages.scene import Scene, cylinder_of
-from messages.types import Correction, FingerPath, Pattern, TwinEye
-from nodes.models.rigid import apply
-from nodes.twin.error_map import ErrorMap, error_map
-from nodes.twin.eye import push_sizes, tilt_sizes
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.stroke import object_pose
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.scene import Scene, cylinder_of
+from flexsheet.messages.types import Correction, FingerPath, Pattern, TwinEye
+from flexsheet.nodes.models.rigid import apply
+from flexsheet.nodes.twin.error_map import ErrorMap, error_map
+from flexsheet.nodes.twin.eye import push_sizes, tilt_sizes
 
 CORRECTIONS: tuple[Correction, ...] = get_args(Correction)
 HOVER_M = 0.03

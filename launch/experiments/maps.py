@@ -8,9 +8,15 @@ import numpy as np
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from launch.experiments.image import CORRECTIONS, Picture, Series, error_map_of, map_figures
-from launch.experiments.pictures import CORRECTION_NAMES
-from nodes.twin.error_map import ErrorMap
+from flexsheet.launch.experiments.image import (
+    CORRECTIONS,
+    Picture,
+    Series,
+    error_map_of,
+    map_figures,
+)
+from flexsheet.launch.experiments.pictures import CORRECTION_NAMES
+from flexsheet.nodes.twin.error_map import ErrorMap
 
 LEAST_MM, MOST_MM = 0.01, 10.0
 """Of the colours, which are logarithmic."""

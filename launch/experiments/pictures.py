@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from launch.experiments.image import Picture
-from launch.experiments.stroke import PAPER_TABLE_1, Recording, StrokeErrors
+from flexsheet.launch.experiments.image import Picture
+from flexsheet.launch.experiments.stroke import PAPER_TABLE_1, Recording, StrokeErrors
 
 EVENTS = (
     "fingertip",

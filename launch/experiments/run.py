@@ -9,15 +9,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from launch.experiments import ExperimentError, image, stroke
-from launch.experiments.driver import Driver
-from launch.plans.plan import load_plan
-from launch.plans.planned import Plan
-from launch.running.prepare import prepare_plan
-from launch.running.supervisor import RunningGraph
-from messages.scene import Scene
-from messages.types import Correction, FingerPath, Shading
-from nodes.signals import handle_signals
+from flexsheet.launch.experiments import ExperimentError, image, stroke
+from flexsheet.launch.experiments.driver import Driver
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.running.prepare import prepare_plan
+from flexsheet.launch.running.supervisor import RunningGraph
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Correction, FingerPath, Shading
+from flexsheet.nodes.signals import handle_signals
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
 RUNS = Path("runs")

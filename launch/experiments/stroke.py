@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_smoothing_spline
 
-from launch.experiments import ExperimentError
-from launch.experiments.lag import lag_s
-from messages.bag import BagReader
-from messages.base import Header, Message
-from messages.scene import ArmSpec, Cylinder, Scene, cylinder_of
-from messages.types import (
+from flexsheet.launch.experiments import ExperimentError
+from flexsheet.launch.experiments.lag import lag_s
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.scene import ArmSpec, Cylinder, Scene, cylinder_of
+from flexsheet.messages.types import (
     ArmState,
     FingerPath,
     Fingertip,
@@ -26,8 +26,8 @@ from messages.types import (
     TwinArms,
     TwinFinger,
 )
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape, principal_curvatures
 
 Floats = NDArray[np.float64]
 

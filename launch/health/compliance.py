@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes import cache
-from nodes.fem_solver.soft_body_factory import SoftBodyFactory
-from nodes.models.sheet.force_models import SheetForceModel
-from nodes.planner.compliance import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes import cache
+from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
+from flexsheet.nodes.models.sheet.force_models import SheetForceModel
+from flexsheet.nodes.planner.compliance import (
     GOOD_RATIO,
     WEBER_RATIO,
     WEBER_RATIO_BARE,

@@ -13,12 +13,12 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 from typing import Literal
 
-from launch.health.system import OPENGL, opengl_problem
-from launch.plans.documents import BadInputError
-from launch.plans.plan import load_plan
-from launch.running.cpu import CpuWatch
-from launch.running.runs import is_free, live_runs, orphans, root
-from messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
+from flexsheet.launch.health.system import OPENGL, opengl_problem
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.running.cpu import CpuWatch
+from flexsheet.launch.running.runs import is_free, live_runs, orphans, root
+from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
 
 DEMO = Path(__file__).parent.parent / "demo.yaml"
 CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")

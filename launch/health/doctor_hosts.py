@@ -16,20 +16,20 @@ from typing import Literal
 
 import psutil
 
-from launch.health.doctor import LEAST_DISK_BYTES, check_libraries
-from launch.health.system import OPENGL, opengl_problem
-from launch.health.visits import Reach, Visit
-from launch.plans.hosts import is_loopback
-from launch.plans.planned import Plan, PlannedNode
-from launch.plans.wires import FIRST_PORT, PORTS
-from launch.running.host import devices_of, folder_of, python_version, software
-from launch.running.keys import secret_file
-from launch.running.runs import is_free
-from messages.bus import HANDSHAKE_FAILED
-from messages.busy import BUSY_REMEDY, describe_busy, is_busy
-from messages.security import SecurityError, public_of, read_secret
-from messages.topics import TOPICS
-from messages.types import HostStatus, PortStatus
+from flexsheet.launch.health.doctor import LEAST_DISK_BYTES, check_libraries
+from flexsheet.launch.health.system import OPENGL, opengl_problem
+from flexsheet.launch.health.visits import Reach, Visit
+from flexsheet.launch.plans.hosts import is_loopback
+from flexsheet.launch.plans.planned import Plan, PlannedNode
+from flexsheet.launch.plans.wires import FIRST_PORT, PORTS
+from flexsheet.launch.running.host import devices_of, folder_of, python_version, software
+from flexsheet.launch.running.keys import secret_file
+from flexsheet.launch.running.runs import is_free
+from flexsheet.messages.bus import HANDSHAKE_FAILED
+from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
+from flexsheet.messages.security import SecurityError, public_of, read_secret
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import HostStatus, PortStatus
 
 State = Literal["ok", "warning", "failed", "not asked"]
 SLACK = 0.1

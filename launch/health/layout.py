@@ -2,8 +2,8 @@
 
 The range is sampled: where a finger can touch the object, how the sheet can lie there, how deep it
 is pushed, how far it is stretched, how fast it must move on.  How the sheet lies follows the
-planner's own rules (`nodes.planner.rolling`), whether an arm can hold it the bridge's
-(`nodes.arm_bridge.reach`).
+planner's own rules (`flexsheet.nodes.planner.rolling`), whether an arm can hold it the bridge's
+(`flexsheet.nodes.arm_bridge.reach`).
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Arms, ArmSpec, Pose, Scene
-from messages.types import Side
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.reach import (
+from flexsheet.messages.scene import Arms, ArmSpec, Pose, Scene
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.reach import (
     LIMITS,
     RANGES,
     SPEED_LIMITS,
@@ -31,11 +31,11 @@ from nodes.arm_bridge.reach import (
     best_reach,
     coordinated_path,
 )
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.models.shapes import Nearest, make_shape
-from nodes.models.sheet import stretch_for_edge_force
-from nodes.planner.rolling import Contact, rolled, rolling_twist, tangent
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import Nearest, make_shape
+from flexsheet.nodes.models.sheet import stretch_for_edge_force
+from flexsheet.nodes.planner.rolling import Contact, rolled, rolling_twist, tangent
 
 Floats = NDArray[np.float64]
 Progress = Callable[[str], None]

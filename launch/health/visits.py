@@ -17,15 +17,15 @@ from typing import Any, Literal
 import zmq
 from zmq.utils.monitor import parse_monitor_message
 
-from launch.plans.hosts import is_loopback, launcher_on
-from launch.plans.planned import Plan, Writer
-from launch.running.runs import Run, local_sources
-from messages.base import Header
-from messages.bus import Source, Subscriber
-from messages.security import KeyRing
-from messages.topics import topic_named
-from messages.types import ArmState, Clocks, HostStatus, Status
-from nodes.node import PortCounts
+from flexsheet.launch.plans.hosts import is_loopback, launcher_on
+from flexsheet.launch.plans.planned import Plan, Writer
+from flexsheet.launch.running.runs import Run, local_sources
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Source, Subscriber
+from flexsheet.messages.security import KeyRing
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import ArmState, Clocks, HostStatus, Status
+from flexsheet.nodes.node import PortCounts
 
 CONNECT_S = 4.0
 """Longer than the three seconds after which the kernel knows that nobody has the address."""

@@ -14,29 +14,29 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from launch.methods.finite import finite
-from launch.methods.machine import machine_name
-from launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
-from launch.running.code_state import git_state
-from messages.files import write_file
-from messages.scene import Scene
-from nodes.cache import EtaEstimator
-from nodes.methods import Family, Point, Trial, measure, pareto_front
+from flexsheet.launch.methods.finite import finite
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
+from flexsheet.launch.running.code_state import git_state
+from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.cache import EtaEstimator
+from flexsheet.nodes.methods import Family, Point, Trial, measure, pareto_front
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FAMILIES: dict[str, str] = {
-    "marker": "nodes.triangulator.families:MARKER",
-    "triangulation": "nodes.triangulator.families:TRIANGULATION",
-    "tracking": "launch.methods.families:TRACKING",
-    "kinematics": "nodes.arm_bridge.kinematics:KINEMATICS",
-    "soft-body": "nodes.fem_solver.benchmarks:SOFT_BODY",
-    "correction": "launch.methods.families:CORRECTION",
-    "sheet-force": "launch.methods.families:SHEET_FORCE",
-    "sheet-shape": "launch.methods.families:SHEET_SHAPE",
-    "mesh-normal": "nodes.planner.families:MESH_NORMAL",
-    "rolling": "nodes.planner.families:ROLLING",
+    "marker": "flexsheet.nodes.triangulator.families:MARKER",
+    "triangulation": "flexsheet.nodes.triangulator.families:TRIANGULATION",
+    "tracking": "flexsheet.launch.methods.families:TRACKING",
+    "kinematics": "flexsheet.nodes.arm_bridge.kinematics:KINEMATICS",
+    "soft-body": "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY",
+    "correction": "flexsheet.launch.methods.families:CORRECTION",
+    "sheet-force": "flexsheet.launch.methods.families:SHEET_FORCE",
+    "sheet-shape": "flexsheet.launch.methods.families:SHEET_SHAPE",
+    "mesh-normal": "flexsheet.nodes.planner.families:MESH_NORMAL",
+    "rolling": "flexsheet.nodes.planner.families:ROLLING",
 }
 """Families by their name on the command line; each node's folder describes its own."""
 

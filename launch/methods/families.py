@@ -7,17 +7,17 @@ from functools import lru_cache
 
 import numpy as np
 
-from launch.bench.twin_sheet import twin_errors, twin_force, twin_points
-from launch.experiments.stroke import stroke_path
-from messages.scene import Cylinder, Scene
-from messages.types import FingerPath
-from nodes.planner import force_table
-from nodes.planner.sheet_force import sheet_force_family
-from nodes.renderer.benchmarks import correction_family
-from nodes.renderer.sheet_shape_benchmark import sheet_shape_family
-from nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
-from nodes.twin.finger import FingerMotion
-from nodes.twin.gestures import GESTURES
+from flexsheet.launch.bench.twin_sheet import twin_errors, twin_force, twin_points
+from flexsheet.launch.experiments.stroke import stroke_path
+from flexsheet.messages.scene import Cylinder, Scene
+from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.planner import force_table
+from flexsheet.nodes.planner.sheet_force import sheet_force_family
+from flexsheet.nodes.renderer.benchmarks import correction_family
+from flexsheet.nodes.renderer.sheet_shape_benchmark import sheet_shape_family
+from flexsheet.nodes.triangulator.tracking_benchmark import TruePathCase, make_tracking_family
+from flexsheet.nodes.twin.finger import FingerMotion
+from flexsheet.nodes.twin.gestures import GESTURES
 
 CORRECTION = correction_family(twin_errors)
 QUICK_CORRECTION = correction_family(twin_errors, solved=False)

@@ -8,7 +8,7 @@ from io import StringIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from messages.files import write_file
+from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,13 +23,13 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
-from launch.methods.charts import duration, family_at, git_commit, measure_family
-from launch.methods.machine import machine_name
-from launch.plans.documents import BadInputError, Problem, did_you_mean
-from launch.plans.plan import load_scene
-from messages.files import DISK_ERRORS, write_error
-from messages.scene import Scene
-from nodes.methods import Family, Point, Trial
+from flexsheet.launch.methods.charts import duration, family_at, git_commit, measure_family
+from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.files import DISK_ERRORS, write_error
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import Family, Point, Trial
 
 REPEATS = 10
 MARGIN = 0.2
@@ -77,51 +77,60 @@ TUNABLES = (
     Tunable(
         "marker",
         "marker",
-        ("nodes.triangulator.families:MARKER",),
+        ("flexsheet.nodes.triangulator.families:MARKER",),
         _by_name("moments", "weighted_centroid", "subpixel_fit"),
     ),
     Tunable(
         "triangulation",
         "triangulation",
-        ("nodes.triangulator.families:TRIANGULATION",),
+        ("flexsheet.nodes.triangulator.families:TRIANGULATION",),
         _by_name("dlt"),
     ),
     Tunable(
         "tracking",
         "tracking",
-        ("launch.methods.families:TRACKING",),
+        ("flexsheet.launch.methods.families:TRACKING",),
         _by_name("none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"),
     ),
     Tunable(
         "kinematics",
         "kinematics",
-        ("nodes.arm_bridge.kinematics:KINEMATICS",),
+        ("flexsheet.nodes.arm_bridge.kinematics:KINEMATICS",),
         _by_name("closed_form_continuous"),
     ),
     Tunable(
         "sheet-force",
         "sheet_force",
-        ("launch.methods.families:SHEET_LAWS", "launch.methods.families:SHEET_FORCE"),
+        (
+            "flexsheet.launch.methods.families:SHEET_LAWS",
+            "flexsheet.launch.methods.families:SHEET_FORCE",
+        ),
         _by_name("linear", "scaled", "table"),
     ),
     Tunable(
         "sheet-shape",
         "sheet_shape",
-        ("launch.methods.families:QUICK_SHAPE", "launch.methods.families:SHEET_SHAPE"),
+        (
+            "flexsheet.launch.methods.families:QUICK_SHAPE",
+            "flexsheet.launch.methods.families:SHEET_SHAPE",
+        ),
         _by_name("four_triangles", "reduced_order"),
     ),
     Tunable(
         "correction",
         "correction",
-        ("launch.methods.families:QUICK_CORRECTION", "launch.methods.families:CORRECTION"),
+        (
+            "flexsheet.launch.methods.families:QUICK_CORRECTION",
+            "flexsheet.launch.methods.families:CORRECTION",
+        ),
         _by_name("none", "one_plane", "four_triangles", "two_pass"),
     ),
     Tunable(
         "soft-body",
         "soft_body",
         (
-            "nodes.fem_solver.benchmarks:SOFT_BODY_LINEAR",
-            "nodes.fem_solver.benchmarks:SOFT_BODY_TABLES",
+            "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY_LINEAR",
+            "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY_TABLES",
         ),
         {
             "linear, coarse": _soft_body("linear", 0.006),

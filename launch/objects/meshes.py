@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
-from launch.objects.textures import put_image
-from launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
-from messages.limits import LimitedModel
-from messages.scene import Mesh, Positive, Scene
-from nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape
-from nodes.models.shapes.smooth_mesh import default_smoothing_m
-from nodes.models.shapes.triangles import (
+from flexsheet.launch.objects.textures import put_image
+from flexsheet.launch.plans.documents import BadInputError, Document, Key, did_you_mean, validate
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.scene import Mesh, Positive, Scene
+from flexsheet.nodes.models.shapes import SHAPES, MeshError, SmoothMeshShape
+from flexsheet.nodes.models.shapes.smooth_mesh import default_smoothing_m
+from flexsheet.nodes.models.shapes.triangles import (
     MAX_TRIANGLES,
     check_mesh,
     count_intersections,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.plans.documents import BadInputError, Document, Key
+from flexsheet.launch.plans.documents import BadInputError, Document, Key
 
 APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"

@@ -35,8 +35,8 @@ from ruamel.yaml.tokens import (
     ScalarToken,
 )
 
-from launch.plans.renamed_keys import LAUNCH_KEYS, NODE_PARAMETERS, SCENE_KEYS, VALUES
-from messages.scene import Scene
+from flexsheet.launch.plans.renamed_keys import LAUNCH_KEYS, NODE_PARAMETERS, SCENE_KEYS, VALUES
+from flexsheet.messages.scene import Scene
 
 M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18

@@ -5,10 +5,17 @@ from __future__ import annotations
 import ipaddress
 from pathlib import Path
 
-from launch.plans.documents import BadInputError, Document, Key, Problem, read_document, validate
-from launch.plans.launch_file import HostSpec, LaunchFile
-from launch.plans.planned import LAUNCHER, MAIN
-from messages.security import is_key
+from flexsheet.launch.plans.documents import (
+    BadInputError,
+    Document,
+    Key,
+    Problem,
+    read_document,
+    validate,
+)
+from flexsheet.launch.plans.launch_file import HostSpec, LaunchFile
+from flexsheet.launch.plans.planned import LAUNCHER, MAIN
+from flexsheet.messages.security import is_key
 
 
 def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:

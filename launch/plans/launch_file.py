@@ -8,8 +8,14 @@ from typing import Annotated, Any
 from pydantic import Field
 from ruamel.yaml.error import YAMLError
 
-from launch.plans.documents import BadInputError, Document, Problem, did_you_mean, parse_value
-from launch.plans.planned import MAIN, RestartSpec, Strict
+from flexsheet.launch.plans.documents import (
+    BadInputError,
+    Document,
+    Problem,
+    did_you_mean,
+    parse_value,
+)
+from flexsheet.launch.plans.planned import MAIN, RestartSpec, Strict
 
 RECORDER_NICE = 5
 """What it reads waits for it in queues; nothing else waits."""

@@ -8,17 +8,24 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from launch.plans.documents import BadInputError, Document, Key, Problem, did_you_mean, validate
-from launch.plans.hosts import clock_node, is_loopback
-from launch.plans.launch_file import RECORDER_NICE, ClocksSpec, LaunchFile, NodeSpec
-from launch.plans.planned import LAUNCHER, RUN_DIRECTORY, TOOLS, PlannedPort, tools_on
-from messages.calibration import load_calibration, refuse_other_camera
-from messages.calibration_file import CalibrationFileError, CalibrationMismatchError
-from messages.scene import Scene
-from messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
-from messages.topics import TOPICS, Topic
-from nodes import NODES, UnknownNodeError, node_class
-from nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
+from flexsheet.launch.plans.documents import (
+    BadInputError,
+    Document,
+    Key,
+    Problem,
+    did_you_mean,
+    validate,
+)
+from flexsheet.launch.plans.hosts import clock_node, is_loopback
+from flexsheet.launch.plans.launch_file import RECORDER_NICE, ClocksSpec, LaunchFile, NodeSpec
+from flexsheet.launch.plans.planned import LAUNCHER, RUN_DIRECTORY, TOOLS, PlannedPort, tools_on
+from flexsheet.messages.calibration import load_calibration, refuse_other_camera
+from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
+from flexsheet.messages.topics import TOPICS, Topic
+from flexsheet.nodes import NODES, UnknownNodeError, node_class
+from flexsheet.nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
 
 RUN_FILES = ("plan", "git", "launcher")
 """What a run's directory has files of, beside one named after each node."""

@@ -12,11 +12,22 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from launch.objects.meshes import scene_of
-from launch.plans.documents import BadInputError, Document, Problem, read_document, validate
-from launch.plans.hosts import check_hosts
-from launch.plans.launch_file import LaunchFile, apply_console, apply_record, apply_setting
-from launch.plans.members import (
+from flexsheet.launch.objects.meshes import scene_of
+from flexsheet.launch.plans.documents import (
+    BadInputError,
+    Document,
+    Problem,
+    read_document,
+    validate,
+)
+from flexsheet.launch.plans.hosts import check_hosts
+from flexsheet.launch.plans.launch_file import (
+    LaunchFile,
+    apply_console,
+    apply_record,
+    apply_setting,
+)
+from flexsheet.launch.plans.members import (
     Member,
     check_calibrations,
     check_wires,
@@ -24,9 +35,14 @@ from launch.plans.members import (
     members_of,
     resolve_member,
 )
-from launch.plans.planned import MAIN, Plan, PlannedNode, PlannedPort, Writer
-from launch.plans.wires import check_inputs, endpoints_of, resolve_further_inputs, writers_of
-from messages.scene import Scene
+from flexsheet.launch.plans.planned import MAIN, Plan, PlannedNode, PlannedPort, Writer
+from flexsheet.launch.plans.wires import (
+    check_inputs,
+    endpoints_of,
+    resolve_further_inputs,
+    writers_of,
+)
+from flexsheet.messages.scene import Scene
 
 
 def load_plan(

@@ -10,9 +10,9 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from messages.bus import Source
-from messages.limits import LimitedModel
-from messages.scene import Scene
+from flexsheet.messages.bus import Source
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.scene import Scene
 
 MAIN = "main"
 """The host of the launcher's own topics, of the recorder and of the command-line tools."""

@@ -6,12 +6,12 @@ import hashlib
 from collections.abc import Iterable
 from itertools import product
 
-from launch.plans.documents import Document, Problem, did_you_mean
-from launch.plans.hosts import launcher_on
-from launch.plans.launch_file import LaunchFile
-from launch.plans.members import Member
-from launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
-from messages.topics import TOPICS
+from flexsheet.launch.plans.documents import Document, Problem, did_you_mean
+from flexsheet.launch.plans.hosts import launcher_on
+from flexsheet.launch.plans.launch_file import LaunchFile
+from flexsheet.launch.plans.members import Member
+from flexsheet.launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
+from flexsheet.messages.topics import TOPICS
 
 SAID_FROM_ANYWHERE = ("estop",)
 """What tools on the other hosts may write too: a stop, by whoever stands beside the arm."""

@@ -1,6 +1,6 @@
 """Writes docs/cli.md: every command with its arguments, options and examples.
 
-python -m launch.reference.cli > docs/cli.md
+python -m flexsheet.launch.reference.cli > docs/cli.md
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from typing import Any
 
 from typer.main import get_command
 
-from launch.cli import app
-from launch.commands.output import examples_in
+from flexsheet.launch.cli import app
+from flexsheet.launch.commands.output import examples_in
 
 INTRODUCTION = """\
 # Command line
 
-<!-- Written by `python -m launch.reference.cli > docs/cli.md`; a test compares. -->
+<!-- Written by `python -m flexsheet.launch.reference.cli > docs/cli.md`; a test compares. -->
 
 Data goes to stdout, words to stderr; `--json` makes the data JSON.  Exit codes: 0 done, 1 failed,
 2 the input is wrong, 3 a replay differs from what was live, or `tune` found no method good enough.

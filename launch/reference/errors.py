@@ -1,6 +1,6 @@
 """Writes docs/errors.md: every message that says what is wrong, read from the code that says it.
 
-python -m launch.reference.errors > docs/errors.md
+python -m flexsheet.launch.reference.errors > docs/errors.md
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import re
 from collections.abc import Iterable
 from typing import get_args
 
-from launch.reference.remedies import AREAS, FINGERTIP, PARTICULAR, REMEDIES, Area
-from launch.reference.sentences import FILLED_IN, Said, classes, messages
+from flexsheet.launch.reference.remedies import AREAS, FINGERTIP, PARTICULAR, REMEDIES, Area
+from flexsheet.launch.reference.sentences import FILLED_IN, Said, classes, messages
 
 SHORTEST_MATCH = 8
 """Letters below which the part of a message that somebody gives would fit anything."""
@@ -22,7 +22,7 @@ _LEFT_OUT = re.compile(r"\s*(?:\.\.\.|…)\s*")
 INTRODUCTION = """\
 # Errors
 
-<!-- Written by `python -m launch.reference.errors > docs/errors.md`; a test compares. -->
+<!-- Written by `python -m flexsheet.launch.reference.errors > docs/errors.md`; a test compares. -->
 
 What each message means and what to do.  `flexsheet explain 'THE MESSAGE'` finds the place for you.
 A `<word>` stands for what the message fills in.  Exit codes: 0 done, 1 failed, 2 the input is
@@ -157,7 +157,7 @@ def meaning(kind: str, area: Area) -> str:
 
 def undocumented() -> list[str]:
     """Classes without a remedy, remedies without a class, reasons without a meaning."""
-    from messages.types import FingertipReason
+    from flexsheet.messages.types import FingertipReason
 
     raised = {one.kind for one in messages()} | {
         "BadInputError",

@@ -1,6 +1,6 @@
 """Writes docs/parameters.md: what can be set of each node in a launch file.
 
-python -m launch.reference.parameters > docs/parameters.md
+python -m flexsheet.launch.reference.parameters > docs/parameters.md
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from messages.reference import field_type, parts_of, type_section
-from nodes import NODES, node_class
-from nodes.node import parameters_of
+from flexsheet.messages.reference import field_type, parts_of, type_section
+from flexsheet.nodes import NODES, node_class
+from flexsheet.nodes.node import parameters_of
 
 ROOT = Path(__file__).resolve().parents[2]
 UNITS = {
@@ -26,7 +26,7 @@ UNITS = {
 INTRODUCTION = """\
 # Parameters
 
-<!-- Written by `python -m launch.reference.parameters > docs/parameters.md`; a test compares. -->
+<!-- Written by `python -m flexsheet.launch.reference.parameters`; a test compares. -->
 
 What can be set of each node: in a launch file under `nodes: NAME: parameters:`, or on the command
 line by `--set NAME.PARAMETER=VALUE`.  Units are in the names.  `flexsheet node describe NODE`

@@ -1,6 +1,6 @@
 """Writes the register map into docs/modbus.md, between its marks, from the code that speaks it.
 
-python -m launch.reference.registers
+python -m flexsheet.launch.reference.registers
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
-from nodes.arm_bridge.modbus import (
+from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
     FAULT_BITS,
@@ -20,7 +20,10 @@ from nodes.arm_bridge.modbus import (
 )
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "modbus.md"
-BEGIN = "<!-- registers: written by `python -m launch.reference.registers`; a test compares -->\n"
+BEGIN = (
+    "<!-- registers: written by `python -m flexsheet.launch.reference.registers`; "
+    "a test compares -->\n"
+)
 END = "<!-- end of registers -->\n"
 KINDS = {"H": "u16", "I": "u32", "f": "float32"}
 

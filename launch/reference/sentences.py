@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from launch.reference.remedies import PARTICULAR
+from flexsheet.launch.reference.remedies import PARTICULAR
 
 ROOT = Path(__file__).resolve().parents[2]
 FLOORS = ("messages", "nodes", "launch")

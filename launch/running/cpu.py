@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from messages.types import CpuPressure, ProgramCpu
+from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
 """Fraction of the time for which a node may wait; beyond it the computer is called busy."""

@@ -12,7 +12,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from messages.types import EStop
+from flexsheet.messages.types import EStop
 
 STATE_VARIABLE = "FLEXSHEET_STATE"
 """Environment variable that moves the directory of what outlives a computer's start."""

@@ -19,20 +19,20 @@ from typing import Any
 import psutil
 import zmq
 
-from launch.plans.hosts import clock_node, launcher_on
-from launch.plans.planned import Plan, PlannedNode, tools_on
-from launch.running.cpu import BACKGROUND_NICE, CpuWatch
-from launch.running.estop_file import EStopFile
-from messages.base import Header, Message
-from messages.bus import Handler, Publisher, Source, Subscriber
-from messages.busy import BUSY_REMEDY, describe_busy, is_busy
-from messages.clock import SystemClock
-from messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
-from messages.security import KeyChange, KeyRing
-from messages.topics import topic_named
-from messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
-from nodes.node import PortCounts
-from nodes.stop_socket import StopSocket
+from flexsheet.launch.plans.hosts import clock_node, launcher_on
+from flexsheet.launch.plans.planned import Plan, PlannedNode, tools_on
+from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
+from flexsheet.launch.running.estop_file import EStopFile
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Handler, Publisher, Source, Subscriber
+from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
+from flexsheet.messages.security import KeyChange, KeyRing
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
+from flexsheet.nodes.node import PortCounts
+from flexsheet.nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0

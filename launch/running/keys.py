@@ -15,12 +15,12 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
-from launch.plans.documents import BadInputError, Problem, did_you_mean, read_document
-from launch.plans.hosts import load_keys
-from launch.plans.planned import Plan
-from launch.running.runs import Run, ring_file
-from messages.files import write_file
-from messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
+from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean, read_document
+from flexsheet.launch.plans.hosts import load_keys
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.running.runs import Run, ring_file
+from flexsheet.messages.files import write_file
+from flexsheet.messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
 
 KEYS_VARIABLE = "FLEXSHEET_KEYS"
 """Environment variable that moves the directory of secret keys."""

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from launch.plans.planned import Plan
-from messages.methods import SheetShapeMethod, chosen
-from messages.scene import Scene
-from nodes.cache import default_cache_dir
-from nodes.models.sheet.membrane import NoEquilibriumError
-from nodes.renderer import deflection_cache
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.messages.methods import SheetShapeMethod, chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.cache import default_cache_dir
+from flexsheet.nodes.models.sheet.membrane import NoEquilibriumError
+from flexsheet.nodes.renderer import deflection_cache
 
 Progress = Callable[[str], None]
 
@@ -56,7 +56,7 @@ def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress
 
 def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]:
     """Return a function that reports (done, total) in steps, with the time left."""
-    from nodes.cache import EtaEstimator
+    from flexsheet.nodes.cache import EtaEstimator
 
     remaining, next_share = EtaEstimator(), 0.0
 
@@ -75,7 +75,7 @@ def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress
 
     Raises NoEquilibriumError for a sheet of which the membrane finds none.
     """
-    from nodes.planner import force_table
+    from flexsheet.nodes.planner import force_table
 
     on_progress = _with_time_left("computing the sheet's force, once", progress)
     force_table.load_or_compute(scene, cache_dir, on_progress)
@@ -95,10 +95,10 @@ def prepare_soft_body(
     scheduler: as the fem_solver node's parameter. Raises NoSoftBodyError where the scheduler cannot
     be used, the body cannot be meshed, or memory is insufficient.
     """
-    from nodes.cache import EtaEstimator
-    from nodes.fem_solver import body, precompute_table
-    from nodes.fem_solver.precompute import WorkBudget
-    from nodes.fem_solver.soft_body_factory import SoftBodyFactory
+    from flexsheet.nodes.cache import EtaEstimator
+    from flexsheet.nodes.fem_solver import body, precompute_table
+    from flexsheet.nodes.fem_solver.precompute import WorkBudget
+    from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 
     folder = cache_dir or default_cache_dir()
     remaining, reported_percent = EtaEstimator(), -1

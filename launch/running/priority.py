@@ -7,7 +7,7 @@ import resource
 from collections.abc import Sequence
 from pathlib import Path
 
-from launch.plans.planned import PlannedNode
+from flexsheet.launch.plans.planned import PlannedNode
 
 MIN_NICE = -20
 CAP_SYS_NICE = 23

@@ -19,12 +19,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from messages.files import write_file
+from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
     import psutil
 
-    from messages.bus import Source
+    from flexsheet.messages.bus import Source
 
 RUN_VARIABLE = "FLEXSHEET_RUN"
 """Environment variable that tags every process of a run."""
@@ -86,14 +86,14 @@ def ring_file(run: Run, host: str) -> Path:
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
     """Endpoints of a plan with the run's directory filled in."""
-    from launch.plans.planned import RUN_DIRECTORY
+    from flexsheet.launch.plans.planned import RUN_DIRECTORY
 
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
     """Sources of a plan with the run's directory filled in."""
-    from launch.plans.planned import RUN_DIRECTORY
+    from flexsheet.launch.plans.planned import RUN_DIRECTORY
 
     return tuple(
         replace(one, endpoint=one.endpoint.replace(RUN_DIRECTORY, str(run.directory)))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from launch.plans.planned import Plan
+from flexsheet.launch.plans.planned import Plan
 
 TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
 NETWORK = TEMPLATE.with_name("90-flexsheet.conf")

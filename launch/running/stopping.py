@@ -23,8 +23,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from launch.running.runs import live_runs
-from nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, peer_of
+from flexsheet.launch.running.runs import live_runs
+from flexsheet.nodes.stop_socket import ANSWER, MAX_REQUEST_BYTES, REQUEST, SUFFIX, peer_of
 
 CONTINUE_AFTER_S = 0.06
 KILL_AFTER_S = 0.15

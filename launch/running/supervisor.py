@@ -24,16 +24,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from launch.plans.documents import BadInputError, Problem, read_document
-from launch.plans.hosts import clock_node, is_loopback
-from launch.plans.plan import load_scene
-from launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, Plan, PlannedNode, PlannedPort
-from launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
-from launch.running.code_state import git_state
-from launch.running.host import HostVoice
-from launch.running.keys import KeyWatch, make_rings
-from launch.running.priority import min_nice_step, precedence_problem
-from launch.running.runs import (
+from flexsheet.launch.plans.documents import BadInputError, Problem, read_document
+from flexsheet.launch.plans.hosts import clock_node, is_loopback
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.launch.plans.planned import (
+    LAUNCHER,
+    MAIN,
+    RUN_DIRECTORY,
+    Plan,
+    PlannedNode,
+    PlannedPort,
+)
+from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
+from flexsheet.launch.running.code_state import git_state
+from flexsheet.launch.running.host import HostVoice
+from flexsheet.launch.running.keys import KeyWatch, make_rings
+from flexsheet.launch.running.priority import min_nice_step, precedence_problem
+from flexsheet.launch.running.runs import (
     HOST_FILE,
     RUN_VARIABLE,
     Run,
@@ -44,15 +51,15 @@ from launch.running.runs import (
     ring_file,
     sweep,
 )
-from launch.running.starvation import ProcessorTime, starved_s
-from messages.base import Header
-from messages.bus import Publisher
-from messages.clock import SystemClock
-from messages.files import write_file
-from messages.security import KeyRing, SecurityError
-from messages.topics import topic_named
-from messages.types import NodeProcess
-from nodes.runner import NodeConfig, PortConfig
+from flexsheet.launch.running.starvation import ProcessorTime, starved_s
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Publisher
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.files import write_file
+from flexsheet.messages.security import KeyRing, SecurityError
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import NodeProcess
+from flexsheet.nodes.runner import NodeConfig, PortConfig
 
 SOFTWARE = Path(__file__).resolve().parents[2]
 STOP_GRACE_S = 3.0

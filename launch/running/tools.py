@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING
 
 import structlog
 
-from launch.plans.planned import MAIN, Plan, tools_on
-from launch.running.runs import Run, local_endpoints, local_sources, ring_file
-from messages.base import Header, Message
-from messages.bus import Handler, Problem, Publisher, Subscriber
-from messages.clock import SystemClock
-from messages.security import KeyRing
-from messages.topics import topic_named
-from messages.types import HostStatus, Status
+from flexsheet.launch.plans.planned import MAIN, Plan, tools_on
+from flexsheet.launch.running.runs import Run, local_endpoints, local_sources, ring_file
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.bus import Handler, Problem, Publisher, Subscriber
+from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.security import KeyRing
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import HostStatus, Status
 
 if TYPE_CHECKING:
-    from launch.plans.documents import BadInputError
-    from launch.running.supervisor import RunningGraph
+    from flexsheet.launch.plans.documents import BadInputError
+    from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
 """Readers look for a writer that was not there at most every half second."""
@@ -151,7 +151,7 @@ class ToolsWriter:
 
 def _refusal(plan: Plan, topic: str, host: str) -> BadInputError:
     """Why tools on a host do not write a topic, and who may."""
-    from launch.plans import documents
+    from flexsheet.launch.plans import documents
 
     may = ", ".join(topics_for_tools(plan, host))
     if topic in topics_for_tools(plan):

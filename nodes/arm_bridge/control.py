@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.clock_table import MAX_STAMP_AHEAD_NS
-from messages.types import Arming, ArmMode, ArmState, EStop
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.goal import Goal, pace, slowed
-from nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
-from nodes.arm_bridge.limiter import (
+from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
+from flexsheet.messages.types import Arming, ArmMode, ArmState, EStop
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.goal import Goal, pace, slowed
+from flexsheet.nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
+from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
     bounded_step,
     braked,
@@ -29,17 +29,21 @@ from nodes.arm_bridge.limiter import (
     with_tool_speed,
     within_range,
 )
-from nodes.arm_bridge.link import Freshness
-from nodes.arm_bridge.standstill import MAX_RESTART_SHIFT_M, StandstillMonitor, edge_shift_m
-from nodes.arm_bridge.way import START_BOUNDS, Alignment, Way, lag
-from nodes.models.motion import (
+from flexsheet.nodes.arm_bridge.link import Freshness
+from flexsheet.nodes.arm_bridge.standstill import (
+    MAX_RESTART_SHIFT_M,
+    StandstillMonitor,
+    edge_shift_m,
+)
+from flexsheet.nodes.arm_bridge.way import START_BOUNDS, Alignment, Way, lag
+from flexsheet.nodes.models.motion import (
     EdgeBound,
     SheetBounds,
     SheetMotion,
     coast_sheet,
     follow_sheet,
 )
-from nodes.models.rigid import is_rigid
+from flexsheet.nodes.models.rigid import is_rigid
 
 Floats = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Pose, Scene
-from messages.types import Side
-from nodes.arm_bridge.kinematics import (
+from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.kinematics import (
     JOINT_MAX_RAD,
     JOINT_MIN_RAD,
     JOINT_SPEED_RAD_PER_S,
@@ -18,10 +18,10 @@ from nodes.arm_bridge.kinematics import (
     forward,
     next_joints,
 )
-from nodes.arm_bridge.limiter import TOOL_SPEED_SHARE, JointLimits, SheetLimits
-from nodes.models.motion import EdgeBound, SheetMotion
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
+from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_SHARE, JointLimits, SheetLimits
+from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
 
 Floats = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import SheetTarget
-from nodes.models.motion import SheetBounds, SheetMotion, extrapolate
-from nodes.models.rigid import transform, vector_from_rotation
+from flexsheet.messages.types import SheetTarget
+from flexsheet.nodes.models.motion import SheetBounds, SheetMotion, extrapolate
+from flexsheet.nodes.models.rigid import transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
 

@@ -26,9 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from nodes.arm_bridge.kinematics import forward
-from nodes.models.camera import project
-from nodes.models.rigid import (
+from flexsheet.nodes.arm_bridge.kinematics import forward
+from flexsheet.nodes.models.camera import project
+from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
     rotation_from_vector,

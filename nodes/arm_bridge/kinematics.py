@@ -18,10 +18,10 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from messages.methods import KinematicsMethod
-from messages.scene import Scene
-from nodes.methods import Family, Trial
-from nodes.models.rigid import (
+from flexsheet.messages.methods import KinematicsMethod
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import Family, Trial
+from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
     rotation_from_vector,
@@ -29,7 +29,7 @@ from nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from nodes.models.sheet import edge_poses, flange_pose
+from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 
 Floats = NDArray[np.float64]
 JointsFor = Callable[[Floats, Floats], Floats]

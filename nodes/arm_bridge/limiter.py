@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.motion import BRAKE_FRACTION, closing_speed
-from nodes.models.rigid import angle_between
-from nodes.models.sheet import edge_force_n
+from flexsheet.nodes.models.motion import BRAKE_FRACTION, closing_speed
+from flexsheet.nodes.models.rigid import angle_between
+from flexsheet.nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Literal
 
-from nodes.arm_bridge.link import ArmLink
-from nodes.arm_bridge.modbus import ModbusLink
-from nodes.arm_bridge.mxt import MxtLink
+from flexsheet.nodes.arm_bridge.link import ArmLink
+from flexsheet.nodes.arm_bridge.modbus import ModbusLink
+from flexsheet.nodes.arm_bridge.mxt import MxtLink
 
 Driver = Literal["modbus", "mxt", "mxt_pose"]
 

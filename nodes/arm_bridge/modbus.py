@@ -22,7 +22,7 @@ from pymodbus.exceptions import ModbusException
 from pymodbus.framer import FramerSocket
 from pymodbus.pdu import DecodePDU, ModbusPDU
 
-from nodes.arm_bridge.link import (
+from flexsheet.nodes.arm_bridge.link import (
     ArmAnswerError,
     ArmLinkError,
     ArmRefusedError,

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.arm_bridge.kinematics import FLANGE_M, forward
-from nodes.arm_bridge.link import (
+from flexsheet.nodes.arm_bridge.kinematics import FLANGE_M, forward
+from flexsheet.nodes.arm_bridge.link import (
     JOINTS,
     ArmAnswerError,
     ArmRefusedError,

@@ -5,21 +5,21 @@ from __future__ import annotations
 import asyncio
 from typing import ClassVar
 
-from messages.base import Header
-from messages.methods import KinematicsMethod, chosen
-from messages.scene import Scene
-from messages.types import Arming, ArmState, EStop, SheetTarget, Side
-from nodes.arm_bridge.control import ArmControl, OtherArm, Patience
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.goal import Goal, Timing, goal_of
-from nodes.arm_bridge.kinematics import STEPS
-from nodes.arm_bridge.link import ArmLinkError, ArmSilentError
-from nodes.arm_bridge.link_drivers import link_for
-from nodes.arm_bridge.pacing import Pace
-from nodes.arm_bridge.parameters import ArmBridgeParameters
-from nodes.arm_bridge.report import Exchanged, arm_state
-from nodes.arm_bridge.way import Lookout
-from nodes.node import Input, Node, Output, periodic
+from flexsheet.messages.base import Header
+from flexsheet.messages.methods import KinematicsMethod, chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Arming, ArmState, EStop, SheetTarget, Side
+from flexsheet.nodes.arm_bridge.control import ArmControl, OtherArm, Patience
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.goal import Goal, Timing, goal_of
+from flexsheet.nodes.arm_bridge.kinematics import STEPS
+from flexsheet.nodes.arm_bridge.link import ArmLinkError, ArmSilentError
+from flexsheet.nodes.arm_bridge.link_drivers import link_for
+from flexsheet.nodes.arm_bridge.pacing import Pace
+from flexsheet.nodes.arm_bridge.parameters import ArmBridgeParameters
+from flexsheet.nodes.arm_bridge.report import Exchanged, arm_state
+from flexsheet.nodes.arm_bridge.way import Lookout
+from flexsheet.nodes.node import Input, Node, Output, periodic
 
 
 class ArmBridge(Node):

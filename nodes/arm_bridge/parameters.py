@@ -6,11 +6,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from messages.methods import KinematicsMethod
-from messages.scene import NonNegative, Positive
-from messages.types import Side
-from nodes.arm_bridge.link_drivers import Driver
-from nodes.node import NodeParameters
+from flexsheet.messages.methods import KinematicsMethod
+from flexsheet.messages.scene import NonNegative, Positive
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.link_drivers import Driver
+from flexsheet.nodes.node import NodeParameters
 
 
 class ArmBridgeParameters(NodeParameters):

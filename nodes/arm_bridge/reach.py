@@ -14,9 +14,9 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import Side
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.kinematics import (
+from flexsheet.messages.types import Side
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.kinematics import (
     BRANCHES,
     CENTRE_RAD,
     FARTHEST_WRIST_M,
@@ -32,9 +32,15 @@ from nodes.arm_bridge.kinematics import (
     next_joints,
     singularities,
 )
-from nodes.models.motion import SheetMotion
-from nodes.models.rigid import apply, inverse, rotation_from_vector, transform, vector_from_rotation
-from nodes.models.sheet import edge_force_n
+from flexsheet.nodes.models.motion import SheetMotion
+from flexsheet.nodes.models.rigid import (
+    apply,
+    inverse,
+    rotation_from_vector,
+    transform,
+    vector_from_rotation,
+)
+from flexsheet.nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

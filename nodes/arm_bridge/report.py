@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from messages.base import Header
-from messages.types import ArmState
-from nodes.arm_bridge.control import ArmControl, OtherArm
-from nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.messages.base import Header
+from flexsheet.messages.types import ArmState
+from flexsheet.nodes.arm_bridge.control import ArmControl, OtherArm
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 
 
 @dataclass(slots=True)

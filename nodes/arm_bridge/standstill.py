@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.arm_bridge.link import Freshness
+from flexsheet.nodes.arm_bridge.link import Freshness
 
 Floats = NDArray[np.float64]
 

@@ -13,17 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.arm_bridge.geometry import ArmGeometry
-from nodes.arm_bridge.limiter import (
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
     place_trouble,
     relaxed_limits,
     sheet_trouble,
 )
-from nodes.arm_bridge.reach import PathError, Step, hold_step, path_through, sheet_between
-from nodes.arm_bridge.standstill import edge_shift_m
-from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
-from nodes.models.rigid import is_rigid, vector_from_rotation
+from flexsheet.nodes.arm_bridge.reach import PathError, Step, hold_step, path_through, sheet_between
+from flexsheet.nodes.arm_bridge.standstill import edge_shift_m
+from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
+from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
 
 Floats = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.camera.corners import BoardPair, View
-from nodes.models import rigid
+from flexsheet.nodes.camera.corners import BoardPair, View
+from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]
 

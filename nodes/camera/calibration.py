@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.calibration import Board, PairResidual, StereoCalibration, Uncertainty
-from messages.scene import Lens
-from nodes.camera.bundle import (
+from flexsheet.messages.calibration import Board, PairResidual, StereoCalibration, Uncertainty
+from flexsheet.messages.scene import Lens
+from flexsheet.nodes.camera.bundle import (
     LEFT,
     PARAMETERS,
     RIGHT,
@@ -26,7 +26,7 @@ from nodes.camera.bundle import (
     RigFit,
     pose_transform,
 )
-from nodes.camera.corners import (
+from flexsheet.nodes.camera.corners import (
     BoardPair,
     Progress,
     board_points,
@@ -34,8 +34,8 @@ from nodes.camera.corners import (
     find_pairs,
     ignore_progress,
 )
-from nodes.camera.selection import Selection, fit_selection, not_determined
-from nodes.camera.uncertainty import (
+from flexsheet.nodes.camera.selection import Selection, fit_selection, not_determined
+from flexsheet.nodes.camera.uncertainty import (
     jackknife_covariance,
     position_slopes,
     position_spread,

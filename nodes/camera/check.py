@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.calibration import Board, StereoCalibration
-from nodes.camera.bundle import (
+from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.nodes.camera.bundle import (
     LEFT,
     RIGHT,
     STAND,
@@ -23,7 +23,7 @@ from nodes.camera.bundle import (
     lens_arrays,
     pose_transform,
 )
-from nodes.camera.corners import (
+from flexsheet.nodes.camera.corners import (
     BoardPair,
     CalibrationError,
     Progress,
@@ -35,7 +35,7 @@ from nodes.camera.corners import (
     read_gray,
     same_order,
 )
-from nodes.camera.selection import MIN_PAIRS, Selection, fit_selection
+from flexsheet.nodes.camera.selection import MIN_PAIRS, Selection, fit_selection
 
 Floats = NDArray[np.float64]
 

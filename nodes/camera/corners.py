@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.calibration import Board
+from flexsheet.messages.calibration import Board
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

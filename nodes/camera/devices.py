@@ -8,11 +8,19 @@ from dataclasses import replace
 
 import cv2
 
-from messages.scene import StereoCamera
-from nodes.camera.files import ImagesReader, VideoReader
-from nodes.camera.image_pair import DeviceError, ImagePair, Now, Reader, Regions, check_size, cut
-from nodes.camera.live import CameraReader
-from nodes.camera.sources import AnySource, ImagesSource, OpenCvSource, VideoSource
+from flexsheet.messages.scene import StereoCamera
+from flexsheet.nodes.camera.files import ImagesReader, VideoReader
+from flexsheet.nodes.camera.image_pair import (
+    DeviceError,
+    ImagePair,
+    Now,
+    Reader,
+    Regions,
+    check_size,
+    cut,
+)
+from flexsheet.nodes.camera.live import CameraReader
+from flexsheet.nodes.camera.sources import AnySource, ImagesSource, OpenCvSource, VideoSource
 
 MAX_RETRY_S = 30.0
 

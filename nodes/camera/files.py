@@ -11,11 +11,11 @@ from pathlib import Path
 
 import cv2
 
-from messages.scene import StereoCamera
-from nodes.camera.image_pair import DeviceError, Image, ImagePair, gray, halves
-from nodes.camera.live import open_capture
-from nodes.camera.sources import ImagesSource, VideoSource
-from nodes.camera.stamps import Pairing
+from flexsheet.messages.scene import StereoCamera
+from flexsheet.nodes.camera.image_pair import DeviceError, Image, ImagePair, gray, halves
+from flexsheet.nodes.camera.live import open_capture
+from flexsheet.nodes.camera.sources import ImagesSource, VideoSource
+from flexsheet.nodes.camera.stamps import Pairing
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from messages.scene import StereoCamera
-from messages.types import StereoPair
+from flexsheet.messages.scene import StereoCamera
+from flexsheet.messages.types import StereoPair
 
 Image = NDArray[np.uint8]
 Now = Callable[[], int]

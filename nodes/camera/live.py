@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import cv2
 
-from messages.scene import StereoCamera
-from nodes.camera.image_pair import (
+from flexsheet.messages.scene import StereoCamera
+from flexsheet.nodes.camera.image_pair import (
     DeviceError,
     Image,
     ImagePair,
@@ -19,9 +19,9 @@ from nodes.camera.image_pair import (
     gray,
     halves,
 )
-from nodes.camera.settings import choose_backend, fix_settings, set_format, set_region
-from nodes.camera.sources import OpenCvSource
-from nodes.camera.stamps import Pairing, StampJudge
+from flexsheet.nodes.camera.settings import choose_backend, fix_settings, set_format, set_region
+from flexsheet.nodes.camera.sources import OpenCvSource
+from flexsheet.nodes.camera.stamps import Pairing, StampJudge
 
 WAITING = 4
 """Number of frames that wait for their partner; a camera further ahead loses its oldest."""

@@ -8,11 +8,11 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from messages.base import Header
-from messages.scene import Positive, Scene, StereoCamera
-from messages.types import StereoPair
-from nodes.camera.devices import ReaderThread, open_reader
-from nodes.camera.image_pair import (
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Positive, Scene, StereoCamera
+from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.camera.devices import ReaderThread, open_reader
+from flexsheet.nodes.camera.image_pair import (
     DeviceError,
     ImagePair,
     Regions,
@@ -22,9 +22,9 @@ from nodes.camera.image_pair import (
     make_stereo_message,
     skew_reason,
 )
-from nodes.camera.region import ExplicitRegions, resolve_regions
-from nodes.camera.sources import AnySource, TwinSource
-from nodes.node import Input, Node, NodeParameters, Output
+from flexsheet.nodes.camera.region import ExplicitRegions, resolve_regions
+from flexsheet.nodes.camera.sources import AnySource, TwinSource
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output
 
 JOIN_S = 3.0
 

@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from messages.limits import LimitedModel
-from messages.scene import Lens, Scene
-from nodes.camera.image_pair import DeviceError, Region, Regions
-from nodes.models import camera, rigid
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.scene import Lens, Scene
+from flexsheet.nodes.camera.image_pair import DeviceError, Region, Regions
+from flexsheet.nodes.models import camera, rigid
 
 Floats = NDArray[np.float64]
 

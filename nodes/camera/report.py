@@ -15,12 +15,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.files import write_file
-from nodes.camera.bundle import PARAMETERS, pose_transform
-from nodes.camera.calibration import CalibrationResult
-from nodes.camera.check import Rig
-from nodes.camera.corners import board_points, describe
-from nodes.models import rigid
+from flexsheet.messages.files import write_file
+from flexsheet.nodes.camera.bundle import PARAMETERS, pose_transform
+from flexsheet.nodes.camera.calibration import CalibrationResult
+from flexsheet.nodes.camera.check import Rig
+from flexsheet.nodes.camera.corners import board_points, describe
+from flexsheet.nodes.models import rigid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.camera.bundle import (
+from flexsheet.nodes.camera.bundle import (
     NotDeterminedError,
     RigFit,
     board_pose,
@@ -22,8 +22,8 @@ from nodes.camera.bundle import (
     pose_transform,
     pose_vector,
 )
-from nodes.camera.corners import BoardPair, CalibrationError, View
-from nodes.models import rigid
+from flexsheet.nodes.camera.corners import BoardPair, CalibrationError, View
+from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from typing import Protocol
 
 import cv2
 
-from messages.scene import StereoCamera
-from nodes.camera.image_pair import Region
+from flexsheet.messages.scene import StereoCamera
+from flexsheet.nodes.camera.image_pair import Region
 
 EXPOSURE_TOLERANCE = 0.05
 RATE_TOLERANCE = 0.02

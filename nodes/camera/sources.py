@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field
 
-from messages.limits import LimitedModel
-from messages.scene import Finite, NonNegative, Positive
+from flexsheet.messages.limits import LimitedModel
+from flexsheet.messages.scene import Finite, NonNegative, Positive
 
 
 class Source(LimitedModel):

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.camera.bundle import (
+from flexsheet.nodes.camera.bundle import (
     LEFT,
     PARAMETERS,
     RIGHT,
@@ -24,8 +24,8 @@ from nodes.camera.bundle import (
     lens_arrays,
     pose_transform,
 )
-from nodes.camera.corners import BoardPair, Progress, ignore_progress
-from nodes.models import rigid
+from flexsheet.nodes.camera.corners import BoardPair, Progress, ignore_progress
+from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from messages.base import Header
-from messages.scene import Positive
-from messages.types import ClockEcho, ClockOffset, ClockPing, Clocks
-from nodes.clock.offset import OtherClock, make_sample
-from nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Positive
+from flexsheet.messages.types import ClockEcho, ClockOffset, ClockPing, Clocks
+from flexsheet.nodes.clock.offset import OtherClock, make_sample
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 SILENT_NS = 2_000_000_000
 FORGOTTEN_NS = 60_000_000_000

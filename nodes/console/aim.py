@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.models.shapes import Shape, make_shape
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
 

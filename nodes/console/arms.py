@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 
 Floats = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from html import escape
 
-from messages.types import ArmMode, ArmState, SheetTarget
-from nodes.console.panels import MODES, words
+from flexsheet.messages.types import ArmMode, ArmState, SheetTarget
+from flexsheet.nodes.console.panels import MODES, words
 
 
 class BannerState(IntEnum):

@@ -12,16 +12,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.base import Message
-from messages.methods import chosen
-from messages.scene import Scene
-from messages.types import Correction, Display, EStop, Frame, Moment, Recording, TwinEye
-from nodes.console import scenes
-from nodes.console.aim import Aim
-from nodes.console.finger import Finger
-from nodes.console.graph_facts import GraphFacts
-from nodes.console.kept import Kept, load_kept, save_kept
-from nodes.console.replay import Timeline, bags_in
+from flexsheet.messages.base import Message
+from flexsheet.messages.methods import chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Correction, Display, EStop, Frame, Moment, Recording, TwinEye
+from flexsheet.nodes.console import scenes
+from flexsheet.nodes.console.aim import Aim
+from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.graph_facts import GraphFacts
+from flexsheet.nodes.console.kept import Kept, load_kept, save_kept
+from flexsheet.nodes.console.replay import Timeline, bags_in
 
 Floats = NDArray[np.float64]
 Publish = Callable[[Message], None]

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import Correction
-from nodes.console.controls import Ask, Html, on_value
+from flexsheet.messages.types import Correction
+from flexsheet.nodes.console.controls import Ask, Html, on_value
 
 CORRECTIONS = ("two_pass", "four_triangles", "one_plane", "none")
 PICTURES = (

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.base import Message
-from messages.types import FingerPath
-from nodes.console.aim import HOVER_M, Aim
+from flexsheet.messages.base import Message
+from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.console.aim import HOVER_M, Aim
 
 Floats = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.console import panels
-from nodes.console.controls import Html
-from nodes.console.history import SERIES, WINDOW_S, widen_isolated
+from flexsheet.nodes.console import panels
+from flexsheet.nodes.console.controls import Html
+from flexsheet.nodes.console.history import SERIES, WINDOW_S, widen_isolated
 
 Floats = NDArray[np.float64]
 

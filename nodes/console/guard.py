@@ -28,7 +28,7 @@ from websockets.datastructures import Headers, MultipleValuesError
 from websockets.exceptions import InvalidHandshake, InvalidMessage
 from websockets.http11 import Request, Response
 
-from nodes.console.dress import dressed
+from flexsheet.nodes.console.dress import dressed
 
 LEAST_TOKEN = 16
 COOKIE = "flexsheet-token"

@@ -7,8 +7,8 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import ArmState, Fingertip, Frame, SheetTarget, SoftBody
-from nodes.console.newest import Source
+from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, SoftBody
+from flexsheet.nodes.console.newest import Source
 
 Floats = NDArray[np.float64]
 

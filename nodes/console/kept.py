@@ -6,10 +6,10 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from messages.files import write_file
-from messages.scene import Scene
-from nodes.console.finger import FingerIntent
-from nodes.console.scenes import SceneChoiceError
+from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.console.finger import FingerIntent
+from flexsheet.nodes.console.scenes import SceneChoiceError
 
 
 class Kept(BaseModel):

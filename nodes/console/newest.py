@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol, TypeVar
 
-from messages.base import Header, Message
-from messages.topics import Topic, topic_named
-from messages.wire import WireError, decode
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.topics import Topic, topic_named
+from flexsheet.messages.wire import WireError, decode
 
 M = TypeVar("M", bound=Message)
 

@@ -10,18 +10,18 @@ from typing import Any, ClassVar, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from messages.base import Header, Message
-from messages.scene import Positive, Scene
-from messages.topics import Delivery, Topic, topic_named
-from messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
-from messages.wire import WireError
-from nodes.console.desk import Desk, Files
-from nodes.console.finger import Finger
-from nodes.console.graph_facts import GraphFacts
-from nodes.console.guard import Guard, read_token, start_server
-from nodes.console.newest import Newest
-from nodes.console.operator import Operator
-from nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.scene import Positive, Scene
+from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
+from flexsheet.messages.wire import WireError
+from flexsheet.nodes.console.desk import Desk, Files
+from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.graph_facts import GraphFacts
+from flexsheet.nodes.console.guard import Guard, read_token, start_server
+from flexsheet.nodes.console.newest import Newest
+from flexsheet.nodes.console.operator import Operator
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
 SHOWN = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),

@@ -10,11 +10,11 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from messages.bag import BagError
-from messages.base import Header, Message
-from messages.busy import describe_busy
-from messages.scene import Scene
-from messages.types import (
+from flexsheet.messages.bag import BagError
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.busy import describe_busy
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import (
     ArmState,
     Correction,
     Display,
@@ -27,16 +27,16 @@ from messages.types import (
     Status,
     TwinEye,
 )
-from nodes.console import panels
-from nodes.console.banner import GraphState
-from nodes.console.controls import Ask
-from nodes.console.desk import SETTLE_S, Desk
-from nodes.console.history import History
-from nodes.console.newest import Newest, Source
-from nodes.console.page import Page
-from nodes.console.picture import picture_of
-from nodes.console.record_tab import NO_BAG
-from nodes.console.view import LAYERS
+from flexsheet.nodes.console import panels
+from flexsheet.nodes.console.banner import GraphState
+from flexsheet.nodes.console.controls import Ask
+from flexsheet.nodes.console.desk import SETTLE_S, Desk
+from flexsheet.nodes.console.history import History
+from flexsheet.nodes.console.newest import Newest, Source
+from flexsheet.nodes.console.page import Page
+from flexsheet.nodes.console.picture import picture_of
+from flexsheet.nodes.console.record_tab import NO_BAG
+from flexsheet.nodes.console.view import LAYERS
 
 Floats = NDArray[np.float64]
 

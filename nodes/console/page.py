@@ -6,16 +6,16 @@ from typing import Any
 
 import viser
 
-from messages.scene import Scene
-from nodes.console import banner, panels
-from nodes.console.banner import GraphState
-from nodes.console.controls import Ask, Html, handing
-from nodes.console.desk import Desk
-from nodes.console.eye_tab import EyeTab
-from nodes.console.graph_tab import GraphTab
-from nodes.console.record_tab import RecordTab
-from nodes.console.touch_tab import TouchTab
-from nodes.console.view import View
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.console import banner, panels
+from flexsheet.nodes.console.banner import GraphState
+from flexsheet.nodes.console.controls import Ask, Html, handing
+from flexsheet.nodes.console.desk import Desk
+from flexsheet.nodes.console.eye_tab import EyeTab
+from flexsheet.nodes.console.graph_tab import GraphTab
+from flexsheet.nodes.console.record_tab import RecordTab
+from flexsheet.nodes.console.touch_tab import TouchTab
+from flexsheet.nodes.console.view import View
 
 BRAND = (14, 92, 132)
 STOP_COLOR = (185, 28, 28)

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from html import escape
 from math import isnan
 
-from messages.topics import TOPICS
-from messages.types import Fingertip, PortStatus, Status
-from nodes.console.desk import LookState
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import Fingertip, PortStatus, Status
+from flexsheet.nodes.console.desk import LookState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
 SLOW_SHARE = 0.5

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.base import Header
-from messages.scene import Pose, Scene
-from messages.types import ArmState, Fingertip, Skin, SoftBody
-from nodes.console.arms import link_poses
-from nodes.console.newest import Source
-from nodes.console.sheet import hit_by_ray, sheet_points
-from nodes.models.rigid import transform_from_rpy
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.types import ArmState, Fingertip, Skin, SoftBody
+from flexsheet.nodes.console.arms import link_poses
+from flexsheet.nodes.console.newest import Source
+from flexsheet.nodes.console.sheet import hit_by_ray, sheet_points
+from flexsheet.nodes.models.rigid import transform_from_rpy
 
 Floats = NDArray[np.float64]
 

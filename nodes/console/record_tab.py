@@ -7,8 +7,8 @@ from typing import Any
 
 import viser
 
-from nodes.console.controls import Ask, Html, handing, on_value, show_value
-from nodes.console.desk import Replay
+from flexsheet.nodes.console.controls import Ask, Html, handing, on_value, show_value
+from flexsheet.nodes.console.desk import Replay
 
 PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
 NO_BAG = "(no bag)"

@@ -9,12 +9,12 @@ from typing import TypeVar
 
 from mcap.records import Message as Record
 
-from messages.bag import BagError, BagReader, Chunk, split_frames
-from messages.base import Header, Message
-from messages.topics import TOPICS
-from messages.types import Moment
-from messages.wire import WireError, decode
-from nodes.console.newest import checked
+from flexsheet.messages.bag import BagError, BagReader, Chunk, split_frames
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import Moment
+from flexsheet.messages.wire import WireError, decode
+from flexsheet.nodes.console.newest import checked
 
 M = TypeVar("M", bound=Message)
 
@@ -43,7 +43,7 @@ class Timeline:
         self.seconds = 0.0
 
     def newest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """See `nodes.console.newest.Source`; at `seconds`."""
+        """See `flexsheet.nodes.console.newest.Source`; at `seconds`."""
         times, _ = self._places.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:

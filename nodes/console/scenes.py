@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
-from nodes.models.rigid import rotation_from_rpy
-from nodes.models.sheet import stretch_for_edge_force
+from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
+from flexsheet.nodes.models.rigid import rotation_from_rpy
+from flexsheet.nodes.models.sheet import stretch_for_edge_force
 
 Floats = NDArray[np.float64]
 Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh

@@ -1,7 +1,7 @@
 """The sheet as the page draws it: ruled between its edges, dented by the finger.
 
 The dent is that of a soap film, good to look at; what the sheet truly does is the business of
-`nodes.models.sheet`.
+`flexsheet.nodes.models.sheet`.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import apply, inverse
-from nodes.models.sheet import corners, sheet_from_edges
+from flexsheet.nodes.models.rigid import apply, inverse
+from flexsheet.nodes.models.sheet import corners, sheet_from_edges
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]

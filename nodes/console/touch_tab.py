@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from messages.scene import Scene
-from nodes.console.controls import Ask, Html, handing, on_value, show_value
-from nodes.console.desk import Sliders
-from nodes.console.finger import Finger
-from nodes.console.scenes import MIN_STRETCH_RATIO, max_stretch_ratio
-from nodes.console.view import LAYERS, VIEWPOINTS, View
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.console.controls import Ask, Html, handing, on_value, show_value
+from flexsheet.nodes.console.desk import Sliders
+from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.scenes import MIN_STRETCH_RATIO, max_stretch_ratio
+from flexsheet.nodes.console.view import LAYERS, VIEWPOINTS, View
 
 REACH_MM = 80.0
 DEEPEST_MM = 50.0

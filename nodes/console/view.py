@@ -9,12 +9,12 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
-from nodes.console.creases import split_creases
-from nodes.console.picture import Picture, ray_vertices, rays, transform_of
-from nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
-from nodes.models.rigid import apply, quaternion_from_rotation, transform
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
+from flexsheet.nodes.console.creases import split_creases
+from flexsheet.nodes.console.picture import Picture, ray_vertices, rays, transform_of
+from flexsheet.nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
+from flexsheet.nodes.models.rigid import apply, quaternion_from_rotation, transform
 
 Floats = NDArray[np.float64]
 Color = tuple[int, int, int]

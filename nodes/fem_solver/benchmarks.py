@@ -18,15 +18,15 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.cache import default_cache_dir
-from nodes.fem_solver import snapshots
-from nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
-from nodes.fem_solver.closest_contact import ContactQuery
-from nodes.fem_solver.mesh import boundary_faces
-from nodes.fem_solver.newton import EquilibriumState, NeoHookeanBody
-from nodes.fem_solver.precompute import SoftBodyModel, WorkBudget, load_or_compute
-from nodes.fem_solver.reference import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.cache import default_cache_dir
+from flexsheet.nodes.fem_solver import snapshots
+from flexsheet.nodes.fem_solver.body import SceneBody, build_scene_body, make_soft_body_spec
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.mesh import boundary_faces
+from flexsheet.nodes.fem_solver.newton import EquilibriumState, NeoHookeanBody
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, WorkBudget, load_or_compute
+from flexsheet.nodes.fem_solver.reference import (
     LocalTable,
     ReferenceSolution,
     has_focused_meshes,
@@ -36,9 +36,9 @@ from nodes.fem_solver.reference import (
     select_references,
     solve_cached_jobs,
 )
-from nodes.fem_solver.snapshot_interpolator import SurfaceLocator
-from nodes.fem_solver.snapshots import SamplePoint, SnapshotJob
-from nodes.methods import Family, Progress, Trial, clip_range
+from flexsheet.nodes.fem_solver.snapshot_interpolator import SurfaceLocator
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint, SnapshotJob
+from flexsheet.nodes.methods import Family, Progress, Trial, clip_range
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

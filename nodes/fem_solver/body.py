@@ -8,17 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from messages.types import Fingertip, Skin, SoftBody
-from nodes.fem_solver.closest_contact import ContactAnchor, locate, locate_sticking, slide_anchor
-from nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
-from nodes.fem_solver.mesh import mesh_spec, world_from_mesh
-from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
-from nodes.fem_solver.precompute_table import TableSpec
-from nodes.fem_solver.table import Table, TableSoftBody
-from nodes.models import rigid
-from nodes.models.prediction import path_at
-from nodes.models.shapes import Shape, make_shape
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Fingertip, Skin, SoftBody
+from flexsheet.nodes.fem_solver.closest_contact import (
+    ContactAnchor,
+    locate,
+    locate_sticking,
+    slide_anchor,
+)
+from flexsheet.nodes.fem_solver.contact import LinearSoftBody, Response, SoftBodyMethod
+from flexsheet.nodes.fem_solver.mesh import mesh_spec, world_from_mesh
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
+from flexsheet.nodes.fem_solver.precompute_table import TableSpec
+from flexsheet.nodes.fem_solver.table import Table, TableSoftBody
+from flexsheet.nodes.models import rigid
+from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.shapes import Shape
+from flexsheet.nodes.models.shapes import Shape
 
 Floats = NDArray[np.float64]
 

@@ -20,9 +20,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.closest_contact import ContactQuery
-from nodes.fem_solver.mesh.solid import triangle_shape_functions
-from nodes.models.shapes import Shape
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.mesh.solid import triangle_shape_functions
+from flexsheet.nodes.models.shapes import Shape
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

@@ -15,7 +15,7 @@ from typing import Any
 
 import distributed
 
-from nodes.fem_solver import precompute_table
+from flexsheet.nodes.fem_solver import precompute_table
 
 untyped: Any = distributed
 """`distributed` without types: its arguments and results are not annotated."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.mesh import EDGES
 
 if TYPE_CHECKING:
     from scipy.sparse import csc_matrix

@@ -16,14 +16,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.elasticity import (
+from flexsheet.nodes.fem_solver.elasticity import (
     jacobians,
     lame_constants,
     quadrature,
     scatter_add,
     shape_gradients,
 )
-from nodes.fem_solver.mesh import EDGES
+from flexsheet.nodes.fem_solver.mesh import EDGES
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

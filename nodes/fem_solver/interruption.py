@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import TypeVar
 
-from nodes.fem_solver.precompute import Interrupted
+from flexsheet.nodes.fem_solver.precompute import Interrupted
 
 T = TypeVar("T")
 

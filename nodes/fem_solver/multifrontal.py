@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
+from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -21,11 +21,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
-from nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
-from nodes.fem_solver.hyperelastic import NeoHookeanSolid
-from nodes.fem_solver.mesh import FACES, SUBTRIANGLES, boundary_faces
-from nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
+from flexsheet.nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
+from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
+from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
+from flexsheet.nodes.fem_solver.mesh import FACES, SUBTRIANGLES, boundary_faces
+from flexsheet.nodes.fem_solver.multifrontal import Factors, IndefiniteError, NestedDissection
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -6,24 +6,24 @@ import asyncio
 from functools import partial
 from threading import Event
 
-from messages.base import Header
-from messages.scene import Scene
-from messages.types import Fingertip, Skin, SoftBody
-from nodes import cache
-from nodes.cache import EtaEstimator
-from nodes.fem_solver import body, precompute
-from nodes.fem_solver.closest_contact import ContactAnchor
-from nodes.fem_solver.contact import Response
-from nodes.fem_solver.deadline_fallback import DeadlineFallback
-from nodes.fem_solver.interruption import run_unless_superseded
-from nodes.fem_solver.parameters import FemSolverParameters
-from nodes.fem_solver.soft_body_factory import (
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Fingertip, Skin, SoftBody
+from flexsheet.nodes import cache
+from flexsheet.nodes.cache import EtaEstimator
+from flexsheet.nodes.fem_solver import body, precompute
+from flexsheet.nodes.fem_solver.closest_contact import ContactAnchor
+from flexsheet.nodes.fem_solver.contact import Response
+from flexsheet.nodes.fem_solver.deadline_fallback import DeadlineFallback
+from flexsheet.nodes.fem_solver.interruption import run_unless_superseded
+from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
+from flexsheet.nodes.fem_solver.soft_body_factory import (
     FACTORY_PARAMETERS,
     SKIN_SPACING_M,
     SoftBodyFactory,
     choose_method,
 )
-from nodes.node import Input, Node, Output
+from flexsheet.nodes.node import Input, Node, Output
 
 
 class FemSolver(Node):

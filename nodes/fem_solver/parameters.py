@@ -7,9 +7,9 @@ from typing import Literal
 
 from pydantic import Field
 
-from messages.scene import NonNegative, Positive
-from nodes.fem_solver.soft_body_factory import MethodChoice
-from nodes.node import NodeParameters
+from flexsheet.messages.scene import NonNegative, Positive
+from flexsheet.nodes.fem_solver.soft_body_factory import MethodChoice
+from flexsheet.nodes.node import NodeParameters
 
 
 class FemSolverParameters(NodeParameters):

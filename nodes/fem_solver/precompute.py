@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Plane
-from nodes.cache import CheckpointStore, Specification, cached, encode_fields, make_digest
-from nodes.fem_solver.contact import DragResponse, SkinResponse
-from nodes.fem_solver.mesh import MeshSpec, SolidMesh, build_mesh, mesh_budget
+from flexsheet.messages.scene import Plane
+from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields, make_digest
+from flexsheet.nodes.fem_solver.contact import DragResponse, SkinResponse
+from flexsheet.nodes.fem_solver.mesh import MeshSpec, SolidMesh, build_mesh, mesh_budget
 
 if TYPE_CHECKING:
-    from nodes.fem_solver.multifrontal import Factors, NestedDissection
+    from flexsheet.nodes.fem_solver.multifrontal import Factors, NestedDissection
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -143,9 +143,13 @@ def compute(
     without sufficient support, and ValueError for a material or size out of bounds. Raises
     MemoryError, before anything is allocated, if the machine has too little memory.
     """
-    from nodes.fem_solver.elasticity import element_stiffness, lame_constants, require_support
-    from nodes.fem_solver.multifrontal import NestedDissection
-    from nodes.models.shapes import make_shape
+    from flexsheet.nodes.fem_solver.elasticity import (
+        element_stiffness,
+        lame_constants,
+        require_support,
+    )
+    from flexsheet.nodes.fem_solver.multifrontal import NestedDissection
+    from flexsheet.nodes.models.shapes import make_shape
 
     lame_constants(1.0, spec.poisson_ratio)
     need = estimate_budget(spec)

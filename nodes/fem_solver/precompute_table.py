@@ -27,16 +27,16 @@ from pathlib import Path
 
 import numpy as np
 
-from nodes.background import enter_background
-from nodes.cache import CheckpointStore, Specification, cached, encode_fields
-from nodes.fem_solver import precompute, snapshots
-from nodes.fem_solver.contact import unit_linear_body
-from nodes.fem_solver.mesh import build_mesh
-from nodes.fem_solver.mesh.from_scene import VERSION as mesh_version
-from nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
-from nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator, place_snapshots
-from nodes.fem_solver.table import Table, fill_table, table_bytes
-from nodes.models.shapes import make_shape
+from flexsheet.nodes.background import enter_background
+from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields
+from flexsheet.nodes.fem_solver import precompute, snapshots
+from flexsheet.nodes.fem_solver.contact import unit_linear_body
+from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import VERSION as mesh_version
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel, SoftBodySpec
+from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator, place_snapshots
+from flexsheet.nodes.fem_solver.table import Table, fill_table, table_bytes
+from flexsheet.nodes.models.shapes import make_shape
 
 VERSION = 3
 """Increase whenever the same specification gives other numbers."""

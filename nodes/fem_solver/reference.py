@@ -15,23 +15,29 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Cylinder, Scene
-from nodes.cache import CheckpointStore, encode_fields, load_arrays, load_cached, save_arrays
-from nodes.fem_solver import snapshots
-from nodes.fem_solver.body import SceneBody, attach_table, make_table_spec
-from nodes.fem_solver.contact import unit_linear_body
-from nodes.fem_solver.mesh import build_mesh
-from nodes.fem_solver.precompute import SoftBodyModel
-from nodes.fem_solver.precompute_table import local_processes, solve_all, table_cache
-from nodes.fem_solver.snapshot_interpolator import (
+from flexsheet.messages.scene import Cylinder, Scene
+from flexsheet.nodes.cache import (
+    CheckpointStore,
+    encode_fields,
+    load_arrays,
+    load_cached,
+    save_arrays,
+)
+from flexsheet.nodes.fem_solver import snapshots
+from flexsheet.nodes.fem_solver.body import SceneBody, attach_table, make_table_spec
+from flexsheet.nodes.fem_solver.contact import unit_linear_body
+from flexsheet.nodes.fem_solver.mesh import build_mesh
+from flexsheet.nodes.fem_solver.precompute import SoftBodyModel
+from flexsheet.nodes.fem_solver.precompute_table import local_processes, solve_all, table_cache
+from flexsheet.nodes.fem_solver.snapshot_interpolator import (
     NEIGHBOURS,
     SnapshotInterpolator,
     SurfaceLocator,
     place_snapshots,
 )
-from nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob
-from nodes.fem_solver.table import CANDIDATE_FACES, END_SPAN_M, Table, fill_table
-from nodes.methods import Progress
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, SnapshotJob
+from flexsheet.nodes.fem_solver.table import CANDIDATE_FACES, END_SPAN_M, Table, fill_table
+from flexsheet.nodes.methods import Progress
 
 Floats = NDArray[np.float64]
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.solid import SUBTRIANGLES, triangle_shape_functions
-from nodes.fem_solver.snapshots import SamplePoint, Snapshot, reflect_snapshot
+from flexsheet.nodes.fem_solver.mesh.solid import SUBTRIANGLES, triangle_shape_functions
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint, Snapshot, reflect_snapshot
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

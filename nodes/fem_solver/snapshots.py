@@ -14,8 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Cylinder, StripSupport
-from nodes.fem_solver.mesh import Focus, MeshSpec, SolidMesh, boundary_faces, cylinder_mesh
+from flexsheet.messages.scene import Cylinder, StripSupport
+from flexsheet.nodes.fem_solver.mesh import (
+    Focus,
+    MeshSpec,
+    SolidMesh,
+    boundary_faces,
+    cylinder_mesh,
+)
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
@@ -90,7 +96,7 @@ def solve_snapshot(job: SnapshotJob, stopped: Callable[[], bool] = lambda: False
 
     Raises SnapshotCancelledError once `stopped` returns true; other errors as `NeoHookeanBody`.
     """
-    from nodes.fem_solver.newton import NeoHookeanBody  # late, as all that needs scipy
+    from flexsheet.nodes.fem_solver.newton import NeoHookeanBody  # late, as all that needs scipy
 
     body = NeoHookeanBody(
         job.nodes,
@@ -254,5 +260,5 @@ def reflect_snapshot(
 
 
 def decode_snapshot(content: dict[str, NDArray[Any]]) -> Snapshot:
-    """Return the snapshot that `nodes.cache.encode_fields` stored."""
+    """Return the snapshot that `flexsheet.nodes.cache.encode_fields` stored."""
     return Snapshot(reached=int(content.pop("reached")), **content)

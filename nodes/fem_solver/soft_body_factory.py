@@ -10,10 +10,10 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
-from messages.methods import SoftBodyMethod, chosen
-from messages.scene import Scene
-from nodes.cache import load_cached
-from nodes.fem_solver import body, precompute, precompute_table
+from flexsheet.messages.methods import SoftBodyMethod, chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.cache import load_cached
+from flexsheet.nodes.fem_solver import body, precompute, precompute_table
 
 MethodChoice = SoftBodyMethod | Literal["auto"]
 """`auto`: the nonlinear table if it is cached, else linear."""
@@ -138,7 +138,9 @@ class SoftBodyFactory:
     def _executor(self) -> Iterator[tuple[Executor, int]]:
         """Yield the executor of the snapshots, and how many of its workers run on this machine."""
         if self.scheduler is not None:
-            from nodes.fem_solver.dask_executor import connect_workers  # late: it is slow to import
+            from flexsheet.nodes.fem_solver.dask_executor import (
+                connect_workers,  # late: it is slow to import
+            )
 
             with connect_workers(self.scheduler) as executor:
                 yield executor, 0

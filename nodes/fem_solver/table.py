@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.closest_contact import ContactQuery
-from nodes.fem_solver.contact import (
+from flexsheet.nodes.fem_solver.closest_contact import ContactQuery
+from flexsheet.nodes.fem_solver.contact import (
     CURVE_FRACTIONS,
     LinearSoftBody,
     Response,
@@ -30,9 +30,12 @@ from nodes.fem_solver.contact import (
     curve_depths,
     saturate_depth,
 )
-from nodes.fem_solver.mesh.solid import triangle_shape_functions, triangle_shape_functions_at
-from nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator
-from nodes.fem_solver.snapshots import SamplePoint
+from flexsheet.nodes.fem_solver.mesh.solid import (
+    triangle_shape_functions,
+    triangle_shape_functions_at,
+)
+from flexsheet.nodes.fem_solver.snapshot_interpolator import SnapshotInterpolator
+from flexsheet.nodes.fem_solver.snapshots import SamplePoint
 
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]

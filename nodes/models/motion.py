@@ -13,7 +13,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import (
+from flexsheet.nodes.models.rigid import (
     moved,
     rotation_from_vector,
     skew,

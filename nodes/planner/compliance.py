@@ -25,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, PchipInterpolator
 
-from messages.scene import SheetSpec
-from nodes.models.sheet import (
+from flexsheet.messages.scene import SheetSpec
+from flexsheet.nodes.models.sheet import (
     edge_force_for_stiffness,
     edge_force_n,
     push_stiffness_n_per_m,
     stretch_for_edge_force,
 )
-from nodes.models.sheet.force_models import (
+from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,
     Place,
     SheetForceModel,

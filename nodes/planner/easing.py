@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.motion import (
+from flexsheet.nodes.models.motion import (
     EdgeBound,
     SheetBounds,
     SheetMotion,
     closing_speed,
     desired_velocity,
 )
-from nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
 

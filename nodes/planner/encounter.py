@@ -8,10 +8,10 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import Phase
-from nodes.models.rigid import inverse
-from nodes.models.shapes import Nearest, Shape, projection_jacobian, tightest_curvature
-from nodes.planner.rolling import (
+from flexsheet.messages.types import Phase
+from flexsheet.nodes.models.rigid import inverse
+from flexsheet.nodes.models.shapes import Nearest, Shape, projection_jacobian, tightest_curvature
+from flexsheet.nodes.planner.rolling import (
     Contact,
     rim_lift_m,
     rolled,

@@ -16,10 +16,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.methods import Case, Family, Trial
-from nodes.models.rigid import apply
-from nodes.models.shapes import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.models.rigid import apply
+from flexsheet.nodes.models.shapes import (
     CylinderShape,
     EllipsoidShape,
     Shape,
@@ -27,9 +27,14 @@ from nodes.models.shapes import (
     SphereShape,
     tightest_curvature,
 )
-from nodes.models.shapes.smooth_mesh import default_smoothing_m
-from nodes.models.shapes.triangles import Facets, half_edges, triangle_normals, vertex_normals
-from nodes.planner.rolling import Contact, rolled, tangent, turned
+from flexsheet.nodes.models.shapes.smooth_mesh import default_smoothing_m
+from flexsheet.nodes.models.shapes.triangles import (
+    Facets,
+    half_edges,
+    triangle_normals,
+    vertex_normals,
+)
+from flexsheet.nodes.planner.rolling import Contact, rolled, tangent, turned
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -10,14 +10,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.methods import SheetForceMethod
-from messages.scene import Scene
-from nodes.cache import Specification, cached, load_cached
-from nodes.methods import Progress
-from nodes.models.sheet.force_models import LinearSheetModel, ScaledSheetModel, SheetForceModel
-from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.tabulated import TabulatedSheetModel
-from nodes.planner.sheet_force import membrane_table, rubber_of
+from flexsheet.messages.methods import SheetForceMethod
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.cache import Specification, cached, load_cached
+from flexsheet.nodes.methods import Progress
+from flexsheet.nodes.models.sheet.force_models import (
+    LinearSheetModel,
+    ScaledSheetModel,
+    SheetForceModel,
+)
+from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
+from flexsheet.nodes.planner.sheet_force import membrane_table, rubber_of
 
 VERSION = 1
 """Version of the computation; another version computes the table again."""

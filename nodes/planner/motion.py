@@ -10,14 +10,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from messages.types import Phase
-from nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.models.shapes import make_shape
-from nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
-from nodes.planner.encounter import Encounter, Presentation, Reach
-from nodes.planner.yielding import Yielding
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Phase
+from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.planner.easing import EasedMotion, JerkBounds, ease_sheet
+from flexsheet.nodes.planner.encounter import Encounter, Presentation, Reach
+from flexsheet.nodes.planner.yielding import Yielding
 
 Floats = NDArray[np.float64]
 

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from messages.base import Header
-from messages.methods import SheetForceMethod, chosen
-from messages.scene import Scene
-from messages.sheet_calibration import SheetCalibration, load_sheet_calibration
-from messages.types import Fingertip, SheetTarget, SoftBody
-from nodes.models.prediction import path_at
-from nodes.node import Input, Node, Output
-from nodes.planner.force_table import law_by
-from nodes.planner.lead import next_lead_s
-from nodes.planner.motion import Plan, Planned
-from nodes.planner.order import Order
-from nodes.planner.parameters import PlannerParameters
-from nodes.planner.sheet_force import law_for
-from nodes.planner.yielding import Yielding
+from flexsheet.messages.base import Header
+from flexsheet.messages.methods import SheetForceMethod, chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.sheet_calibration import SheetCalibration, load_sheet_calibration
+from flexsheet.messages.types import Fingertip, SheetTarget, SoftBody
+from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.node import Input, Node, Output
+from flexsheet.nodes.planner.force_table import law_by
+from flexsheet.nodes.planner.lead import next_lead_s
+from flexsheet.nodes.planner.motion import Plan, Planned
+from flexsheet.nodes.planner.order import Order
+from flexsheet.nodes.planner.parameters import PlannerParameters
+from flexsheet.nodes.planner.sheet_force import law_for
+from flexsheet.nodes.planner.yielding import Yielding
 
 FIRST_LEAD_S = 0.05
 CLOCK_SLACK_S = 0.005

@@ -7,13 +7,13 @@ from typing import Literal
 
 from pydantic import Field
 
-from messages.methods import SheetForceMethod
-from messages.scene import NonNegative, Positive
-from nodes.models.motion import SheetBounds
-from nodes.node import NodeParameters
-from nodes.planner.easing import JerkBounds
-from nodes.planner.motion import PlanSettings
-from nodes.planner.yielding import Presents
+from flexsheet.messages.methods import SheetForceMethod
+from flexsheet.messages.scene import NonNegative, Positive
+from flexsheet.nodes.models.motion import SheetBounds
+from flexsheet.nodes.node import NodeParameters
+from flexsheet.nodes.planner.easing import JerkBounds
+from flexsheet.nodes.planner.motion import PlanSettings
+from flexsheet.nodes.planner.yielding import Presents
 
 
 class PlannerParameters(NodeParameters):

@@ -15,8 +15,8 @@ from math import atan2, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import angle_between, transform
-from nodes.models.shapes import Nearest, Shape
+from flexsheet.nodes.models.rigid import angle_between, transform
+from flexsheet.nodes.models.shapes import Nearest, Shape
 
 Floats = NDArray[np.float64]
 

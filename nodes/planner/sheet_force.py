@@ -9,11 +9,11 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene, SheetSpec
-from messages.sheet_calibration import SheetCalibration, refuse_other_sheet
-from nodes.methods import Family, Trial, clip_range
-from nodes.models.sheet.fit import make_model
-from nodes.models.sheet.force_models import (
+from flexsheet.messages.scene import Scene, SheetSpec
+from flexsheet.messages.sheet_calibration import SheetCalibration, refuse_other_sheet
+from flexsheet.nodes.methods import Family, Trial, clip_range
+from flexsheet.nodes.models.sheet.fit import make_model
+from flexsheet.nodes.models.sheet.force_models import (
     LinearSheetModel,
     MembraneSheetModel,
     Place,
@@ -21,9 +21,9 @@ from nodes.models.sheet.force_models import (
     SheetForce,
     SheetForceModel,
 )
-from nodes.models.sheet.membrane import push_path
-from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
+from flexsheet.nodes.models.sheet.membrane import push_path
+from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel, make_tabulated_model
 
 Floats = NDArray[np.float64]
 

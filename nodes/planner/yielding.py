@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from messages.types import SoftBody
-from nodes.models.sheet.force_models import CENTRE, Place, SheetForceModel
-from nodes.planner.compliance import (
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import SoftBody
+from flexsheet.nodes.models.sheet.force_models import CENTRE, Place, SheetForceModel
+from flexsheet.nodes.planner.compliance import (
     FELT_N,
     Compliance,
     ObjectCurve,

@@ -8,8 +8,8 @@ from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
-from messages.bag import BagError, BagWriter
-from messages.files import free_bytes
+from flexsheet.messages.bag import BagError, BagWriter
+from flexsheet.messages.files import free_bytes
 
 __all__ = ["free_bytes", "free_path", "open_bag"]
 

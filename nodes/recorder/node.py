@@ -8,14 +8,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, ClassVar
 
-from messages.bag import BagError, BagWriter
-from messages.base import Header
-from messages.topics import Delivery, Topic, topic_named
-from messages.types import Recording
-from messages.wire import decode
-from nodes.node import Input, Node, periodic
-from nodes.recorder.files import free_bytes, open_bag
-from nodes.recorder.parameters import RecorderParameters
+from flexsheet.messages.bag import BagError, BagWriter
+from flexsheet.messages.base import Header
+from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.types import Recording
+from flexsheet.messages.wire import decode
+from flexsheet.nodes.node import Input, Node, periodic
+from flexsheet.nodes.recorder.files import free_bytes, open_bag
+from flexsheet.nodes.recorder.parameters import RecorderParameters
 
 TRY_AGAIN_NS = 5_000_000_000
 """After a disk has refused, it is not asked again for so long."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import Field
 
-from nodes.node import NodeParameters
+from flexsheet.nodes.node import NodeParameters
 
 RUN_FILES = tuple(
     Path("@run") / name for name in ("launch.yaml", "scene.yaml", "plan.json", "git.json")

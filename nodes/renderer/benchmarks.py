@@ -15,19 +15,19 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Cylinder, Scene, cylinder_of
-from messages.types import Correction, Display, Pattern
-from nodes.methods import Case, Family, Trial
-from nodes.models.rigid import rotation_from_vector, transform
-from nodes.models.shapes import make_shape
-from nodes.models.sheet import edge_poses
-from nodes.renderer import deflection_cache
-from nodes.renderer.gl import DrawStyle, headless_context
-from nodes.renderer.object_surface import make_surface
-from nodes.renderer.output import Image
-from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
-from nodes.renderer.sheet import SheetPose, estimate_sheet
-from nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
+from flexsheet.messages.scene import Cylinder, Scene, cylinder_of
+from flexsheet.messages.types import Correction, Display, Pattern
+from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.renderer import deflection_cache
+from flexsheet.nodes.renderer.gl import DrawStyle, headless_context
+from flexsheet.nodes.renderer.object_surface import make_surface
+from flexsheet.nodes.renderer.output import Image
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.nodes.renderer.sheet_mesh import SheetMesh, pyramid_mesh
 
 Floats = NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.camera import camera_matrix
-from nodes.models.rigid import inverse
+from flexsheet.nodes.models.camera import camera_matrix
+from flexsheet.nodes.models.rigid import inverse
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

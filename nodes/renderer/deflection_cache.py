@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.background import enter_background
-from nodes.cache import Specification, cached
-from nodes.models.sheet.indentation import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.background import enter_background
+from flexsheet.nodes.cache import Specification, cached
+from flexsheet.nodes.models.sheet.indentation import (
     IndentationBasis,
     IndentationCase,
     IndentationRange,
     solve_indentation,
     solve_indentation_basis,
 )
-from nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from messages.base import Header
-from messages.clock import Clock
-from messages.types import (
+from flexsheet.messages.base import Header
+from flexsheet.messages.clock import Clock
+from flexsheet.messages.types import (
     ArmState,
     Display,
     Eye,
@@ -18,13 +18,13 @@ from messages.types import (
     Skin,
     SoftBody,
 )
-from nodes.node import Input
-from nodes.renderer.display_latency import DisplayLatencyEstimator
-from nodes.renderer.output import both_eyes, select_drawn_eyes, select_eyes, which_eye
-from nodes.renderer.output_window import OutputWindow
-from nodes.renderer.scene_renderer import SceneRenderer
-from nodes.renderer.sheet_pose_predictor import SheetPosePredictor, predict_fingertip
-from nodes.renderer.skin_extrapolator import SkinExtrapolator
+from flexsheet.nodes.node import Input
+from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
+from flexsheet.nodes.renderer.output import both_eyes, select_drawn_eyes, select_eyes, which_eye
+from flexsheet.nodes.renderer.output_window import OutputWindow
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.renderer.sheet_pose_predictor import SheetPosePredictor, predict_fingertip
+from flexsheet.nodes.renderer.skin_extrapolator import SkinExtrapolator
 
 VISIBLE_CHANGE_M = 1e-4
 """A fifth of a pixel of half a millimetre. A smaller change is shown a second late."""

@@ -12,13 +12,13 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.renderer.correction import (
+from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
     NEAR_M,
     ProjectionScreen,
     sector_normals,
 )
-from nodes.renderer.lens import ClipLens
+from flexsheet.nodes.renderer.lens import ClipLens
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -348,7 +348,7 @@ def _grid_mesh() -> tuple[Floats, NDArray[np.int32]]:
 
 def shader_text(name: str) -> str:
     """Return the shader's text; the file's text replaces a line `#include "name"`."""
-    text = files("nodes.renderer").joinpath(name).read_text()
+    text = files("flexsheet.nodes.renderer").joinpath(name).read_text()
     return re.sub(r'^#include "(.+)"$', lambda line: shader_text(line[1]), text, flags=re.MULTILINE)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from messages.scene import Lens
+from flexsheet.messages.scene import Lens
 
 REACH_MARGIN = 1.1
 """Ratio of slopes beyond the image's corners up to which the lens must be invertible."""

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 
-from messages.base import Header
-from messages.methods import chosen
-from messages.scene import Scene
-from messages.types import (
+from flexsheet.messages.base import Header
+from flexsheet.messages.methods import chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import (
     ArmState,
     Display,
     Eye,
@@ -17,14 +17,14 @@ from messages.types import (
     Skin,
     SoftBody,
 )
-from nodes.cache import load_cached
-from nodes.node import Input, Node, Output, periodic
-from nodes.renderer import deflection_cache
-from nodes.renderer.display_latency import DisplayLatencyEstimator
-from nodes.renderer.frame_renderer import FrameRenderer, RendererInputs
-from nodes.renderer.output_window import OutputWindow, open_output
-from nodes.renderer.parameters import RendererParameters
-from nodes.renderer.scene_renderer import SceneRenderer
+from flexsheet.nodes.cache import load_cached
+from flexsheet.nodes.node import Input, Node, Output, periodic
+from flexsheet.nodes.renderer import deflection_cache
+from flexsheet.nodes.renderer.display_latency import DisplayLatencyEstimator
+from flexsheet.nodes.renderer.frame_renderer import FrameRenderer, RendererInputs
+from flexsheet.nodes.renderer.output_window import OutputWindow, open_output
+from flexsheet.nodes.renderer.parameters import RendererParameters
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer
 
 
 class Renderer(Node):

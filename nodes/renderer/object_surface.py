@@ -15,10 +15,14 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Sphere
-from nodes.models.rigid import apply
-from nodes.models.shapes import MeshError, Shape
-from nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles, refine_facets
+from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Sphere
+from flexsheet.nodes.models.rigid import apply
+from flexsheet.nodes.models.shapes import MeshError, Shape
+from flexsheet.nodes.models.shapes.triangles import (
+    find_degenerate,
+    nearest_in_triangles,
+    refine_facets,
+)
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -7,8 +7,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Eyes
-from messages.types import Eye, StereoMode
+from flexsheet.messages.scene import Eyes
+from flexsheet.messages.types import Eye, StereoMode
 
 Image = NDArray[np.uint8]
 Floats = NDArray[np.float64]

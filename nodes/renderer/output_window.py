@@ -8,17 +8,17 @@ from typing import Any, Protocol
 import glfw
 import moderngl
 
-from messages.types import Display
-from nodes.renderer.gl import headless_context
-from nodes.renderer.monitors import (
+from flexsheet.messages.types import Display
+from flexsheet.nodes.renderer.gl import headless_context
+from flexsheet.nodes.renderer.monitors import (
     find_monitor,
     hidden_window,
     open_window,
     refresh_period_s,
     start_glfw,
 )
-from nodes.renderer.parameters import RendererParameters
-from nodes.renderer.presenter import SLOTS, Presenter, Shown, Slot, make_slot
+from flexsheet.nodes.renderer.parameters import RendererParameters
+from flexsheet.nodes.renderer.presenter import SLOTS, Presenter, Shown, Slot, make_slot
 
 CLOSED = "the window was closed and frames are not shown; restart the node to open it"
 

@@ -7,11 +7,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from messages.methods import Correction, SheetShapeMethod
-from messages.scene import NonNegative, Positive
-from messages.types import StereoMode
-from nodes.node import NodeParameters
-from nodes.renderer.gl import SAMPLES
+from flexsheet.messages.methods import Correction, SheetShapeMethod
+from flexsheet.messages.scene import NonNegative, Positive
+from flexsheet.messages.types import StereoMode
+from flexsheet.nodes.node import NodeParameters
+from flexsheet.nodes.renderer.gl import SAMPLES
 
 
 class RendererParameters(NodeParameters):

@@ -17,9 +17,9 @@ import glfw
 import moderngl
 import numpy as np
 
-from messages.types import StereoMode
-from nodes.renderer.gl import shader_text
-from nodes.renderer.monitors import WindowError, glfw_errors
+from flexsheet.messages.types import StereoMode
+from flexsheet.nodes.renderer.gl import shader_text
+from flexsheet.nodes.renderer.monitors import WindowError, glfw_errors
 
 SLOTS = 3
 IDLE_S = 0.1

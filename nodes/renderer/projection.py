@@ -14,8 +14,16 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.renderer.gl import SAMPLES, Canvas, DrawStyle, EyeView, Uniforms, set_view, shader_text
-from nodes.renderer.sheet_mesh import SheetMesh
+from flexsheet.nodes.renderer.gl import (
+    SAMPLES,
+    Canvas,
+    DrawStyle,
+    EyeView,
+    Uniforms,
+    set_view,
+    shader_text,
+)
+from flexsheet.nodes.renderer.sheet_mesh import SheetMesh
 
 Floats = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from messages.scene import Lens, Pose, Projector, StereoCamera
-from nodes.models.camera import camera_matrix, normalize, project
-from nodes.models.rigid import (
+from flexsheet.messages.scene import Lens, Pose, Projector, StereoCamera
+from flexsheet.nodes.models.camera import camera_matrix, normalize, project
+from flexsheet.nodes.models.rigid import (
     apply,
     inverse,
     rotation_from_vector,
@@ -25,7 +25,7 @@ from nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from nodes.renderer.gray_code import DecodeError, Image, decode_patterns, find_pixels
+from flexsheet.nodes.renderer.gray_code import DecodeError, Image, decode_patterns, find_pixels
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from messages.methods import SheetShapeMethod
-from messages.scene import Mesh, Pose, Scene
-from messages.types import Display, SheetTarget, Skin, SoftBody
-from nodes.models.rigid import apply, inverse, transform, transform_from_rpy
-from nodes.models.shapes import make_shape
-from nodes.models.sheet import corners
-from nodes.models.sheet.indentation import IndentationBasis
-from nodes.renderer.correction import (
+from flexsheet.messages.methods import SheetShapeMethod
+from flexsheet.messages.scene import Mesh, Pose, Scene
+from flexsheet.messages.types import Display, SheetTarget, Skin, SoftBody
+from flexsheet.nodes.models.rigid import apply, inverse, transform, transform_from_rpy
+from flexsheet.nodes.models.shapes import make_shape
+from flexsheet.nodes.models.sheet import corners
+from flexsheet.nodes.models.sheet.indentation import IndentationBasis
+from flexsheet.nodes.renderer.correction import (
     NEAR_M,
     ProjectionScreen,
     clip_from_screen,
@@ -25,13 +25,20 @@ from nodes.renderer.correction import (
     on_imaginary_screen,
     pixel_from_screen,
 )
-from nodes.renderer.gl import SAMPLES, SCREEN_PATTERNS, Canvas, DrawStyle, EyeView, SurfaceMaterial
-from nodes.renderer.lens import clip_lens
-from nodes.renderer.object_surface import DeformationTransfer, make_surface
-from nodes.renderer.output import Image, both_eyes, pack
-from nodes.renderer.projection import ScreenRectangle, TwoPassProjector
-from nodes.renderer.sheet import SheetPose, screen_for
-from nodes.renderer.sheet_mesh import (
+from flexsheet.nodes.renderer.gl import (
+    SAMPLES,
+    SCREEN_PATTERNS,
+    Canvas,
+    DrawStyle,
+    EyeView,
+    SurfaceMaterial,
+)
+from flexsheet.nodes.renderer.lens import clip_lens
+from flexsheet.nodes.renderer.object_surface import DeformationTransfer, make_surface
+from flexsheet.nodes.renderer.output import Image, both_eyes, pack
+from flexsheet.nodes.renderer.projection import ScreenRectangle, TwoPassProjector
+from flexsheet.nodes.renderer.sheet import SheetPose, screen_for
+from flexsheet.nodes.renderer.sheet_mesh import (
     MAX_TRIANGLES_DEPTH_M,
     SheetMesh,
     deflected_mesh,

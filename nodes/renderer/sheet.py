@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import Correction
-from nodes.models.rigid import apply, inverse, moved
-from nodes.models.sheet import corners, sheet_from_edges
-from nodes.renderer.correction import (
+from flexsheet.messages.types import Correction
+from flexsheet.nodes.models.rigid import apply, inverse, moved
+from flexsheet.nodes.models.sheet import corners, sheet_from_edges
+from flexsheet.nodes.renderer.correction import (
     ProjectionScreen,
     ScreenPlane,
     make_flat_screen,

@@ -8,10 +8,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import apply, inverse
-from nodes.models.sheet.indentation import IndentationBasis, triangulate_grid
-from nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
-from nodes.renderer.sheet import SheetPose
+from flexsheet.nodes.models.rigid import apply, inverse
+from flexsheet.nodes.models.sheet.indentation import IndentationBasis, triangulate_grid
+from flexsheet.nodes.renderer.correction import GRAZING_SINE, MIN_PUSH_M
+from flexsheet.nodes.renderer.sheet import SheetPose
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]

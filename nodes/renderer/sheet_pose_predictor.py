@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import ArmState, Fingertip, SheetTarget
-from nodes.models.prediction import path_at
-from nodes.node import Input
-from nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
-from nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.messages.types import ArmState, Fingertip, SheetTarget
+from flexsheet.nodes.models.prediction import path_at
+from flexsheet.nodes.node import Input
+from flexsheet.nodes.renderer.scene_renderer import SceneRenderer, pose_matrix
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
 
 Floats = NDArray[np.float64]
 

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-from messages.scene import Scene
-from nodes.methods import Case, Family, Trial, clip_range
-from nodes.models.sheet import edge_poses
-from nodes.models.sheet.indentation import triangulate_grid
-from nodes.models.sheet.membrane import push_path
-from nodes.renderer import deflection_cache
-from nodes.renderer.sheet import SheetPose, estimate_sheet
-from nodes.renderer.sheet_mesh import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import Case, Family, Trial, clip_range
+from flexsheet.nodes.models.sheet import edge_poses
+from flexsheet.nodes.models.sheet.indentation import triangulate_grid
+from flexsheet.nodes.models.sheet.membrane import push_path
+from flexsheet.nodes.renderer import deflection_cache
+from flexsheet.nodes.renderer.sheet import SheetPose, estimate_sheet
+from flexsheet.nodes.renderer.sheet_mesh import (
     MAX_TRIANGLES_DEPTH_M,
     SheetMesh,
     deflected_mesh,

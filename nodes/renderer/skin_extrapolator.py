@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections import deque
 
-from messages.base import Header
-from messages.types import SoftBody
+from flexsheet.messages.base import Header
+from flexsheet.messages.types import SoftBody
 
 HISTORY = 8
 MIN_BASE_S, MAX_BASE_S = 0.02, 0.06

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from messages.types import FingertipReason
-from nodes.triangulator.fingertip import Candidate, StereoDetection
-from nodes.triangulator.tracking import Tracker
-from nodes.triangulator.triangulation import TriangulatedPoint
+from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.triangulator.fingertip import Candidate, StereoDetection
+from flexsheet.nodes.triangulator.tracking import Tracker
+from flexsheet.nodes.triangulator.triangulation import TriangulatedPoint
 
 Floats = NDArray[np.float64]
 TrackStatus = Literal["tentative", "ambiguous", "clutter"]

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.methods import Case, Family, Trial
-from nodes.models import rigid
-from nodes.triangulator.marker import MARKER_METHODS, BlobFilter, Marker, detect_blobs
-from nodes.triangulator.subpixel import PixelNoise
-from nodes.triangulator.triangulation import (
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.models import rigid
+from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter, Marker, detect_blobs
+from flexsheet.nodes.triangulator.subpixel import PixelNoise
+from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
     dlt,

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import FingertipReason
-from nodes.triangulator.marker import (
+from flexsheet.messages.types import FingertipReason
+from flexsheet.nodes.triangulator.marker import (
     SHARP_PX,
     Blob,
     BlobFilter,
@@ -21,9 +21,9 @@ from nodes.triangulator.marker import (
     is_overexposed,
     window_around,
 )
-from nodes.triangulator.subpixel import PixelNoise
-from nodes.triangulator.tracking import Gate
-from nodes.triangulator.triangulation import (
+from flexsheet.nodes.triangulator.subpixel import PixelNoise
+from flexsheet.nodes.triangulator.tracking import Gate
+from flexsheet.nodes.triangulator.triangulation import (
     ClosestApproach,
     StereoGeometry,
     Triangulate,

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
+from flexsheet.nodes.triangulator.subpixel import DiscStart, PixelNoise, fit_discs
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

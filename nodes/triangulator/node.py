@@ -7,21 +7,21 @@ from functools import partial
 
 import numpy as np
 
-from messages.base import Header
-from messages.calibration import StereoCalibration, load_calibration
-from messages.methods import chosen
-from messages.scene import Scene
-from messages.types import Fingertip, FingertipReason, StereoPair
-from nodes.node import Input, Node, Output
-from nodes.triangulator.data_association import DataAssociation
-from nodes.triangulator.filters import TRACKING_METHODS
-from nodes.triangulator.fingertip import DetectorConfig, detect_all
-from nodes.triangulator.marker import MARKER_METHODS, BlobFilter
-from nodes.triangulator.parameters import TriangulatorParameters
-from nodes.triangulator.skew import compensate_detection_skew
-from nodes.triangulator.subpixel import PixelNoise
-from nodes.triangulator.tracking import Tracker, TrackingSettings
-from nodes.triangulator.triangulation import (
+from flexsheet.messages.base import Header
+from flexsheet.messages.calibration import StereoCalibration, load_calibration
+from flexsheet.messages.methods import chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Fingertip, FingertipReason, StereoPair
+from flexsheet.nodes.node import Input, Node, Output
+from flexsheet.nodes.triangulator.data_association import DataAssociation
+from flexsheet.nodes.triangulator.filters import TRACKING_METHODS
+from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect_all
+from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
+from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
+from flexsheet.nodes.triangulator.skew import compensate_detection_skew
+from flexsheet.nodes.triangulator.subpixel import PixelNoise
+from flexsheet.nodes.triangulator.tracking import Tracker, TrackingSettings
+from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     StereoGeometry,
     TriangulatedPoint,

@@ -7,9 +7,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from messages.methods import MarkerMethod, TrackingMethod, TriangulationMethod
-from messages.scene import Positive
-from nodes.node import NodeParameters
+from flexsheet.messages.methods import MarkerMethod, TrackingMethod, TriangulationMethod
+from flexsheet.messages.scene import Positive
+from flexsheet.nodes.node import NodeParameters
 
 
 class TriangulatorParameters(NodeParameters):

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.triangulator.fingertip import StereoDetection
-from nodes.triangulator.triangulation import (
+from flexsheet.nodes.triangulator.fingertip import StereoDetection
+from flexsheet.nodes.triangulator.triangulation import (
     StereoGeometry,
     TriangulatedPoint,
     project_with_jacobian,

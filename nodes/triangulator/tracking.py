@@ -1,6 +1,6 @@
 """Decide which measured points enter the track: gating, late points, loss and track initiation.
 
-The filter in `nodes.triangulator.filters` estimates the motion from these points.
+The filter in `flexsheet.nodes.triangulator.filters` estimates the motion from these points.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.types import FingertipState
-from nodes.triangulator.filters import Estimate, Filter
+from flexsheet.messages.types import FingertipState
+from flexsheet.nodes.triangulator.filters import Estimate, Filter
 
 Floats = NDArray[np.float64]
 GateResult = Literal["ok", "too_fast", "unconfirmed"]

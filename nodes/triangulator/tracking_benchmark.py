@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Scene
-from nodes.methods import Case, Family, Trial
-from nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter
-from nodes.triangulator.triangulation import StereoGeometry, dlt, measure
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.methods import Case, Family, Trial
+from flexsheet.nodes.triangulator.filters import TRACKING_METHODS, Estimate, Filter
+from flexsheet.nodes.triangulator.triangulation import StereoGeometry, dlt, measure
 
 Floats = NDArray[np.float64]
 TruePath = Callable[[float], Floats]

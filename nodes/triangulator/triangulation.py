@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.calibration import StereoCalibration, refuse_other_camera
-from messages.scene import Lens, StereoCamera
-from messages.types import StereoPair
-from nodes.models import camera, rigid
+from flexsheet.messages.calibration import StereoCalibration, refuse_other_camera
+from flexsheet.messages.scene import Lens, StereoCamera
+from flexsheet.messages.types import StereoPair
+from flexsheet.nodes.models import camera, rigid
 
 Floats = NDArray[np.float64]
 Triangulate = Callable[[Floats, Floats, Floats], Floats]

@@ -8,12 +8,12 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from messages.base import Header
-from messages.scene import ArmSpec, NonNegative, Positive, Scene
-from messages.types import TwinArms
-from nodes.models.rigid import inverse, transform, transform_from_rpy
-from nodes.node import Input, Node, NodeParameters, Output, periodic
-from nodes.twin.arms import (
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
+from flexsheet.messages.types import TwinArms
+from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.twin.arms import (
     ArmServer,
     Controller,
     Fault,
@@ -22,7 +22,7 @@ from nodes.twin.arms import (
     forward,
     solve_inverse_kinematics,
 )
-from nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
+from flexsheet.nodes.twin.mxt_controller import FILTER_S, MxtController, MxtServer
 
 Loopback = Annotated[str, AfterValidator(check_loopback)]
 

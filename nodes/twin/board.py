@@ -12,11 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.calibration import Board
-from messages.scene import Lens, StereoCamera
-from nodes.models.rigid import apply, rotation_from_vector, transform
-from nodes.twin.pixels import Sensor, quantize
-from nodes.twin.rig import pixels_of, slopes_of
+from flexsheet.messages.calibration import Board
+from flexsheet.messages.scene import Lens, StereoCamera
+from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
+from flexsheet.nodes.twin.pixels import Sensor, quantize
+from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

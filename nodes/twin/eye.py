@@ -17,12 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Projector, Scene
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.twin import rig
-from nodes.twin.membrane import DeformedSheet, Rubber, solve
-from nodes.twin.rig import slopes_of
-from nodes.twin.true_object import TrueBody, TrueObject
+from flexsheet.messages.scene import Projector, Scene
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.twin import rig
+from flexsheet.nodes.twin.membrane import DeformedSheet, Rubber, solve
+from flexsheet.nodes.twin.rig import slopes_of
+from flexsheet.nodes.twin.true_object import TrueBody, TrueObject
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -8,12 +8,21 @@ from functools import partial
 
 from pydantic import Field
 
-from messages.base import Header
-from messages.scene import Positive, Projector, Scene
-from messages.types import Display, Eye, Frame, Skin, SoftBody, TwinArms, TwinEye, TwinFinger
-from nodes.node import Input, Node, NodeParameters, Output
-from nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
-from nodes.twin.render_queue import RenderQueue
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import Positive, Projector, Scene
+from flexsheet.messages.types import (
+    Display,
+    Eye,
+    Frame,
+    Skin,
+    SoftBody,
+    TwinArms,
+    TwinEye,
+    TwinFinger,
+)
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output
+from flexsheet.nodes.twin.eye import METRES_PER_PX, EyeCamera, EyeSituation, Floats
+from flexsheet.nodes.twin.render_queue import RenderQueue
 
 Job = tuple[EyeSituation, Floats, Frame, Header]
 

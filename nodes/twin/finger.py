@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from messages.types import PathJoin
+from flexsheet.messages.types import PathJoin
 
 Floats = NDArray[np.float64]
 Real = TypeVar("Real", float, Floats)

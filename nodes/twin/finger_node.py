@@ -9,14 +9,14 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from messages.base import Header
-from messages.scene import NonNegative, Scene
-from messages.types import FingerPath, StereoPair, TwinFinger
-from nodes.node import Input, Node, NodeParameters, Output
-from nodes.twin.clutter import CLUTTER
-from nodes.twin.finger import FingerMotion, FingerState
-from nodes.twin.pixels import TwinCamera
-from nodes.twin.rig import make_true_camera
+from flexsheet.messages.base import Header
+from flexsheet.messages.scene import NonNegative, Scene
+from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output
+from flexsheet.nodes.twin.clutter import CLUTTER
+from flexsheet.nodes.twin.finger import FingerMotion, FingerState
+from flexsheet.nodes.twin.pixels import TwinCamera
+from flexsheet.nodes.twin.rig import make_true_camera
 
 
 class TwinFingerParameters(NodeParameters):

@@ -33,10 +33,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from messages.scene import Scene
-from messages.types import FingerPath
-from nodes.twin.finger import smoothstep
-from nodes.twin.paths import map_to_surface, place_path, touchable
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.twin.finger import smoothstep
+from flexsheet.nodes.twin.paths import map_to_surface, place_path, touchable
 
 Floats = NDArray[np.float64]
 Sampled = tuple[Floats, Floats]

@@ -14,8 +14,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from nodes.models.rigid import transform_from_rpy
-from nodes.twin.arms import (
+from flexsheet.nodes.models.rigid import transform_from_rpy
+from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
     LATE_S,
     RANGE_RAD,

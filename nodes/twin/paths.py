@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 
-from messages.scene import Scene
-from messages.types import FingerPath
-from nodes.models.rigid import apply, transform_from_rpy
-from nodes.models.shapes import Nearest, Shape, make_shape
-from nodes.twin.finger import FingerPathError, SmoothPath
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import FingerPath
+from flexsheet.nodes.models.rigid import apply, transform_from_rpy
+from flexsheet.nodes.models.shapes import Nearest, Shape, make_shape
+from flexsheet.nodes.twin.finger import FingerPathError, SmoothPath
 
 Floats = NDArray[np.float64]
 FAR_M = 2.0

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chndtr
 
-from messages.scene import Lens, StereoCamera
-from messages.types import Side
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.twin.clutter import (
+from flexsheet.messages.scene import Lens, StereoCamera
+from flexsheet.messages.types import Side
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.twin.clutter import (
     CLUTTER,
     FINGER_DIRECTION,
     FINGER_LENGTH_M,
@@ -34,7 +34,7 @@ from nodes.twin.clutter import (
     SecondMarker,
     Sheet,
 )
-from nodes.twin.rig import pixel_of, pixels_per_slope, slopes_of
+from flexsheet.nodes.twin.rig import pixel_of, pixels_per_slope, slopes_of
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -13,10 +13,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Lens, Pose, Projector, Scene, StereoCamera
-from nodes.models.rigid import apply, inverse, rotation_from_vector, transform, transform_from_rpy
-from nodes.twin.pixels import Sensor, quantize
-from nodes.twin.rig import pixels_of, slopes_of
+from flexsheet.messages.scene import Lens, Pose, Projector, Scene, StereoCamera
+from flexsheet.nodes.models.rigid import (
+    apply,
+    inverse,
+    rotation_from_vector,
+    transform,
+    transform_from_rpy,
+)
+from flexsheet.nodes.twin.pixels import Sensor, quantize
+from flexsheet.nodes.twin.rig import pixels_of, slopes_of
 
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]

@@ -14,8 +14,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Lens, StereoCamera
-from nodes.models.rigid import rotation_from_vector, transform
+from flexsheet.messages.scene import Lens, StereoCamera
+from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 
 Floats = NDArray[np.float64]
 T = TypeVar("T", float, Floats)

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
-from nodes.models.rigid import apply, transform_from_rpy
-from nodes.models.shapes import Shape, make_shape
-from nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles
+from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
+from flexsheet.nodes.models.rigid import apply, transform_from_rpy
+from flexsheet.nodes.models.shapes import Shape, make_shape
+from flexsheet.nodes.models.shapes.triangles import find_degenerate, nearest_in_triangles
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.bags.report.series import Grid, Spread, States
-from launch.bags.report.session import Session
-from launch.methods.svg import COLOURS, INK, drawn_for_pages, svg_of
-from nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
+from flexsheet.launch.bags.report.series import Grid, Spread, States
+from flexsheet.launch.bags.report.session import Session
+from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, svg_of
+from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

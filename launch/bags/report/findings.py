@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from messages.busy import BUSY_REMEDY
+from flexsheet.messages.busy import BUSY_REMEDY
 
 Gravity = Literal["bad", "doubtful"]
 

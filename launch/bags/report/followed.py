@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.bags.report.series import Grid, Moments, Spread
+from flexsheet.launch.bags.report.series import Grid, Moments, Spread
 
 Floats = NDArray[np.float64]
 

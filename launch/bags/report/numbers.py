@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from launch.bags.report.series import Range, Spread, States
-from launch.bags.report.session import Arm, HostLoad, NodeSaid, Session
-from launch.bags.report.strokes import FingerRun
-from messages.busy import describe_busy
-from messages.methods import Methods
-from messages.scene import Scene
-from messages.topics import TOPICS
-from nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
+from flexsheet.launch.bags.report.series import Range, Spread, States
+from flexsheet.launch.bags.report.session import Arm, HostLoad, NodeSaid, Session
+from flexsheet.launch.bags.report.strokes import FingerRun
+from flexsheet.messages.busy import describe_busy
+from flexsheet.messages.methods import Methods
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
+from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
 DEGREES = float(np.degrees(1.0))
 

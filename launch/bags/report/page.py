@@ -8,11 +8,11 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from launch.bags.report.album import Album, Shot
-from launch.bags.report.charts import Chart, charts_of
-from launch.bags.report.findings import CHECKED, Finding, findings_of
-from launch.bags.report.numbers import numbers_of
-from launch.bags.report.session import Session
+from flexsheet.launch.bags.report.album import Album, Shot
+from flexsheet.launch.bags.report.charts import Chart, charts_of
+from flexsheet.launch.bags.report.findings import CHECKED, Finding, findings_of
+from flexsheet.launch.bags.report.numbers import numbers_of
+from flexsheet.launch.bags.report.session import Session
 
 MARK = "<!-- made by: flexsheet bag report -->"
 """A file that has it may be written over by a later report."""

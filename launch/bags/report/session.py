@@ -13,18 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from launch.bags.report.album import Album
-from launch.bags.report.series import Events, Grid, Moments, Places, Range, Spread, States
-from launch.bags.report.strokes import SheetErrors
-from launch.experiments.stroke import events_of
-from launch.plans.planned import Plan
-from messages.bag import BagError, BagInfo, BagReader
-from messages.base import Header, Message
-from messages.busy import is_busy
-from messages.clock_table import ClockTable
-from messages.scene import Scene
-from messages.topics import TOPICS
-from messages.types import (
+from flexsheet.launch.bags.report.album import Album
+from flexsheet.launch.bags.report.series import Events, Grid, Moments, Places, Range, Spread, States
+from flexsheet.launch.bags.report.strokes import SheetErrors
+from flexsheet.launch.experiments.stroke import events_of
+from flexsheet.launch.plans.planned import Plan
+from flexsheet.messages.bag import BagError, BagInfo, BagReader
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.busy import is_busy
+from flexsheet.messages.clock_table import ClockTable
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import (
     ArmState,
     Clocks,
     EStop,

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch.bags.report.followed import FollowedFinger
-from launch.bags.report.series import Grid, Moments, Range
-from launch.experiments.stroke import (
+from flexsheet.launch.bags.report.followed import FollowedFinger
+from flexsheet.launch.bags.report.series import Grid, Moments, Range
+from flexsheet.launch.experiments.stroke import (
     Track,
     edge_row,
     object_pose,
@@ -26,11 +26,11 @@ from launch.experiments.stroke import (
     stroke_window_s,
     track,
 )
-from messages.bag import BagReader
-from messages.scene import ArmSpec, Scene
-from messages.types import ArmState, Fingertip, SheetTarget, TwinArms, TwinFinger
-from nodes.models.rigid import apply, inverse, transform_from_rpy
-from nodes.models.shapes import Shape, make_shape
+from flexsheet.messages.bag import BagReader
+from flexsheet.messages.scene import ArmSpec, Scene
+from flexsheet.messages.types import ArmState, Fingertip, SheetTarget, TwinArms, TwinFinger
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import Shape, make_shape
 
 Floats = NDArray[np.float64]
 

@@ -7,12 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from launch.bags.report.findings import findings_of
-from launch.bags.report.numbers import numbers_of
-from launch.bags.report.page import MARK, page_of
-from launch.bags.report.session import Progress, Session, read_session
-from messages.bag import BagError
-from messages.files import DISK_ERRORS, write_error
+from flexsheet.launch.bags.report.findings import findings_of
+from flexsheet.launch.bags.report.numbers import numbers_of
+from flexsheet.launch.bags.report.page import MARK, page_of
+from flexsheet.launch.bags.report.session import Progress, Session, read_session
+from flexsheet.messages.bag import BagError
+from flexsheet.messages.files import DISK_ERRORS, write_error
 
 
 def default_output(bag: Path) -> Path:

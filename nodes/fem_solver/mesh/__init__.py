@@ -7,8 +7,8 @@ mesh = build_mesh(spec)                     # in the frame of `world_from_mesh(s
 
 from __future__ import annotations
 
-from nodes.fem_solver.mesh.cylinder import Focus, cylinder_mesh
-from nodes.fem_solver.mesh.from_scene import (
+from flexsheet.nodes.fem_solver.mesh.cylinder import Focus, cylinder_mesh
+from flexsheet.nodes.fem_solver.mesh.from_scene import (
     MeshBudget,
     MeshSpec,
     build_mesh,
@@ -17,7 +17,7 @@ from nodes.fem_solver.mesh.from_scene import (
     mesh_spec,
     world_from_mesh,
 )
-from nodes.fem_solver.mesh.solid import (
+from flexsheet.nodes.fem_solver.mesh.solid import (
     EDGES,
     FACES,
     SUBTRIANGLES,

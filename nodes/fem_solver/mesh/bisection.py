@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

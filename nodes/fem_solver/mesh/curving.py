@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.quality import MIN_JACOBIAN_RATIO, min_jacobian_ratios
-from nodes.fem_solver.mesh.solid import EDGES, boundary_faces
+from flexsheet.nodes.fem_solver.mesh.quality import MIN_JACOBIAN_RATIO, min_jacobian_ratios
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES, boundary_faces
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

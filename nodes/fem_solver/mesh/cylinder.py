@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.solid import EDGES, SUBTRIANGLES, SolidMesh, boundary_faces
+from flexsheet.nodes.fem_solver.mesh.solid import EDGES, SUBTRIANGLES, SolidMesh, boundary_faces
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -17,13 +17,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
-from nodes.fem_solver.mesh.curving import curve_edges
-from nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
-from nodes.fem_solver.mesh.quality import MIN_RADIUS_RATIO, radius_ratios
-from nodes.fem_solver.mesh.smoothing import SPRINGS_OFF_SURFACE, make_surface_query, smooth_mesh
-from nodes.fem_solver.mesh.solid import EDGES, UnfitMeshError, add_midside_nodes, orient_tetrahedra
-from nodes.models.shapes import Shape
+from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
+from flexsheet.nodes.fem_solver.mesh.curving import curve_edges
+from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
+from flexsheet.nodes.fem_solver.mesh.quality import MIN_RADIUS_RATIO, radius_ratios
+from flexsheet.nodes.fem_solver.mesh.smoothing import (
+    SPRINGS_OFF_SURFACE,
+    make_surface_query,
+    smooth_mesh,
+)
+from flexsheet.nodes.fem_solver.mesh.solid import (
+    EDGES,
+    UnfitMeshError,
+    add_midside_nodes,
+    orient_tetrahedra,
+)
+from flexsheet.nodes.models.shapes import Shape
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import (
+from flexsheet.messages.scene import (
     BaseSupport,
     Cylinder,
     Ellipsoid,
@@ -22,22 +22,22 @@ from messages.scene import (
     StripSupport,
     Support,
 )
-from nodes.fem_solver.mesh.cylinder import cylinder_mesh
-from nodes.fem_solver.mesh.fitted import fit_mesh, limit_sizes_by_curvature
-from nodes.fem_solver.mesh.grading import Grading
-from nodes.fem_solver.mesh.mapped import distance_to_rectangle, mesh_by_map, mesh_slab
-from nodes.fem_solver.mesh.quality import signed_volumes
-from nodes.fem_solver.mesh.solid import (
+from flexsheet.nodes.fem_solver.mesh.cylinder import cylinder_mesh
+from flexsheet.nodes.fem_solver.mesh.fitted import fit_mesh, limit_sizes_by_curvature
+from flexsheet.nodes.fem_solver.mesh.grading import Grading
+from flexsheet.nodes.fem_solver.mesh.mapped import distance_to_rectangle, mesh_by_map, mesh_slab
+from flexsheet.nodes.fem_solver.mesh.quality import signed_volumes
+from flexsheet.nodes.fem_solver.mesh.solid import (
     SolidMesh,
     UnfitMeshError,
     boundary_faces,
     make_solid_mesh,
     restrict_touchable,
 )
-from nodes.fem_solver.mesh.supports import select_fixed
-from nodes.models import rigid
-from nodes.models.shapes import Shape, make_shape
-from nodes.models.shapes.triangles import volume_m3
+from flexsheet.nodes.fem_solver.mesh.supports import select_fixed
+from flexsheet.nodes.models import rigid
+from flexsheet.nodes.models.shapes import Shape, make_shape
+from flexsheet.nodes.models.shapes.triangles import volume_m3
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -22,14 +22,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import Ellipsoid, Plane, RoundedBox, Sphere
-from nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
-from nodes.fem_solver.mesh.curving import curve_edges
-from nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
-from nodes.fem_solver.mesh.quality import radius_ratios
-from nodes.fem_solver.mesh.smoothing import SPRINGS_ON_SURFACE, make_surface_query, smooth_mesh
-from nodes.fem_solver.mesh.solid import UnfitMeshError, add_midside_nodes, orient_tetrahedra
-from nodes.models.shapes import Shape
+from flexsheet.messages.scene import Ellipsoid, Plane, RoundedBox, Sphere
+from flexsheet.nodes.fem_solver.mesh.bisection import CELL, bisect, make_lattice
+from flexsheet.nodes.fem_solver.mesh.curving import curve_edges
+from flexsheet.nodes.fem_solver.mesh.grading import EDGE_SIZE_RATIO, Grading, longest_edges
+from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
+from flexsheet.nodes.fem_solver.mesh.smoothing import (
+    SPRINGS_ON_SURFACE,
+    make_surface_query,
+    smooth_mesh,
+)
+from flexsheet.nodes.fem_solver.mesh.solid import (
+    UnfitMeshError,
+    add_midside_nodes,
+    orient_tetrahedra,
+)
+from flexsheet.nodes.models.shapes import Shape
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -16,8 +16,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.fem_solver.mesh.quality import radius_ratios
-from nodes.models.shapes import Shape
+from flexsheet.nodes.fem_solver.mesh.quality import radius_ratios
+from flexsheet.nodes.models.shapes import Shape
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from messages.scene import (
+from flexsheet.messages.scene import (
     BaseSupport,
     BoxPatchSupport,
     SpherePatchSupport,
     StripSupport,
     Support,
 )
-from nodes.fem_solver.mesh.solid import UnfitMeshError
+from flexsheet.nodes.fem_solver.mesh.solid import UnfitMeshError
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from nodes.models.shapes.smooth_mesh import SmoothMeshShape
-from nodes.models.shapes.solids import (
+from flexsheet.nodes.models.shapes.smooth_mesh import SmoothMeshShape
+from flexsheet.nodes.models.shapes.solids import (
     CylinderShape,
     EllipsoidShape,
     PlaneShape,
     RoundedBoxShape,
     SphereShape,
 )
-from nodes.models.shapes.surface import (
+from flexsheet.nodes.models.shapes.surface import (
     Convex,
     Nearest,
     Shape,
@@ -21,7 +21,7 @@ from nodes.models.shapes.surface import (
     projection_jacobian,
     tightest_curvature,
 )
-from nodes.models.shapes.triangles import MeshError
+from flexsheet.nodes.models.shapes.triangles import MeshError
 
 SHAPES: dict[str, type[Shape]] = {
     "cylinder": CylinderShape,

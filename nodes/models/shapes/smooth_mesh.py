@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nodes.models.shapes.surface import (
+from flexsheet.nodes.models.shapes.surface import (
     EQUAL_DISTANCE_M,
     Bools,
     Floats,
@@ -40,7 +40,7 @@ from nodes.models.shapes.surface import (
     descend,
     descend_one,
 )
-from nodes.models.shapes.triangles import (
+from flexsheet.nodes.models.shapes.triangles import (
     Indices,
     MeshError,
     check_mesh,

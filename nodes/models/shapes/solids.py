@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nodes.models.shapes.surface import (
+from flexsheet.nodes.models.shapes.surface import (
     EQUAL_DISTANCE_M,
     FRONT,
     Bools,

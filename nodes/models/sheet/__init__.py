@@ -6,8 +6,8 @@ Sheet frame: origin at the centre, x from the left clamped edge to the right one
 
 from __future__ import annotations
 
-from nodes.models.sheet.geometry import corners, edge_poses, flange_pose, sheet_from_edges
-from nodes.models.sheet.tension import (
+from flexsheet.nodes.models.sheet.geometry import corners, edge_poses, flange_pose, sheet_from_edges
+from flexsheet.nodes.models.sheet.tension import (
     edge_force_for_stiffness,
     edge_force_n,
     push_stiffness_n_per_m,

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel
-from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.tabulated import TabulatedSheetModel
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel
+from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]

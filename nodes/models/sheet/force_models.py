@@ -18,9 +18,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.sheet.membrane import CELLS, push_path
-from nodes.models.sheet.rubber import Rubber
-from nodes.models.sheet.tension import PUSH_FACTOR
+from flexsheet.nodes.models.sheet.membrane import CELLS, push_path
+from flexsheet.nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.tension import PUSH_FACTOR
 
 Floats = NDArray[np.float64]
 Place = tuple[float, float]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.rigid import inverse, transform
+from flexsheet.nodes.models.rigid import inverse, transform
 
 Floats = NDArray[np.float64]
 

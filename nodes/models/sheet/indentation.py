@@ -18,8 +18,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from nodes.models.sheet.membrane import push_path
-from nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.membrane import push_path
+from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
 

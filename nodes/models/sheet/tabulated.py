@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from nodes.models.sheet.force_models import Place, ScaledSheetModel, SheetForce
-from nodes.models.sheet.rubber import Rubber
+from flexsheet.nodes.models.sheet.force_models import Place, ScaledSheetModel, SheetForce
+from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
 Measure = Callable[[float, Floats, Place], Floats]
