@@ -35,6 +35,7 @@ import zstandard
 from pydantic import BaseModel
 from ruamel.yaml import YAML
 
+import flexsheet.launch
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_plan, load_scene

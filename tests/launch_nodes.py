@@ -9,10 +9,13 @@ import time
 from pathlib import Path
 from typing import ClassVar
 
+import numpy as np
+
 from flexsheet.messages.base import Header
-from flexsheet.messages.types import ArmState, EStop, Side, TwinFinger
+from flexsheet.messages.types import ArmState, EStop, Fingertip, Side, TwinFinger
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 from tests.arm_states import arm_state
+from tests.fingertips import fingertip
 
 
 class BeaconParameters(NodeParameters):
@@ -23,6 +26,17 @@ class BeaconParameters(NodeParameters):
     deaf: bool = False
     exit_code: int | None = None
     with_child: bool = False
+
+
+class FingertipSource(Node):
+    """Publishes a fingertip at rest, 50 times a second."""
+
+    parameters: BeaconParameters
+    fingertip: Output[Fingertip]
+
+    @periodic("rate_hz")
+    def publish(self) -> None:
+        self.fingertip.publish(fingertip(np.zeros(3)))
 
 
 class Beacon(Node):

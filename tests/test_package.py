@@ -1,0 +1,168 @@
+"""The import package: its public names, one name per module, and what a wheel holds."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+import flexsheet
+from flexsheet.nodes import node_class
+from tests.doc_pages import blocks
+
+ROOT = Path(__file__).resolve().parent.parent
+FOLDERS = ("messages", "nodes", "launch")
+
+
+def run_python(code: str, cwd: Path, path: str = "") -> str:
+    environment = {**os.environ, "PYTHONPATH": path}
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code],
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", flexsheet.__all__)
+def test_each_public_name_is_documented(name: str) -> None:
+    value = getattr(flexsheet, name)
+    assert value is getattr(flexsheet, name)
+    if inspect.isclass(value) or inspect.isfunction(value):
+        assert inspect.getdoc(value), f"flexsheet.{name} has no docstring"
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="'flexsheet' has no attribute 'unknown'"):
+        _ = flexsheet.unknown  # type: ignore[attr-defined]
+
+
+def test_static_and_lazy_names_agree() -> None:
+    """Type checkers read the imports, Python reads the table."""
+    tree = ast.parse((ROOT / "flexsheet" / "__init__.py").read_text())
+    imported = {
+        alias.name: node.module
+        for branch in ast.walk(tree) if isinstance(branch, ast.If)
+        for node in branch.body if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }  # fmt: skip
+    assert imported == flexsheet._MODULES
+    assert sorted(flexsheet.__all__) == sorted(imported)
+
+
+def test_importing_the_package_imports_no_library(tmp_path: Path) -> None:
+    loaded = json.loads(
+        run_python("import flexsheet, json, sys; print(json.dumps(sorted(sys.modules)))", tmp_path)
+    )
+    assert {"numpy", "zmq", "pydantic", "flexsheet.messages"}.isdisjoint(loaded)
+
+
+def test_no_module_is_imported_under_two_names(tmp_path: Path) -> None:
+    """With the checkout on the path, and with foreign packages of the same names."""
+    for name in FOLDERS:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise RuntimeError('foreign package')\n")
+    code = (
+        "import json, sys, flexsheet\n"
+        "for name in flexsheet.__all__: getattr(flexsheet, name)\n"
+        "from flexsheet.nodes import NODES, node_class\n"
+        "for name in NODES: node_class(name)\n"
+        "print(json.dumps(sorted(sys.modules)))"
+    )
+    for path in (str(ROOT), str(tmp_path)):
+        loaded = json.loads(run_python(code, tmp_path, path).splitlines()[-1])
+        assert not [name for name in loaded if name.split(".")[0] in FOLDERS]
+
+
+def test_sources_import_the_package_by_its_name() -> None:
+    for folder in (*FOLDERS, "tests", "benchmarks", "website", "flexsheet"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                names = []
+                if isinstance(node, ast.Import):
+                    names = [alias.name for alias in node.names]
+                elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+                    names = [node.module]
+                wrong = [name for name in names if name.split(".")[0] in FOLDERS]
+                assert not wrong, f"{path.relative_to(ROOT)}: import flexsheet.{wrong[0]}"
+
+
+def test_node_types_of_old_launch_files_are_found() -> None:
+    assert node_class("nodes.planner.node:Planner") is node_class("planner")
+
+
+def test_nothing_changes_the_import_path() -> None:
+    for folder in (*FOLDERS, "flexsheet"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                changes = isinstance(node, ast.Attribute) and node.attr in ("path", "meta_path")
+                if changes and isinstance(node.value, ast.Name):
+                    assert node.value.id != "sys", f"{path.relative_to(ROOT)}:{node.lineno}"
+
+
+def test_a_wheel_holds_the_package_only(tmp_path: Path) -> None:
+    subprocess.run(
+        [
+            sys.executable, "-c",
+            "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])",
+            str(tmp_path),
+        ],
+        cwd=copy_of_sources(tmp_path / "sources"), check=True, capture_output=True, timeout=120,
+    )  # fmt: skip
+    (wheel,) = tmp_path.glob("*.whl")
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {name.split("/")[0] for name in names} <= {
+        "flexsheet",
+        f"{wheel.stem.split('-py')[0]}.dist-info",
+    }
+    for wanted in (
+        "flexsheet/nodes/renderer/node.py",
+        "flexsheet/launch/demo.yaml",
+        "flexsheet/launch/scenes/cylinder.yaml",
+    ):
+        assert wanted in names
+
+
+def test_the_script_of_the_readme_runs(tmp_path: Path) -> None:
+    """On a graph of one node, which publishes fingertips."""
+    (script,) = (
+        block.text for block in blocks(ROOT / "README.md") if "flexsheet.load_plan" in block.text
+    )
+    (tmp_path / "launch").mkdir()
+    (tmp_path / "launch" / "demo.yaml").write_text(
+        "nodes: {source: {type: 'tests.launch_nodes:FingertipSource'}}\n"
+    )
+    with tempfile.TemporaryDirectory(prefix="fs-", dir="/tmp") as runs:
+        done = subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=tmp_path, env={**os.environ, "FLEXSHEET_RUNS": runs},
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 3
+    assert len([line for line in script.splitlines() if line.strip()]) <= 12
+
+
+def copy_of_sources(folder: Path) -> Path:
+    """Link what a build reads into a folder, so that the build writes nothing into the checkout."""
+    folder.mkdir()
+    for name in (*FOLDERS, "flexsheet", "pyproject.toml", "README.md", "LICENSE"):
+        (folder / name).symlink_to(ROOT / name)
+    return folder
+
+
+def test_every_module_has_one_file() -> None:
+    """The links lead to the folders beside the package, and nowhere else."""
+    for name in FOLDERS:
+        assert os.readlink(ROOT / "flexsheet" / name) == f"../{name}"
+        module = importlib.import_module(f"flexsheet.{name}")
+        assert Path(str(module.__file__)).resolve() == ROOT / name / "__init__.py"
