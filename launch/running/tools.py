@@ -12,8 +12,6 @@ from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import structlog
-
 from flexsheet.launch.plans.planned import MAIN, Plan, tools_on
 from flexsheet.launch.running.runs import Run, local_endpoints, local_sources, ring_file
 from flexsheet.messages.base import Header, Message
@@ -87,6 +85,9 @@ async def read_topic(
     count: how many; None: until the caller stops.  On a slow reader messages queue up.
     Raises KeyError for a topic that does not exist.
     """
+    # Commands that look into a graph start faster without it.
+    import structlog
+
     arrived: asyncio.Queue[tuple[Message, Header]] = asyncio.Queue()
     subscriber = subscriber_to(
         topic,
