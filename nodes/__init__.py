@@ -7,11 +7,28 @@ that a process loads no other node's libraries.
 from __future__ import annotations
 
 from difflib import get_close_matches
+from enum import StrEnum
 from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from flexsheet.nodes.node import Node
+
+
+class NodeRole(StrEnum):
+    """What a node is to the launcher, the doctor and the replay, whatever its class is named.
+
+    A node class declares it as `role`; one that publishes the state of an arm is an arm bridge
+    without saying so.
+    """
+
+    ARM_BRIDGE = "arm_bridge"
+    CLOCK = "clock"
+    CONSOLE = "console"
+    FINGER_SIMULATOR = "finger_simulator"
+    RECORDER = "recorder"
+    RENDERER = "renderer"
+
 
 NODES: dict[str, str] = {
     "camera": "flexsheet.nodes.camera.node:Camera",

@@ -36,7 +36,8 @@ from flexsheet.messages.clock import Clock
 from flexsheet.messages.clock_table import ClockTable
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.topics import Delivery, Topic, topic_named
-from flexsheet.messages.types import PortStatus, Status
+from flexsheet.messages.types import ArmState, PortStatus, Status
+from flexsheet.nodes import NodeRole
 
 M = TypeVar("M", bound=Message)
 Send = Callable[[Topic, Message, Header], None]
@@ -224,6 +225,16 @@ def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
 
 
+def role_of(node_class: type[Node]) -> NodeRole | None:
+    """The declared role of a node class; an arm bridge is known by what it publishes."""
+    publishes = {
+        port.message for port in ports_of(node_class).values() if port.direction == "output"
+    }
+    if node_class.role is None and ArmState in publishes:
+        return NodeRole.ARM_BRIDGE
+    return node_class.role
+
+
 def timers_of(node_class: type[Node]) -> list[Timer]:
     """The methods of a node class that are marked `@periodic`."""
     return [
@@ -243,11 +254,19 @@ class Node:
     """Whether `deliver` is given each message as the wire's frames, unopened."""
     measures_clocks: ClassVar[bool] = False
     """Whether it wants the stamps of other hosts as they are, of their clocks."""
+    role: ClassVar[NodeRole | None] = None
     opens_devices: ClassVar[bool] = False
     """Whether it reaches for devices, ports or files of its own: a replay must not start it."""
 
     async def settle(self) -> None:
         """Wait for work that handlers have left to others; a replay stands still until then."""
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        """Say why `bag verify` must not step a node with these parameters; empty: it may."""
+        if cls.opens_devices:
+            return "it uses devices of its own, whose data are not in the bag"
+        return ""
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:

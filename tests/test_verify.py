@@ -183,10 +183,10 @@ def rewritten(
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("arm_left_bridge", "would command an arm"),
+        ("arm_left_bridge", "commands an arm"),
         ("twin_arms", "over TCP"),
-        ("twin_finger", "films by its own clock"),
-        ("recorder", "writes a bag"),
+        ("twin_finger", "takes images by its own clock"),
+        ("recorder", "wrote this bag"),
     ],
 )
 def test_nodes_that_cannot_be_stepped_say_why(bag: Path, name: str, why: str) -> None:

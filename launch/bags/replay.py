@@ -32,21 +32,8 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
 from flexsheet.messages.types import Clocks, Status
 from flexsheet.messages.wire import decode, encode
-from flexsheet.nodes import UnknownNodeError, node_class
+from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import Node, parameters_of, timers_of
-
-REFUSALS = {
-    "camera": "it reads a device, which is not in the bag; with stereo recorded, "
-    "`bag verify triangulator` starts from what it read",
-    "arm_bridge": "it would command an arm, and what the arm answered is in the bag as this node's "
-    "output only; `bag verify planner` shows what it was told",
-    "twin_arms": "it answers the arms' bridges over TCP, and what they said there is not recorded",
-    "twin_finger": "it films by its own clock, and what it did is what the bag holds as "
-    "twin/finger",
-    "recorder": "it writes a bag, and what it wrote is this one",
-    "console": "it serves a page, and what people did there is in the bag as its outputs only",
-}
-"""Why nodes of a type are not stepped through a bag."""
 
 CLOCKS = "clocks"
 EPOCH = 0
@@ -196,20 +183,9 @@ def _plan_of(reader: BagReader) -> Plan:
 
 
 def refusal(node: PlannedNode) -> str:
-    """Why a node cannot be stepped through a bag, in a sentence; empty: it can."""
-    # Of any type of parameters: those of the node's own class.
-    parameters: Any = parameters_of(node_class(node.type)).model_validate(node.parameters)
-    if node.type == "camera" and parameters.source.kind == "twin":
-        return ""  # it hands on what came on twin/stereo, and reaches for nothing
-    if node.type == "renderer" and parameters.output == "window":
-        return (
-            "it shows its frames in a window; its drawing is verified with a bag of a headless run"
-        )
-    if node.type in REFUSALS:
-        return REFUSALS[node.type]
-    if node_class(node.type).opens_devices:
-        return "it reaches for devices of its own, which are not in the bag"
-    return ""
+    """Say why a node cannot be stepped through a bag; empty: it can."""
+    class_ = node_class(node.type)
+    return class_.replay_refusal(parameters_of(class_).model_validate(node.parameters))
 
 
 async def replay(bag: Path, planned: PlannedNode, progress: Progress = _untold) -> Pass:
@@ -502,7 +478,7 @@ def _check_inputs(bag: Path, reader: BagReader, plan: Plan, node: PlannedNode) -
     """Every input must have been recorded (an input on which nothing came is no lack)."""
     recorded = set(reader.topics)
     for other in plan.nodes.values():
-        if other.type == "recorder":
+        if other.role is NodeRole.RECORDER:
             recorded |= {port.topic for port in other.inputs}
     lacking = [port.topic for port in node.inputs if port.topic not in recorded]
     if lacking:

@@ -17,6 +17,7 @@ from flexsheet.launch.running.prepare import prepare_plan
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, FingerPath, Shading
+from flexsheet.nodes import node_class
 from flexsheet.nodes.signals import handle_signals
 
 DEMO_FILE = Path(__file__).resolve().parent.parent / "demo.yaml"
@@ -104,9 +105,13 @@ async def _interruptible(work: Coroutine[Any, Any, None]) -> None:
 
 
 def settings_of_type(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """The setting ("parameter=value") for each node of a type, as that launch file names it."""
-    nodes = load_plan(launch_file).nodes.values()
-    return [f"{node.name}.{setting}" for node in nodes if node.type == node_type]
+    """Name the setting ("parameter=value") of each node whose class is that of a type."""
+    wanted = node_class(node_type)
+    return [
+        f"{node.name}.{setting}"
+        for node in load_plan(launch_file).nodes.values()
+        if issubclass(node_class(node.type), wanted)
+    ]
 
 
 def stroke_procedure(

@@ -30,6 +30,7 @@ from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.security import SecurityError, public_of, read_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import HostStatus, PortStatus
+from flexsheet.nodes import NodeRole
 
 State = Literal["ok", "warning", "failed", "not asked"]
 SLACK = 0.1
@@ -377,19 +378,19 @@ def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
             }[check]
             yield HostFinding(host, check, "failed", what, remedy)
     for node in nodes:
-        if node.type == "arm_bridge":
+        if node.role is NodeRole.ARM_BRIDGE:
             yield _arm(node, visit)
 
 
 def _arm(node: PlannedNode, visit: Visit) -> HostFinding:
-    arm = visit.arms.get(str(node.parameters["side"]))
-    check = f"arm {node.parameters['side']}"
+    arm = visit.arms.get(str(node.arm_side))
+    check = f"arm {node.arm_side}"
     if arm is None:
         return _silent_arm(node, visit, check)
     what = ", ".join(filter(None, (arm.mode, arm.reason, "; ".join(arm.faults))))
     if arm.mode == "disconnected":
-        where = f"{node.parameters['host']}:{node.parameters['port']}"
-        remedy = f"is the controller at {where} on, and its program running? docs/modbus.md"
+        where = "" if node.device_address is None else f" at {node.device_address}"
+        remedy = f"is the controller{where} on, and its program running? docs/modbus.md"
         return HostFinding(visit.host, check, "failed", what, remedy)
     if arm.faults:
         remedy = "when the cause is mended: flexsheet arms reset"
@@ -502,14 +503,14 @@ def before_start(plan: Plan, here: str, key_problem: str | None) -> Iterator[Hos
         yield HostFinding(here, "devices", "failed", what, remedy)
     elif devices:
         yield HostFinding(here, "devices", "ok", ", ".join(devices))
-    if any(node.type == "renderer" for node in nodes):
+    if any(node.role is NodeRole.RENDERER for node in nodes):
         problem = opengl_problem()
         if problem is None:
             yield HostFinding(here, "opengl", "ok", "a headless context can be made (EGL)")
         else:
             yield HostFinding(here, "opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
     for node in nodes:
-        if node.type == "arm_bridge":
+        if node.role is NodeRole.ARM_BRIDGE:
             yield _controller(here, node)
     folder = folder_of(nodes)
     yield _disk(here, shutil.disk_usage(folder if folder.is_dir() else Path.cwd()).free)
@@ -535,12 +536,14 @@ def _ports(plan: Plan, here: str) -> HostFinding:
 
 def _controller(here: str, node: PlannedNode) -> HostFinding:
     """Whether an arm's controller takes connections; a graph that runs holds the only one."""
-    check = f"arm {node.parameters['side']}"
+    check = f"arm {node.arm_side}"
+    if node.device_address is None:
+        return HostFinding(here, check, "not asked", f"{node.name} has a driver of its own")
     address, port = str(node.parameters["host"]), int(node.parameters["port"])
     if is_loopback(address):
         what = f"{address}:{port}: the twin's, which starts with the graph"
         return HostFinding(here, check, "not asked", what)
-    if node.parameters["driver"] != "modbus":
+    if node.parameters.get("driver") != "modbus":
         return HostFinding(here, check, "not asked", f"{address}:{port} speaks UDP")
     try:
         socket.create_connection((address, port), CONTROLLER_S).close()

@@ -25,6 +25,7 @@ from flexsheet.messages.bus import Source, Subscriber
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import topic_named
 from flexsheet.messages.types import ArmState, Clocks, HostStatus, Status
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
 
 CONNECT_S = 4.0
@@ -244,6 +245,6 @@ def _has_said_all(plan: Plan, visit: Visit) -> bool:
     return (
         visit.status is not None
         and all(node.name in visit.nodes for node in nodes)
-        and (visit.clocks is not None or all(node.type != "clock" for node in nodes))
-        and len(visit.arms) >= sum(node.type == "arm_bridge" for node in nodes)
+        and (visit.clocks is not None or all(node.role is not NodeRole.CLOCK for node in nodes))
+        and len(visit.arms) >= sum(node.role is NodeRole.ARM_BRIDGE for node in nodes)
     )

@@ -16,6 +16,8 @@ from flexsheet.launch.plans.documents import (
     parse_value,
 )
 from flexsheet.launch.plans.planned import MAIN, RestartSpec, Strict
+from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
+from flexsheet.nodes.node import role_of
 
 RECORDER_NICE = 5
 """What it reads waits for it in queues; nothing else waits."""
@@ -128,7 +130,7 @@ def apply_record(document: Document, bag: Path) -> None:
         )
     names = document.values.get("nodes")
     for name, spec in names.items() if isinstance(names, dict) else ():
-        if isinstance(spec, dict) and spec.get("type") == "recorder":
+        if isinstance(spec, dict) and _role(spec.get("type")) is NodeRole.RECORDER:
             document.set(("nodes", name, "parameters", "bag"), str(bag), origin)
             return
     document.set(("record", "bag"), str(bag), origin)
@@ -138,13 +140,21 @@ def apply_console(document: Document) -> None:
     origin = "--console"
     nodes = document.values.get("nodes")
     specs = [one for one in nodes.values() if isinstance(one, dict)] if nodes else []
-    types = {str(spec.get("type")) for spec in specs}
-    if "console" not in types:
+    roles = {_role(spec.get("type")) for spec in specs}
+    if NodeRole.CONSOLE not in roles:
         added: dict[str, Any] = {"type": "console", "nice": CONSOLE_NICE}
-        if "twin_finger" not in types:
+        if NodeRole.FINGER_SIMULATOR not in roles:
             added["parameters"] = {"drives_finger": False}
         document.set(("nodes", "console"), added, origin)
-    if "recorder" not in types and "record" not in document.values:
+    if NodeRole.RECORDER not in roles and "record" not in document.values:
         parameters = {"bag": str(RECORDINGS.absolute()), "start_paused": True}
         recorder = {"type": "recorder", "nice": RECORDER_NICE, "parameters": parameters}
         document.set(("nodes", "recorder"), recorder, origin)
+
+
+def _role(type_name: object) -> NodeRole | None:
+    """The role of a node type; None also for one that resolving will report as unknown."""
+    try:
+        return role_of(node_class(str(type_name)))
+    except (UnknownNodeError, ImportError, AttributeError, TypeError):
+        return None

@@ -43,6 +43,7 @@ from flexsheet.launch.plans.wires import (
     writers_of,
 )
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes.node import role_of
 
 
 def load_plan(
@@ -153,6 +154,7 @@ def _planned(
     return PlannedNode(
         name=member.name,
         type=member.spec.type,
+        role=None if member.type is None else role_of(member.type),
         host=host,
         parameters=in_full(member, document, resolve_paths=resolve_paths),
         inputs=tuple(

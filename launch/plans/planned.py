@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, model_validator
 
 from flexsheet.messages.bus import Source
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes import NodeRole
 
 MAIN = "main"
 """The host of the launcher's own topics, of the recorder and of the command-line tools."""
@@ -22,6 +23,17 @@ LAUNCHER, TOOLS = "launch", "tools"
 
 RUN_DIRECTORY = "@run"
 """Stands for the run's directory in endpoints and parameters; known only when the run starts."""
+
+
+ROLES_OF_TYPES = {
+    "arm_bridge": NodeRole.ARM_BRIDGE,
+    "clock": NodeRole.CLOCK,
+    "console": NodeRole.CONSOLE,
+    "recorder": NodeRole.RECORDER,
+    "renderer": NodeRole.RENDERER,
+    "twin_finger": NodeRole.FINGER_SIMULATOR,
+}
+"""Roles of the node types that plans in bags name, from before plans held roles."""
 
 
 class Strict(LimitedModel):
@@ -84,8 +96,29 @@ class PlannedNode(Strict):
     outputs: tuple[PlannedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
+    role: NodeRole | None = Field(default=None, description="declared by the node's class")
     liveness_s: float | None = Field(default=None, description="none in bags from before")
     nice: int = Field(default=0, description="bags from before there was one have none")
+
+    @property
+    def arm_side(self) -> str | None:
+        """Which arm's state the node publishes, "left" or "right"; None: of none."""
+        sides = {"arm_left": "left", "arm_right": "right"}
+        return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
+
+    @property
+    def device_address(self) -> str | None:
+        """Where the node reaches its device, "host:port"; None: its parameters do not say."""
+        host, port = self.parameters.get("host"), self.parameters.get("port")
+        return None if host is None or port is None else f"{host}:{port}"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _add_role(cls, values: Any) -> Any:
+        """Give nodes of plans from before there were roles the role of their type."""
+        if isinstance(values, dict) and "role" not in values:
+            return {**values, "role": ROLES_OF_TYPES.get(values.get("type"))}
+        return values
 
 
 class Plan(Strict):

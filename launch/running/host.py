@@ -31,6 +31,7 @@ from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS, ClockTable
 from flexsheet.messages.security import KeyChange, KeyRing
 from flexsheet.messages.topics import topic_named
 from flexsheet.messages.types import ArmState, EStop, HostKey, HostStatus, NodeProcess
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import PortCounts
 from flexsheet.nodes.stop_socket import StopSocket
 
@@ -337,9 +338,9 @@ def shows_estop(state: ArmState) -> bool:
 
 
 def arms_of(plan: Plan) -> list[str]:
-    """Where the plan's arms are reached."""
-    bridges = [node.parameters for node in plan.nodes.values() if node.type == "arm_bridge"]
-    return [f"{one.get('host')}:{one.get('port')}" for one in bridges]
+    """List the plan's arms by the address of each; a bridge without one counts by its name."""
+    bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
+    return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
 
 def waits_for_a_person(plan: Plan) -> bool:
@@ -377,7 +378,7 @@ def devices_of(nodes: list[PlannedNode]) -> list[str]:
 def folder_of(nodes: list[PlannedNode]) -> Path:
     """Where the host's recorder writes; the working folder where there is none, or not yet."""
     for node in nodes:
-        if node.type == "recorder":
+        if node.role is NodeRole.RECORDER:
             folder = Path(str(node.parameters["bag"])).parent
             if folder.is_dir():
                 return folder

@@ -10,6 +10,7 @@ from typing import Literal
 from flexsheet.launch.plans.planned import Plan
 from flexsheet.messages.methods import SheetShapeMethod, chosen
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.cache import default_cache_dir
 from flexsheet.nodes.models.sheet.membrane import NoEquilibriumError
 from flexsheet.nodes.renderer import deflection_cache
@@ -30,7 +31,7 @@ def prepare_plan(plan: Plan, progress: Progress) -> None:
     if scene is None:
         return
     for node in plan.nodes.values():
-        if node.type == "renderer" and _takes_dents(scene, node.parameters["sheet_shape"]):
+        if node.role is NodeRole.RENDERER and _takes_dents(scene, node.parameters["sheet_shape"]):
             prepare_dents(scene, node.parameters["cache_dir"], progress)
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flexsheet.launch.plans.planned import Plan
+from flexsheet.nodes import NodeRole
 
 TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
 NETWORK = TEMPLATE.with_name("90-flexsheet.conf")
@@ -21,7 +22,7 @@ STATE = Path("/var/lib/flexsheet")
 def bags_of(plan: Plan, host: str) -> Iterator[Path]:
     """Where a host's recorders put what they record."""
     for node in plan.nodes_on(host):
-        if node.type == "recorder":
+        if node.role is NodeRole.RECORDER:
             yield Path(node.parameters["bag"])
 
 

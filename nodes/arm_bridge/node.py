@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.methods import KinematicsMethod, chosen
@@ -33,6 +33,13 @@ class ArmBridge(Node):
     estop: Input[EStop]
     arming: Input[Arming]
     arm: Output[ArmState]
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        return (
+            "it commands an arm, whose answers are in the bag only as this node's output; "
+            "`bag verify planner` shows the targets that it got"
+        )
 
     async def setup(self) -> None:
         given = self.parameters

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
@@ -58,6 +58,15 @@ class Camera(Node):
     waiting: tuple[ImagePair, int] | None = None
     warned: tuple[str, ...] = ()
     superseded = refused = 0
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        if parameters.source.kind == "twin":
+            return ""  # It passes on twin/stereo and opens no device.
+        return (
+            "it reads a device, which is not in the bag; with stereo recorded, "
+            "`bag verify triangulator` starts from what it read"
+        )
 
     async def close(self) -> None:
         await self._stop_reading()

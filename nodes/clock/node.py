@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Positive
 from flexsheet.messages.types import ClockEcho, ClockOffset, ClockPing, Clocks
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.clock.offset import OtherClock, make_sample
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
 
@@ -26,6 +29,7 @@ class ClockNode(Node):
     """Ping all others, answer them with the next ping, and publish the offsets on this host."""
 
     measures_clocks = True
+    role: ClassVar[NodeRole | None] = NodeRole.CLOCK
     parameters: ClockParameters
     clock_ping: Input[ClockPing]
     clock_ping_out: Output[ClockPing]

@@ -15,6 +15,7 @@ from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.topics import Delivery, Topic, topic_named
 from flexsheet.messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
 from flexsheet.messages.wire import WireError
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.console.desk import Desk, Files
 from flexsheet.nodes.console.finger import Finger
 from flexsheet.nodes.console.graph_facts import GraphFacts
@@ -70,6 +71,7 @@ class Console(Node):
 
     takes_frames: ClassVar[bool] = True
     opens_devices: ClassVar[bool] = True
+    role: ClassVar[NodeRole | None] = NodeRole.CONSOLE
     parameters: ConsoleParameters
     scene: Output[Scene]
     display: Output[Display]
@@ -77,6 +79,10 @@ class Console(Node):
     recording: Output[Recording]
     moment: Output[Moment]
     twin__finger_path: Output[FingerPath]
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        return "it serves a page; only its outputs are in the bag, not what people did there"
 
     @classmethod
     def further_inputs(

@@ -13,6 +13,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.topics import Delivery, Topic, topic_named
 from flexsheet.messages.types import Recording
 from flexsheet.messages.wire import decode
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import Input, Node, periodic
 from flexsheet.nodes.recorder.files import free_bytes, open_bag
 from flexsheet.nodes.recorder.parameters import RecorderParameters
@@ -29,9 +30,14 @@ class Recorder(Node):
     bag goes on, with the last messages of all latched topics first.
     """
 
+    role: ClassVar[NodeRole | None] = NodeRole.RECORDER
     parameters: RecorderParameters
     takes_frames: ClassVar[bool] = True
     opens_devices: ClassVar[bool] = True
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        return "it wrote this bag"
 
     @classmethod
     def further_inputs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from typing import Any, ClassVar
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.methods import chosen
@@ -17,6 +18,7 @@ from flexsheet.messages.types import (
     Skin,
     SoftBody,
 )
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.cache import load_cached
 from flexsheet.nodes.node import Input, Node, Output, periodic
 from flexsheet.nodes.renderer import deflection_cache
@@ -34,6 +36,7 @@ class Renderer(Node):
     published when it was drawn, or with a window when that showed it.
     """
 
+    role: ClassVar[NodeRole | None] = NodeRole.RENDERER
     parameters: RendererParameters
     scene: Input[Scene]
     skin: Input[Skin]
@@ -45,6 +48,14 @@ class Renderer(Node):
     eye: Input[Eye]
     display: Input[Display]
     frame: Output[Frame]
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        if parameters.output == "window":
+            return (
+                "it shows its frames in a window; verify its drawing with a bag of a headless run"
+            )
+        return ""
 
     async def setup(self) -> None:
         self._loop = asyncio.get_running_loop()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field
@@ -60,6 +60,10 @@ class TwinArmsNode(Node):
     parameters: TwinArmsParameters
     scene: Input[Scene]
     twin__arms: Output[TwinArms]
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        return "it answers the arms' bridges over TCP, and their requests are not recorded"
 
     async def setup(self) -> None:
         self.servers: dict[str, ArmServer | MxtServer] = {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from functools import cached_property
-from typing import Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -12,6 +12,7 @@ from pydantic import Field
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import NonNegative, Scene
 from flexsheet.messages.types import FingerPath, StereoPair, TwinFinger
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.node import Input, Node, NodeParameters, Output
 from flexsheet.nodes.twin.clutter import CLUTTER
 from flexsheet.nodes.twin.finger import FingerMotion, FingerState
@@ -36,6 +37,7 @@ class TwinFingerParameters(NodeParameters):
 class TwinFingerNode(Node):
     """Move a true finger along its path, and render its images at the camera's rate."""
 
+    role: ClassVar[NodeRole | None] = NodeRole.FINGER_SIMULATOR
     parameters: TwinFingerParameters
     scene: Input[Scene]
     twin__finger_path: Input[FingerPath]
@@ -53,6 +55,10 @@ class TwinFingerNode(Node):
     def has_scene(self) -> asyncio.Event:
         """Event that the first scene sets."""
         return asyncio.Event()
+
+    @classmethod
+    def replay_refusal(cls, parameters: Any) -> str:
+        return "it takes images by its own clock; its motion is in the bag as twin/finger"
 
     async def setup(self) -> None:
         self.filming = asyncio.create_task(self._film())
