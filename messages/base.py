@@ -6,8 +6,21 @@ import hashlib
 import json
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict
+
+
+@dataclass(frozen=True, slots=True)
+class StampMark:
+    """Marks a field as an instant on the clock of the header's stamps."""
+
+
+Stamp = Annotated[int, StampMark()]
+"""An instant in ns on the clock that the header names; 0: none.
+
+A reader whose clock differs gets such fields moved onto its own; a duration is a plain `int`.
+"""
 
 
 class Message(BaseModel):
@@ -50,6 +63,16 @@ class Header:
     writer: str
     epoch: int
     plan: str = ""
+
+
+@cache
+def stamp_fields(message_type: type[Message]) -> tuple[str, ...]:
+    """Names of the message's fields that are instants: those of type `Stamp`."""
+    return tuple(
+        name
+        for name, field in message_type.model_fields.items()
+        if any(isinstance(mark, StampMark) for mark in field.metadata)
+    )
 
 
 @cache

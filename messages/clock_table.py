@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TypeVar
 
-from flexsheet.messages.base import Header, Message
+from flexsheet.messages.base import Header, Message, stamp_fields
 from flexsheet.messages.types import ClockOffset, Clocks
 
 M = TypeVar("M", bound=Message)
@@ -84,10 +84,10 @@ class ClockTable:
 
 
 def shifted(message: M, shift_ns: int) -> M:
-    """The message with its instants moved: top-level integers named `..._ns`; 0 means none."""
+    """Move the message's instants (fields of type `Stamp`) by a shift; 0 means none and stays."""
     moved = {
         name: max(1, value + shift_ns)
-        for name in type(message).model_fields
-        if name.endswith("_ns") and isinstance(value := getattr(message, name), int) and value
+        for name in stamp_fields(type(message))
+        if (value := getattr(message, name))
     }
     return message.model_copy(update=moved) if moved else message

@@ -26,7 +26,7 @@ from flexsheet.messages.arrays import (
     Vector3,
     Vector6,
 )
-from flexsheet.messages.base import Message, MessagePart
+from flexsheet.messages.base import Message, MessagePart, Stamp
 from flexsheet.messages.scene import Finite, NonNegative, Positive
 
 Correction = methods.Correction
@@ -114,7 +114,7 @@ class SheetTarget(Message):
 
     phase: Phase
     reason: str = Field(description="why the sheet holds or waits; empty otherwise")
-    valid_at_ns: int = Field(description="on the clock of the header's stamps")
+    valid_at_ns: Stamp = Field(description="on the clock of the header's stamps")
     world_from_sheet: Transform
     twist_world: Vector6 = Field(description="linear (m/s) of the centre, then angular (rad/s)")
     stretch_ratio: Positive = Field(description="distance of the edges over the slack width")
@@ -158,8 +158,10 @@ class ArmState(Message):
     world_from_flange: Transform
     world_from_flange_commanded: Transform
     command_age_s: NonNegative | None = Field(description="of the sheet target in use; None: none")
-    target_source_ns: int = Field(description="exposure of the picture behind that target; 0: none")
-    command_sent_ns: int = Field(description="when the newest command was written; 0: never")
+    target_source_ns: Stamp = Field(
+        description="exposure of the picture behind that target; 0: none"
+    )
+    command_sent_ns: Stamp = Field(description="when the newest command was written; 0: never")
     edge_distance_m: NonNegative | None = Field(description="between both edges; None: unknown")
     edge_force_n: NonNegative | None
     cycle_s: NonNegative = Field(description="duration of the last exchange with the arm")
@@ -237,7 +239,7 @@ class Frame(Message):
     eyes_world_m: EyePair = Field(description="left, right")
     world_from_sheet: Transform
     pushed_point_world_m: Vector3
-    predicted_to_ns: int = Field(description="the instant that the picture was drawn for")
+    predicted_to_ns: Stamp = Field(description="the instant that the picture was drawn for")
     draw_s: NonNegative
     late_frames: int = Field(
         ge=0, description="whose light was later than predicted by more than half a frame"
@@ -245,12 +247,12 @@ class Frame(Message):
     eye: Literal["both", "left", "right"] = Field(
         default="both", description="whose picture it is: one eye's, where frames alternate"
     )
-    drawn_ns: int = Field(default=0, description="when the graphics card was through with it")
-    swapped_ns: int = Field(default=0, description="when the window showed it; 0: no window did")
-    light_ns: int = Field(
+    drawn_ns: Stamp = Field(default=0, description="when the graphics card was through with it")
+    swapped_ns: Stamp = Field(default=0, description="when the window showed it; 0: no window did")
+    light_ns: Stamp = Field(
         default=0, description="the middle of its light, as measured; without a window: assumed"
     )
-    shaped_for_ns: int = Field(
+    shaped_for_ns: Stamp = Field(
         default=0, description="the instant whose finger dents the object; 0: it is at rest"
     )
     fingertip_world_m: Annotated[NDArray[np.float64], ArraySpec("<f8", ("points", 3))] = Field(

@@ -32,7 +32,7 @@ def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
     assert [writer.name for writer in plan.writers["scene"]] == ["console"]
     assert plan.nodes["console"].nice > 0
     assert plan.nodes["console"].parameters["page_port"] == 8123
-    assert plan.ports_of_its_own(None) == [("console", 8123)]
+    assert plan.listening_nodes(None) == [("console", 8123)]
     assert plan.nodes["console"].parameters["drives_finger"]
     assert plan.nodes["recorder"].parameters["start_paused"]
     # In the run's directory NAME.json is what the launcher tells the node of that name.

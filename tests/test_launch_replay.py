@@ -13,8 +13,8 @@ from flexsheet.launch.bags.player import shifted
 from flexsheet.launch.bags.replay import field_differences, replay, verify
 from flexsheet.launch.plans.plan import load_plan
 from flexsheet.messages.bag import BagError, BagWriter
-from flexsheet.messages.base import Header
-from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.base import Header, Message, Stamp, stamp_fields
+from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.messages.types import EStop, SheetTarget, TwinFinger
 from flexsheet.messages.wire import decode
 
@@ -128,3 +128,18 @@ def test_instants_in_a_message_move_with_its_stamps() -> None:
     assert moved.valid_at_ns == 5_700
     never = target.model_copy(update={"valid_at_ns": 0})
     assert shifted(never, 700) is never
+
+
+class Timed(Message):
+    seen_ns: Stamp
+    duration_ns: int
+
+
+def test_a_duration_is_no_instant() -> None:
+    assert shifted(Timed(seen_ns=10, duration_ns=20), 5) == Timed(seen_ns=15, duration_ns=20)
+
+
+@pytest.mark.parametrize("topic", TOPICS.values(), ids=lambda topic: topic.name)
+def test_every_instant_of_a_message_is_marked(topic: Topic) -> None:
+    named = {name for name in topic.message.model_fields if name.endswith("_ns")}
+    assert named == set(stamp_fields(topic.message))

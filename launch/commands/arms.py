@@ -18,6 +18,7 @@ from flexsheet.launch.commands.output import (
     print_table,
     words,
 )
+from flexsheet.nodes import NodeRole
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -159,9 +160,9 @@ def reset(
 def _what_moves(plan: Plan) -> str:
     """What the arms of a plan do after a reset, by their bridges' `arming`."""
     arming = {
-        node.parameters["side"]: node.parameters["arming"]
+        str(node.arm_side): node.parameters.get("arming")
         for node in plan.nodes.values()
-        if node.type == "arm_bridge"
+        if node.role is NodeRole.ARM_BRIDGE
     }
     waiting = [side for side, how in arming.items() if how != "by_itself"]
     free = [side for side in arming if side not in waiting]

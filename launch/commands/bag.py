@@ -214,7 +214,7 @@ def verify(
         str,
         typer.Argument(
             help="Name of the node in the bag's launch file.",
-            autocompletion=complete.replayed_nodes,
+            autocompletion=complete.node_types,
         ),
     ],
     bag: BagArgument,

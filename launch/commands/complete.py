@@ -23,16 +23,6 @@ def node_types(incomplete: str) -> list[str]:
     return _fitting(NODES, incomplete)
 
 
-def replayed_nodes(incomplete: str) -> list[str]:
-    """What `bag verify` steps: types, after which launch files mostly name their nodes.
-
-    The shell does not say what stands behind the cursor, where the bag will be."""
-    from flexsheet.launch.bags.replay import REFUSALS
-    from flexsheet.nodes import NODES
-
-    return _fitting((name for name in NODES if name not in REFUSALS), incomplete)
-
-
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
     """Hosts of the launch file that is named already."""
     from flexsheet.launch.plans.documents import BadInputError

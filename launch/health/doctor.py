@@ -185,7 +185,7 @@ def check_demo() -> Finding:
         plan = load_plan(DEMO)
     except BadInputError as error:
         return Finding("demo", "failed", str(error))
-    taken = [port for _, port in plan.ports_of_its_own(None) if not is_free("127.0.0.1", port)]
+    taken = [port for _, port in plan.listening_nodes(None) if not is_free("127.0.0.1", port)]
     if taken:
         what = f"ports in use: {', '.join(map(str, taken))}"
         return Finding("demo", "warning", what, "is a graph running? else change them with --set")

@@ -526,7 +526,7 @@ def _ports(plan: Plan, here: str) -> HostFinding:
     ]
     mine = is_loopback(address) or address in own_addresses()
     taken = [port for port in wanted if mine and not is_free(address, port)]
-    taken += [port for _, port in plan.ports_of_its_own(here) if not is_free("127.0.0.1", port)]
+    taken += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
     if taken:
         remedy = "ss -ltnp says who; does a graph run here that is another user's?"
         what = f"in use: {', '.join(map(str, sorted(taken)))}"

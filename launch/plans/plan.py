@@ -43,7 +43,7 @@ from flexsheet.launch.plans.wires import (
     writers_of,
 )
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.node import role_of
+from flexsheet.nodes.node import listen_ports, role_of
 
 
 def load_plan(
@@ -154,6 +154,7 @@ def _planned(
     return PlannedNode(
         name=member.name,
         type=member.spec.type,
+        listen_ports=() if member.parameters is None else listen_ports(member.parameters),
         role=None if member.type is None else role_of(member.type),
         host=host,
         parameters=in_full(member, document, resolve_paths=resolve_paths),

@@ -96,6 +96,7 @@ class PlannedNode(Strict):
     outputs: tuple[PlannedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
+    listen_ports: tuple[int, ...] = Field(default=(), description="TCP, on loopback")
     role: NodeRole | None = Field(default=None, description="declared by the node's class")
     liveness_s: float | None = Field(default=None, description="none in bags from before")
     nice: int = Field(default=0, description="bags from before there was one have none")
@@ -117,7 +118,7 @@ class PlannedNode(Strict):
     def _add_role(cls, values: Any) -> Any:
         """Give nodes of plans from before there were roles the role of their type."""
         if isinstance(values, dict) and "role" not in values:
-            return {**values, "role": ROLES_OF_TYPES.get(values.get("type"))}
+            return {**values, "role": ROLES_OF_TYPES.get(str(values.get("type")))}
         return values
 
 
@@ -160,14 +161,9 @@ class Plan(Strict):
         """The nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
-    def ports_of_its_own(self, host: str | None) -> list[tuple[str, int]]:
-        """(node, TCP port) that nodes listen on by themselves: parameters named `..._port`."""
-        return [
-            (node.name, value)
-            for node in self.nodes_on(host)
-            for name, value in node.parameters.items()
-            if name.endswith("_port") and isinstance(value, int) and value > 0
-        ]
+    def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
+        """(node, TCP port) for each port on which a node itself listens."""
+        return [(node.name, port) for node in self.nodes_on(host) for port in node.listen_ports]
 
     def scene_message(self) -> Scene | None:
         return None if self.scene is None else Scene.model_validate(self.scene)

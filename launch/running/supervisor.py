@@ -716,7 +716,7 @@ def _check_ports(plan: Plan, host: str | None) -> None:
         for writer in writers
         if writer.tcp is not None and host in (None, writer.host)
     ]
-    wanted += [(node, "127.0.0.1", str(port)) for node, port in plan.ports_of_its_own(host)]
+    wanted += [(node, "127.0.0.1", str(port)) for node, port in plan.listening_nodes(host)]
     problems = [
         Problem(
             plan.launch_file,

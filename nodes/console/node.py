@@ -22,7 +22,7 @@ from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.guard import Guard, read_token, start_server
 from flexsheet.nodes.console.newest import Newest
 from flexsheet.nodes.console.operator import Operator
-from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.node import Input, ListenPort, Node, NodeParameters, Output, periodic
 
 SHOWN = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),
@@ -35,7 +35,7 @@ class ConsoleParameters(NodeParameters):
     """Where the page is, and how often it changes while somebody looks."""
 
     address: str = Field(default="127.0.0.1", description="IP address that the page is served at")
-    page_port: int = Field(default=8080, ge=0, le=65535, description="0: any that is free")
+    page_port: ListenPort = Field(default=8080, description="0: any that is free")
     token_file: Path | None = Field(
         default=None, description="who looks must know what is in it; needed beyond loopback"
     )

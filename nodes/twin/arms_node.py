@@ -12,7 +12,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
-from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.node import Input, ListenPort, Node, NodeParameters, Output, periodic
 from flexsheet.nodes.twin.arms import (
     ArmServer,
     Controller,
@@ -31,8 +31,8 @@ START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 class TwinArmsParameters(NodeParameters):
     host: Loopback = "127.0.0.1"
-    left_port: int = Field(default=5020, ge=0, le=65535, description="0: any free one")
-    right_port: int = Field(default=5021, ge=0, le=65535)
+    left_port: ListenPort = Field(default=5020, description="0: any free one")
+    right_port: ListenPort = 5021
     rate_hz: Positive = 140.8
     servo_lag_s: Positive = 0.025
     noise_rad: NonNegative = Field(default=5e-6, description="of the measured joints")
