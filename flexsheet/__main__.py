@@ -10,7 +10,13 @@ by inheritance is taken like any other: docs/launch-files.md says why.
 from __future__ import annotations
 
 # The built-in module: `signal` itself imports others first.
-from _signal import SIG_DFL, SIG_UNBLOCK, SIGINT, pthread_sigmask, signal
+from _signal import (  # type: ignore[import-not-found]  # typeshed has no stub of it
+    SIG_DFL,
+    SIG_UNBLOCK,
+    SIGINT,
+    pthread_sigmask,
+    signal,
+)
 
 signal(SIGINT, SIG_DFL)
 pthread_sigmask(SIG_UNBLOCK, {SIGINT})
