@@ -124,6 +124,9 @@ class BagWriter:
                 self._writer.start(profile=PROFILE, library="flexsheet")
                 self._file.flush()
         except BagError:
+            # What is buffered cannot be written either; the error that is raised says why.
+            with suppress(OSError):
+                self._file.close()
             self.path.unlink(missing_ok=True)
             raise
         for name, values in (metadata or {}).items():

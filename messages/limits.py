@@ -58,11 +58,12 @@ MAX_BY_NAME = {
     "workers": 1024.0,
     "confirm_frames": 1000.0,
     "window_half_px": 256.0,
-    "most_waiting": 10_000.0,
+    "max_queue": 10_000.0,
 }
 
 MAX_BY_UNIT = {
     "_area_px": MAX_IMAGE_PX**2,
+    "metres_per_px": 0.1,
     "_m_per_s3": 1e6,
     "_m_per_s2": 1e4,
     "_m_per_s": MAX_SPEED_M_PER_S,
@@ -85,7 +86,7 @@ MAX_BY_UNIT = {
 }
 """By the end of a name, the longest first."""
 
-MIN_BY_UNIT = {"_m": 1e-6, "_s": 1e-6, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
+MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-6, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
 """Of fields that must be above zero; a fraction of what any device resolves."""
 
 MIN_POSITIVE = 1e-9

@@ -161,7 +161,7 @@ async def test_a_swap_that_waits_holds_up_nothing_else(
 
 async def test_a_closed_window_leaves_the_renderer_drawing_unseen(bench: WindowBench) -> None:
     await bench.draw("mono")
-    screen = bench.node._screen
+    screen = bench.node._output
     assert isinstance(screen, ProjectorWindow)
     glfw.set_window_should_close(screen._window, True)
     bench.node.refresh()
@@ -173,12 +173,12 @@ async def test_a_closed_window_leaves_the_renderer_drawing_unseen(bench: WindowB
 
 async def test_a_lost_context_is_made_anew(bench: WindowBench, display: VirtualDisplay) -> None:
     await bench.draw("mono")
-    screen = bench.node._screen
+    screen = bench.node._output
     assert isinstance(screen, ProjectorWindow)
     assert screen._presenter is not None
     screen._presenter.problem = WindowError("the graphics card was reset")
     bench.node.refresh()
-    assert bench.node._screen is not screen
+    assert bench.node._output is not screen
     frame = await bench.draw("mono")
     assert np.array_equal(display.pixels(), frame.pixels[0])
 
@@ -189,7 +189,7 @@ async def test_a_window_of_another_size_shows_the_middle_unscaled(
     bench = WindowBench(output="window")
     await bench.start()
     try:
-        screen = bench.node._screen
+        screen = bench.node._output
         assert isinstance(screen, ProjectorWindow)
         glfw.set_window_size(screen._window, 300, 200)
         await until(lambda: screen.poll() and "300x200" in screen.note)

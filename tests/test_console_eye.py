@@ -141,7 +141,7 @@ def test_a_picture_that_takes_long_is_shown_all_the_same(scene: Scene) -> None:
     assert (look.label, len(sent)) == (label, 2), "nothing else is asked for meanwhile"
     assert look.waited_s(80.0) == 78.0
     pixel = np.zeros((2, 2, 3), np.uint8)
-    eye = TwinEye(label=label, correction="none", metres_per_px=1e-3, seen=pixel, proper=pixel)
+    eye = TwinEye(label=label, correction="none", metres_per_px=1e-3, seen=pixel, expected=pixel)
     assert look.got(eye, 80.0)
     assert (look.state, len(sent)) == (LookState.RESTING, 2)
     look.advance(90.0)

@@ -309,7 +309,7 @@ def test_about_a_focus_a_cylinders_mesh_leans_to_no_side(angle_rad: float) -> No
 @pytest.mark.parametrize("name", SHAPES)
 def test_the_same_scene_gives_the_same_mesh(name: str) -> None:
     first, again = mesh(name), build_mesh(mesh_spec(scene(SHAPES[name]), SPACING))
-    for part in ("nodes", "elements", "slab", "fixed", "skin", "touch", "contact_faces"):
+    for part in ("nodes", "elements", "slab", "fixed", "skin", "contact_nodes", "contact_faces"):
         assert (getattr(first, part) == getattr(again, part)).all(), part
 
 

@@ -194,7 +194,7 @@ def test_where_newton_does_not_settle_the_push_ends(monkeypatch: pytest.MonkeyPa
             raise NewtonNotConvergedError("not settled")
         return solve_equilibrium(body, displacement, to, *rest, **also)
 
-    monkeypatch.setattr(NeoHookeanBody, "settle", never_deeper)
+    monkeypatch.setattr(NeoHookeanBody, "solve_equilibrium", never_deeper)
     answer = solve_snapshot(job)
     assert answer.reached == 2
     assert answer.force_n[1] @ job.sample.normal > 0.0

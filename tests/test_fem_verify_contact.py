@@ -100,7 +100,7 @@ def touches(penalty: tuple[float, float]) -> list[Touch]:
     faces = boundary_faces(elements)
     top = faces[(nodes[faces, 2] == 0.0).all(axis=1)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(newton, "BED_RATIO", penalty[0])
+        patch.setattr(newton, "PENALTY_RATIO", penalty[0])
         patch.setattr(newton, "ROUNDING_RATIO", penalty[1])
         body = newton.NeoHookeanBody(
             nodes,
@@ -143,7 +143,7 @@ def sunk_at(r: float, patch: float, force: float) -> float:
     return float((1 - NU**2) / E * pressure / (2 * patch) * bend)
 
 
-@pytest.mark.parametrize(("bed", "name", "off"), [(HARD, "hard", 0.04), (SHIPPED, "own", 0.1)])
+@pytest.mark.parametrize(("penalty", "name", "off"), [(HARD, "hard", 0.04), (SHIPPED, "own", 0.1)])
 def test_light_pushes_follow_hertz(
     record_property: Record, penalty: tuple[float, float], name: str, off: float
 ) -> None:

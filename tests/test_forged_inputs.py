@@ -181,9 +181,9 @@ def forged_tip(bench: ForgedBench, kind: str, random: Random) -> tuple[Fingertip
         tip = honest.model_copy(
             update={"position_world_m": values[0], "velocity_world_m_per_s": values[1]}
         )
-        path = honest.ahead_world_m.copy()
+        path = honest.predicted_path_world_m.copy()
         path[random.integers(len(path))] = odd
-        return tip.model_copy(update={"ahead_world_m": path}), header
+        return tip.model_copy(update={"predicted_path_world_m": path}), header
     if kind in ("stale", "future"):
         age_s = random.choice([0.5, 30.0, 1e6]) * (1.0 if kind == "stale" else -1.0)
         tip = fingertip(random.normal(0.0, 0.1, 3))
@@ -192,9 +192,13 @@ def forged_tip(bench: ForgedBench, kind: str, random: Random) -> tuple[Fingertip
         speed = random.choice([3.0, 100.0, 1e9])
         return fingertip(AT_FRONT, random.normal(0.0, speed, 3)), header
     if kind == "path":
-        return honest.model_copy(update={"ahead_world_m": random.normal(0.0, 0.1, (13, 3))}), header
+        return honest.model_copy(
+            update={"predicted_path_world_m": random.normal(0.0, 0.1, (13, 3))}
+        ), header
     if kind == "path nan":
-        return honest.model_copy(update={"ahead_world_m": np.full((13, 3), np.nan)}), header
+        return honest.model_copy(
+            update={"predicted_path_world_m": np.full((13, 3), np.nan)}
+        ), header
     if kind == "behind":
         return fingertip(np.array([0.0, 0.0, -random.uniform(0.01, 0.3)])), header
     return honest.model_copy(update={"covariance": np.full((6, 6), np.nan)}), header

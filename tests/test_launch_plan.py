@@ -128,11 +128,11 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH + "  triangulator: {type: triangulator, parameters: {ahead_s: 0.1}}\n",
-            'unknown key "ahead_s"; it was renamed: write "prediction_horizon_s"',
+            'unknown key "ahead_s"; it is now "prediction_horizon_s"',
         ),
         (
             GRAPH + "  triangulator: {type: triangulator, parameters: {tracking: hand}}\n",
-            "'hand' does not fit; it was renamed or removed: write \"singer_tremor\"",
+            "'hand' does not fit; it is now \"singer_tremor\"",
         ),
         (GRAPH + "    host: left\n", 'unknown host "left"; there are: main'),
         (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),

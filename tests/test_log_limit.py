@@ -17,7 +17,9 @@ class Log:
         self.now_s = 0.0
         self.passed: list[dict[str, Any]] = []
         self.logger = structlog.wrap_logger(
-            None, processors=[RepeatLimiter(lambda: self.now_s), self._keep]
+            None,
+            processors=[RepeatLimiter(lambda: self.now_s), self._keep],
+            wrapper_class=structlog.BoundLogger,
         )
 
     def _keep(self, _: Any, __: str, record: Any) -> Any:

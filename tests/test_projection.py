@@ -185,7 +185,7 @@ def test_dent_shapes_are_kept_and_found_again(
         solves.append(rubber)
         return few_dents()
 
-    monkeypatch.setattr(deflection_cache, "solve_dents", solve_few)
+    monkeypatch.setattr(deflection_cache, "solve_indentation_basis", solve_few)
     assert load_cached(deflection_cache.shapes_cache(SCENE), tmp_path) is None
     deflection_cache.load_or_compute(SCENE, tmp_path)
     kept = deflection_cache.load_or_compute(SCENE, tmp_path)

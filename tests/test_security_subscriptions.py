@@ -25,7 +25,7 @@ from tests.test_security import FINGER, Street, street
 __all__ = ["room", "street"]
 
 ROOT = Path(__file__).resolve().parent.parent
-ATTACK_BYTES = 6_000_000
+ATTACK_BYTES = 3_000_000
 ATTACKERS = 4
 MAX_GROWTH_KB = 48_000
 

@@ -139,7 +139,10 @@ class Alignment:
 
 
 def check_way(arm: ArmGeometry, other: ArmGeometry, way: Way) -> Alignment | str:
-    """How this arm begins on the way, or which arm cannot go it, by which limit and where."""
+    """Return how this arm begins on the path, or the reason why an arm cannot follow it.
+
+    The reason names the arm, the limit and the position.
+    """
     left, right = (arm, other) if arm.left else (other, arm)
     if not (is_rigid(way.start.world_from_sheet) and is_rigid(way.goal.world_from_sheet)):
         return "no way: the edges do not say where the sheet is"

@@ -31,5 +31,5 @@ class GraphFacts:
         return cls(
             others_may_reset=() if nodes[console]["host"] in hosts else hosts,
             records=bool(recorders),
-            records_on_request=any(one["parameters"]["waits"] for one in recorders),
+            records_on_request=any(one["parameters"]["start_paused"] for one in recorders),
         )
