@@ -90,9 +90,8 @@ class Counts:
 
 
 def subscriber_socket(context: Any, endpoint: str) -> Any:
-    opened = context.socket(zmq.DEALER)
-    opened.setsockopt(zmq.PROBE_ROUTER, 1)
-    opened.setsockopt(zmq.IMMEDIATE, 1)
+    opened = context.socket(zmq.SUB)
+    opened.setsockopt(zmq.SUBSCRIBE, b"")
     opened.setsockopt(zmq.RCVHWM, 1000)
     opened.connect(endpoint)
     return opened
@@ -294,14 +293,12 @@ class BusLine:
         if not self._design.typed:
             raw = self._raw[0]
             raw[:16] = sequence.to_bytes(8, "little") + stamp_ns.to_bytes(8, "little")
-            self._publisher._serve_subscribers()
             self._publisher._send([bytes(raw), *self._raw[1:]])
         elif self._design.inline_bytes is None:
             self._publisher.send(self._payload.make(sequence), header_of(sequence, stamp_ns))
         else:
             message = self._payload.make(sequence)
             inline_bytes = self._design.inline_bytes
-            self._publisher._serve_subscribers()
             self._publisher._send(
                 encode(message, header_of(sequence, stamp_ns), inline_bytes=inline_bytes)
             )

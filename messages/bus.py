@@ -52,13 +52,7 @@ IPC, IPC_PATH_BYTES = "ipc://", 107
 BIND_PATIENCE_S = 1.0
 IPC_CLOSING_S = 0.02
 REFUSABLE_BYTES = 256 << 20
-MAX_SUBSCRIPTION_BYTES = 512
-"""Of a frame that a publisher is sent: the largest is the last one of a CURVE handshake."""
-
-MAX_SUBSCRIBERS_PER_HOST = 128
-"""Of one publisher; the oldest connection of a host that opens more is closed."""
-
-RECONNECT_MIN_MS, RECONNECT_MAX_MS = 20, 500
+SUBSCRIPTION_BYTES = 1 << 16
 HANDSHAKE_MS = 5000
 GIVEN_UP_S = 0.5
 CLOCKS_REMEMBERED = 16
@@ -140,57 +134,13 @@ class Source:
     host: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class _Peer:
-    """The other end of a connection: its host by key, else its address, and the connection."""
-
-    host: str
-    connection_fd: int | None
-
-    @classmethod
-    def of(cls, frame: zmq.Frame) -> _Peer:
-        """The peer that sent a frame."""
-
-        def read(name: str | int) -> Any:
-            try:
-                return frame.get(name)
-            except zmq.ZMQError:
-                return None
-
-        return cls(read("User-Id") or read("Peer-Address") or "this computer", read(zmq.SRCFD))
-
-    def shut_down(self, endpoints: Sequence[str]) -> bool:
-        """Close the connection if it still leads to one of `endpoints`; whether it did.
-
-        It may have ended meanwhile, and its number may be another file's.  In the worst case
-        another subscriber of the same endpoint has to connect again.
-        """
-        if self.connection_fd is None:
-            return False
-        try:
-            with socket.fromfd(self.connection_fd, socket.AF_UNIX, socket.SOCK_STREAM) as opened:
-                opened.getpeername()
-                local = opened.getsockname()
-                name = f"ipc://{local}" if isinstance(local, str) else f":{local[1]}"
-                if not any(endpoint.endswith(name) for endpoint in endpoints):
-                    return False
-                opened.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            return False
-        return True
-
-
 class Publisher:
     """Sends the messages of one topic to whoever is connected; needs a running loop if latched or
-    if there are keys.  Without a loop, new subscribers are noticed with each message.
-
-    Subscribers announce themselves by one empty message per connection (ZMQ_PROBE_ROUTER).  A
-    connection that sends anything else is closed.  A ZeroMQ PUB socket would store every
-    subscription that it is sent, at 45 times its size, before any code of ours could refuse it.
+    if there are keys.
 
     bind: endpoints, "ipc:///path" or "tcp://address:port" ("tcp://127.0.0.1:*" takes a free port).
     keys: only hosts of this ring may connect by tcp; without it tcp is bound on loopback alone.
-    on_refused: called with a sentence for each connection that was refused or closed.
+    on_refused: told of connections that were refused.
     """
 
     def __init__(
@@ -207,15 +157,6 @@ class Publisher:
         self._latched = topic.delivery is Delivery.LATCHED
         self._keys = keys if any(one.startswith("tcp:") for one in bind) else None
         self._domain: bytes | None = None
-        self._on_refused = on_refused
-        self._loop: asyncio.AbstractEventLoop | None
-        try:
-            self._loop = asyncio.get_running_loop()
-        except RuntimeError:
-            if self._latched or self._keys is not None:
-                raise
-            self._loop = None
-        self._subscribers: dict[bytes, _Peer] = {}
         if self._keys is not None:
             self._domain = Gatekeeper.admit(self._keys, on_refused)
         try:
@@ -225,12 +166,12 @@ class Publisher:
             raise
 
     def _open(self, bind: Sequence[str]) -> None:
-        self._socket = _open_socket(zmq.ROUTER, self.topic)
-        self._subscribers.clear()
+        self._loop = asyncio.get_running_loop() if self._latched else None
+        self._socket = _open_socket(zmq.XPUB if self._latched else zmq.PUB, self.topic)
         endpoints = []
         try:
-            # Else nobody would learn that a subscriber has gone.
-            self._socket.setsockopt(zmq.ROUTER_MANDATORY, 1)
+            if self._latched:
+                self._socket.setsockopt(zmq.XPUB_VERBOSE, 1)
             # What is bound before keys are set is open to this host, which ipc alone reaches.
             for endpoint in sorted(bind, key=lambda one: one.startswith("tcp:")):
                 if endpoint.startswith("tcp:"):
@@ -244,8 +185,8 @@ class Publisher:
             raise
         self.endpoints = endpoints
         if self._loop is not None:
-            self._loop.add_reader(self._socket.fileno(), self._serve_subscribers)
-            self._loop.call_soon(self._serve_subscribers)
+            self._loop.add_reader(self._socket.fileno(), self._serve_late_subscribers)
+            self._loop.call_soon(self._serve_late_subscribers)
 
     def renew_keys(self, change: KeyChange) -> None:
         """Open anew where a key is ours no more, or somebody's who may be connected."""
@@ -263,25 +204,11 @@ class Publisher:
         self._send(frames)
         if self._latched:
             self._last = frames
-        # `send` may have taken the event of a new subscriber away from the loop.
-        self._serve_subscribers()
+            self._serve_late_subscribers()
 
     def _send(self, frames: list[Any]) -> None:
-        for subscriber in tuple(self._subscribers):
-            self._send_to(subscriber, frames)
-
-    def _send_to(self, subscriber: bytes, frames: list[Any]) -> None:
-        """Send a message to one subscriber; one whose queue is full sees a gap."""
+        # A PUB socket drops for a subscriber whose queue is full, which that one sees as a gap.
         send = self._socket.send
-        try:
-            send(subscriber, NOBLOCK_MORE)
-        except zmq.Again:
-            return
-        except zmq.ZMQError as error:
-            if error.errno != errno.EHOSTUNREACH:
-                raise
-            self._subscribers.pop(subscriber, None)
-            return
         if len(frames) == 1:
             send(frames[0], NOBLOCK)
         else:
@@ -289,38 +216,18 @@ class Publisher:
                 send(frame, NOBLOCK_MORE, copy=False)
             send(frames[-1], NOBLOCK, copy=False)
 
-    def _serve_subscribers(self) -> None:
-        """Read what peers sent, a batch at a time; send a new subscriber the latched message."""
-        for _ in range(BATCH):
-            if self._socket.closed or not int(self._socket.getsockopt(EVENTS)) & POLLIN:
-                return
-            peer, *frames = self._socket.recv_multipart(NOBLOCK, copy=False)
-            self._on_peer_message(peer.bytes, frames)
-        if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon(self._serve_subscribers)
+    def _serve_late_subscribers(self) -> None:
+        """Send the last message again if somebody subscribed; until nobody else did meanwhile."""
+        while not self._socket.closed and self._new_subscribers() and self._last is not None:
+            self._send(self._last)
 
-    def _on_peer_message(self, subscriber: bytes, frames: list[zmq.Frame]) -> None:
-        """Note a new subscriber; close the connection of a peer that sends anything else."""
-        peer = _Peer.of(frames[0])
-        known = subscriber in self._subscribers
-        if known or len(frames) > 1 or len(frames[0]):
-            self._close_connection(subscriber, peer, "sent more than its one subscription")
-            return
-        of_host = [name for name, one in self._subscribers.items() if one.host == peer.host]
-        if len(of_host) >= MAX_SUBSCRIBERS_PER_HOST:
-            oldest = of_host[0]
-            why = f"is the oldest of more than {MAX_SUBSCRIBERS_PER_HOST}"
-            self._close_connection(oldest, self._subscribers[oldest], why)
-        self._subscribers[subscriber] = peer
-        if self._last is not None:
-            self._send_to(subscriber, self._last)
-
-    def _close_connection(self, subscriber: bytes, peer: _Peer, why: str) -> None:
-        self._subscribers.pop(subscriber, None)
-        if peer.shut_down(self.endpoints):
-            self._on_refused(
-                f'topic "{self.topic.name}": a connection from {peer.host} was closed: it {why}'
-            )
+    def _new_subscribers(self) -> bool:
+        found = False
+        try:
+            while True:
+                found |= self._socket.recv(zmq.NOBLOCK)[:1] == b"\x01"
+        except zmq.Again:
+            return found
 
     def forget(self) -> None:
         """Keep nothing for late subscribers any more, until the next message."""
@@ -574,16 +481,14 @@ class _Line:
         """Connect and begin to read."""
         topic = self._subscriber.topic
         self._loop = asyncio.get_running_loop()
-        self._socket = _open_socket(zmq.DEALER, topic)
+        self._socket = _open_socket(zmq.SUB, topic)
         try:
-            # Together they announce this subscriber with each connection.
-            self._socket.setsockopt(zmq.PROBE_ROUTER, 1)
-            self._socket.setsockopt(zmq.IMMEDIATE, 1)
             if self._unopened:
                 # Who takes frames gives way to others, for seconds on a busy computer.  A full
                 # queue would leave the publisher's heartbeats unread, and what follows once it has
                 # hung up is the abort that `_open_socket` tells of.
                 self._socket.setsockopt(zmq.RCVHWM, 0)
+            self._socket.setsockopt(zmq.SUBSCRIBE, b"")
             if self.secured:
                 self._monitor = self._socket.get_monitor_socket(WATCHED)
                 self._loop.add_reader(self._monitor.fileno(), self._hear_of_connections)
@@ -738,22 +643,19 @@ def _open_socket(kind: int, topic: Topic) -> zmq.Socket[bytes]:
         zmq.SNDHWM: length,
         zmq.RCVHWM: length,
         zmq.LINGER: LINGER_MS,
-        zmq.RECONNECT_IVL: RECONNECT_MIN_MS,
-        zmq.RECONNECT_IVL_MAX: RECONNECT_MAX_MS,
+        zmq.RECONNECT_IVL: 20,
+        zmq.RECONNECT_IVL_MAX: 500,
         # Whoever connects and says nothing is not kept.
         zmq.HANDSHAKE_IVL: HANDSHAKE_MS,
     }
-    if kind == zmq.DEALER:
+    if kind == zmq.SUB:
         # A larger frame makes ZeroMQ give the endpoint up, for good and without a word.  So what is
         # merely too large is let in, to be refused and counted; this limit saves the memory.
         options[zmq.MAXMSGSIZE] = topic.max_bytes + REFUSABLE_BYTES
         options |= VANISHED
     else:
-        # A publisher is sent subscriptions and handshakes: nobody shall fill the memory.  Its queue
-        # has no limit: where one is full when its sender hangs up, libzmq 4.3.5 aborts the process
-        # with the next heartbeat.
-        options[zmq.MAXMSGSIZE] = MAX_SUBSCRIPTION_BYTES
-        options[zmq.RCVHWM] = 0
+        # A publisher is sent subscriptions and handshakes: a stranger shall not fill the memory.
+        options[zmq.MAXMSGSIZE] = SUBSCRIPTION_BYTES
     for option, value in options.items():
         opened.setsockopt(option, value)
     return opened

@@ -86,7 +86,7 @@ MAX_BY_UNIT = {
 }
 """By the end of a name, the longest first."""
 
-MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-6, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
+MIN_BY_UNIT = {"metres_per_px": 1e-6, "_m": 1e-6, "_s": 1e-9, "_hz": 1e-3, "_px": 1e-3, "_pa": 1.0}
 """Of fields that must be above zero; a fraction of what any device resolves."""
 
 MIN_POSITIVE = 1e-9

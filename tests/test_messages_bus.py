@@ -77,24 +77,6 @@ class Ear:
         return [header.sequence for _, header in self.heard]
 
 
-class ForeignPublisher:
-    """Sends any frames to whoever connects."""
-
-    def __init__(self, endpoint: str) -> None:
-        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.ROUTER)
-        self._socket.bind(endpoint)
-        self._subscribers: list[bytes] = []
-
-    def send(self, *frames: Any) -> None:
-        while self._socket.poll(0):
-            self._subscribers.append(self._socket.recv_multipart()[0])
-        for subscriber in self._subscribers:
-            self._socket.send_multipart([subscriber, *frames])
-
-    def close(self) -> None:
-        self._socket.close(linger=0)
-
-
 class Room:
     """Makes publishers and ears, and clears them away."""
 
@@ -115,10 +97,13 @@ class Room:
         self.closers.append(ear.subscriber.close)
         return ear
 
-    def foreign(self, endpoint: str) -> ForeignPublisher:
-        foreign = ForeignPublisher(endpoint)
-        self.closers.append(foreign.close)
-        return foreign
+    def raw(self, kind: int, endpoint: str) -> zmq.Socket[bytes]:
+        """A foreign socket that knows nothing of messages."""
+        opened: zmq.Socket[bytes] = zmq.Context.instance().socket(kind)
+        opened.setsockopt(zmq.LINGER, 0)
+        opened.bind(endpoint)
+        self.closers.append(lambda: opened.close(linger=0))
+        return opened
 
 
 @pytest_asyncio.fixture
@@ -335,12 +320,12 @@ async def test_close_within_the_handler(room: Room) -> None:
 
 async def test_bad_messages_are_refused_and_good_ones_pass(room: Room) -> None:
     topic = TOPICS["estop"]
-    foreign = room.foreign(room.endpoint())
+    foreign = room.raw(zmq.PUB, room.endpoint())
     ear = room.ear(topic)
     good = encode(stop("fine"), header(1))
     number = 1
     while not ear.heard:
-        foreign.send(*encode(stop("fine"), header(number)))
+        foreign.send_multipart(encode(stop("fine"), header(number)))
         number += 1
         await asyncio.sleep(0.002)
     bad: list[list[Any]] = [
@@ -353,8 +338,8 @@ async def test_bad_messages_are_refused_and_good_ones_pass(room: Room) -> None:
         [bytes(good[0]) + b" " * topic.max_bytes],
     ]
     for frames in bad:
-        foreign.send(*frames)
-    foreign.send(*encode(stop("still fine"), header(number)))
+        foreign.send_multipart(frames)
+    foreign.send_multipart(encode(stop("still fine"), header(number)))
     await until(lambda: ear.heard[-1][0].reason == "still fine")
     assert ear.counts.rejected == len(bad)
     assert len(ear.problems) == 4  # malformed, frames, type, size: each once
@@ -363,15 +348,15 @@ async def test_bad_messages_are_refused_and_good_ones_pass(room: Room) -> None:
 
 async def test_many_times_too_large_a_frame_is_counted_and_ends_nothing(room: Room) -> None:
     topic = TOPICS["estop"]
-    foreign = room.foreign(room.endpoint())
+    foreign = room.raw(zmq.PUB, room.endpoint())
     ear = room.ear(topic)
     number = 0
     while not ear.heard:
         number += 1
-        foreign.send(*encode(stop("fine"), header(number)))
+        foreign.send_multipart(encode(stop("fine"), header(number)))
         await asyncio.sleep(0.002)
     foreign.send(bytes(10 * topic.max_bytes))
-    foreign.send(*encode(stop("after"), header(number + 1)))
+    foreign.send_multipart(encode(stop("after"), header(number + 1)))
     await until(lambda: ear.heard[-1][0].reason == "after")
     assert ear.counts.rejected == 1
     assert "at most" in ear.problems[0]

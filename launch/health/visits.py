@@ -164,7 +164,7 @@ async def _connect(address: str, port: int) -> int:
 
 async def _shake_hands(endpoint: str, host: str, keys: KeyRing | None) -> Reach:
     """Whether each end proves to the other that it has its key."""
-    opened: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.DEALER)
+    opened: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
     opened.setsockopt(zmq.LINGER, 0)
     monitor = opened.get_monitor_socket(sum(HANDSHAKES))
     try:
