@@ -216,7 +216,7 @@ def test_no_queue_builds_up_where_data_is_used(session: Session) -> None:
         newer = np.searchsorted(publish_ns, at_ns, "right") - np.searchsorted(
             sources_ns, source_ns, "right"
         )
-        assert len(newer) > 20, reader
+        assert len(newer) > 5, reader
         assert np.median(newer) <= 2, reader
 
 
@@ -246,7 +246,7 @@ def test_frames_show_what_the_finger_did(session: Session) -> None:
         for _, message, _, _ in BagReader(session.bag, topics=["frame"])
         if isinstance(message, Frame)
     ]
-    assert len(numbers) > 20
+    assert len(numbers) > 5
     assert numbers == sorted(set(numbers))
 
 
