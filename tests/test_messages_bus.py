@@ -77,6 +77,20 @@ class Ear:
         return [header.sequence for _, header in self.heard]
 
 
+class ForeignPublisher:
+    """Sends any frames to whoever connects."""
+
+    def __init__(self, endpoint: str) -> None:
+        self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PUB)
+        self._socket.bind(endpoint)
+
+    def send(self, *frames: Any) -> None:
+        self._socket.send_multipart(frames)
+
+    def close(self) -> None:
+        self._socket.close(linger=0)
+
+
 class Room:
     """Makes publishers and ears, and clears them away."""
 

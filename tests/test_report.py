@@ -179,7 +179,7 @@ def test_a_nodes_methods_are_those_of_its_parameters_else_of_its_scene() -> None
     tuned = sessions.SCENE.model_copy(update={"methods": chosen})
     eye = {"marker": "auto", "triangulation": "dlt", "tracking": "auto", "rate_hz": 60.0}
     assert methods_of(eye, tuned) == "marker moments, triangulation dlt, tracking default"
-    assert methods_of(eye, None) == "mark default, triangulation dlt, tracking default"
+    assert methods_of(eye, None) == "marker default, triangulation dlt, tracking default"
     assert methods_of({"method": "auto"}, tuned) == "linear"
     assert methods_of({"side": "left"}, tuned) is None
 

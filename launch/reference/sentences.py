@@ -200,7 +200,7 @@ def _is_said(text: str) -> bool:
 def _says_why(function: ast.FunctionDef | ast.AsyncFunctionDef, file: str) -> bool:
     """Whether a function answers in words why something is not as it should be."""
     returns = "" if function.returns is None else ast.unparse(function.returns)
-    if returns not in ("str | None", "str"):
+    if "str" not in returns.split(" | "):
         return False
     about = (ast.get_docstring(function) or "").split("\n")[0]
     named = _ANSWERS_WHY.search(function.name) or _SAYS_WHY.search(about)
