@@ -278,8 +278,6 @@ async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
     async with Recorder(street.port) as wire:
         ear = street.ear(street.rings["left"], port=wire.port)
         await street.speak(mouth, lambda: len(ear.heard) > 5)
-    assert len(mouth._subscribers) <= 1
-    refused_before = len(mouth._subscribers)
     reader, writer = await asyncio.open_connection("127.0.0.1", street.port)
     writer.write(b"".join(sent))
     answer = bytearray()
@@ -293,7 +291,6 @@ async def test_a_recorded_connection_cannot_be_replayed(street: Street) -> None:
     listening = asyncio.create_task(listen())
     await street.speak(mouth, listening.done)
     writer.close()
-    assert len(mouth._subscribers) <= refused_before, "nobody new has announced himself"
     # Greeting (64 bytes) and WELCOME (170 bytes in a frame) at most: no message.
     assert len(answer) < 300
 

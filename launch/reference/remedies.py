@@ -208,7 +208,7 @@ PARTICULAR = {
     "is not measured": "for some seconds after a start that is so; else its clock node or the "
     "network is down (docs/clocks.md).",
     "ms are allowed": "quieten the network, set up chrony, or allow more (docs/clocks.md).",
-    "no way: <error>": "bring the arms nearer to the sheet by hand, or the sheet to another place "
+    "no way: <first>": "bring the arms nearer to the sheet by hand, or the sheet to another place "
     "(docs/arms.md).",
     ": keeping the last valid sheet plane": "the arms are silent, or the sheet faces "
     "away; it recovers by itself.",
