@@ -187,8 +187,6 @@ async def kill(lab: Lab, host: str, node: str, span: Span) -> None:
     # Looking for it takes up to 0.1 s on a busy computer, and the arms' time runs from the kill.
     pid = lab.pid_of(host, node)
     before = lab.restarts(host, node)
-    if node.startswith("twin_") and host != "main":
-        await lab.until(lab.strokes_at_the_top, f"the finger at the top, before {node} is killed")
     span.begin()
     os.kill(pid, signal.SIGKILL)
     await lab.until(lambda: lab.restarts(host, node) > before, f"{node} to be started again")
@@ -197,8 +195,6 @@ async def kill(lab: Lab, host: str, node: str, span: Span) -> None:
 async def kill_launcher(lab: Lab, host: str, span: Span) -> None:
     """The launcher dies, its nodes with it; somebody (systemd) starts it again."""
     process = lab.launchers[host]
-    if host != "main":
-        await lab.until(lab.strokes_at_the_top, f"the finger at the top, before {host} is killed")
     span.begin()
     process.kill()
     await asyncio.to_thread(process.wait)

@@ -170,7 +170,9 @@ class Lab:
             values["nodes"]["planner"]["topics"] = {"soft_body": None}
         for side in ("left", "right"):
             values["nodes"][f"arm_{side}_bridge"]["parameters"].update(bridge)
-            values["nodes"][f"twin_{side}"]["parameters"]["watchdog_s"] = watchdog_s
+            values["nodes"][f"twin_{side}"]["parameters"].update(
+                watchdog_s=watchdog_s, joints_file=str(self.folder / f"{side}.joints")
+            )
             # The arm's own record, which no network can spoil.
             values["nodes"][f"record_{side}"] = {
                 "type": "recorder",
@@ -352,17 +354,6 @@ class Lab:
             and finger.path_time_s > 0
             and not finger.path_done
         )
-
-    def strokes_at_the_top(self) -> bool:
-        """Whether the finger is where the arms stood when they were switched on.
-
-        There alone a twin may die: started anew its arm stands at that place, while real ones stay
-        where they were, and a sheet whose other edge is elsewhere is a fault that stays.
-        """
-        finger = self.newest.get("twin/finger")
-        if not self.strokes() or not isinstance(finger, TwinFinger):
-            return False
-        return abs((finger.path_time_s + STROKE_S) % (2 * STROKE_S) - STROKE_S) < 0.1 * STROKE_S
 
     def status(self, host: str) -> HostStatus | None:
         found = self.newest.get(f"host {host}")

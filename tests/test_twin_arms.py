@@ -249,6 +249,49 @@ async def test_the_node_switches_its_arms_on_with_the_first_scene() -> None:
         await node.close()
 
 
+async def switch_on(joints_file: Path) -> TwinArmsNode:
+    """Start the node and give it a scene."""
+    scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
+    parameters = TwinArmsParameters(left_port=0, right_port=0, joints_file=str(joints_file))
+    node = TwinArmsNode(parameters, name="twin", clock=VirtualClock(), send=lambda *_: None)
+    await node.setup()
+    await node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
+    assert node.errors == 0, node.last_error
+    return node
+
+
+async def test_a_restarted_arm_stands_where_it_stood(tmp_path: Path) -> None:
+    first = await switch_on(tmp_path / "joints")
+    left = first.servers["left"].controller
+    at_start, right_joints = left.servo.joints_rad, first.servers["right"].controller.servo
+    left.servo.velocity_rad_per_s[0] = 0.5
+    first.clock.move_to(20_000_000)
+    await first.cycle()
+    await first.close()
+    assert left.servo.joints_rad[0] > at_start[0] + 1e-3
+    second = await switch_on(tmp_path / "joints")
+    try:
+        for side, before in (("left", left.servo), ("right", right_joints)):
+            after = second.servers[side].controller.servo
+            assert after.joints_rad.tolist() == before.joints_rad.tolist()
+    finally:
+        await second.close()
+
+
+@pytest.mark.parametrize("content", [b"", b"short", bytes([255]) * 96, np.full(12, 9.0).tobytes()])
+async def test_an_invalid_file_of_joints_is_replaced(tmp_path: Path, content: bytes) -> None:
+    fresh = await switch_on(tmp_path / "fresh")
+    (tmp_path / "spoilt").write_bytes(content)
+    node = await switch_on(tmp_path / "spoilt")
+    try:
+        for side in ("left", "right"):
+            expected = fresh.servers[side].controller.servo.joints_rad
+            assert node.servers[side].controller.servo.joints_rad.tolist() == expected.tolist()
+    finally:
+        await fresh.close()
+        await node.close()
+
+
 def test_a_gear_has_play_when_its_motor_turns_back() -> None:
     servo = Servo(JOINTS.copy(), 0.025, backlash_rad=2e-3)
     up, down = JOINTS + 0.1, JOINTS - 0.1

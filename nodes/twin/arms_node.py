@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from flexsheet.messages.types import TwinArms
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
 from flexsheet.nodes.node import Input, ListenPort, Node, NodeParameters, Output, periodic
 from flexsheet.nodes.twin.arms import (
+    RANGE_RAD,
     ArmServer,
     Controller,
     Fault,
@@ -47,9 +49,33 @@ class TwinArmsParameters(NodeParameters):
     restart_after_s: Positive = Field(
         default=2.0, description="how long an operator takes to clear an error of mxt"
     )
+    joints_file: str | None = Field(
+        default=None,
+        description="file of the joints; a restarted arm stands where it stood, as a real one does",
+    )
     fault: Fault = Field(default="none", description="what `fault_side` suffers from")
     fault_side: Literal["left", "right"] = "left"
     fault_after_s: NonNegative = Field(default=0.0, description="since the arms were switched on")
+
+
+def open_joints_file(path: str | None) -> dict[str, Floats]:
+    """Map the joints of both arms, rad, onto a file that outlasts the process.
+
+    The joints of a new file, or without a file, are NaN.  Raises OSError.
+    """
+    if path is None:
+        rows = np.full((2, 6), np.nan)
+    else:
+        exists = Path(path).exists() and Path(path).stat().st_size == 2 * 6 * 8
+        rows = np.memmap(path, dtype=np.float64, mode="r+" if exists else "w+", shape=(2, 6))
+        if not exists:
+            rows[:] = np.nan
+    return {"left": rows[0], "right": rows[1]}
+
+
+def is_valid_position(joints_rad: Floats) -> bool:
+    """Return whether the joints are finite and within the arm's range."""
+    return bool(((joints_rad >= RANGE_RAD[:, 0]) & (joints_rad <= RANGE_RAD[:, 1])).all())
 
 
 class TwinArmsNode(Node):
@@ -70,6 +96,7 @@ class TwinArmsNode(Node):
         self._world_from_base: dict[str, Floats] = {}
         self._moved_ns: dict[str, int] = {}
         self._started_ns = 0
+        self._stored_joints = open_joints_file(self.parameters.joints_file)
 
     async def close(self) -> None:
         for server in self.servers.values():
@@ -88,7 +115,10 @@ class TwinArmsNode(Node):
                 continue
             port = self.parameters.left_port if side == "left" else self.parameters.right_port
             self._moved_ns[side] = self._started_ns
-            server = self._server(side, self._start_joints(side, spec, scene), port, number)
+            joints_rad = self._stored_joints[side]
+            if not is_valid_position(joints_rad):
+                joints_rad = self._start_joints(side, spec, scene)
+            server = self._server(side, joints_rad, port, number)
             await server.start()
             self.servers[side] = server
 
@@ -134,7 +164,9 @@ class TwinArmsNode(Node):
         duration_s = (now_ns - self._moved_ns[side]) * 1e-9
         self._moved_ns[side] = now_ns
         if duration_s > 0.0 and side in self.servers:
-            self.servers[side].controller.advance(duration_s)
+            controller = self.servers[side].controller
+            controller.advance(duration_s)
+            self._stored_joints[side][:] = controller.servo.joints_rad
 
     @periodic("rate_hz")
     async def cycle(self) -> None:
