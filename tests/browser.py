@@ -14,7 +14,6 @@ DRAWN_WITHOUT_GPU = (
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
 )
-DEADLINE_S = 40.0
 TWO_FRAMES = "() => new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
 """The page finds out what lies under the mouse when it draws."""
 

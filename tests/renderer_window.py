@@ -21,7 +21,7 @@ from flexsheet.nodes.renderer.monitors import WindowError, find_monitor, start_g
 from flexsheet.nodes.renderer.output import pack
 from flexsheet.nodes.renderer.output_window import CLOSED, ProjectorWindow
 from tests.test_renderer import Bench
-from tests.waiting import until
+from tests.waiting import DEADLINE_S, until
 
 pytestmark = pytest.mark.skipif(
     shutil.which("Xvfb") is None, reason="no Xvfb: apt-get install xvfb libgl1 libglx-mesa0"
@@ -144,7 +144,7 @@ async def test_a_swap_that_waits_holds_up_nothing_else(
     swaps, refresh = glfw.swap_buffers, threading.Event()
 
     def waiting(window: object) -> None:
-        refresh.wait(20)
+        refresh.wait(DEADLINE_S)
         swaps(window)
 
     monkeypatch.setattr(glfw, "swap_buffers", waiting)

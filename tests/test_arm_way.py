@@ -32,7 +32,7 @@ from tests.test_arm_control import (
     sheet_at,
 )
 from tests.test_arm_loop import Rig, running_rig
-from tests.waiting import until
+from tests.waiting import DEADLINE_S, until
 
 Floats = NDArray[np.float64]
 LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
@@ -255,7 +255,7 @@ async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
 
     def slow(arm: ArmGeometry, other: ArmGeometry, way: Way) -> str | None:
         threads.append(threading.get_ident())
-        assert go_on.wait(10.0)
+        assert go_on.wait(DEADLINE_S)
         return "barred"
 
     monkeypatch.setattr(way_module, "check_way", slow)

@@ -11,8 +11,7 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,10 +28,10 @@ from flexsheet.launch.running.stopping import (
 )
 from flexsheet.nodes import stop_socket
 from flexsheet.nodes.stop_socket import MAX_CONNECTIONS, StopSocket
+from tests.waiting import DEADLINE_S, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
 FLEXSHEET = [sys.executable, "-m", "flexsheet"]
-DEADLINE_S = 60.0
 REASON = "a hand in the sheet"
 
 
@@ -42,13 +41,6 @@ def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setenv(runs.ROOT_VARIABLE, str(folder))
     yield folder
     shutil.rmtree(folder)
-
-
-def wait_until(condition: Callable[[], Any], what: str) -> None:
-    end_s = time.monotonic() + DEADLINE_S
-    while not condition():
-        assert time.monotonic() < end_s, f"waited in vain: {what}"
-        time.sleep(0.02)
 
 
 @dataclass

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import os
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing import get_context
 
 from flexsheet.nodes.background import MAX_NICE, enter_background
 from flexsheet.nodes.fem_solver.precompute_table import local_processes
 
 
-def priority() -> tuple[int, int]:
-    """Return the niceness and the scheduling class of this process."""
-    return os.getpriority(os.PRIO_PROCESS, 0), os.sched_getscheduler(0)
+def priority_in(workers: Executor) -> tuple[int, int]:
+    """Return niceness and scheduling class of a worker, which need not import this file for it.
+
+    At its priority an import takes a minute beside other tests.
+    """
+    niceness = workers.submit(os.getpriority, os.PRIO_PROCESS, 0)
+    scheduling = workers.submit(os.sched_getscheduler, 0)
+    return niceness.result(), scheduling.result()
 
 
 def test_a_background_process_gives_way_to_all_others() -> None:
     with ProcessPoolExecutor(1, get_context("spawn"), initializer=enter_background) as workers:
-        assert workers.submit(priority).result() == (MAX_NICE, os.SCHED_BATCH)
+        assert priority_in(workers) == (MAX_NICE, os.SCHED_BATCH)
 
 
 def test_workers_of_a_soft_bodys_table_are_background_processes() -> None:
     with local_processes(1) as workers:
-        assert workers.submit(priority).result() == (MAX_NICE, os.SCHED_BATCH)
+        assert priority_in(workers) == (MAX_NICE, os.SCHED_BATCH)

@@ -29,6 +29,7 @@ from flexsheet.nodes.camera.devices import ReaderThread, open_reader
 from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, halves
 from flexsheet.nodes.camera.node import CameraParameters
 from flexsheet.nodes.camera.sources import ImagesSource, OpenCvSource, VideoSource
+from tests.waiting import DEADLINE_S
 
 
 @pytest.fixture(scope="module")
@@ -257,7 +258,7 @@ def test_frames_that_a_device_lost_are_counted(scene: Scene) -> None:
         finish=lambda pairs: ended.set(),
     )
     thread.start()
-    thread.join(10)
+    thread.join(DEADLINE_S)
     assert ended.is_set()
     assert lost == [0, 0, 0, 3, 3]
 
@@ -289,7 +290,7 @@ def test_an_error_inside_opencv_is_a_device_error_and_tried_again(scene: Scene) 
         finish=lambda pairs: pytest.fail("not finished"),
     )
     thread.start()
-    thread.join(10)
+    thread.join(DEADLINE_S)
     assert not thread.is_alive()
     assert failures == ["broken: OpenCV: no such colour"] * 2
 

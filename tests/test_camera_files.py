@@ -26,6 +26,7 @@ from flexsheet.nodes.camera.devices import ReaderThread, open_reader
 from flexsheet.nodes.camera.files import read_times
 from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, Reader
 from flexsheet.nodes.camera.sources import AnySource, ImagesSource, VideoSource
+from tests.waiting import DEADLINE_S
 
 MS = 1_000_000
 UNEVEN_MS = [0, 20, 40, 90, 100, 133]
@@ -283,6 +284,6 @@ def test_whatever_goes_wrong_while_reading_is_told() -> None:
         finish=lambda pairs: None,
     )
     thread.start()
-    thread.join(5.0)
+    thread.join(DEADLINE_S)
     assert not thread.is_alive()
     assert [str(error) for error in errors] == ["cam: MemoryError: no room for a picture"] * 2

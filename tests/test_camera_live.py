@@ -33,6 +33,7 @@ from flexsheet.nodes.camera.image_pair import DeviceError, ImagePair, Region, Re
 from flexsheet.nodes.camera.live import CameraReader
 from flexsheet.nodes.camera.sources import OpenCvSource
 from flexsheet.nodes.camera.stamps import LAPSES, SLACK, Pairing, StampJudge
+from tests.waiting import DEADLINE_S
 
 pytestmark = pytest.mark.alone
 
@@ -413,7 +414,7 @@ def test_a_camera_that_hangs_is_named_and_released_when_it_wakes(
         reader.close()
         assert not right.captures[0].released.is_set()
         right.shots.put(None)
-        assert right.captures[0].released.wait(10)
+        assert right.captures[0].released.wait(DEADLINE_S)
 
 
 def test_two_cameras_that_never_meet_are_told_of(
@@ -436,7 +437,7 @@ def test_two_cameras_that_never_meet_are_told_of(
         for number in range(3):
             cameras[0].shoot(3 * number * PERIOD_NS)
             cameras[1].shoot((3 * number + 1) * PERIOD_NS)
-        waiting.join(10)
+        waiting.join(DEADLINE_S)
     assert told_of
     assert "both give pictures, but none within half a period" in told_of[0]
 
@@ -449,7 +450,7 @@ def test_a_reader_that_waits_is_interrupted(
         waiting = threading.Thread(target=lambda: results.append(reader.read()))
         waiting.start()
         reader.interrupt()
-        waiting.join(10)
+        waiting.join(DEADLINE_S)
         assert results == [None]
 
 

@@ -24,7 +24,7 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Display, EStop, Status
 from flexsheet.nodes import NODES
-from tests.waiting import wait_until
+from tests.waiting import DEADLINE_S, wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
 GRAPH: dict[str, Any] = {
@@ -233,7 +233,7 @@ def test_a_node_that_fails_for_good_is_exit_code_one(tmp_path: Path, runs_root: 
 
 
 def test_echo_prints_messages_and_stops(flexsheet: Command, running: Path) -> None:
-    said = flexsheet("topic", "echo", "twin/finger", "--once", "--timeout", "20")
+    said = flexsheet("topic", "echo", "twin/finger", "--once", "--timeout", DEADLINE_S)
     assert said.code == 0
     assert said.out.startswith("--- beacon #")
     assert "path_label: count" in said.out

@@ -24,10 +24,11 @@ from flexsheet.nodes.console.guard import Guard, start_server
 from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.page import Page
 from tests.arm_states import arm_state
-from tests.browser import BROWSER_MARKS, CHROMIUM, DEADLINE_S, DRAWN_WITHOUT_GPU, TWO_FRAMES
+from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
 from tests.console_parts import Shelf, cylinder
 from tests.fingertips import fingertip
 from tests.test_console_words import port, status
+from tests.waiting import DEADLINE_S
 
 pytestmark = BROWSER_MARKS
 
@@ -62,7 +63,7 @@ class Findings:
 async def browser_tab() -> AsyncIterator[BrowserTab]:
     async with async_playwright() as play:
         browser = await play.chromium.launch(
-            executable_path=str(CHROMIUM), args=list(DRAWN_WITHOUT_GPU)
+            executable_path=str(CHROMIUM), args=list(DRAWN_WITHOUT_GPU), timeout=1e3 * DEADLINE_S
         )
         tab = await browser.new_page(viewport={"width": 1000, "height": 700})
         tab.set_default_timeout(1e3 * DEADLINE_S)
@@ -76,7 +77,6 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -
     scene = cylinder().model_copy(update={"name": MARKUP})
     faulty = {"left": arm_state("left", mode="fault", faults=(MARKUP,), reason=MARKUP)}
     page.touch.show_scene(scene, scene, (MARKUP, "other"), Sliders.of(scene))
-    page.show_state(GraphState(MARKUP, faulty, overload=MARKUP, solver_note=MARKUP, replay=MARKUP))
     page.show_problem(MARKUP)
     page.record.show_bags((f"{MARKUP}.mcap",))
     page.record.show_state(panels.recorder(MARKUP, (MARKUP,)), recording=True)
@@ -84,6 +84,8 @@ async def show_names_with_markup(page: Page, tab: BrowserTab, found: Findings) -
     statuses = {MARKUP: (broken, 0.0)}
     tables = panels.topics_table(statuses) + panels.nodes_table(statuses)
     page.graph.show(tables, History().columns())
+    # Shown last: what it says is there only once all else is.
+    page.show_state(GraphState(MARKUP, faulty, overload=MARKUP, solver_note=MARKUP, replay=MARKUP))
     await expect(tab.get_by_role("status")).to_contain_text(MARKUP)
     found.texts["banner"] = await tab.locator(".fs-state").inner_text()
     found.texts["problem"] = await tab.locator(".fs-problem").inner_text()

@@ -27,6 +27,7 @@ from flexsheet.nodes.console.guard import (
     start_server,
 )
 from flexsheet.nodes.console.node import ConsoleParameters
+from tests.waiting import DEADLINE_S
 
 Floats = NDArray[np.float64]
 TOKEN = "0123456789abcdef0123"
@@ -152,7 +153,7 @@ async def answer_to(port: int, sent: bytes) -> tuple[int, dict[str, str]]:
     """Send bytes and return the status and the headers (lower case) of the answer."""
     reader, writer = await asyncio.open_connection("127.0.0.1", port)
     writer.write(sent)
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(DEADLINE_S):
         head = await reader.readuntil(b"\r\n\r\n")
     writer.close()
     first, *rest = head.decode().split("\r\n")
@@ -213,7 +214,7 @@ async def test_garbage_after_the_handshake_costs_one_log_line(
     protocol = websockets.Subprotocol(f"viser-v{viser.__version__}")
     async with websockets.connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol]) as socket:
         await socket.send(b"\xc1 no message")
-        async with asyncio.timeout(20):
+        async with asyncio.timeout(DEADLINE_S):
             with suppress(websockets.ConnectionClosed):
                 async for _ in socket:
                     pass

@@ -285,12 +285,14 @@ async def run_session(folder: Path) -> Session:
     names = ("scene", "twin/finger_path", "twin/finger", "estop", "recording", "moment")
     async with async_playwright() as play:
         async with RunningGraph(plan) as graph:
-            await graph.wait_ready(120)
+            await graph.wait_ready(DEADLINE_S)
             async with hearing(graph, *names) as heard:
                 session = Session(heard, folder / "bags" / "a.mcap", {}, {})
                 session.notes["foreign"] = await refused(port, Origin="http://evil.example")
                 browser = await play.chromium.launch(
-                    executable_path=str(CHROMIUM), args=list(DRAWN_WITHOUT_GPU)
+                    executable_path=str(CHROMIUM),
+                    args=list(DRAWN_WITHOUT_GPU),
+                    timeout=1e3 * DEADLINE_S,
                 )
                 page = await browser.new_page(viewport={"width": 860, "height": 420})
                 page.set_default_timeout(1e3 * DEADLINE_S)

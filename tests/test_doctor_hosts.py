@@ -336,7 +336,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
     assert {("main", "launcher", "warning"), ("left", "launcher", "warning")} <= set(bad(asked_not))
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(DEADLINE_S)
-        found = await examine(plan, "main", graph.run, 10.0)
+        found = await examine(plan, "main", graph.run, DEADLINE_S)
         for check in ("reachable", "launcher", "plan", "keys", "clocks", "nodes"):
             states = {one.host: one.state for one in found if one.check == check}
             assert states == {"main": "ok", "left": "ok"}, (check, found)

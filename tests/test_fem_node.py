@@ -25,6 +25,7 @@ from flexsheet.nodes.fem_solver.body import SceneBody
 from flexsheet.nodes.fem_solver.node import FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
+from tests.waiting import DEADLINE_S
 
 SCENES = Path(__file__).parents[1] / "launch" / "scenes"
 
@@ -286,13 +287,13 @@ async def test_a_newer_scene_interrupts_the_precomputation(
     thinner = thin | {"radius_m": 0.029}
     try:
         bench.node.deliver("scene", scene(geometry=thin), header(2))
-        assert await asyncio.to_thread(begun.wait, 60)
+        assert await asyncio.to_thread(begun.wait, DEADLINE_S)
         bench.node.deliver("scene", scene(geometry=thinner), header(3))
         bench.node.deliver("scene", scene(), header(4))
-        async with asyncio.timeout(60):
+        async with asyncio.timeout(DEADLINE_S):
             await asyncio.gather(*bench.node.mailbox_tasks())
         meshed.set()
-        assert await asyncio.to_thread(ended.wait, 60), "the abandoned work goes on"
+        assert await asyncio.to_thread(ended.wait, DEADLINE_S), "the abandoned work goes on"
     finally:
         meshed.set()
         await bench.node.close()

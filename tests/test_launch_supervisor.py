@@ -603,7 +603,8 @@ def test_foreign_packages_on_the_path_do_not_win(tmp_path: Path) -> None:
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
     done = subprocess.run(
         [*FLEXSHEET, "launch", str(path), "--duration", "0.1"],
-        env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+        env=environment, cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE_S,
+        check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "all 2 nodes are ready" in done.stderr

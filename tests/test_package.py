@@ -18,6 +18,7 @@ import pytest
 import flexsheet
 from flexsheet.nodes import node_class
 from tests.doc_pages import blocks
+from tests.waiting import DEADLINE_S
 
 ROOT = Path(__file__).resolve().parent.parent
 FOLDERS = ("messages", "nodes", "launch")
@@ -27,7 +28,7 @@ def run_python(code: str, cwd: Path, path: str = "") -> str:
     environment = {**os.environ, "PYTHONPATH": path}
     done = subprocess.run(
         [sys.executable, "-P", "-c", code],
-        cwd=cwd, env=environment, capture_output=True, text=True, timeout=60, check=False,
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=DEADLINE_S, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -116,7 +117,8 @@ def test_a_wheel_holds_the_package_only(tmp_path: Path) -> None:
             "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])",
             str(tmp_path),
         ],
-        cwd=copy_of_sources(tmp_path / "sources"), check=True, capture_output=True, timeout=120,
+        cwd=copy_of_sources(tmp_path / "sources"), check=True, capture_output=True,
+        timeout=DEADLINE_S,
     )  # fmt: skip
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
@@ -145,7 +147,7 @@ def test_the_script_of_the_readme_runs(tmp_path: Path) -> None:
         done = subprocess.run(
             [sys.executable, "-c", script],
             cwd=tmp_path, env={**os.environ, "FLEXSHEET_RUNS": runs},
-            capture_output=True, text=True, timeout=60, check=False,
+            capture_output=True, text=True, timeout=DEADLINE_S, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) == 3

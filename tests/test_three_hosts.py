@@ -19,6 +19,7 @@ from flexsheet.launch.plans.plan import load_plan
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, Lab
 from tests.lab_bags import Span, gaps, held, read_arm, wanted
+from tests.waiting import DEADLINE_S
 
 SIDES = ("left", "right")
 LONGEST_M = 0.24 * 1.15
@@ -129,7 +130,7 @@ async def test_arms_that_stroke_stop_with_what_fails_and_move_when_told_so() -> 
             await a_stop_outlives_all_launchers(lab)
         for host in HOSTS:
             lab.launchers[host].send_signal(signal.SIGINT)
-        codes = [await asyncio.to_thread(lab.launchers[host].wait, 40) for host in HOSTS]
+        codes = [await asyncio.to_thread(lab.launchers[host].wait, DEADLINE_S) for host in HOSTS]
         assert codes == [0, 0, 0]
         judge_bags(lab, troubles)
 
