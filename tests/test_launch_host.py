@@ -17,7 +17,7 @@ from flexsheet.launch.plans.hosts import launcher_on
 from flexsheet.launch.plans.plan import load_plan
 from flexsheet.launch.plans.planned import TOOLS, Plan
 from flexsheet.launch.running import runs
-from flexsheet.launch.running.host import devices_of
+from flexsheet.launch.running.host import list_device_files
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.launch.running.tools import ToolsWriter, subscriber_to
 from flexsheet.messages.types import EStop, HostStatus
@@ -133,5 +133,5 @@ def test_the_launchers_are_writers_of_their_own(tmp_path: Path) -> None:
 
 def test_devices_are_found_wherever_parameters_name_them() -> None:
     lab = load_plan(Path(__file__).resolve().parent.parent / "launch" / "lab.yaml")
-    assert devices_of(lab.nodes_on("main")) == ["/dev/video0", "/dev/video2"]
-    assert devices_of(lab.nodes_on("left")) == []
+    assert list_device_files(lab.nodes_on("main")) == ["/dev/video0", "/dev/video2"]
+    assert list_device_files(lab.nodes_on("left")) == []

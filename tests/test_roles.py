@@ -81,6 +81,7 @@ def test_the_shipped_nodes_have_their_roles() -> None:
     roles = {name: role_of(node_class(name)) for name in NODES}
     assert {name: role for name, role in roles.items() if role is not None} == {
         "arm_bridge": NodeRole.ARM_BRIDGE,
+        "camera": NodeRole.CAMERA,
         "clock": NodeRole.CLOCK,
         "console": NodeRole.CONSOLE,
         "recorder": NodeRole.RECORDER,

@@ -22,10 +22,9 @@ from flexsheet.launch.health.visits import Reach, Visit
 from flexsheet.launch.plans.hosts import is_loopback
 from flexsheet.launch.plans.planned import Plan, PlannedNode
 from flexsheet.launch.plans.wires import FIRST_PORT, PORTS
-from flexsheet.launch.running.host import devices_of, folder_of, python_version, software
+from flexsheet.launch.running.host import folder_of, list_device_files, python_version, software
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
-from flexsheet.messages.bus import HANDSHAKE_FAILED
 from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.security import SecurityError, public_of, read_secret
 from flexsheet.messages.topics import TOPICS
@@ -176,11 +175,11 @@ def _way(plan: Plan, here: str, visit: Visit, *, running: bool) -> Iterator[Host
         state: State = "warning" if visit.reach == "closed" and not running else "failed"
         yield HostFinding(host, check, state, what.format(**words), remedy.format(**words))
         yield HostFinding(host, "all else", "not asked", "its launcher would say")
+    for text in visit.failed_handshakes[:NAMES_SHOWN]:
+        # The first handshake of this visit succeeded, so the keys are right.
+        remedy = "the host is very busy or the network slow; run this again"
+        yield HostFinding(host, "keys", "warning", text, remedy)
     for text in visit.refused[:NAMES_SHOWN]:
-        if text.endswith(tuple(HANDSHAKE_FAILED.values())):
-            # Its keys were right when it was asked first.
-            yield HostFinding(host, "keys", "warning", text, "it is very busy, or far: ask again")
-            continue
         yield HostFinding(
             host,
             "messages",
@@ -344,11 +343,18 @@ def rate_problem(port: PortStatus) -> str | None:
     return None
 
 
+OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
+    NodeRole.CAMERA: ("camera", "docs/camera.md; does another program hold it?"),
+    NodeRole.RENDERER: ("picture", f"OpenGL: there, flexsheet doctor; on Debian: {OPENGL.manual}"),
+}
+"""Check and remedy of the nodes that must publish, by role."""
+
+
 def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
     """What the host is there for: cameras, projector, its arm."""
     assert visit.status is not None
     host, missing = visit.host, visit.status.missing_devices
-    devices = devices_of(list(nodes))
+    devices = list_device_files(nodes)
     if missing:
         yield HostFinding(
             host,
@@ -360,9 +366,9 @@ def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
     elif devices:
         yield HostFinding(host, "devices", "ok", ", ".join(devices))
     for node in nodes:
-        check = {"camera": "camera", "renderer": "picture"}.get(node.type)
-        if check is None:
+        if node.role not in OUTPUT_CHECKS:
             continue
+        check, remedy = OUTPUT_CHECKS[node.role]
         status = visit.nodes.get(node.name)
         if status is None:
             yield HostFinding(host, check, "failed", f"{node.name} is silent", "see its log")
@@ -372,10 +378,6 @@ def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
         if sent > 0.0:
             yield HostFinding(host, check, "ok", what)
         else:
-            remedy = {
-                "camera": "docs/camera.md; does another program hold it?",
-                "picture": f"OpenGL: there, flexsheet doctor; on Debian: {OPENGL.manual}",
-            }[check]
             yield HostFinding(host, check, "failed", what, remedy)
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
@@ -409,8 +411,8 @@ def _silent_arm(node: PlannedNode, visit: Visit, check: str) -> HostFinding:
         return HostFinding(visit.host, check, "failed", f"{node.name} is silent", "see its log")
     assert visit.status is not None
     starts = any(one.state == "starting" for one in visit.status.nodes)
-    where = f"{node.parameters['host']}:{node.parameters['port']}"
-    remedy = f"is the controller at {where} on, and its program running? see its log"
+    where = "" if node.device_address is None else f" at {node.device_address}"
+    remedy = f"is the controller{where} on, and its program running? see its log"
     return HostFinding(visit.host, check, "warning" if starts else "failed", status.note, remedy)
 
 
@@ -495,7 +497,7 @@ def before_start(plan: Plan, here: str, key_problem: str | None) -> Iterator[Hos
         libraries.remedy,
     )
     yield _ports(plan, here)
-    devices = devices_of(nodes)
+    devices = list_device_files(nodes)
     missing = [one for one in devices if not os.path.exists(one)]
     if missing:
         remedy = "is it plugged in? else another number: v4l2-ctl --list-devices"
@@ -539,14 +541,14 @@ def _controller(here: str, node: PlannedNode) -> HostFinding:
     check = f"arm {node.arm_side}"
     if node.device_address is None:
         return HostFinding(here, check, "not asked", f"{node.name} has a driver of its own")
-    address, port = str(node.parameters["host"]), int(node.parameters["port"])
+    address, _, port = node.device_address.rpartition(":")
     if is_loopback(address):
         what = f"{address}:{port}: the twin's, which starts with the graph"
         return HostFinding(here, check, "not asked", what)
     if node.parameters.get("driver") != "modbus":
         return HostFinding(here, check, "not asked", f"{address}:{port} speaks UDP")
     try:
-        socket.create_connection((address, port), CONTROLLER_S).close()
+        socket.create_connection((address, int(port)), CONTROLLER_S).close()
     except OSError as error:
         remedy = f"is the controller on, {address} its address, and its Modbus server running?"
         return HostFinding(here, check, "failed", f"{address}:{port}: {error}", remedy)

@@ -65,7 +65,11 @@ HANDSHAKES: dict[int, Reach] = {
 
 @dataclass(slots=True)
 class Visit:
-    """What came of asking one host; `refused`: sentences about messages that were not taken."""
+    """The answers of one host, and the problems that reading them met.
+
+    refused: messages that were not accepted.  failed_handshakes: connections that did not prove
+    their key though an earlier one did.
+    """
 
     host: str
     reach: Reach
@@ -75,6 +79,7 @@ class Visit:
     clocks: Clocks | None = None
     arms: dict[str, ArmState] = field(default_factory=dict)
     refused: list[str] = field(default_factory=list)
+    failed_handshakes: list[str] = field(default_factory=list)
 
 
 async def visit_all(
@@ -224,6 +229,7 @@ async def _listen(
                     handler,
                     PortCounts(),
                     on_problem=visit.refused.append,
+                    on_handshake_failed=visit.failed_handshakes.append,
                     keys=keys,
                 )
             )

@@ -26,6 +26,7 @@ from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.nodes import NODES, UnknownNodeError, node_class
 from flexsheet.nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
+from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
 """What a run's directory has files of, beside one named after each node."""
@@ -205,18 +206,18 @@ def _connect_ports(
 def check_wires(
     members: list[Member], spec: LaunchFile, document: Document, problems: list[Problem]
 ) -> None:
-    """A device's own protocol knows no keys: it stays on the wire of the host it belongs to."""
+    """Check that no device is reached across the network: device protocols are not encrypted."""
     for member in members:
-        address = getattr(member.parameters, "host", None)
-        if member.type is None or not member.type.opens_devices or not isinstance(address, str):
+        if member.parameters is None:
             continue
-        for name, host in spec.hosts.items():
+        marked = find_marked(member.parameters, ParameterMark.DEVICE_HOST)
+        for (key, address), (name, host) in product(marked.items(), spec.hosts.items()):
             if host.address == address and name != member.spec.host and not is_loopback(address):
                 problems.append(
                     document.problem(
-                        (*member.key, "parameters", "host"),
-                        f'{address} is host "{name}": what it says would cross the network '
-                        "without keys",
+                        (*member.key, "parameters", *key),
+                        f'{address} is host "{name}": its data would cross the network '
+                        "without encryption",
                         f"run {member.name} there (host: {name})",
                     )
                 )
@@ -225,7 +226,7 @@ def check_wires(
 def check_calibrations(
     members: list[Member], scene: Scene | None, document: Document, problems: list[Problem]
 ) -> None:
-    """Parameters that name a calibration's file are read, and held against the scene."""
+    """Read the calibration files that parameters name, and compare them with the scene."""
 
     def check_camera(path: Path) -> None:
         measured = load_calibration(path)
@@ -237,18 +238,22 @@ def check_calibrations(
         if scene is not None:
             refuse_other_sheet(measured, scene.sheet)
 
-    checks = {"calibration": check_camera, "sheet_calibration": check_sheet}
-    for member, (name, check) in product(members, checks.items()):
-        calibration = getattr(member.parameters, name, None)
-        if not isinstance(calibration, Path):
+    checks = {
+        ParameterMark.CAMERA_CALIBRATION: check_camera,
+        ParameterMark.SHEET_CALIBRATION: check_sheet,
+    }
+    for member, (mark, check) in product(members, checks.items()):
+        if member.parameters is None:
             continue
-        key = (*member.key, "parameters", name)
-        path = Path(_absolute(calibration, _base(document, key)))
-        try:
-            check(path)
-        except (CalibrationFileError, CalibrationMismatchError) as error:
-            said = str(error) if str(path) in str(error) else f"{path}: {error}"
-            problems.append(document.problem(key, said))
+        for marked, calibration in find_marked(member.parameters, mark).items():
+            key = (*member.key, "parameters", *marked)
+            path = Path(_absolute(calibration, _base(document, key)))
+            try:
+                check(path)
+            except CalibrationFileError as error:
+                problems.append(document.problem(key, str(error)))
+            except CalibrationMismatchError as error:
+                problems.append(document.problem(key, f"{path}: {error}"))
 
 
 def in_full(member: Member, document: Document, *, resolve_paths: bool) -> dict[str, Any]:

@@ -10,7 +10,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
 from flexsheet.launch.objects.meshes import scene_of
 from flexsheet.launch.plans.documents import (
@@ -43,7 +46,8 @@ from flexsheet.launch.plans.wires import (
     writers_of,
 )
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.node import listen_ports, role_of
+from flexsheet.nodes.node import NodeParameters, role_of
+from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 
 def load_plan(
@@ -151,13 +155,23 @@ def _planned(
     resolve_paths: bool,
 ) -> PlannedNode:
     host = member.spec.host
+    assert member.type is not None  # a member without a class is a problem
+    assert member.parameters is not None
+    parameters = in_full(member, document, resolve_paths=resolve_paths)
     return PlannedNode(
         name=member.name,
         type=member.spec.type,
-        listen_ports=() if member.parameters is None else listen_ports(member.parameters),
-        role=None if member.type is None else role_of(member.type),
+        listen_ports=tuple(filter(None, _marked(member.parameters, ParameterMark.LISTEN_PORT))),
+        device_address=_device_address(member.parameters),
+        device_files=_device_files(member.parameters),
+        calibrations={
+            ".".join(map(str, key)): str(_value_at(parameters, key))
+            for mark in (ParameterMark.CAMERA_CALIBRATION, ParameterMark.SHEET_CALIBRATION)
+            for key in find_marked(member.parameters, mark)
+        },
+        role=role_of(member.type),
         host=host,
-        parameters=in_full(member, document, resolve_paths=resolve_paths),
+        parameters=parameters,
         inputs=tuple(
             PlannedPort(
                 port=port,
@@ -183,3 +197,24 @@ def _planned(
         liveness_s=member.spec.liveness_s,
         nice=member.spec.nice,
     )
+
+
+def _marked(parameters: NodeParameters, mark: ParameterMark) -> list[Any]:
+    return list(find_marked(parameters, mark).values())
+
+
+def _device_address(parameters: NodeParameters) -> str | None:
+    """Return "host:port" of the device; None unless exactly one host and one port are marked."""
+    hosts = _marked(parameters, ParameterMark.DEVICE_HOST)
+    ports = _marked(parameters, ParameterMark.DEVICE_PORT)
+    return f"{hosts[0]}:{ports[0]}" if len(hosts) == len(ports) == 1 else None
+
+
+def _device_files(parameters: NodeParameters) -> tuple[str, ...]:
+    """Return the marked paths, sorted, without URLs of streams."""
+    files = _marked(parameters, ParameterMark.DEVICE_FILE)
+    return tuple(sorted({file for file in files if not urlsplit(file).scheme}))
+
+
+def _value_at(values: Any, key: tuple[str | int, ...]) -> Any:
+    return reduce(lambda inner, part: inner[part], key, values)

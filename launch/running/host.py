@@ -11,10 +11,9 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 import psutil
 import zmq
@@ -37,7 +36,6 @@ from flexsheet.nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
-DEVICES = "/dev/"
 REASON_LENGTH = 1000
 """What is longer is cut: an e-stop must fit into every message that repeats it."""
 
@@ -110,7 +108,7 @@ class HostVoice:
         self._unwritten = False
         self._untold = ""
         nodes = plan.nodes_on(host)
-        self._devices, self._folder = devices_of(nodes), folder_of(nodes)
+        self._devices, self._folder = list_device_files(nodes), folder_of(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
@@ -361,18 +359,9 @@ def software() -> str:
     return f"flexsheet {own}, pyzmq {zmq.pyzmq_version()}, libzmq {zmq.zmq_version()}"
 
 
-def devices_of(nodes: list[PlannedNode]) -> list[str]:
-    """Device files that the nodes' parameters name."""
-
-    def texts(value: Any) -> list[str]:
-        if isinstance(value, str):
-            return [value]
-        if isinstance(value, dict):
-            value = list(value.values())
-        return [text for one in value for text in texts(one)] if isinstance(value, list) else []
-
-    found = [text for node in nodes for text in texts(node.parameters)]
-    return sorted({text for text in found if text.startswith(DEVICES)})
+def list_device_files(nodes: Sequence[PlannedNode]) -> list[str]:
+    """Return the device files that the nodes open, sorted."""
+    return sorted({file for node in nodes for file in node.device_files})
 
 
 def folder_of(nodes: list[PlannedNode]) -> Path:
