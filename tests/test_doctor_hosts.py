@@ -26,9 +26,9 @@ from flexsheet.launch.health.doctor_hosts import (
     own_key_problem,
     rate_problem,
 )
-from flexsheet.launch.health.visits import Reach, Visit, way_to
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import MAIN, Plan
+from flexsheet.launch.health.probe import Reach, Visit, probe_port
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import MAIN, ResolvedGraph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.keys import KEYS_VARIABLE, secret_file
 from flexsheet.launch.running.supervisor import RunningGraph
@@ -67,8 +67,8 @@ def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def three() -> Plan:
-    plan = load_plan(ROOT / "launch" / "three.yaml")
+def three() -> ResolvedGraph:
+    plan = load_graph(ROOT / "launch" / "three.yaml")
     keys = {name: new_key_pair()[0] for name in NAMES}
     return plan.model_copy(update={"keys": keys})
 
@@ -86,7 +86,7 @@ def said(node: str, *outputs: PortStatus, note: str = "", inputs: Any = ()) -> S
     )  # fmt: skip
 
 
-def good(plan: Plan) -> dict[str, Visit]:
+def good(plan: ResolvedGraph) -> dict[str, Visit]:
     """What three hosts say where all is well."""
     found = {}
     for name in plan.hosts:
@@ -135,7 +135,7 @@ def bad(found: list[HostFinding]) -> list[tuple[str, str, str]]:
     return [(one.host, one.check, one.state) for one in found if one.state != "ok"]
 
 
-def test_where_all_is_well_nothing_is_found(three: Plan) -> None:
+def test_where_all_is_well_nothing_is_found(three: ResolvedGraph) -> None:
     found = judge(three, "main", good(three))
     assert bad(found) == []
     checks = {one.check for one in found}
@@ -146,7 +146,9 @@ def test_where_all_is_well_nothing_is_found(three: Plan) -> None:
     assert {one.host for one in found} == set(NAMES)
 
 
-def test_a_host_with_other_code_may_speak_of_topics_that_are_unknown_here(three: Plan) -> None:
+def test_a_host_with_other_code_may_report_topics_unknown_here(
+    three: ResolvedGraph,
+) -> None:
     visits = good(three)
     visits["left"].nodes["arm_left_bridge"] = said(
         "arm_left_bridge", port("a_topic_of_tomorrow", 50.0), note="well"
@@ -234,7 +236,7 @@ TROUBLES: dict[str, tuple[Any, tuple[str, str, str], str]] = {
 
 
 @pytest.mark.parametrize("name", TROUBLES)
-def test_each_trouble_is_found_where_it_is_and_has_a_remedy(three: Plan, name: str) -> None:
+def test_each_fault_is_found_at_its_host_and_has_a_remedy(three: ResolvedGraph, name: str) -> None:
     bring_about, expected, remedy = TROUBLES[name]
     found = good(three)
     bring_about(found)
@@ -246,7 +248,7 @@ def test_each_trouble_is_found_where_it_is_and_has_a_remedy(three: Plan, name: s
 
 
 @pytest.mark.parametrize("reach", [*WAYS, *SILENCES])
-def test_silence_has_a_cause_and_the_rest_was_not_asked(three: Plan, reach: Reach) -> None:
+def test_silence_has_a_cause_and_the_rest_was_not_asked(three: ResolvedGraph, reach: Reach) -> None:
     found = good(three) | {"left": Visit("left", reach)}
     findings = [one for one in judge(three, "main", found) if one.host == "left"]
     states = [one.state for one in findings if one.state != "ok"]
@@ -256,7 +258,7 @@ def test_silence_has_a_cause_and_the_rest_was_not_asked(three: Plan, reach: Reac
     assert "{" not in failed.what + failed.remedy
 
 
-def test_before_anything_is_started_nothing_is_wrong(three: Plan) -> None:
+def test_before_anything_is_started_nothing_is_wrong(three: ResolvedGraph) -> None:
     found = {name: Visit(name, "closed") for name in NAMES} | {"main": Visit("main", "itself")}
     states = {one.state for one in judge(three, "main", found)}
     assert states == {"ok", "warning", "not asked"}
@@ -277,15 +279,15 @@ def test_rates_are_held_against_the_table(topic: str, rate_hz: float, wrong: boo
 async def test_how_far_one_comes_by_tcp(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         taken = server.getsockname()[1]
-        assert await way_to("127.0.0.1", taken) == "speaks"
-    assert await way_to("127.0.0.1", taken) == "closed"
+        assert await probe_port("127.0.0.1", taken) == "speaks"
+    assert await probe_port("127.0.0.1", taken) == "closed"
 
     async def ways(numbers: dict[int, int]) -> Reach:
         async def connect(_: str, port: int) -> int:
             return numbers[port]
 
         monkeypatch.setattr(visits, "_connect", connect)
-        return await way_to("192.0.2.9", 20_000)
+        return await probe_port("192.0.2.9", 20_000)
 
     assert await ways({20_000: errno.ENETUNREACH}) == "no way"
     assert await ways({20_000: errno.EHOSTUNREACH, 22: errno.EHOSTUNREACH}) == "absent"
@@ -316,11 +318,11 @@ async def test_keys_that_do_not_fit_are_told_apart(monkeypatch: pytest.MonkeyPat
             assert await visits._shake_hands(endpoint, "left", known.ring("main")) == "silent"
 
 
-def plan_of(folder: Path, **values: Any) -> Plan:
+def plan_of(folder: Path, **values: Any) -> ResolvedGraph:
     path = folder / "graph.yaml"
     nodes = {"beacon": BEACON, "other": BEACON | {"host": "left", "topics": {"twin__finger": None}}}
     path.write_text(json.dumps({"nodes": nodes, "hosts": ADDRESSES} | values))
-    return load_plan(path)
+    return load_graph(path)
 
 
 async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
@@ -339,7 +341,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
             states = {one.host: one.state for one in found if one.check == check}
             assert states == {"main": "ok", "left": "ok"}, (check, found)
         # Another host of the plan asks, from outside of any run, about another plan.
-        other = plan_of(folder, hosts=addresses, from_tools=["twin/stereo"], nodes={
+        other = plan_of(folder, hosts=addresses, external_topics=["twin/stereo"], nodes={
             "beacon": BEACON | {"parameters": {"rate_hz": 17.0}},
             "other": BEACON | {"host": "left", "topics": {"twin__finger": None}},
         })  # fmt: skip
@@ -349,7 +351,7 @@ async def test_a_running_graph_is_asked_with_its_keys(folder: Path) -> None:
 
 
 def test_own_keys_and_address_are_looked_at_before_the_start(
-    folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch
+    folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.opengl_problem", lambda: "no EGL")
     assert "there is no key" in (own_key_problem(three, "main") or "")
@@ -365,7 +367,9 @@ def test_own_keys_and_address_are_looked_at_before_the_start(
     assert failed == {"address", "keys", "opengl"}
 
 
-def test_which_host_this_is(folder: Path, three: Plan, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_which_host_this_is(
+    folder: Path, three: ResolvedGraph, monkeypatch: pytest.MonkeyPatch
+) -> None:
     two = plan_of(folder)
     monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
     assert host_here(two, None, None) == "left"

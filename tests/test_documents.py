@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch.plans import documents
 from flexsheet.launch.plans.documents import MAX_VALUES, BadInputError, read_document, validate
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 
 MAX_TOKENS = 20 * MAX_VALUES
 
@@ -67,7 +67,7 @@ def test_a_hostile_file_is_refused_with_little_work(
     file = tmp_path / "graph.yaml"
     file.write_text(text)
     with pytest.raises(BadInputError) as refused:
-        load_plan(file)
+        load_graph(file)
     assert str(file) in str(refused.value)
     assert said in str(refused.value)
     assert "Commented" not in str(refused.value)
@@ -89,7 +89,7 @@ def test_errors_name_no_class(tmp_path: Path, text: str) -> None:
     file = tmp_path / "graph.yaml"
     file.write_text(text)
     with pytest.raises(BadInputError) as refused:
-        load_plan(file)
+        load_graph(file)
     assert "it must hold keys and values" in str(refused.value)
     for word in ("instance", "dictionary", "Spec"):
         assert word not in str(refused.value)

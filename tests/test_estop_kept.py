@@ -15,10 +15,10 @@ from typing import Self
 
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import RUN_DIRECTORY, Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import RUN_DIRECTORY, ResolvedGraph
 from flexsheet.launch.running.estop_file import STATE_VARIABLE, EStopFile
-from flexsheet.launch.running.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
+from flexsheet.launch.running.host import REASON_LENGTH, HostAgent, arms_of, waits_for_a_person
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
@@ -47,14 +47,14 @@ def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(made)
 
 
-def plan_of(folder: Path, *, arming: str = "by_command") -> Plan:
+def plan_of(folder: Path, *, arming: str = "by_command") -> ResolvedGraph:
     """A graph in which an arm waits for a person's word; only its launchers are started."""
     path = folder / "graph.yaml"
     bridge = BRIDGE | {"parameters": {"side": "left", "arming": arming}}
     topics = ["arm_right", "scene", "sheet_target"]
-    values = {"nodes": {"bridge": bridge}, "hosts": HOSTS, "from_tools": topics}
+    values = {"nodes": {"bridge": bridge}, "hosts": HOSTS, "external_topics": topics}
     path.write_text(json.dumps(values))
-    return load_plan(path)
+    return load_graph(path)
 
 
 @dataclass
@@ -62,15 +62,15 @@ class Launchers:
     """The launchers' voices of all hosts, and a tool that says e-stops."""
 
     folder: Path
-    plan: Plan
+    plan: ResolvedGraph
     said: list[str] = field(default_factory=list)
-    voices: dict[str, HostVoice] = field(default_factory=dict)
+    voices: dict[str, HostAgent] = field(default_factory=dict)
 
     async def __aenter__(self) -> Self:
         self._clock = SystemClock()
         self._epoch, self._sequence = self._clock.now_ns(), 0
         for host in self.plan.hosts:
-            self.voices[host] = HostVoice(
+            self.voices[host] = HostAgent(
                 self.plan, host, run_id="1", code="", processes=tuple, pids=dict,
                 endpoints=lambda ends: tuple(map(self._near, ends)),
                 sources=lambda ones: tuple(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.host import arms_of, folder_of
 from flexsheet.messages.types import ArmState
 from flexsheet.nodes import NODES, NodeRole, node_class
@@ -27,11 +27,11 @@ class OwnRecorder(Recorder):
     """A laboratory's recorder."""
 
 
-def plan_with(folder: Path, bridge: dict[str, object], **more: object) -> Plan:
+def plan_with(folder: Path, bridge: dict[str, object], **more: object) -> ResolvedGraph:
     path = folder / "graph.yaml"
     nodes = {"bridge": {"topics": {"arm": "arm_left"}, **bridge}, **more}
     path.write_text(json.dumps({"nodes": nodes}))
-    return load_plan(path)
+    return load_graph(path)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_plans_of_old_bags_have_the_roles_of_their_types(tmp_path: Path) -> None
     (node,) = plan["nodes"].values()
     del node["role"]
     node["type"] = "arm_bridge"
-    assert Plan.model_validate(plan).nodes["bridge"].role is NodeRole.ARM_BRIDGE
+    assert ResolvedGraph.model_validate(plan).nodes["bridge"].role is NodeRole.ARM_BRIDGE
 
 
 def test_the_shipped_nodes_have_their_roles() -> None:

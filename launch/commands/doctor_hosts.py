@@ -23,7 +23,7 @@ from flexsheet.launch.commands.output import (
 
 if TYPE_CHECKING:
     from flexsheet.launch.health.doctor_hosts import HostFinding
-    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
 
 PATIENCE_S = 4.0
@@ -94,13 +94,13 @@ def ask_running(patience_s: float = PATIENCE_S) -> list[HostFinding]:
     return asyncio.run(examine(plan, host_of(run), run, patience_s))
 
 
-def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
+def _graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
     """The plan, and the graph of that launch file that runs here."""
-    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.plans.plan import load_graph
 
     if launch_file is None:
         return running_graph(None)
-    plan = load_plan(launch_file)
+    plan = load_graph(launch_file)
     try:
         running, run = running_graph(None)
     except CommandError:
@@ -109,11 +109,11 @@ def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
     return plan, run if same or running.hash == plan.hash else None
 
 
-def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
+def host_here(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
     """Which host of the plan this computer is; CommandError where that cannot be told."""
     from flexsheet.launch.health.doctor_hosts import own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
-    from flexsheet.launch.plans.planned import MAIN
+    from flexsheet.launch.plans.plan_model import MAIN
     from flexsheet.launch.running.tools import host_of
 
     if wanted is not None:
@@ -136,12 +136,14 @@ def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
     )
 
 
-async def examine(plan: Plan, here: str, run: Run | None, patience_s: float) -> list[HostFinding]:
+async def examine(
+    plan: ResolvedGraph, here: str, run: Run | None, patience_s: float
+) -> list[HostFinding]:
     """All findings: what this computer sees, and what the others say."""
     import tempfile
 
     from flexsheet.launch.health.doctor_hosts import before_start, judge, own_key_problem
-    from flexsheet.launch.health.visits import visit_all
+    from flexsheet.launch.health.probe import probe_all
     from flexsheet.launch.running.keys import secret_file
     from flexsheet.messages.security import KeyRing, write_ring
 
@@ -152,7 +154,7 @@ async def examine(plan: Plan, here: str, run: Run | None, patience_s: float) -> 
             file = Path(folder) / "ring.json"
             write_ring(file, host=here, secret_file=secret_file(here), public=plan.keys)
             keys = KeyRing(file)
-        visits = await visit_all(plan, here=here, keys=keys, run=run, patience_s=patience_s)
+        visits = await probe_all(plan, here=here, keys=keys, run=run, patience_s=patience_s)
     findings = judge(plan, here, visits)
     if visits[here].status is None:
         seen = await asyncio.to_thread(lambda: list(before_start(plan, here, key_problem)))

@@ -15,7 +15,7 @@ from typing import Literal
 
 from flexsheet.launch.health.system import OPENGL, opengl_problem
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
 from flexsheet.launch.running.runs import is_free, live_runs, orphans, root
 from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
@@ -182,7 +182,7 @@ def check_leftovers() -> Finding:
 def check_demo() -> Finding:
     """The demo's launch file resolves, and the ports that its nodes listen on are free."""
     try:
-        plan = load_plan(DEMO)
+        plan = load_graph(DEMO)
     except BadInputError as error:
         return Finding("demo", "failed", str(error))
     taken = [port for _, port in plan.listening_nodes(None) if not is_free("127.0.0.1", port)]

@@ -17,11 +17,11 @@ from typing import Literal
 import psutil
 
 from flexsheet.launch.health.doctor import LEAST_DISK_BYTES, check_libraries
+from flexsheet.launch.health.probe import Reach, Visit
 from flexsheet.launch.health.system import OPENGL, opengl_problem
-from flexsheet.launch.health.visits import Reach, Visit
 from flexsheet.launch.plans.hosts import is_loopback
-from flexsheet.launch.plans.planned import Plan, PlannedNode
-from flexsheet.launch.plans.wires import FIRST_PORT, PORTS
+from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
+from flexsheet.launch.plans.routing import FIRST_PORT, PORTS
 from flexsheet.launch.running.host import folder_of, list_device_files, python_version, software
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
@@ -112,7 +112,7 @@ SILENCES: dict[Reach, tuple[str, str, str]] = {
 """It is there, and this is what hinders the rest."""
 
 
-def judge(plan: Plan, here: str, visits: Mapping[str, Visit]) -> list[HostFinding]:
+def judge(plan: ResolvedGraph, here: str, visits: Mapping[str, Visit]) -> list[HostFinding]:
     """All findings, host by host, about what the visits brought."""
     found: list[HostFinding] = []
     own = visits[here].status
@@ -140,7 +140,7 @@ def judge(plan: Plan, here: str, visits: Mapping[str, Visit]) -> list[HostFindin
     return found
 
 
-def _way(plan: Plan, here: str, visit: Visit, *, running: bool) -> Iterator[HostFinding]:
+def _way(plan: ResolvedGraph, here: str, visit: Visit, *, running: bool) -> Iterator[HostFinding]:
     host, address = visit.host, plan.hosts[visit.host]
     words = {
         "host": host,
@@ -189,7 +189,7 @@ def _way(plan: Plan, here: str, visit: Visit, *, running: bool) -> Iterator[Host
         )
 
 
-def _plan(plan: Plan, here: str, visit: Visit) -> Iterator[HostFinding]:
+def _plan(plan: ResolvedGraph, here: str, visit: Visit) -> Iterator[HostFinding]:
     assert visit.status is not None
     if visit.status.plan_hash == plan.hash:
         yield HostFinding(visit.host, "plan", "ok", plan.hash)
@@ -217,7 +217,7 @@ def _plan(plan: Plan, here: str, visit: Visit) -> Iterator[HostFinding]:
         )
 
 
-def _keys(plan: Plan, visit: Visit) -> HostFinding:
+def _keys(plan: ResolvedGraph, visit: Visit) -> HostFinding:
     assert visit.status is not None
     theirs = {one.host: one.key for one in visit.status.keys}
     names = sorted(theirs.keys() | plan.keys.keys())
@@ -254,7 +254,7 @@ def _software(visit: Visit, reference: tuple[str, str, str]) -> HostFinding:
     return HostFinding(visit.host, "software", "ok", what)
 
 
-def _clocks(plan: Plan, visit: Visit, visits: Mapping[str, Visit]) -> HostFinding:
+def _clocks(plan: ResolvedGraph, visit: Visit, visits: Mapping[str, Visit]) -> HostFinding:
     """The other hosts' clocks as this one's clock node knows them, against the plan's limit."""
     remedy = "docs/clocks.md: chrony, and is the network quiet?"
     if visit.clocks is None:
@@ -288,7 +288,7 @@ def _clocks(plan: Plan, visit: Visit, visits: Mapping[str, Visit]) -> HostFindin
     return HostFinding(visit.host, "clocks", "ok", what)
 
 
-def _nodes(plan: Plan, visit: Visit) -> HostFinding:
+def _nodes(plan: ResolvedGraph, visit: Visit) -> HostFinding:
     assert visit.status is not None
     nodes = visit.status.nodes
     away = [one.name for one in nodes if one.state != "ready"]
@@ -350,7 +350,7 @@ OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
 """Check and remedy of the nodes that must publish, by role."""
 
 
-def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
+def _parts(nodes: Sequence[ResolvedNode], visit: Visit) -> Iterator[HostFinding]:
     """What the host is there for: cameras, projector, its arm."""
     assert visit.status is not None
     host, missing = visit.host, visit.status.missing_devices
@@ -384,7 +384,7 @@ def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
             yield _arm(node, visit)
 
 
-def _arm(node: PlannedNode, visit: Visit) -> HostFinding:
+def _arm(node: ResolvedNode, visit: Visit) -> HostFinding:
     arm = visit.arms.get(str(node.arm_side))
     check = f"arm {node.arm_side}"
     if arm is None:
@@ -404,7 +404,7 @@ def _arm(node: PlannedNode, visit: Visit) -> HostFinding:
     return HostFinding(visit.host, check, "ok", f"{what}; {ready}")
 
 
-def _silent_arm(node: PlannedNode, visit: Visit, check: str) -> HostFinding:
+def _silent_arm(node: ResolvedNode, visit: Visit, check: str) -> HostFinding:
     """Tell an arm that its bridge waits for from a bridge that does not report."""
     status = visit.nodes.get(node.name)
     if status is None:
@@ -449,7 +449,7 @@ def _shown(texts: Sequence[str]) -> list[str]:
     return [*texts[:NAMES_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
 
-def own_key_problem(plan: Plan, here: str) -> str | None:
+def own_key_problem(plan: ResolvedGraph, here: str) -> str | None:
     """Why this computer's key cannot be used for a host of the plan; None: it can."""
     if not plan.keys:
         return None
@@ -466,7 +466,7 @@ def own_key_problem(plan: Plan, here: str) -> str | None:
     return None
 
 
-def before_start(plan: Plan, here: str, key_problem: str | None) -> Iterator[HostFinding]:
+def before_start(plan: ResolvedGraph, here: str, key_problem: str | None) -> Iterator[HostFinding]:
     """What this computer can say of itself as a host of the plan while no graph runs on it."""
     address, nodes = plan.hosts[here], plan.nodes_on(here)
     if is_loopback(address) or address in own_addresses():
@@ -518,7 +518,7 @@ def before_start(plan: Plan, here: str, key_problem: str | None) -> Iterator[Hos
     yield _disk(here, shutil.disk_usage(folder if folder.is_dir() else Path.cwd()).free)
 
 
-def _ports(plan: Plan, here: str) -> HostFinding:
+def _ports(plan: ResolvedGraph, here: str) -> HostFinding:
     address = plan.hosts[here]
     wanted = [
         int(writer.tcp.rpartition(":")[2])
@@ -536,7 +536,7 @@ def _ports(plan: Plan, here: str) -> HostFinding:
     return HostFinding(here, "ports", "ok", f"{len(wanted)} are free")
 
 
-def _controller(here: str, node: PlannedNode) -> HostFinding:
+def _controller(here: str, node: ResolvedNode) -> HostFinding:
     """Whether an arm's controller takes connections; a graph that runs holds the only one."""
     check = f"arm {node.arm_side}"
     if node.device_address is None:

@@ -1,8 +1,8 @@
-"""A launch file, checked and resolved: which node runs where, with what, and who talks to whom.
+"""Check a launch file and resolve it: which node runs where, with which parameters and endpoints.
 
-The launch file is the graph.  `load_plan` turns it into a `Plan` in which every endpoint is known
-before any process starts; everything that is wrong with the file is reported at once.  Every host
-computes the same plan from the same file, and the plan's hash says so.
+`load_graph` returns a `ResolvedGraph`, in which every endpoint is known before any process starts.
+All errors of the file are reported at once.  Every host resolves the same file to the same graph;
+hosts compare its hash.
 """
 
 from __future__ import annotations
@@ -30,16 +30,22 @@ from flexsheet.launch.plans.launch_file import (
     apply_record,
     apply_setting,
 )
-from flexsheet.launch.plans.members import (
+from flexsheet.launch.plans.plan_model import (
+    MAIN,
+    ResolvedGraph,
+    ResolvedNode,
+    ResolvedPort,
+    Writer,
+)
+from flexsheet.launch.plans.resolve_nodes import (
     Member,
     check_calibrations,
     check_wires,
+    collect_entries,
     in_full,
-    members_of,
-    resolve_member,
+    resolve_entry,
 )
-from flexsheet.launch.plans.planned import MAIN, Plan, PlannedNode, PlannedPort, Writer
-from flexsheet.launch.plans.wires import (
+from flexsheet.launch.plans.routing import (
     check_inputs,
     endpoints_of,
     resolve_further_inputs,
@@ -50,13 +56,13 @@ from flexsheet.nodes.node import NodeParameters, role_of
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 
-def load_plan(
+def load_graph(
     path: Path,
     *,
     settings: Sequence[str] = (),
     record: Path | None = None,
     console: bool = False,
-) -> Plan:
+) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
     settings: "node.parameter=value" each, value in YAML, over what the file says.
@@ -75,9 +81,9 @@ def load_plan(
     problems: list[Problem] = []
     check_hosts(spec.hosts, document, problems)
     scene_document, scene = _load_scene(spec, document, problems)
-    members = members_of(spec, document, problems)
+    members = collect_entries(spec, document, problems)
     for member in members:
-        resolve_member(member, document, problems)
+        resolve_entry(member, document, problems)
     writers = writers_of(spec, members, document, problems, has_scene=scene is not None)
     resolve_further_inputs(members, writers, document, problems)
     check_inputs(members, writers, document, problems)
@@ -106,7 +112,7 @@ def load_plan(
             for member in sorted(members, key=lambda member: member.name)
         ],
     }
-    return Plan(
+    return ResolvedGraph(
         launch_file=str(path),
         launch_text=document.text,
         scene_file=None if scene_document is None else str(scene_document.path),
@@ -153,12 +159,12 @@ def _planned(
     document: Document,
     *,
     resolve_paths: bool,
-) -> PlannedNode:
+) -> ResolvedNode:
     host = member.spec.host
     assert member.type is not None  # a member without a class is a problem
     assert member.parameters is not None
     parameters = in_full(member, document, resolve_paths=resolve_paths)
-    return PlannedNode(
+    return ResolvedNode(
         name=member.name,
         type=member.spec.type,
         listen_ports=tuple(filter(None, _marked(member.parameters, ParameterMark.LISTEN_PORT))),
@@ -173,7 +179,7 @@ def _planned(
         host=host,
         parameters=parameters,
         inputs=tuple(
-            PlannedPort(
+            ResolvedPort(
                 port=port,
                 topic=topic.name,
                 endpoints=tuple(one.endpoint_for(host) for one in endpoints[topic.name]),
@@ -182,7 +188,7 @@ def _planned(
         )
         + member.unconnected_ports("input"),
         outputs=tuple(
-            PlannedPort(
+            ResolvedPort(
                 port=port,
                 topic=topic.name,
                 endpoints=next(

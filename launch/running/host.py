@@ -19,7 +19,7 @@ import psutil
 import zmq
 
 from flexsheet.launch.plans.hosts import clock_node, launcher_on
-from flexsheet.launch.plans.planned import Plan, PlannedNode, tools_on
+from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode, tools_on
 from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
 from flexsheet.messages.base import Header, Message
@@ -50,7 +50,7 @@ Endpoints = Callable[[tuple[str, ...]], tuple[str, ...]]
 Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
-class HostVoice:
+class HostAgent:
     """The launcher's part in the graph, for one host; use between `start` and `close`.
 
     endpoints, sources: fill in the run's directory.  code: the commit, for `HostStatus`.
@@ -60,7 +60,7 @@ class HostVoice:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: ResolvedGraph,
         host: str,
         *,
         run_id: str,
@@ -335,13 +335,13 @@ def shows_estop(state: ArmState) -> bool:
     return state.mode == "estop" or any(fault.startswith("e-stop: ") for fault in state.faults)
 
 
-def arms_of(plan: Plan) -> list[str]:
+def arms_of(plan: ResolvedGraph) -> list[str]:
     """List the plan's arms by the address of each; a bridge without one counts by its name."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
 
-def waits_for_a_person(plan: Plan) -> bool:
+def waits_for_a_person(plan: ResolvedGraph) -> bool:
     """Whether arms move at a person's word only; those that go by themselves are simulated."""
     return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
 
@@ -359,12 +359,12 @@ def software() -> str:
     return f"flexsheet {own}, pyzmq {zmq.pyzmq_version()}, libzmq {zmq.zmq_version()}"
 
 
-def list_device_files(nodes: Sequence[PlannedNode]) -> list[str]:
+def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
     """Return the device files that the nodes open, sorted."""
     return sorted({file for node in nodes for file in node.device_files})
 
 
-def folder_of(nodes: list[PlannedNode]) -> Path:
+def folder_of(nodes: list[ResolvedNode]) -> Path:
     """Where the host's recorder writes; the working folder where there is none, or not yet."""
     for node in nodes:
         if node.role is NodeRole.RECORDER:

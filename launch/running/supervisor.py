@@ -27,17 +27,17 @@ from typing import Any, Self
 from flexsheet.launch.plans.documents import BadInputError, Problem, read_document
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.launch.plans.planned import (
+from flexsheet.launch.plans.plan_model import (
     LAUNCHER,
     MAIN,
     RUN_DIRECTORY,
-    Plan,
-    PlannedNode,
-    PlannedPort,
+    ResolvedGraph,
+    ResolvedNode,
+    ResolvedPort,
 )
 from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from flexsheet.launch.running.code_state import git_state
-from flexsheet.launch.running.host import HostVoice
+from flexsheet.launch.running.host import HostAgent
 from flexsheet.launch.running.keys import KeyWatch, make_rings
 from flexsheet.launch.running.priority import min_nice_step, precedence_problem
 from flexsheet.launch.running.runs import (
@@ -235,7 +235,7 @@ class RunningGraph:
     """
 
     def __init__(
-        self, plan: Plan, *, host: str | None = None, report: Report | None = None
+        self, plan: ResolvedGraph, *, host: str | None = None, report: Report | None = None
     ) -> None:
         self.plan, self._host, self._report_to = plan, host, report
         self.nodes = plan.nodes_on(host)
@@ -248,7 +248,7 @@ class RunningGraph:
         self._keepers: dict[str, asyncio.Task[None]] = {}
         self._ready = {node.name: asyncio.Event() for node in self.nodes}
         self._publishers: list[Publisher] = []
-        self._voices: dict[str, HostVoice] = {}
+        self._voices: dict[str, HostAgent] = {}
         self._rings: dict[str, KeyRing] = {}
         self._keys_watch: asyncio.Task[None] | None = None
         self._lifeline: tuple[int, int] | None = None
@@ -424,7 +424,7 @@ class RunningGraph:
 
     def _start_voice(self, host: str) -> None:
         git = json.loads((self.run.directory / "git.json").read_text())
-        voice = HostVoice(
+        voice = HostAgent(
             self.plan,
             host,
             run_id=self.run.id,
@@ -478,7 +478,7 @@ class RunningGraph:
                 if host in self._voices:
                     self._voices[host].renew_keys(change)
 
-    async def _keep(self, node: PlannedNode) -> None:
+    async def _keep(self, node: ResolvedNode) -> None:
         """Run the node again and again, as its policy says; NodeFailedError when for good."""
         policy = node.restart
         recent: deque[float] = deque()
@@ -506,7 +506,7 @@ class RunningGraph:
             await asyncio.sleep(delay_s)
             self.restarts[node.name] += 1
 
-    async def _run_once(self, node: PlannedNode) -> str | None:
+    async def _run_once(self, node: ResolvedNode) -> str | None:
         """One life of a node; returns what was wrong with its end, None if nothing was."""
         child = self._spawn(node)
         await asyncio.wait(
@@ -532,7 +532,7 @@ class RunningGraph:
             return f"hung: no sign of life for {node.liveness_s:g} s; its log shows where"
         return describe_exit(code)
 
-    async def _outlives(self, child: Child, node: PlannedNode) -> bool:
+    async def _outlives(self, child: Child, node: ResolvedNode) -> bool:
         """Whether the process hangs, and so has to be ended; False when it ends by itself."""
         if node.liveness_s is None:
             return False
@@ -554,7 +554,7 @@ class RunningGraph:
             child.end_hanging()
         return hangs
 
-    def _spawn(self, node: PlannedNode) -> Child:
+    def _spawn(self, node: ResolvedNode) -> Child:
         assert self._lifeline is not None  # made before any keeper
         environment = {
             **os.environ,
@@ -620,10 +620,10 @@ async def _end(children: list[Child]) -> None:
         await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
 
 
-def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
+def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
     """What a node's process is told, with the run's directory filled in."""
 
-    def outputs(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
+    def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
             PortConfig(
                 port=port.port, topic=port.topic, endpoints=local_endpoints(run, port.endpoints)
@@ -631,7 +631,7 @@ def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
             for port in planned
         )
 
-    def inputs(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
+    def inputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
             PortConfig(
                 port=port.port,
@@ -662,7 +662,7 @@ def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
     )
 
 
-def _clocks_port(plan: Plan, host: str, run: Run) -> PortConfig | None:
+def _clocks_port(plan: ResolvedGraph, host: str, run: Run) -> PortConfig | None:
     writer = plan.writer("clocks", clock_node(host))
     if writer is None:
         return None
@@ -689,7 +689,7 @@ def _fill_run(value: Any, run: Run) -> Any:
     return value
 
 
-def _refuse_open_network(plan: Plan, host: str | None) -> None:
+def _refuse_open_network(plan: ResolvedGraph, host: str | None) -> None:
     if host is not None and host not in plan.hosts:
         raise BadInputError(
             [Problem("--host", (), f'unknown host "{host}"', f"there are: {', '.join(plan.hosts)}")]
@@ -708,7 +708,7 @@ def _refuse_open_network(plan: Plan, host: str | None) -> None:
             )
 
 
-def _check_ports(plan: Plan, host: str | None) -> None:
+def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
     """Every TCP port that this launcher's processes will listen on must be free."""
     wanted = [
         (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))

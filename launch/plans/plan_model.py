@@ -82,7 +82,7 @@ class Writer(Strict):
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
 
 
-class PlannedPort(Strict):
+class ResolvedPort(Strict):
     """A port, its topic, and the endpoints: bound for an output, connected to for an input."""
 
     port: str
@@ -90,15 +90,15 @@ class PlannedPort(Strict):
     endpoints: tuple[str, ...]
 
 
-class PlannedNode(Strict):
+class ResolvedNode(Strict):
     """All that is needed to start one node."""
 
     name: str
     type: str
     host: str
     parameters: dict[str, Any]
-    inputs: tuple[PlannedPort, ...]
-    outputs: tuple[PlannedPort, ...]
+    inputs: tuple[ResolvedPort, ...]
+    outputs: tuple[ResolvedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
     listen_ports: tuple[int, ...] = Field(default=(), description="TCP, on loopback")
@@ -135,7 +135,7 @@ class PlannedNode(Strict):
         return {**derived, **values}
 
 
-class Plan(Strict):
+class ResolvedGraph(Strict):
     """A resolved launch file."""
 
     launch_file: str
@@ -144,7 +144,7 @@ class Plan(Strict):
     scene_text: str
     scene: dict[str, Any] | None
     hosts: dict[str, str] = Field(description="address by name")
-    nodes: dict[str, PlannedNode]
+    nodes: dict[str, ResolvedNode]
     writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
     keys: dict[str, str] = Field(default={}, description="public key by host; no part of the hash")
     estop_resetters: tuple[str, ...] = Field(default=(MAIN,), description="hosts that may")
@@ -170,7 +170,7 @@ class Plan(Strict):
             if writer.host in self.estop_resetters
         )
 
-    def nodes_on(self, host: str | None) -> list[PlannedNode]:
+    def nodes_on(self, host: str | None) -> list[ResolvedNode]:
         """The nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 

@@ -18,7 +18,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from flexsheet.launch.plans.hosts import is_loopback, launcher_on
-from flexsheet.launch.plans.planned import Plan, Writer
+from flexsheet.launch.plans.plan_model import ResolvedGraph, Writer
 from flexsheet.launch.running.runs import Run, local_sources
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Source, Subscriber
@@ -82,8 +82,8 @@ class Visit:
     failed_handshakes: list[str] = field(default_factory=list)
 
 
-async def visit_all(
-    plan: Plan, *, here: str, keys: KeyRing | None, run: Run | None, patience_s: float
+async def probe_all(
+    plan: ResolvedGraph, *, here: str, keys: KeyRing | None, run: Run | None, patience_s: float
 ) -> dict[str, Visit]:
     """Ask all hosts at once.
 
@@ -101,7 +101,7 @@ async def visit_all(
     return {one.host: one for one in visits}
 
 
-async def _visit_here(plan: Plan, host: str, run: Run | None, patience_s: float) -> Visit:
+async def _visit_here(plan: ResolvedGraph, host: str, run: Run | None, patience_s: float) -> Visit:
     if run is None:
         return Visit(host, "itself")
     visit = Visit(host, "speaks")
@@ -118,14 +118,14 @@ async def _visit_here(plan: Plan, host: str, run: Run | None, patience_s: float)
 
 
 async def _visit(
-    plan: Plan, host: str, here: str, keys: KeyRing | None, patience_s: float
+    plan: ResolvedGraph, host: str, here: str, keys: KeyRing | None, patience_s: float
 ) -> Visit:
     writer = plan.writer("host", launcher_on(host))
     # A plan of several hosts has a tcp endpoint for each writer.
     assert writer is not None
     assert writer.tcp is not None
     address, port = plan.hosts[host], int(writer.tcp.rpartition(":")[2])
-    reach = await way_to(address, port)
+    reach = await probe_port(address, port)
     if reach != "speaks":
         return Visit(host, reach)
     if keys is None and (plan.keys or not is_loopback(address)):
@@ -138,7 +138,7 @@ async def _visit(
     return visit
 
 
-async def way_to(address: str, port: int) -> Reach:
+async def probe_port(address: str, port: int) -> Reach:
     """How far one comes towards a port by TCP; "speaks": it takes connections."""
     number = await _connect(address, port)
     if number == 0:
@@ -191,7 +191,7 @@ async def _shake_hands(endpoint: str, host: str, keys: KeyRing | None) -> Reach:
 
 
 async def _listen(
-    plan: Plan,
+    plan: ResolvedGraph,
     visit: Visit,
     keys: KeyRing | None,
     source_of: Callable[[Writer], Source],
@@ -246,7 +246,7 @@ async def _listen(
             subscriber.close()
 
 
-def _has_said_all(plan: Plan, visit: Visit) -> bool:
+def _has_said_all(plan: ResolvedGraph, visit: Visit) -> bool:
     nodes = plan.nodes_on(visit.host)
     return (
         visit.status is not None

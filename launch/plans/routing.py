@@ -9,8 +9,8 @@ from itertools import product
 from flexsheet.launch.plans.documents import Document, Problem, did_you_mean
 from flexsheet.launch.plans.hosts import launcher_on
 from flexsheet.launch.plans.launch_file import LaunchFile
-from flexsheet.launch.plans.members import Member
-from flexsheet.launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
+from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
+from flexsheet.launch.plans.resolve_nodes import Member
 from flexsheet.messages.topics import TOPICS
 
 SAID_FROM_ANYWHERE = ("estop",)
@@ -49,17 +49,19 @@ def writers_of(
                 )
             else:
                 writers.setdefault(topic.name, []).append((member.name, member.spec.host))
-    for i, name in enumerate(spec.from_tools):
+    for i, name in enumerate(spec.external_topics):
         if name not in TOPICS:
             problems.append(
                 document.problem(
-                    ("from_tools", i), f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
+                    ("external_topics", i),
+                    f'unknown topic "{name}"',
+                    did_you_mean(name, list(TOPICS)),
                 )
             )
         elif name in writers and not TOPICS[name].many_writers:
             problems.append(
                 document.problem(
-                    ("from_tools", i),
+                    ("external_topics", i),
                     f'topic "{name}" is written by "{writers[name][0][0]}" already',
                     "a topic has one writer",
                 )
@@ -111,13 +113,13 @@ def check_inputs(
                 remedy = (
                     'name a scene file in "scene"'
                     if topic.name == "scene"
-                    else 'add the node that does, list it in "from_tools" for a tool to write, '
-                    f"or leave the port out with topics: {{{port_name}: null}}"
+                    else 'add a node that writes it, list it in "external_topics" if a tool '
+                    f"writes it, or disconnect the port with topics: {{{port_name}: null}}"
                 )
                 problems.append(
                     document.problem(
                         (*member.key, "topics", port_name),
-                        f'nobody writes topic "{topic.name}"',
+                        f'no node writes topic "{topic.name}"',
                         remedy,
                     )
                 )

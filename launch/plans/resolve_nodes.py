@@ -18,7 +18,7 @@ from flexsheet.launch.plans.documents import (
 )
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.launch_file import RECORDER_NICE, ClocksSpec, LaunchFile, NodeSpec
-from flexsheet.launch.plans.planned import LAUNCHER, RUN_DIRECTORY, TOOLS, PlannedPort, tools_on
+from flexsheet.launch.plans.plan_model import LAUNCHER, RUN_DIRECTORY, TOOLS, ResolvedPort, tools_on
 from flexsheet.messages.calibration import load_calibration, refuse_other_camera
 from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 from flexsheet.messages.scene import Scene
@@ -52,15 +52,15 @@ class Member:
             found += [(f"in/{topic.name}", topic) for topic in self.further_inputs]
         return found
 
-    def unconnected_ports(self, direction: str) -> tuple[PlannedPort, ...]:
+    def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
         return tuple(
-            PlannedPort(port=port.name, topic=topic.name, endpoints=())
+            ResolvedPort(port=port.name, topic=topic.name, endpoints=())
             for port, topic in self.unconnected
             if port.direction == direction
         )
 
 
-def members_of(spec: LaunchFile, document: Document, problems: list[Problem]) -> list[Member]:
+def collect_entries(spec: LaunchFile, document: Document, problems: list[Problem]) -> list[Member]:
     members = []
     for name, node_spec in spec.nodes.items():
         members.append(Member(name, node_spec, ("nodes", name)))
@@ -106,7 +106,7 @@ def _clock_member(host: str, clocks: ClocksSpec) -> Member:
     return Member(clock_node(host), node_spec, ("clocks",))
 
 
-def resolve_member(member: Member, document: Document, problems: list[Problem]) -> None:
+def resolve_entry(member: Member, document: Document, problems: list[Problem]) -> None:
     """Find the member's class, connect its ports to topics, check its parameters."""
     key = member.key
     type_name = member.spec.type
