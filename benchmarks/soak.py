@@ -54,7 +54,7 @@ from flexsheet.launch.methods.machine import machine_name
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
-from flexsheet.launch.running.tools import GraphWriter, subscriber_to
+from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.bag import BagError, BagReader, info
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
@@ -311,7 +311,7 @@ class Soak:
         await self._read_bags(all_of_them=True)
 
     async def _use(self, driver: Driver, scene: Scene) -> None:
-        status = subscriber_to(
+        status = make_subscriber(
             "status", self.plan, self.graph.run, self.heard.take, on_problem=self.problems.append
         )
         writer = GraphWriter(self.plan, self.graph.run, ["recording"])

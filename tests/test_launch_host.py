@@ -19,7 +19,7 @@ from flexsheet.launch.plans.plan_model import TOOLS, ResolvedGraph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.host import list_device_files
 from flexsheet.launch.running.supervisor import RunningGraph
-from flexsheet.launch.running.tools import GraphWriter, subscriber_to
+from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.types import EStop, HostStatus
 from tests.waiting import DEADLINE_S, NOTHING_COMES_S, until
 
@@ -52,7 +52,7 @@ async def heard_late(
     Waits for the expected ones; without any, for a while in which none shall come.
     """
     heard: dict[str, EStop] = {}
-    subscriber = subscriber_to(
+    subscriber = make_subscriber(
         "estop", plan, graph.run,
         lambda message, header: heard.update({header.writer: message}),
         on_problem=pytest.fail,
@@ -96,7 +96,7 @@ async def test_each_host_says_how_it_is_and_how_its_nodes_are(tmp_path: Path) ->
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(DEADLINE_S)
         graph.kill("beacon")
-        subscriber = subscriber_to(
+        subscriber = make_subscriber(
             "host", plan, graph.run,
             lambda message, header: newest.update({message.host: message}),
             on_problem=pytest.fail,

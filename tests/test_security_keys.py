@@ -19,7 +19,7 @@ from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.keys import KEYS_VARIABLE, install
 from flexsheet.launch.running.supervisor import RunningGraph
-from flexsheet.launch.running.tools import subscriber_to
+from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.messages.security import (
     SecurityError,
     is_key,
@@ -242,7 +242,7 @@ async def heard(plan: ResolvedGraph, graph: RunningGraph) -> None:
     """Until a tool on main has heard the beacon on left."""
     fingers: list[TwinFinger] = []
     said: list[str] = []
-    subscriber = subscriber_to(
+    subscriber = make_subscriber(
         "twin/finger", plan, graph.run, lambda message, _: fingers.append(message),
         on_problem=said.append,
     )  # fmt: skip

@@ -190,11 +190,11 @@ class _Arms:
         self.problems: list[str] = []
 
     async def __aenter__(self) -> Self:
-        from flexsheet.launch.running.tools import subscriber_to
+        from flexsheet.launch.running.tools import make_subscriber
 
         for topic in TOPICS:
             self._subscribers.append(
-                subscriber_to(
+                make_subscriber(
                     topic, self._plan, self._run, self._take, on_problem=self.problems.append
                 )
             )
@@ -253,10 +253,10 @@ async def _say(
     as_json: bool,
 ) -> int:
     """Say a word to both arms and wait until it holds; show how they are then."""
-    from flexsheet.launch.running.tools import host_of
+    from flexsheet.launch.running.tools import tools_host
 
     plan, run = running_graph(run_directory)
-    _refuse_reset_from_elsewhere(plan, host_of(run), word)
+    _refuse_reset_from_elsewhere(plan, tools_host(run), word)
     async with _Arms(plan, run) as arms:
         if word is not None:
             await arms.publish(*word)

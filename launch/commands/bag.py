@@ -348,7 +348,7 @@ async def _record(
     """Run a recorder node in this process, connected to the running graph."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file
-    from flexsheet.launch.running.tools import host_of
+    from flexsheet.launch.running.tools import tools_host
     from flexsheet.messages.topics import TOPICS
     from flexsheet.nodes.recorder.node import Recorder
     from flexsheet.nodes.recorder.parameters import RUN_FILES, RecorderParameters
@@ -375,13 +375,13 @@ async def _record(
             PortConfig(
                 port=f"in/{name}",
                 topic=name,
-                endpoints=local_sources(run, plan.sources_to_read(name, host_of(run))),
+                endpoints=local_sources(run, plan.sources_to_read(name, tools_host(run))),
             )
             for name in wanted
         ),
         outputs=(),
         plan_hash=plan.hash,
-        keys_file=ring_file(run, host_of(run)) if plan.keys else None,
+        keys_file=ring_file(run, tools_host(run)) if plan.keys else None,
         run_dir=str(run.directory),
     )
     words.print(f"recording {len(wanted)} topics; Ctrl-C ends", markup=False)

@@ -113,7 +113,7 @@ async def run_graph(
 
     def on_signal() -> None:
         if asked_to_stop.is_set():
-            graph.hurry()
+            graph.kill_all()
         asked_to_stop.set()
 
     with handle_signals(on_signal, *_ending_signals()):

@@ -46,7 +46,7 @@ def install(
 ) -> None:
     """Write flexsheet@.service, the host's environment and settings for TCP; start nothing."""
     from flexsheet.launch.plans.plan import load_graph
-    from flexsheet.launch.running.systemd_unit import STATE, bags_of, files_of
+    from flexsheet.launch.running.systemd_unit import STATE, files_of, list_bags
 
     plan = load_graph(launch_file)
     if host not in plan.hosts:
@@ -56,7 +56,7 @@ def install(
         )
     if not user or set(user) - set(USER_PATTERN):
         raise CommandError(f'--user "{user}" is no name of a user', BAD_INPUT)
-    for bag in bags_of(plan, host):
+    for bag in list_bags(plan, host):
         if not bag.is_relative_to(STATE):
             words.print(
                 f"{bag} cannot be recorded: the service may write to {STATE} only; change the "

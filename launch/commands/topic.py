@@ -386,12 +386,12 @@ def listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, unopened: bool = False
 ) -> Subscriber:
     """A subscriber to the topic in the graph that runs; CommandError when nothing writes it."""
-    from flexsheet.launch.running.tools import subscriber_to
+    from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)
     if not plan.endpoints_to_read(topic.name):
         raise CommandError(f'nobody writes "{topic.name}" in the graph that runs ({run.directory})')
-    return subscriber_to(
+    return make_subscriber(
         topic.name,
         plan,
         run,

@@ -18,7 +18,7 @@ import numpy as np
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.plans.plan_model import TOOLS, ResolvedGraph
 from flexsheet.launch.running.runs import Run
-from flexsheet.launch.running.tools import GraphWriter, subscriber_to
+from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
 from flexsheet.messages.types import (
@@ -64,7 +64,7 @@ class Driver:
     async def __aenter__(self) -> Self:
         self._writer = GraphWriter(self._plan, self._run, WRITTEN)
         for name in READ:
-            subscriber = subscriber_to(
+            subscriber = make_subscriber(
                 name,
                 self._plan,
                 self._run,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from flexsheet.launch.objects.meshes import scene_of
+from flexsheet.launch.objects.meshes import scene_from_document
 from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
@@ -38,18 +38,18 @@ from flexsheet.launch.plans.plan_model import (
     Writer,
 )
 from flexsheet.launch.plans.resolve_nodes import (
-    Member,
+    NodeEntry,
     check_calibrations,
-    check_wires,
+    check_device_hosts,
     collect_entries,
-    in_full,
+    dump_parameters,
     resolve_entry,
 )
 from flexsheet.launch.plans.routing import (
     check_inputs,
-    endpoints_of,
+    list_writers,
+    make_endpoints,
     resolve_further_inputs,
-    writers_of,
 )
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.node import NodeParameters, role_of
@@ -81,21 +81,21 @@ def load_graph(
     problems: list[Problem] = []
     check_hosts(spec.hosts, document, problems)
     scene_document, scene = _load_scene(spec, document, problems)
-    members = collect_entries(spec, document, problems)
-    for member in members:
-        resolve_entry(member, document, problems)
-    writers = writers_of(spec, members, document, problems, has_scene=scene is not None)
-    resolve_further_inputs(members, writers, document, problems)
-    check_inputs(members, writers, document, problems)
-    check_calibrations(members, scene, document, problems)
-    check_wires(members, spec, document, problems)
+    entries = collect_entries(spec, document, problems)
+    for entry in entries:
+        resolve_entry(entry, document, problems)
+    writers = list_writers(spec, entries, document, problems, has_scene=scene is not None)
+    resolve_further_inputs(entries, writers, document, problems)
+    check_inputs(entries, writers, document, problems)
+    check_calibrations(entries, scene, document, problems)
+    check_device_hosts(entries, spec, document, problems)
     if problems:
         raise BadInputError(problems)
 
     addresses = {name: host.address for name, host in spec.hosts.items()}
-    endpoints = endpoints_of(writers, addresses)
+    endpoints = make_endpoints(writers, addresses)
     nodes = {
-        member.name: _planned(member, endpoints, document, resolve_paths=True) for member in members
+        entry.name: _planned(entry, endpoints, document, resolve_paths=True) for entry in entries
     }
     scene_values = None if scene is None else scene.model_dump(mode="json")
     resetters = tuple(
@@ -108,8 +108,8 @@ def load_graph(
         "estop_resetters": resetters,
         "scene": scene_values,
         "nodes": [
-            _planned(member, endpoints, document, resolve_paths=False).model_dump(mode="json")
-            for member in sorted(members, key=lambda member: member.name)
+            _planned(entry, endpoints, document, resolve_paths=False).model_dump(mode="json")
+            for entry in sorted(entries, key=lambda entry: entry.name)
         ],
     }
     return ResolvedGraph(
@@ -142,7 +142,7 @@ def _load_scene(
         return None, None
     try:
         scene_document = read_document(path)
-        return scene_document, scene_of(scene_document)
+        return scene_document, scene_from_document(scene_document)
     except BadInputError as error:
         problems.extend(error.problems)
         return None, None
@@ -150,32 +150,32 @@ def _load_scene(
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file; raises BadInputError."""
-    return scene_of(read_document(path))
+    return scene_from_document(read_document(path))
 
 
 def _planned(
-    member: Member,
+    entry: NodeEntry,
     endpoints: dict[str, tuple[Writer, ...]],
     document: Document,
     *,
     resolve_paths: bool,
 ) -> ResolvedNode:
-    host = member.spec.host
-    assert member.type is not None  # a member without a class is a problem
-    assert member.parameters is not None
-    parameters = in_full(member, document, resolve_paths=resolve_paths)
+    host = entry.spec.host
+    assert entry.type is not None  # a entry without a class is a problem
+    assert entry.parameters is not None
+    parameters = dump_parameters(entry, document, resolve_paths=resolve_paths)
     return ResolvedNode(
-        name=member.name,
-        type=member.spec.type,
-        listen_ports=tuple(filter(None, _marked(member.parameters, ParameterMark.LISTEN_PORT))),
-        device_address=_device_address(member.parameters),
-        device_files=_device_files(member.parameters),
+        name=entry.name,
+        type=entry.spec.type,
+        listen_ports=tuple(filter(None, _marked(entry.parameters, ParameterMark.LISTEN_PORT))),
+        device_address=_device_address(entry.parameters),
+        device_files=_device_files(entry.parameters),
         calibrations={
             ".".join(map(str, key)): str(_value_at(parameters, key))
             for mark in (ParameterMark.CAMERA_CALIBRATION, ParameterMark.SHEET_CALIBRATION)
-            for key in find_marked(member.parameters, mark)
+            for key in find_marked(entry.parameters, mark)
         },
-        role=role_of(member.type),
+        role=role_of(entry.type),
         host=host,
         parameters=parameters,
         inputs=tuple(
@@ -184,24 +184,24 @@ def _planned(
                 topic=topic.name,
                 endpoints=tuple(one.endpoint_for(host) for one in endpoints[topic.name]),
             )
-            for port, topic in member.topics("input")
+            for port, topic in entry.topics("input")
         )
-        + member.unconnected_ports("input"),
+        + entry.unconnected_ports("input"),
         outputs=tuple(
             ResolvedPort(
                 port=port,
                 topic=topic.name,
                 endpoints=next(
-                    one.endpoints for one in endpoints[topic.name] if one.name == member.name
+                    one.endpoints for one in endpoints[topic.name] if one.name == entry.name
                 ),
             )
-            for port, topic in member.topics("output")
+            for port, topic in entry.topics("output")
         )
-        + member.unconnected_ports("output"),
-        restart=member.spec.restart,
-        start_deadline_s=member.spec.start_deadline_s,
-        liveness_s=member.spec.liveness_s,
-        nice=member.spec.nice,
+        + entry.unconnected_ports("output"),
+        restart=entry.spec.restart,
+        start_deadline_s=entry.spec.start_deadline_s,
+        liveness_s=entry.spec.liveness_s,
+        nice=entry.spec.nice,
     )
 
 

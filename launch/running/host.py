@@ -99,7 +99,7 @@ class HostAgent:
         self._kept: EStop | None = None
         self._engaged_ns = 0
         self._resetting: asyncio.Task[None] | None = None
-        self._file = EStopFile(host, arms_of(plan)) if waits_for_a_person(plan) else None
+        self._file = EStopFile(host, list_arms(plan)) if has_manual_arming(plan) else None
         self._stop_socket = (
             None
             if run_directory is None
@@ -108,7 +108,7 @@ class HostAgent:
         self._unwritten = False
         self._untold = ""
         nodes = plan.nodes_on(host)
-        self._devices, self._folder = list_device_files(nodes), folder_of(nodes)
+        self._devices, self._folder = list_device_files(nodes), recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
@@ -127,13 +127,13 @@ class HostAgent:
             for source in self._plan.sources_to_read("estop", self._host)
             if source.writer != self._name
         ]
-        self._heard.append(self._hear("estop", others, self._keep))
+        self._heard.append(self._hear("estop", others, self._latch_estop))
         measured = self._plan.writer("clocks", clock_node(self._host))
         if measured is not None:
             source = measured.source_for(self._host)
             take = self._clock_table.update
             self._heard.append(self._hear("clocks", [source], lambda clocks, _: take(clocks)))
-        self._task = asyncio.create_task(self._speak(), name=f"host {self._host}")
+        self._task = asyncio.create_task(self._publish_loop(), name=f"host {self._host}")
 
     def _hear(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
         subscriber = Subscriber(
@@ -174,7 +174,7 @@ class HostAgent:
         self._on_problem(f"e-stop of {writer}, kept until it is reset")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
 
-    def _keep(self, estop: EStop, header: Header) -> None:
+    def _latch_estop(self, estop: EStop, header: Header) -> None:
         now_ns = self._clock.now_ns()
         _, header, clock_trouble = self._clock_table.localised(estop, header, now_ns)
         if estop.engaged:
@@ -277,7 +277,7 @@ class HostAgent:
         )
         self.publishers[topic].send(message, header)
 
-    async def _speak(self) -> None:
+    async def _publish_loop(self) -> None:
         while True:
             try:
                 status = self._status()
@@ -335,13 +335,13 @@ def shows_estop(state: ArmState) -> bool:
     return state.mode == "estop" or any(fault.startswith("e-stop: ") for fault in state.faults)
 
 
-def arms_of(plan: ResolvedGraph) -> list[str]:
+def list_arms(plan: ResolvedGraph) -> list[str]:
     """List the plan's arms by the address of each; a bridge without one counts by its name."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
 
-def waits_for_a_person(plan: ResolvedGraph) -> bool:
+def has_manual_arming(plan: ResolvedGraph) -> bool:
     """Whether arms move at a person's word only; those that go by themselves are simulated."""
     return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
 
@@ -364,7 +364,7 @@ def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
     return sorted({file for node in nodes for file in node.device_files})
 
 
-def folder_of(nodes: list[ResolvedNode]) -> Path:
+def recording_folder(nodes: list[ResolvedNode]) -> Path:
     """Where the host's recorder writes; the working folder where there is none, or not yet."""
     for node in nodes:
         if node.role is NodeRole.RECORDER:

@@ -19,7 +19,7 @@ STATE = Path("/var/lib/flexsheet")
 """Where the service may write and what is there stays."""
 
 
-def bags_of(plan: ResolvedGraph, host: str) -> Iterator[Path]:
+def list_bags(plan: ResolvedGraph, host: str) -> Iterator[Path]:
     """Where a host's recorders put what they record."""
     for node in plan.nodes_on(host):
         if node.role is NodeRole.RECORDER:

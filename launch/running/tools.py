@@ -38,7 +38,7 @@ class Counts:
     rejected: int = 0
 
 
-def host_of(run: Run) -> str:
+def tools_host(run: Run) -> str:
     """The host whose tools we are."""
     return run.host or MAIN
 
@@ -48,12 +48,12 @@ def topics_for_tools(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
     return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
 
-def keys_of(plan: ResolvedGraph, run: Run) -> KeyRing | None:
+def load_tool_keys(plan: ResolvedGraph, run: Run) -> KeyRing | None:
     """The keys of the host where we are; None where the plan has none."""
-    return KeyRing(ring_file(run, host_of(run))) if plan.keys else None
+    return KeyRing(ring_file(run, tools_host(run))) if plan.keys else None
 
 
-def subscriber_to(
+def make_subscriber(
     topic: str,
     plan: ResolvedGraph,
     run: Run,
@@ -66,12 +66,12 @@ def subscriber_to(
     wanted = topic_named(topic)
     return Subscriber(
         wanted,
-        local_sources(run, plan.sources_to_read(topic, host_of(run))),
+        local_sources(run, plan.sources_to_read(topic, tools_host(run))),
         on_message,
         Counts(),
         on_problem=on_problem,
         unopened=unopened,
-        keys=keys_of(plan, run),
+        keys=load_tool_keys(plan, run),
         # Who does not run our plan must be seen most of all.
         plan=None if wanted.message in (Status, HostStatus) else plan.hash,
     )
@@ -89,7 +89,7 @@ async def read_topic(
     import structlog
 
     arrived: asyncio.Queue[tuple[Message, Header]] = asyncio.Queue()
-    subscriber = subscriber_to(
+    subscriber = make_subscriber(
         topic,
         graph.plan,
         graph.run,
@@ -113,10 +113,10 @@ class GraphWriter:
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
         self._clock = SystemClock()
         self._epoch, self._plan = self._clock.now_ns(), plan.hash
-        keys = keys_of(plan, run)
+        keys = load_tool_keys(plan, run)
         self._sequences: dict[str, int] = {}
         self._publishers: dict[str, Publisher] = {}
-        self._name, host = tools_on(host_of(run)), host_of(run)
+        self._name, host = tools_on(tools_host(run)), tools_host(run)
         try:
             for name in topics:
                 writer = plan.writer(name, self._name)
