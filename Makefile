@@ -63,7 +63,7 @@ lint: $(DEV_STAMP)
 test: $(DEV_STAMP) lint
 	@$(BIN)/python -m flexsheet.launch.health.system --tests
 	@mkdir -p build && : > $(SKIPPED)
-	$(BIN)/flexsheet prepare launch/scenes/cylinder.yaml
+	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
 	@status=0; \
 	export OPENBLAS_NUM_THREADS=1 SKIPPED_FILE=$(SKIPPED); set -x; \
 	$(BIN)/pytest -m "not alone" --numprocesses auto --dist worksteal || status=$$?; \

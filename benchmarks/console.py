@@ -27,8 +27,8 @@ import websockets
 from playwright.async_api import Page, WebSocket, async_playwright
 
 from flexsheet.launch.methods.machine import machine_name
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.running.prepare import prepare_plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.runs import local_endpoints
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.base import Header
@@ -157,8 +157,8 @@ async def browser(url: str, got: Got) -> AsyncIterator[Page]:
 
 
 async def run(seconds: float, settings: list[str]) -> dict[str, Any]:
-    plan = load_plan(DEMO, settings=settings, console=True)
-    prepare_plan(plan, lambda text: None)
+    plan = load_graph(DEMO, settings=settings, console=True)
+    precompute_graph(plan, lambda text: None)
     place = f"127.0.0.1:{plan.nodes['console'].parameters['page_port']}"
     statuses = Statuses()
     result: dict[str, Any] = {"machine": machine_name()}

@@ -38,7 +38,7 @@ from ruamel.yaml import YAML
 import flexsheet.launch
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.bag import (
     BagError,
@@ -597,7 +597,7 @@ def run_launch(data: bytes) -> bool:
     path.write_bytes(text)
     settings = [setting.decode(errors="replace")] if mark else []
     try:
-        plan = load_plan(path, settings=settings)
+        plan = load_graph(path, settings=settings)
     except BadInputError as error:
         refuse_long(error, 100_000)
         return False

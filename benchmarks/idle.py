@@ -33,7 +33,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch.experiments.run import DEMO_FILE
 from flexsheet.launch.methods.machine import machine_name
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.supervisor import RunningGraph
 
 LEFT_OUT = ("twin_finger", "twin_eye")
@@ -123,7 +123,7 @@ def cpu_s(pids: dict[str, int]) -> dict[str, float]:
 async def measure(case: str, seconds: float) -> dict[str, Any]:
     """CPU time over wall time, per process and of the graph's own processes together."""
     with tempfile.TemporaryDirectory() as folder:
-        plan = load_plan(launch_file(Path(folder), CASES[case]))
+        plan = load_graph(launch_file(Path(folder), CASES[case]))
         async with RunningGraph(plan) as graph:
             await graph.wait_ready()
             await asyncio.sleep(SETTLING_S)

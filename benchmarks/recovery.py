@@ -20,7 +20,7 @@ from typing import Any
 from flexsheet.launch.experiments import stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import DEMO_FILE
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.clock import SystemClock
@@ -33,7 +33,7 @@ AGAIN_S = 3.0
 
 async def kill_in_a_stroke(bag: Path) -> int:
     """Run the graph, kill the node in mid stroke, wait until it is back; when it was killed, ns."""
-    plan = load_plan(DEMO_FILE, record=bag)
+    plan = load_graph(DEMO_FILE, record=bag)
     scene = plan.scene_message()
     assert scene is not None
     async with RunningGraph(plan) as graph:

@@ -51,10 +51,10 @@ from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.gestures import gesture_path
 from flexsheet.launch.experiments.run import DEMO_FILE, new_folder
 from flexsheet.launch.methods.machine import machine_name
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.running.prepare import prepare_plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
-from flexsheet.launch.running.tools import ToolsWriter, subscriber_to
+from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.bag import BagError, BagReader, info
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Scene
@@ -285,7 +285,7 @@ class Soak:
         self.log_lines: dict[str, int] = {}
         self.began_s = self.lasted_s = 0.0
         bag = folder / "soak-%Y%m%d-%H%M%S.mcap"
-        self.plan = load_plan(
+        self.plan = load_graph(
             DEMO_FILE, record=bag, settings=["recorder.start_paused=true", *settings]
         )
         self.graph = RunningGraph(self.plan)
@@ -296,7 +296,7 @@ class Soak:
         """Use the graph for so long; what ends it early is told in `problems`."""
         scene = self.plan.scene_message()
         assert scene is not None  # the demo has one
-        prepare_plan(self.plan, say)
+        precompute_graph(self.plan, say)
         try:
             async with self.graph:
                 await self.graph.wait_ready()
@@ -311,10 +311,10 @@ class Soak:
         await self._read_bags(all_of_them=True)
 
     async def _use(self, driver: Driver, scene: Scene) -> None:
-        status = subscriber_to(
+        status = make_subscriber(
             "status", self.plan, self.graph.run, self.heard.take, on_problem=self.problems.append
         )
-        writer = ToolsWriter(self.plan, self.graph.run, ["recording"])
+        writer = GraphWriter(self.plan, self.graph.run, ["recording"])
         status.start()
         others = [start_busy_process() for _ in range(self.busy)]
         lines_before = self._count_log_lines()
@@ -393,7 +393,7 @@ class Soak:
             )
         )
 
-    async def _record(self, writer: ToolsWriter) -> None:
+    async def _record(self, writer: GraphWriter) -> None:
         for number in count(1):
             # Reading a bag takes a part of the next window.
             await asyncio.sleep(self.began_s + number * self.window_s - time.monotonic())

@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 from flexsheet.launch.methods.machine import machine_name
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import ROOT_VARIABLE
 from flexsheet.launch.running.supervisor import RunningGraph
 
@@ -53,7 +53,7 @@ async def measure(rounds: int) -> dict[str, list[float]]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "startup.yaml"
         path.write_text(GRAPH.format(scene=ROOT / "launch" / "scenes" / "cylinder.yaml"))
-        async with RunningGraph(load_plan(path)) as graph:
+        async with RunningGraph(load_graph(path)) as graph:
             await graph.wait_ready()
             for _ in range(rounds):
                 for name in random.sample(list(COMMANDS), len(COMMANDS)):

@@ -6,6 +6,8 @@ Names are imported on first use, so that `import flexsheet` stays fast.  The mes
 
 from __future__ import annotations
 
+import sys
+
 # Importing `typing` would lengthen the time in which an interrupt meets Python's own handler.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -13,10 +15,10 @@ if TYPE_CHECKING:
     from flexsheet.launch.experiments.driver import Driver
     from flexsheet.launch.experiments.run import run_experiment
     from flexsheet.launch.plans.documents import BadInputError
-    from flexsheet.launch.plans.plan import load_plan, load_scene
-    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.plans.plan import load_graph, load_scene
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
-    from flexsheet.launch.running.tools import ToolsWriter, read_topic
+    from flexsheet.launch.running.tools import GraphWriter, read_topic
     from flexsheet.messages.bag import BagError, BagReader, BagWriter, recover
     from flexsheet.messages.base import Header, Message
     from flexsheet.messages.clock import SystemClock, VirtualClock
@@ -31,7 +33,7 @@ _MODULES = {
     "BagWriter": "flexsheet.messages.bag",
     "Driver": "flexsheet.launch.experiments.driver",
     "ExperimentError": "flexsheet.launch.experiments",
-    "ToolsWriter": "flexsheet.launch.running.tools",
+    "GraphWriter": "flexsheet.launch.running.tools",
     "Header": "flexsheet.messages.base",
     "Input": "flexsheet.nodes.node",
     "Message": "flexsheet.messages.base",
@@ -39,19 +41,25 @@ _MODULES = {
     "NodeFailedError": "flexsheet.launch.running.supervisor",
     "NodeParameters": "flexsheet.nodes.node",
     "Output": "flexsheet.nodes.node",
-    "Plan": "flexsheet.launch.plans.planned",
+    "ResolvedGraph": "flexsheet.launch.plans.plan_model",
     "RunningGraph": "flexsheet.launch.running.supervisor",
     "Scene": "flexsheet.messages.scene",
     "SystemClock": "flexsheet.messages.clock",
     "TOPICS": "flexsheet.messages.topics",
     "VirtualClock": "flexsheet.messages.clock",
-    "load_plan": "flexsheet.launch.plans.plan",
+    "load_graph": "flexsheet.launch.plans.plan",
     "load_scene": "flexsheet.launch.plans.plan",
     "periodic": "flexsheet.nodes.node",
     "read_topic": "flexsheet.launch.running.tools",
     "recover": "flexsheet.messages.bag",
     "run_experiment": "flexsheet.launch.experiments.run",
     "topic_named": "flexsheet.messages.topics",
+}
+
+_FORMER_NAMES = {
+    "Plan": "ResolvedGraph",
+    "ToolsWriter": "GraphWriter",
+    "load_plan": "load_graph",
 }
 
 __all__ = [
@@ -62,6 +70,7 @@ __all__ = [
     "BagWriter",
     "Driver",
     "ExperimentError",
+    "GraphWriter",
     "Header",
     "Input",
     "Message",
@@ -69,13 +78,12 @@ __all__ = [
     "NodeFailedError",
     "NodeParameters",
     "Output",
-    "Plan",
+    "ResolvedGraph",
     "RunningGraph",
     "Scene",
     "SystemClock",
-    "ToolsWriter",
     "VirtualClock",
-    "load_plan",
+    "load_graph",
     "load_scene",
     "periodic",
     "read_topic",
@@ -86,6 +94,14 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
+    if name in _FORMER_NAMES:
+        import warnings
+
+        new = _FORMER_NAMES[name]
+        warnings.warn(
+            f"flexsheet.{name} is deprecated; use flexsheet.{new}", DeprecationWarning, stacklevel=2
+        )
+        return getattr(sys.modules[__name__], new)
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module

@@ -36,10 +36,10 @@ os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 def main() -> None:
     """Run the command, or with `--node CONFIG` one node (the launcher starts those)."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
-        from flexsheet.launch.running.child import follow_launcher, give_way
+        from flexsheet.launch.running.child import apply_niceness, exit_with_parent
 
-        follow_launcher()
-        give_way()
+        exit_with_parent()
+        apply_niceness()
         from flexsheet.nodes.runner import main as run_node
 
         sys.exit(run_node(sys.argv[2]))

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -32,9 +32,9 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "chart": ("chart",),
     "tune": ("tune",),
     "calibrate": ("calibrate", "calibrate_arms", "calibrate_projector", "calibrate_sheet"),
-    "prepare": ("prepare",),
+    "precompute": ("precompute",),
     "keys": ("keys",),
-    "service": ("service",),
+    "systemd": ("systemd",),
     "doctor": ("doctor", "doctor_compliance", "doctor_hosts"),
     "explain": ("explain",),
 }
@@ -43,6 +43,10 @@ COMMANDS: dict[str, tuple[str, ...]] = {
 The first one has the typer app `app`, of one command or of many; the others have `register(app)`
 and add to it.
 """
+
+
+FORMER_NAMES = {"prepare": "precompute", "service": "systemd"}
+"""Commands by the names that they had before; help does not list these."""
 
 
 @cache
@@ -68,7 +72,7 @@ class CommandTable(Mapping[str, Any]):
     """The commands of `COMMANDS`, each imported when it is looked up."""
 
     def __getitem__(self, name: str) -> Any:
-        return load_command(name)
+        return load_command(FORMER_NAMES.get(name, name))
 
     def __iter__(self) -> Iterator[str]:
         return iter(COMMANDS)
@@ -97,13 +101,31 @@ app = typer.Typer(
     cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    # Commands take it from their parent.
+    context_settings={"help_option_names": ["-h", "--help"]},
     epilog=examples("flexsheet try", "flexsheet launch launch/demo.yaml", "flexsheet topic list"),
 )
 
 
+def _print_version(requested: bool) -> None:
+    """Print the version and exit if it was requested."""
+    if requested:
+        from importlib.metadata import version
+
+        print(f"flexsheet {version('flexsheet')}")
+        raise typer.Exit
+
+
 @app.callback()
-def flexsheet() -> None:
-    """An encountered-type visual haptic display with a flexible sheet."""
+def flexsheet(
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version", help="Print the version.", callback=_print_version, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    """Control an encountered-type visual-haptic display with a flexible sheet."""
 
 
 def main() -> None:

@@ -267,6 +267,7 @@ class Subscriber:
     on_problem: told in a sentence of losses (at the 1st, 2nd, 4th, 8th, ...; not on `latest`
         topics, where losing is meant), of the first refusal for each cause, and of an exception in
         `on_message`, which ends nothing.
+    on_handshake_failed: gets the problem of each handshake that fails; None: `on_problem` does.
     unopened: call `on_message(frames, header)` with every message that came, whatever the topic's
         delivery; its fields are not looked at.
     keys: ours and those of the hosts; without it tcp leads to loopback alone.
@@ -282,12 +283,14 @@ class Subscriber:
         counts: Counts,
         *,
         on_problem: Problem = _log.error,
+        on_handshake_failed: Problem | None = None,
         unopened: bool = False,
         keys: KeyRing | None = None,
         plan: str | None = None,
         objection: Objection | None = None,
     ) -> None:
         self.topic, self.counts, self.on_problem = topic, counts, on_problem
+        self.on_handshake_failed = on_handshake_failed or on_problem
         self._on_message, self._objection, self._plan = on_message, objection, plan
         self._latched = topic.delivery is Delivery.LATCHED
         newest_only = topic.delivery is Delivery.LATEST and not unopened
@@ -546,7 +549,7 @@ class _Line:
                 self._loop.call_later(GIVEN_UP_S, self._reopen, self._socket)
             if event in HANDSHAKE_FAILED and event not in self._told:
                 self._told.add(event)
-                self._subscriber.on_problem(
+                self._subscriber.on_handshake_failed(
                     f'topic "{self._subscriber.topic.name}": host {self.host} '
                     f"{HANDSHAKE_FAILED[event]}"
                 )

@@ -23,6 +23,7 @@ class NodeRole(StrEnum):
     """
 
     ARM_BRIDGE = "arm_bridge"
+    CAMERA = "camera"
     CLOCK = "clock"
     CONSOLE = "console"
     FINGER_SIMULATOR = "finger_simulator"

@@ -25,7 +25,6 @@ from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import (
-    Annotated,
     Any,
     ClassVar,
     Generic,
@@ -38,7 +37,7 @@ from typing import (
 import numpy as np
 import structlog
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import Clock
@@ -57,15 +56,6 @@ EVERY_QUEUE_LENGTH = 1000
 STEPS_KEPT = 20_000
 TOLD_AGAIN_NS = 5_000_000_000
 """So long after its start a node tells all its steps each time: a recorder may come late."""
-
-
-@dataclass(frozen=True, slots=True)
-class ListenMark:
-    """Marks a parameter as a TCP port on which the node listens."""
-
-
-ListenPort = Annotated[int, Field(ge=0, le=65535), ListenMark()]
-"""A TCP port on which the node listens; 0: any free one."""
 
 
 class NodeParameters(LimitedModel):
@@ -251,16 +241,6 @@ def role_of(node_class: type[Node]) -> NodeRole | None:
     if node_class.role is None and ArmState in publishes:
         return NodeRole.ARM_BRIDGE
     return node_class.role
-
-
-def listen_ports(parameters: NodeParameters) -> tuple[int, ...]:
-    """The TCP ports on which a node with these parameters listens; free ones (0) left out."""
-    return tuple(
-        port
-        for name, field in type(parameters).model_fields.items()
-        if any(isinstance(mark, ListenMark) for mark in field.metadata)
-        and (port := getattr(parameters, name))
-    )
 
 
 def timers_of(node_class: type[Node]) -> list[Timer]:

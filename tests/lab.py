@@ -24,12 +24,12 @@ from ruamel.yaml import YAML
 from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
 from flexsheet.launch.experiments.stroke import STROKE_ANGLE_RAD, TREMOR_M, WANDER_M, object_pose
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.estop_file import STATE_VARIABLE
 from flexsheet.launch.running.keys import KEYS_VARIABLE
 from flexsheet.launch.running.runs import ROOT_VARIABLE, Run
-from flexsheet.launch.running.tools import ToolsWriter
+from flexsheet.launch.running.tools import GraphWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
 from flexsheet.messages.scene import Scene, cylinder_of
@@ -254,8 +254,8 @@ class Lab:
         )
         return found[-1].parent if found else None
 
-    def plan(self) -> Plan:
-        return load_plan(self.launch_file)
+    def plan(self) -> ResolvedGraph:
+        return load_graph(self.launch_file)
 
     async def watch(self, host: str, *topics: str) -> None:
         """Take what a host's own writers of these topics say, as soon as its launcher runs."""
@@ -333,7 +333,7 @@ class Lab:
                 if directory is not None and directory != told:
                     if writer is not None:
                         writer.close()
-                    writer = ToolsWriter(plan, Run(directory.name, directory), [FINGER_PATH])
+                    writer = GraphWriter(plan, Run(directory.name, directory), [FINGER_PATH])
                     writer.publish(FINGER_PATH, path)
                     told = directory
                 finger = self.newest.get("twin/finger")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.types import Arming, EStop
@@ -296,7 +296,7 @@ async def test_the_node_hears_the_word_and_says_what_it_is() -> None:
 def test_real_arms_need_the_word_and_the_demos_do_not() -> None:
     folder = SCENE_FILE.parent.parent
     for name, expected in (("lab.yaml", "by_command"), ("demo.yaml", "by_itself")):
-        nodes = load_plan(folder / name).nodes.values()
+        nodes = load_graph(folder / name).nodes.values()
         found = {node.parameters["arming"] for node in nodes if node.type == "arm_bridge"}
         assert found == {expected}
     values = YAML(typ="safe").load(folder / "lab.yaml")

@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 from flexsheet.launch import cli
 from flexsheet.launch.commands.capture import coverage_view, take_pairs
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.calibration import Board, load_calibration
 from flexsheet.messages.scene import Scene, StereoCamera
 from flexsheet.nodes.camera.bundle import pose_vector
@@ -434,7 +434,7 @@ def launch_file(folder: Path, calibration: Path) -> Path:
         f"scene: {ROOT}/launch/scenes/cylinder.yaml\n"
         "nodes:\n"
         f"  triangulator: {{type: triangulator, parameters: {{calibration: {calibration}}}}}\n"
-        "from_tools: [stereo]\n"
+        "external_topics: [stereo]\n"
     )
     return path
 
@@ -442,7 +442,7 @@ def launch_file(folder: Path, calibration: Path) -> Path:
 def test_a_plan_refuses_a_calibration_that_does_not_belong(tmp_path: Path) -> None:
     shipped = (ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml").read_text()
     (tmp_path / "own.yaml").write_text(shipped)
-    plan = load_plan(launch_file(tmp_path, Path("own.yaml")))
+    plan = load_graph(launch_file(tmp_path, Path("own.yaml")))
     assert plan.nodes["triangulator"].parameters["calibration"] == str(tmp_path / "own.yaml")
     for old, new, said in (
         ("device: twin-bumblebee", "device: other", 'is of device "other", the scene\'s camera'),
@@ -451,10 +451,10 @@ def test_a_plan_refuses_a_calibration_that_does_not_belong(tmp_path: Path) -> No
     ):
         (tmp_path / "foreign.yaml").write_text(shipped.replace(old, new))
         with pytest.raises(BadInputError, match=said) as refused:
-            load_plan(launch_file(tmp_path, Path("foreign.yaml")))
+            load_graph(launch_file(tmp_path, Path("foreign.yaml")))
         (problem,) = refused.value.problems
         assert problem.where == f"{tmp_path / 'graph.yaml'}:3"
         assert problem.key == ("nodes", "triangulator", "parameters", "calibration")
         assert str(tmp_path / "foreign.yaml") in problem.what
     with pytest.raises(BadInputError, match=r"absent\.yaml: cannot be read"):
-        load_plan(launch_file(tmp_path, Path("absent.yaml")))
+        load_graph(launch_file(tmp_path, Path("absent.yaml")))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
 from flexsheet.messages.scene import Lens, Scene, StereoCamera
 from flexsheet.nodes.camera import bundle
@@ -287,5 +287,5 @@ def test_the_twin_calibrated_anew_agrees_with_the_shipped_file() -> None:
 
 
 def test_the_demo_measures_with_the_shipped_file() -> None:
-    plan = load_plan(ROOT / "launch" / "demo.yaml")
+    plan = load_graph(ROOT / "launch" / "demo.yaml")
     assert plan.nodes["triangulator"].parameters["calibration"] == str(SHIPPED)

@@ -35,7 +35,7 @@ GRAPH: dict[str, Any] = {
 }
 LISTENING: dict[str, Any] = {
     "nodes": {"listener": {"type": "tests.launch_nodes:Listener"}},
-    "from_tools": ["twin/finger"],
+    "external_topics": ["twin/finger"],
 }
 
 
@@ -436,7 +436,7 @@ def test_play_can_bring_its_graph_and_restores_latched_topics_first(
             writer.write(TOPICS["display"], show, header, 10**9 + i * 10**8)
             reset = EStop(engaged=False, reason="then all was clear")
             writer.write(TOPICS["estop"], reset, header, 10**9 + i * 10**8)
-    values = {**GRAPH, "from_tools": ["display"], "record": {"bag": "played.mcap"}}
+    values = {**GRAPH, "external_topics": ["display"], "record": {"bag": "played.mcap"}}
     said = flexsheet("bag", "play", bag, "--start", "0.25", "--into", write(tmp_path, values))
     assert said.code == 0, said.err
     assert "played 3 messages on display" in said.err

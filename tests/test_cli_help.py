@@ -9,12 +9,14 @@ import shlex
 import subprocess
 import sys
 from importlib import import_module
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import structlog
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from flexsheet.launch import cli
 from flexsheet.launch.commands import complete
@@ -27,7 +29,7 @@ from flexsheet.launch.commands.output import (
     print_json,
     print_json_line,
 )
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.reference.cli import commands
 from flexsheet.launch.reference.errors import explained, undocumented
 
@@ -73,9 +75,29 @@ def test_a_command_explains_itself_with_examples_that_parse(name: str) -> None:
         settings = [value for key, value in pairwise(words) if key == "--set"]
         if settings:
             given = [Path(word) for word in words if word.endswith(".yaml")]
-            load_plan(ROOT / given[0] if given else DEMO_FILE, settings=settings)
+            load_graph(ROOT / given[0] if given else DEMO_FILE, settings=settings)
     for parameter in command.params:
         assert parameter.help, f"flexsheet {name}: {parameter.name} is not explained"
+
+
+@pytest.mark.parametrize(("former", "name"), cli.FORMER_NAMES.items())
+def test_a_former_name_of_a_command_is_a_hidden_alias(former: str, name: str) -> None:
+    table = cli.CommandTable()
+    assert table[former] is table[name]
+    assert former not in set(table)
+
+
+@pytest.mark.parametrize("words", [(), ("launch",), ("systemd", "install"), ("node", "list")])
+def test_every_command_has_a_short_help_option(words: tuple[str, ...]) -> None:
+    texts = [CliRunner().invoke(cli.app, [*words, option]).output for option in ("-h", "--help")]
+    assert texts[0] == texts[1]
+    assert "Usage" in texts[0]
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    result = CliRunner().invoke(cli.app, ["--version"])
+    assert result.exit_code == 0
+    assert result.output == f"flexsheet {version('flexsheet')}\n"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

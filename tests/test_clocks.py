@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.clock_table import ClockTable
@@ -329,17 +329,17 @@ def test_limits_come_from_the_launch_file(tmp_path: Path) -> None:
     hosts = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
     nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
     given = {"max_offset_uncertainty_s": 0.001}
-    plan = load_plan(write(tmp_path, nodes, hosts=hosts, clocks=given))
+    plan = load_graph(write(tmp_path, nodes, hosts=hosts, clocks=given))
     assert {node.name for node in plan.nodes.values() if node.type == "clock"} == {
         "clock_main",
         "clock_left",
     }
     assert plan.nodes["clock_left"].parameters["max_offset_uncertainty_s"] == 0.001
-    assert plan.hash != load_plan(write(tmp_path, nodes, hosts=hosts)).hash
+    assert plan.hash != load_graph(write(tmp_path, nodes, hosts=hosts)).hash
     assert set(
-        load_plan(write(tmp_path, {"listener": LISTENER}, from_tools=["twin/finger"])).nodes
+        load_graph(write(tmp_path, {"listener": LISTENER}, external_topics=["twin/finger"])).nodes
     ) == {"listener"}
     with pytest.raises(BadInputError, match=r"clocks\.max_offset_uncertanty_s: unknown key"):
-        load_plan(write(tmp_path, nodes, hosts=hosts, clocks={"max_offset_uncertanty_s": 1}))
+        load_graph(write(tmp_path, nodes, hosts=hosts, clocks={"max_offset_uncertanty_s": 1}))
     with pytest.raises(BadInputError, match='"clock_left" is taken'):
-        load_plan(write(tmp_path, {**nodes, "clock_left": beacon()}, hosts=hosts))
+        load_graph(write(tmp_path, {**nodes, "clock_left": beacon()}, hosts=hosts))

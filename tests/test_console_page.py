@@ -17,7 +17,7 @@ import pytest
 import websockets
 from playwright.async_api import Page, async_playwright, expect
 
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.runs import Run, local_endpoints
 from flexsheet.launch.running.supervisor import RunningGraph
@@ -281,7 +281,7 @@ async def run_session(folder: Path) -> Session:
         writer.write(topic_named("fingertip"), fingertip(np.zeros(3)), header, 1)
     port = free_port()
     settings = [f"console.page_port={port}", f"console.bags={folder}/bags"]
-    plan = load_plan(file, console=True, settings=settings)
+    plan = load_graph(file, console=True, settings=settings)
     names = ("scene", "twin/finger_path", "twin/finger", "estop", "recording", "moment")
     async with async_playwright() as play:
         async with RunningGraph(plan) as graph:

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from tests.console_parts import ROOT
 
@@ -28,7 +28,7 @@ def graph(tmp_path: Path) -> Path:
 
 
 def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
-    plan = load_plan(graph, console=True, settings=["console.page_port=8123"])
+    plan = load_graph(graph, console=True, settings=["console.page_port=8123"])
     assert [writer.name for writer in plan.writers["scene"]] == ["console"]
     assert plan.nodes["console"].nice > 0
     assert plan.nodes["console"].parameters["page_port"] == 8123
@@ -43,30 +43,30 @@ def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
     assert {"status", "estop", "display"} <= read
     assert "arm_left" not in read, "which nobody writes here"
     assert "recording" in {port.topic for port in plan.nodes["recorder"].inputs}
-    without = load_plan(graph)
+    without = load_graph(graph)
     assert [writer.name for writer in without.writers["scene"]] == ["launch"]
 
 
 def test_what_the_file_says_of_console_and_recorder_stays(graph: Path, tmp_path: Path) -> None:
     text = graph.read_text()
     graph.write_text(text + "  page: {type: console, parameters: {page_port: 9}}\n")
-    plan = load_plan(graph, console=True, record=tmp_path / "a.mcap")
+    plan = load_graph(graph, console=True, record=tmp_path / "a.mcap")
     assert "console" not in plan.nodes
     assert plan.nodes["page"].parameters["page_port"] == 9
     assert not plan.nodes["recorder"].parameters["start_paused"]
     graph.write_text(text.replace("twin_finger: {type: twin_finger}", "fem_solver: {type: x:Y}"))
     with pytest.raises(BadInputError):
-        load_plan(graph, console=True)
+        load_graph(graph, console=True)
     open_page = "console.address=192.0.2.1"
     graph.write_text(text)
     with pytest.raises(BadInputError, match="token_file"):
-        load_plan(graph, console=True, settings=[open_page])
+        load_graph(graph, console=True, settings=[open_page])
 
 
 def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path) -> None:
     def facts(**options: Any) -> GraphFacts:
         file = tmp_path / "plan.json"
-        file.write_text(load_plan(graph, **options).model_dump_json())
+        file.write_text(load_graph(graph, **options).model_dump_json())
         return GraphFacts.from_plan(file, "console")
 
     on_request = GraphFacts(records=True, records_on_request=True)
@@ -77,5 +77,5 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
 
 def test_a_picture_that_somebody_waits_for_has_the_priority_of_a_frame() -> None:
     """On two busy cores the first picture of the Eye tab took a minute and a half."""
-    nodes = load_plan(ROOT / "launch" / "demo.yaml").nodes
+    nodes = load_graph(ROOT / "launch" / "demo.yaml").nodes
     assert nodes["twin_eye"].nice <= nodes["renderer"].nice

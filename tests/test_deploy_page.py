@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.deploy_trial import HOSTS, PAGE, Stroke, judge_stroke, steps
-from flexsheet.launch.commands.service import install
+from flexsheet.launch.commands.systemd import install
 from flexsheet.messages.bag import BagWriter
 from tests.doc_pages import ROOT
 

@@ -14,8 +14,8 @@ from ruamel.yaml import YAML
 from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.running.service import files_of
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.running.systemd_unit import files_of
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCKER = ROOT / "docker"
@@ -42,7 +42,7 @@ def services(name: str) -> dict[str, Any]:
 def test_each_host_has_a_container_that_ends_in_order_and_remembers(name: str) -> None:
     found = services(name)
     assert set(found) == (set(HOSTS) if name == "three" else {name})
-    plan = load_plan(ROOT / "launch" / LAUNCH_FILES[name])
+    plan = load_graph(ROOT / "launch" / LAUNCH_FILES[name])
     for host, service in found.items():
         *_, file, option, value = service["command"]
         assert (Path(file).name, option, value) == (LAUNCH_FILES[name], "--host", host)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from tests.doc_pages import DOCS, ROOT, anchors, headings, links, name, nav_pages, pages, site_pages
 from website.finish import NetworkError, finish
 from website.graph import LAB, PICTURES, TWIN, Picture, svg
@@ -78,7 +78,7 @@ def test_pictures_of_the_graph_are_as_drawn(file: str) -> None:
 
 @pytest.mark.parametrize(("picture", "file"), [(LAB, "lab.yaml"), (TWIN, "demo.yaml")])
 def test_pictures_of_the_graph_show_what_launch_files_say(picture: Picture, file: str) -> None:
-    plan = load_plan(ROOT / "launch" / file, record=Path("bag.mcap"))
+    plan = load_graph(ROOT / "launch" / file, record=Path("bag.mcap"))
     said = {
         (writer.name, port.topic, node.name)
         for node in plan.nodes.values()

@@ -25,7 +25,7 @@ from typer.testing import CliRunner
 from flexsheet.launch import cli
 from flexsheet.launch.plans.documents import read_document, validate
 from flexsheet.launch.plans.launch_file import LaunchFile
-from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import parameters_of
@@ -138,7 +138,7 @@ def check_yaml(text: str, values: Mapping[str, Any], folder: Path, place: str) -
         spec = validate(LaunchFile, read_document(file))
         check_nodes({name: one.model_dump() for name, one in spec.nodes.items()})
         if {"scene", "nodes"} <= keys:
-            load_plan(file)
+            load_graph(file)
     elif keys <= set(Scene.model_fields):
         whole = YAML(typ="safe").load(SCENE.read_text()) | dict(values)
         YAML(typ="safe").dump(whole, file)

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import pytest
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 from ruamel.yaml import YAML
 
 from flexsheet.launch.plans import documents
-from flexsheet.launch.plans.documents import MAX_VALUES, BadInputError, read_document
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.documents import MAX_VALUES, BadInputError, read_document, validate
+from flexsheet.launch.plans.plan import load_graph
 
 MAX_TOKENS = 20 * MAX_VALUES
 
@@ -66,7 +67,7 @@ def test_a_hostile_file_is_refused_with_little_work(
     file = tmp_path / "graph.yaml"
     file.write_text(text)
     with pytest.raises(BadInputError) as refused:
-        load_plan(file)
+        load_graph(file)
     assert str(file) in str(refused.value)
     assert said in str(refused.value)
     assert "Commented" not in str(refused.value)
@@ -88,7 +89,51 @@ def test_errors_name_no_class(tmp_path: Path, text: str) -> None:
     file = tmp_path / "graph.yaml"
     file.write_text(text)
     with pytest.raises(BadInputError) as refused:
-        load_plan(file)
+        load_graph(file)
     assert "it must hold keys and values" in str(refused.value)
     for word in ("instance", "dictionary", "Spec"):
         assert word not in str(refused.value)
+
+
+class Choice(BaseModel):
+    """A model whose errors quote pydantic's own wording, and whose keys look like its tags."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    either: int | str = 0
+    method: Literal["a", "b"] | Literal["auto"] | float = "auto"
+    by_name: dict[Annotated[str, Field(pattern="^[a-z]+$")], int] = {}
+    checked: int = 0
+
+    @field_validator("checked")
+    @classmethod
+    def _refuse(cls, value: int) -> int:
+        raise ValueError(f"Value error, {value} is refused")
+
+
+@pytest.mark.parametrize(
+    ("text", "key"),
+    [
+        ("either: [1]", ("either",)),
+        ("method: c", ("method",)),
+        ("by_name: {'literal[a]': 1}", ("by_name", "literal[a]")),
+        ("by_name: {a: b}", ("by_name", "a")),
+    ],
+)
+def test_a_problem_names_a_key_that_the_file_has(
+    tmp_path: Path, text: str, key: tuple[str, ...]
+) -> None:
+    file = tmp_path / "choice.yaml"
+    file.write_text(text)
+    with pytest.raises(BadInputError) as caught:
+        validate(Choice, read_document(file))
+    assert {problem.key for problem in caught.value.problems} == {key}
+    assert {problem.where for problem in caught.value.problems} == {f"{file}:1"}
+
+
+def test_the_text_of_a_validator_is_shown_unchanged(tmp_path: Path) -> None:
+    file = tmp_path / "choice.yaml"
+    file.write_text("checked: 3")
+    with pytest.raises(BadInputError) as caught:
+        validate(Choice, read_document(file))
+    assert caught.value.problems[0].remedy == "Value error, 3 is refused"

@@ -15,10 +15,10 @@ from typing import Self
 
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import RUN_DIRECTORY, Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import RUN_DIRECTORY, ResolvedGraph
 from flexsheet.launch.running.estop_file import STATE_VARIABLE, EStopFile
-from flexsheet.launch.running.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
+from flexsheet.launch.running.host import REASON_LENGTH, HostAgent, has_manual_arming, list_arms
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
@@ -47,30 +47,30 @@ def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(made)
 
 
-def plan_of(folder: Path, *, arming: str = "by_command") -> Plan:
+def plan_of(folder: Path, *, arming: str = "by_command") -> ResolvedGraph:
     """A graph in which an arm waits for a person's word; only its launchers are started."""
     path = folder / "graph.yaml"
     bridge = BRIDGE | {"parameters": {"side": "left", "arming": arming}}
     topics = ["arm_right", "scene", "sheet_target"]
-    values = {"nodes": {"bridge": bridge}, "hosts": HOSTS, "from_tools": topics}
+    values = {"nodes": {"bridge": bridge}, "hosts": HOSTS, "external_topics": topics}
     path.write_text(json.dumps(values))
-    return load_plan(path)
+    return load_graph(path)
 
 
 @dataclass
 class Launchers:
-    """The launchers' voices of all hosts, and a tool that says e-stops."""
+    """The host agents of all hosts, and a tool that sends e-stops."""
 
     folder: Path
-    plan: Plan
+    plan: ResolvedGraph
     said: list[str] = field(default_factory=list)
-    voices: dict[str, HostVoice] = field(default_factory=dict)
+    agents: dict[str, HostAgent] = field(default_factory=dict)
 
     async def __aenter__(self) -> Self:
         self._clock = SystemClock()
         self._epoch, self._sequence = self._clock.now_ns(), 0
         for host in self.plan.hosts:
-            self.voices[host] = HostVoice(
+            self.agents[host] = HostAgent(
                 self.plan, host, run_id="1", code="", processes=tuple, pids=dict,
                 endpoints=lambda ends: tuple(map(self._near, ends)),
                 sources=lambda ones: tuple(
@@ -78,7 +78,7 @@ class Launchers:
                 ),
                 keys=None, on_problem=self.said.append,
             )  # fmt: skip
-            self.voices[host].start()
+            self.agents[host].start()
         writer = self.plan.writer("estop", "tools")
         assert writer is not None
         self._tool = Publisher(topic_named("estop"), [self._near(one) for one in writer.endpoints])
@@ -104,8 +104,8 @@ class Launchers:
                 publisher.close()
 
     async def __aexit__(self, *_: object) -> None:
-        for voice in self.voices.values():
-            await voice.close()
+        for agent in self.agents.values():
+            await agent.close()
         self._tool.close()
 
     def _near(self, endpoint: str) -> str:
@@ -203,7 +203,7 @@ def test_a_bridge_refuses_a_reset_from_the_future() -> None:
 
 async def test_what_cannot_be_read_counts_as_a_stop(folder: Path) -> None:
     plan = plan_of(folder)
-    file = EStopFile("left", arms_of(plan))
+    file = EStopFile("left", list_arms(plan))
     file.path.parent.mkdir()
     file.path.write_text("[" * 100_000)
     async with Launchers(folder, plan) as launchers:
@@ -239,8 +239,8 @@ def test_graphs_of_other_arms_keep_stops_of_their_own(folder: Path) -> None:
 
 
 def test_simulated_arms_that_go_by_themselves_forget(folder: Path) -> None:
-    assert waits_for_a_person(plan_of(folder))
-    assert not waits_for_a_person(plan_of(folder, arming="by_itself"))
+    assert has_manual_arming(plan_of(folder))
+    assert not has_manual_arming(plan_of(folder, arming="by_itself"))
 
 
 def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:

@@ -23,7 +23,7 @@ from flexsheet.launch.experiments import driver as driving
 from flexsheet.launch.experiments import stroke
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import DEMO_FILE
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import RUN_VARIABLE
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.launch.running.tools import subscriber_to
@@ -87,7 +87,7 @@ class Session:
 async def run_session(bag: Path, ports: tuple[int, int]) -> Session:
     """Stroke for a few seconds; then kill the triangulator in the middle of another stroke."""
     threads_before = {thread.name for thread in threading.enumerate()}
-    plan = load_plan(DEMO_FILE, settings=on_ports(ports), record=bag)
+    plan = load_graph(DEMO_FILE, settings=on_ports(ports), record=bag)
     scene = plan.scene_message()
     assert scene is not None
     async with RunningGraph(plan) as graph:
@@ -174,7 +174,7 @@ def test_every_logged_topic_that_has_a_rate_arrives_at_it(session: Session) -> N
         if begin_ns <= header.publish_ns <= end_ns:
             stamps.setdefault(topic, []).append(header.publish_ns)
     duration_s = (end_ns - begin_ns) * 1e-9
-    written = load_plan(DEMO_FILE).writers
+    written = load_graph(DEMO_FILE).writers
     expected = {
         name: one.rate_hz
         for name, one in TOPICS.items()

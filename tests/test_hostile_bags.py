@@ -22,7 +22,7 @@ from tests.test_cli import Command
 COMMANDS = ("info {bag}", "verify planner {bag}", "report {bag} -o {out}.html",
             "export {bag} {out}.mcap", "recover {bag} {out}-2.mcap",
             "play {bag} --into {graph}")  # fmt: skip
-GRAPH = "from_tools: [estop]\nnodes: {}\n"
+GRAPH = "external_topics: [estop]\nnodes: {}\n"
 MAX_GROWTH_KB = 400_000
 
 

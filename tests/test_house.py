@@ -17,6 +17,7 @@ SHARED_ROOMS = {
     "flexsheet.nodes.methods",
     "flexsheet.nodes.models",
     "flexsheet.nodes.node",
+    "flexsheet.nodes.parameter_marks",
 }
 TWIN_MAY_SHARE = {
     "flexsheet.nodes.models.rigid",

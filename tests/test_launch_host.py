@@ -14,12 +14,12 @@ from typing import Any
 import pytest
 
 from flexsheet.launch.plans.hosts import launcher_on
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import TOOLS, Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import TOOLS, ResolvedGraph
 from flexsheet.launch.running import runs
-from flexsheet.launch.running.host import devices_of
+from flexsheet.launch.running.host import list_device_files
 from flexsheet.launch.running.supervisor import RunningGraph
-from flexsheet.launch.running.tools import ToolsWriter, subscriber_to
+from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.types import EStop, HostStatus
 from tests.waiting import DEADLINE_S, NOTHING_COMES_S, until
 
@@ -38,21 +38,21 @@ def runs_root(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(folder)
 
 
-def plan_of(folder: Path, nodes: dict[str, Any]) -> Plan:
+def plan_of(folder: Path, nodes: dict[str, Any]) -> ResolvedGraph:
     path = folder / "graph.yaml"
     path.write_text(json.dumps({"nodes": nodes, "hosts": HOSTS}))
-    return load_plan(path)
+    return load_graph(path)
 
 
 async def heard_late(
-    plan: Plan, graph: RunningGraph, expected: dict[str, EStop]
+    plan: ResolvedGraph, graph: RunningGraph, expected: dict[str, EStop]
 ) -> dict[str, EStop]:
     """The e-stops, by writer, that somebody hears who comes only now.
 
     Waits for the expected ones; without any, for a while in which none shall come.
     """
     heard: dict[str, EStop] = {}
-    subscriber = subscriber_to(
+    subscriber = make_subscriber(
         "estop", plan, graph.run,
         lambda message, header: heard.update({header.writer: message}),
         on_problem=pytest.fail,
@@ -74,7 +74,7 @@ async def test_an_estop_outlives_who_said_it_until_it_is_reset(tmp_path: Path) -
 
         async def say(estop: EStop, answer: str) -> None:
             # The topic is latched: a launcher that connects later gets it, too.
-            writer = ToolsWriter(plan, graph.run, ["estop"])
+            writer = GraphWriter(plan, graph.run, ["estop"])
             writer.publish("estop", estop)
             await until(lambda: sum(answer in line for line in said) == 2, answer)
             writer.close()
@@ -96,7 +96,7 @@ async def test_each_host_says_how_it_is_and_how_its_nodes_are(tmp_path: Path) ->
     async with RunningGraph(plan) as graph:
         await graph.wait_ready(DEADLINE_S)
         graph.kill("beacon")
-        subscriber = subscriber_to(
+        subscriber = make_subscriber(
             "host", plan, graph.run,
             lambda message, header: newest.update({message.host: message}),
             on_problem=pytest.fail,
@@ -132,6 +132,6 @@ def test_the_launchers_are_writers_of_their_own(tmp_path: Path) -> None:
 
 
 def test_devices_are_found_wherever_parameters_name_them() -> None:
-    lab = load_plan(Path(__file__).resolve().parent.parent / "launch" / "lab.yaml")
-    assert devices_of(lab.nodes_on("main")) == ["/dev/video0", "/dev/video2"]
-    assert devices_of(lab.nodes_on("left")) == []
+    lab = load_graph(Path(__file__).resolve().parent.parent / "launch" / "lab.yaml")
+    assert list_device_files(lab.nodes_on("main")) == ["/dev/video0", "/dev/video2"]
+    assert list_device_files(lab.nodes_on("left")) == []

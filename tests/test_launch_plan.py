@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from flexsheet.launch.plans.documents import BadInputError, parse_value
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
-from flexsheet.launch.plans.wires import FIRST_PORT, PORTS, _ports
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.launch.plans.routing import FIRST_PORT, PORTS, _ports
 
 ROOT = Path(__file__).resolve().parent.parent
 BEACON = "tests.launch_nodes:Beacon"
@@ -33,12 +33,12 @@ def write(folder: Path, text: str) -> Path:
 
 def complaint(folder: Path, text: str, **options: object) -> str:
     with pytest.raises(BadInputError) as caught:
-        load_plan(write(folder, text), **options)  # type: ignore[arg-type]  # options of the test
+        load_graph(write(folder, text), **options)  # type: ignore[arg-type]  # options of the test
     return str(caught.value)
 
 
 def test_a_plan_knows_every_endpoint(tmp_path: Path) -> None:
-    plan = load_plan(write(tmp_path, GRAPH))
+    plan = load_graph(write(tmp_path, GRAPH))
     assert plan.nodes["listener"].inputs[0].endpoints == ("ipc://@run/beacon.twin.finger",)
     assert plan.nodes["beacon"].parameters["rate_hz"] == 20.0
     assert plan.nodes["beacon"].parameters["ready_after_s"] == 0.0
@@ -47,22 +47,22 @@ def test_a_plan_knows_every_endpoint(tmp_path: Path) -> None:
 
 def test_the_same_file_gives_the_same_hash_and_another_value_another(tmp_path: Path) -> None:
     path = write(tmp_path, GRAPH)
-    assert load_plan(path).hash == load_plan(path).hash
-    assert load_plan(path).hash != load_plan(path, settings=["beacon.rate_hz=21"]).hash
+    assert load_graph(path).hash == load_graph(path).hash
+    assert load_graph(path).hash != load_graph(path, settings=["beacon.rate_hz=21"]).hash
 
 
 def test_the_hash_does_not_depend_on_where_the_file_lies(tmp_path: Path) -> None:
     text = GRAPH.replace("rate_hz: 20", "mark: here/mark")
     (tmp_path / "a").mkdir()
     (tmp_path / "b").mkdir()
-    one, other = load_plan(write(tmp_path / "a", text)), load_plan(write(tmp_path / "b", text))
+    one, other = load_graph(write(tmp_path / "a", text)), load_graph(write(tmp_path / "b", text))
     assert one.hash == other.hash
     assert one.nodes["beacon"].parameters["mark"] == str(tmp_path / "a/here/mark")
 
 
 def test_a_plan_survives_json(tmp_path: Path) -> None:
-    plan = load_plan(write(tmp_path, GRAPH))
-    assert Plan.model_validate_json(plan.model_dump_json()) == plan
+    plan = load_graph(write(tmp_path, GRAPH))
+    assert ResolvedGraph.model_validate_json(plan.model_dump_json()) == plan
 
 
 def test_tcp_between_hosts_and_ipc_within(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ nodes:
   near: {type: "tests.launch_nodes:Listener", host: left}
   far: {type: "tests.launch_nodes:Listener", host: main}
 """
-    plan = load_plan(write(tmp_path, text))
+    plan = load_graph(write(tmp_path, text))
     writer = plan.writers["twin/finger"][0]
     assert writer.tcp is not None
     assert writer.tcp.startswith("tcp://127.0.0.2:")
@@ -85,7 +85,7 @@ nodes:
     status = plan.writer("status", "near")
     assert status is not None
     assert status.endpoint_for("main") == status.tcp
-    alone = load_plan(write(tmp_path, GRAPH))
+    alone = load_graph(write(tmp_path, GRAPH))
     assert {one.tcp for writers in alone.writers.values() for one in writers} == {None}
 
 
@@ -162,16 +162,16 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             f"nodes: {{listener: {{type: '{LISTENER}'}}}}\n",
-            'nobody writes topic "twin/finger"; add the node that does',
+            'no node writes topic "twin/finger"; add a node that writes it',
         ),
         (GRAPH + "scene: nowhere.yaml\n", '"nowhere.yaml" is no file'),
-        (GRAPH + "from_tools: [fingertp]\n", 'did you mean "fingertip"?'),
-        (GRAPH + "from_tools: [twin/finger]\n", 'is written by "beacon" already'),
+        (GRAPH + "external_topics: [fingertp]\n", 'did you mean "fingertip"?'),
+        (GRAPH + "external_topics: [twin/finger]\n", 'is written by "beacon" already'),
         (GRAPH + f"  tools: {{type: '{LISTENER}'}}\n", '"tools" is taken'),
         (GRAPH + f"  plan: {{type: '{LISTENER}'}}\n", '"plan" is taken'),
         (GRAPH + "    restart: {policy: somtimes}\n", "'never', 'on_failure' or 'always'"),
         (GRAPH + "record: {bagg: a.mcap}\n", 'did you mean "bag"?'),
-        (GRAPH + "record: {bag: a.mcap, topics: [stereo]}\n", 'nobody writes topic "stereo"'),
+        (GRAPH + "record: {bag: a.mcap, topics: [stereo]}\n", 'no node writes topic "stereo"'),
         (
             GRAPH.replace(f"type: {BEACON}", "type: arm_bridge").replace(
                 "rate_hz: 20", "side: left"
@@ -185,15 +185,15 @@ def test_what_is_wrong_is_said(tmp_path: Path, text: str, said: str) -> None:
 
 
 def test_all_that_is_wrong_is_said_at_once(tmp_path: Path) -> None:
-    text = GRAPH.replace("rate_hz", "rate") + "    host: left\nfrom_tools: [nothing]\n"
+    text = GRAPH.replace("rate_hz", "rate") + "    host: left\nexternal_topics: [nothing]\n"
     with pytest.raises(BadInputError) as caught:
-        load_plan(write(tmp_path, text))
+        load_graph(write(tmp_path, text))
     assert len(caught.value.problems) == 3
 
 
 def test_a_file_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match="cannot be read"):
-        load_plan(tmp_path / "no.yaml")
+        load_graph(tmp_path / "no.yaml")
 
 
 def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_wrong_settings_are_named(tmp_path: Path, setting: str, said: str) -> No
 
 
 def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
-    plan = load_plan(
+    plan = load_graph(
         write(tmp_path, GRAPH),
         settings=["beacon.rate_hz=7", "recorder.compress=false"],
         record=tmp_path / "a.mcap",
@@ -237,20 +237,20 @@ def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
 
 
 def test_a_topic_from_tools_needs_no_node(tmp_path: Path) -> None:
-    text = f"nodes: {{listener: {{type: '{LISTENER}'}}}}\nfrom_tools: [twin/finger]\n"
-    plan = load_plan(write(tmp_path, text))
+    text = f"nodes: {{listener: {{type: '{LISTENER}'}}}}\nexternal_topics: [twin/finger]\n"
+    plan = load_graph(write(tmp_path, text))
     assert plan.nodes["listener"].inputs[0].endpoints == ("ipc://@run/tools.twin.finger",)
 
 
 def test_a_port_can_be_left_out(tmp_path: Path) -> None:
     text = f"nodes: {{listener: {{type: '{LISTENER}', topics: {{twin__finger: null}}}}}}\n"
-    plan = load_plan(write(tmp_path, text))
+    plan = load_graph(write(tmp_path, text))
     assert plan.nodes["listener"].inputs[0].endpoints == ()
 
 
 @pytest.mark.parametrize("name", ["demo", "lab", "replay"])
 def test_the_launch_files_of_the_house_resolve(name: str) -> None:
-    plan = load_plan(ROOT / "launch" / f"{name}.yaml")
+    plan = load_graph(ROOT / "launch" / f"{name}.yaml")
     assert plan.scene_message() is not None
     for node in plan.nodes.values():
         for port in node.inputs:
@@ -273,7 +273,7 @@ def test_the_launch_files_of_the_house_resolve(name: str) -> None:
 )
 def test_a_calibration_that_is_none_is_refused_before_the_start(setting: str, words: str) -> None:
     with pytest.raises(BadInputError, match=words) as caught:
-        load_plan(ROOT / "launch" / "demo.yaml", settings=[setting])
+        load_graph(ROOT / "launch" / "demo.yaml", settings=[setting])
     assert setting.split("=", maxsplit=1)[0].split(".")[1] in str(caught.value)
 
 
@@ -287,6 +287,6 @@ def test_values_are_read_as_yaml() -> None:
 def test_the_example_of_the_page_on_launch_files_resolves(tmp_path: Path) -> None:
     page = (ROOT / "docs/launch-files.md").read_text()
     example = page.split("```yaml\n")[1].split("```")[0]
-    plan = load_plan(write(tmp_path, example.replace("scenes/", f"{ROOT}/launch/scenes/")))
+    plan = load_graph(write(tmp_path, example.replace("scenes/", f"{ROOT}/launch/scenes/")))
     assert plan.nodes["watcher"].outputs[-1].endpoints == ()
     assert "in/stereo" in [port.port for port in plan.nodes["recorder"].inputs]

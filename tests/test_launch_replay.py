@@ -11,7 +11,7 @@ import pytest
 
 from flexsheet.launch.bags.player import shifted
 from flexsheet.launch.bags.replay import field_differences, replay, verify
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.base import Header, Message, Stamp, stamp_fields
 from flexsheet.messages.topics import TOPICS, Topic
@@ -34,9 +34,9 @@ def finger(number: int) -> TwinFinger:
 def bag_of(folder: Path, *, log_ms: list[int], **parameters: Any) -> Path:
     """A bag with fingers, each exposed 5 ms before it was recorded, for a relay."""
     relay = {"type": "tests.launch_nodes:Relay", "parameters": parameters}
-    graph = {"nodes": {"relay": relay}, "from_tools": ["twin/finger"]}
+    graph = {"nodes": {"relay": relay}, "external_topics": ["twin/finger"]}
     (folder / "graph.yaml").write_text(json.dumps(graph))
-    plan = load_plan(folder / "graph.yaml")
+    plan = load_graph(folder / "graph.yaml")
     bag = folder / "a.mcap"
     with BagWriter(bag, {"recording": {"clock_id": "lab"}}) as writer:
         writer.add_attachment("plan.json", plan.model_dump_json().encode(), "application/json")
@@ -49,7 +49,7 @@ def bag_of(folder: Path, *, log_ms: list[int], **parameters: Any) -> Path:
 
 async def test_timers_come_due_between_messages_on_the_recorded_clock(tmp_path: Path) -> None:
     bag = bag_of(tmp_path, log_ms=[1000, 1120, 1310], rate_hz=10)
-    plan = load_plan(tmp_path / "graph.yaml")
+    plan = load_graph(tmp_path / "graph.yaml")
     result = await replay(bag, plan.nodes["relay"])
     said = [decode(one.data, TOPICS["estop"]) for one in result.sent]
     # Due at 1000 (before the first finger), 1100, 1200 and 1300.

@@ -23,8 +23,8 @@ import pytest
 import zmq
 
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs, supervisor
 from flexsheet.launch.running.priority import min_nice_step
 from flexsheet.launch.running.starvation import ProcessorTime, starved_s
@@ -51,8 +51,8 @@ def beacon(**keys: Any) -> dict[str, Any]:
     return {"type": "tests.launch_nodes:Beacon", **keys}
 
 
-def plan_of(folder: Path, **nodes: dict[str, Any]) -> Plan:
-    return load_plan(write(folder, nodes))
+def plan_of(folder: Path, **nodes: dict[str, Any]) -> ResolvedGraph:
+    return load_graph(write(folder, nodes))
 
 
 def write(folder: Path, nodes: dict[str, Any], **more: Any) -> Path:
@@ -349,7 +349,7 @@ async def test_a_port_in_use_is_named_before_anything_starts(
 ) -> None:
     nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
     hosts = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
-    plan = load_plan(write(tmp_path, nodes, hosts=hosts))
+    plan = load_graph(write(tmp_path, nodes, hosts=hosts))
     endpoint = plan.writers["twin/finger"][0].tcp
     assert endpoint is not None
     with socket.create_server(("127.0.0.2", int(endpoint.rpartition(":")[2]))):
@@ -369,7 +369,7 @@ def heard_estop(bag: Path) -> bool:
 async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None:
     nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
     hosts = {"main": {"address": "127.0.0.1"}, "left": {"address": "127.0.0.2"}}
-    plan = load_plan(write(tmp_path, nodes, hosts=hosts), record=tmp_path / "a.mcap")
+    plan = load_graph(write(tmp_path, nodes, hosts=hosts), record=tmp_path / "a.mcap")
     async with RunningGraph(plan, host="main") as main:
         await main.wait_ready(DEADLINE_S)
         async with RunningGraph(plan, host="left") as left:
@@ -382,7 +382,7 @@ async def test_two_launchers_of_two_hosts_make_one_graph(tmp_path: Path) -> None
 
 async def test_addresses_beyond_loopback_are_refused_without_keys(tmp_path: Path) -> None:
     hosts = {"main": {"address": "192.0.2.1"}}
-    plan = load_plan(write(tmp_path, {"beacon": beacon()}, hosts=hosts))
+    plan = load_graph(write(tmp_path, {"beacon": beacon()}, hosts=hosts))
     with pytest.raises(BadInputError, match=r"graph.yaml:1: hosts.main.address: 192.0.2.1 is bey"):
         await RunningGraph(plan).__aenter__()
 

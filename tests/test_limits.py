@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch.plans.documents import BadInputError, read_document, validate
 from flexsheet.launch.plans.launch_file import LaunchFile
-from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.calibration import StereoCalibration
 from flexsheet.messages.limits import LimitedModel, max_of
 from flexsheet.messages.scene import Scene
@@ -147,7 +147,7 @@ def test_what_was_accepted_once(tmp_path: Path, key: Key, value: float, said: st
     graph = {"scene": "scene.yaml", "nodes": {"arms": {"type": "twin_arms"}}}
     (tmp_path / "graph.yaml").write_text(json.dumps(graph))
     with pytest.raises(BadInputError, match=r"scene\.yaml:[0-9]+: ") as refused:
-        load_plan(tmp_path / "graph.yaml")
+        load_graph(tmp_path / "graph.yaml")
     assert said in str(refused.value)
 
 
@@ -158,7 +158,7 @@ def test_an_absurd_rate_in_a_launch_file_is_refused(tmp_path: Path) -> None:
         r"graph.yaml:4: nodes.arms.parameters.rate_hz: 1e\+308 does not fit; give at most 10000 hz"
     )
     with pytest.raises(BadInputError, match=said):
-        load_plan(file)
+        load_graph(file)
     file.write_text("nodes:\n  arms:\n    type: twin_arms\n    start_deadline_s: 1.0e+300\n")
     with pytest.raises(BadInputError, match=r"start_deadline_s: 1e\+300 does not fit"):
         validate(LaunchFile, read_document(file))

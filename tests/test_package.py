@@ -47,6 +47,13 @@ def test_an_unknown_name_is_an_attribute_error() -> None:
         _ = flexsheet.unknown  # type: ignore[attr-defined]
 
 
+@pytest.mark.parametrize(("former", "name"), flexsheet._FORMER_NAMES.items())
+def test_a_former_name_is_a_deprecated_alias(former: str, name: str) -> None:
+    assert former not in flexsheet.__all__
+    with pytest.deprecated_call(match=f"use flexsheet.{name}"):
+        assert getattr(flexsheet, former) is getattr(flexsheet, name)
+
+
 def test_static_and_lazy_names_agree() -> None:
     """Type checkers read the imports, Python reads the table."""
     tree = ast.parse((ROOT / "flexsheet" / "__init__.py").read_text())
@@ -137,7 +144,7 @@ def test_a_wheel_holds_the_package_only(tmp_path: Path) -> None:
 def test_the_script_of_the_readme_runs(tmp_path: Path) -> None:
     """On a graph of one node, which publishes fingertips."""
     (script,) = (
-        block.text for block in blocks(ROOT / "README.md") if "flexsheet.load_plan" in block.text
+        block.text for block in blocks(ROOT / "README.md") if "flexsheet.load_graph" in block.text
     )
     (tmp_path / "launch").mkdir()
     (tmp_path / "launch" / "demo.yaml").write_text(

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import priority
 from flexsheet.launch.running.priority import MIN_NICE, min_nice_step, precedence_problem
 
 ROOT = Path(__file__).resolve().parent.parent
-DEMO = load_plan(ROOT / "launch" / "demo.yaml")
+DEMO = load_graph(ROOT / "launch" / "demo.yaml")
 
 
 def allow(monkeypatch: pytest.MonkeyPatch, *, capable: bool, limit: int) -> None:
@@ -67,5 +67,5 @@ def test_simulated_arms_may_answer_late_and_then_nothing_else_stops_them() -> No
         bridge = DEMO.nodes[f"arm_{side}_bridge"].parameters
         # Two answers may fail before an arm counts as lost; nothing may give up earlier.
         assert 2 * bridge["timeout_s"] < bridge["stop_after_s"] < arms["watchdog_s"]
-    lab = load_plan(ROOT / "launch" / "lab.yaml").nodes["arm_left_bridge"].parameters
+    lab = load_graph(ROOT / "launch" / "lab.yaml").nodes["arm_left_bridge"].parameters
     assert (lab["timeout_s"], lab["stop_after_s"]) == (None, 0.1)

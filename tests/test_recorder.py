@@ -19,7 +19,7 @@ from typing import Any
 
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.bag import FLUSH_PERIOD_S, BagError, BagReader, BagWriter
@@ -265,7 +265,7 @@ async def test_killed_it_loses_at_most_what_came_since_the_last_flush(tmp_path: 
         },
     }
     (tmp_path / "graph.yaml").write_text(json.dumps({"nodes": nodes}))
-    async with RunningGraph(load_plan(tmp_path / "graph.yaml")) as graph:
+    async with RunningGraph(load_graph(tmp_path / "graph.yaml")) as graph:
         await graph.wait_ready(DEADLINE_S)
         running_ns = time.monotonic_ns()
         # More than what the first flush wrote, and no chunk is full by then.

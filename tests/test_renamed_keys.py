@@ -10,7 +10,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch.plans import renamed_keys
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages import migrations
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Message
@@ -42,7 +42,24 @@ def test_an_old_parameter_gets_an_error_that_names_the_new_one(
     nodes = {"one": {"type": node_type, "parameters": {old: 0.1}}}
     YAML().dump({"nodes": nodes}, file)
     with pytest.raises(BadInputError, match=f'unknown key "{old}"; it is now "{new}"'):
-        load_plan(file)
+        load_graph(file)
+
+
+def test_a_class_path_of_a_shipped_node_gets_the_same_error(tmp_path: Path) -> None:
+    file = tmp_path / "old.yaml"
+    node_type = "flexsheet.nodes.renderer.node:Renderer"
+    YAML().dump({"nodes": {"one": {"type": node_type, "parameters": {"lead_s": 0.1}}}}, file)
+    with pytest.raises(BadInputError, match='it is now "prediction_horizon_s"'):
+        load_graph(file)
+
+
+def test_the_former_key_of_external_topics_gets_an_error_that_names_the_new_one(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "old.yaml"
+    YAML().dump({"nodes": {}, "from_tools": ["fingertip"]}, file)
+    with pytest.raises(BadInputError, match='"from_tools"; it is now "external_topics"'):
+        load_graph(file)
 
 
 @pytest.mark.parametrize("old", renamed_keys.VALUES["sheet_shape"])

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
-from flexsheet.launch.running.host import arms_of, folder_of
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.launch.running.host import list_arms, recording_folder
 from flexsheet.messages.types import ArmState
 from flexsheet.nodes import NODES, NodeRole, node_class
 from flexsheet.nodes.node import Node, NodeParameters, Output, role_of
@@ -27,11 +27,11 @@ class OwnRecorder(Recorder):
     """A laboratory's recorder."""
 
 
-def plan_with(folder: Path, bridge: dict[str, object], **more: object) -> Plan:
+def plan_with(folder: Path, bridge: dict[str, object], **more: object) -> ResolvedGraph:
     path = folder / "graph.yaml"
     nodes = {"bridge": {"topics": {"arm": "arm_left"}, **bridge}, **more}
     path.write_text(json.dumps({"nodes": nodes}))
-    return load_plan(path)
+    return load_graph(path)
 
 
 @pytest.mark.parametrize(
@@ -52,13 +52,13 @@ def test_a_bridge_keeps_its_estop_file_whatever_its_type_is_called(
     plan = plan_with(tmp_path, bridge)
     assert plan.nodes["bridge"].role is NodeRole.ARM_BRIDGE
     assert plan.nodes["bridge"].arm_side == "left"
-    assert len(arms_of(plan)) == 1
+    assert len(list_arms(plan)) == 1
 
 
 def test_arms_of_different_bridges_do_not_share_an_estop_file(tmp_path: Path) -> None:
     own = {"type": f"{__name__}:OwnBridge"}
     plan = plan_with(tmp_path, own, second={**own, "topics": {"arm": "arm_right"}})
-    assert len(set(arms_of(plan))) == 2
+    assert len(set(list_arms(plan))) == 2
 
 
 def test_a_recorder_of_another_class_is_one(tmp_path: Path) -> None:
@@ -66,7 +66,7 @@ def test_a_recorder_of_another_class_is_one(tmp_path: Path) -> None:
     bag = tmp_path / "a.mcap"
     recorder = {"type": f"{__name__}:OwnRecorder", "parameters": {"bag": str(bag)}}
     plan = plan_with(tmp_path, own, recorder=recorder)
-    assert folder_of(plan.nodes_on(None)) == tmp_path
+    assert recording_folder(plan.nodes_on(None)) == tmp_path
 
 
 def test_plans_of_old_bags_have_the_roles_of_their_types(tmp_path: Path) -> None:
@@ -74,13 +74,14 @@ def test_plans_of_old_bags_have_the_roles_of_their_types(tmp_path: Path) -> None
     (node,) = plan["nodes"].values()
     del node["role"]
     node["type"] = "arm_bridge"
-    assert Plan.model_validate(plan).nodes["bridge"].role is NodeRole.ARM_BRIDGE
+    assert ResolvedGraph.model_validate(plan).nodes["bridge"].role is NodeRole.ARM_BRIDGE
 
 
 def test_the_shipped_nodes_have_their_roles() -> None:
     roles = {name: role_of(node_class(name)) for name in NODES}
     assert {name: role for name, role in roles.items() if role is not None} == {
         "arm_bridge": NodeRole.ARM_BRIDGE,
+        "camera": NodeRole.CAMERA,
         "clock": NodeRole.CLOCK,
         "console": NodeRole.CONSOLE,
         "recorder": NodeRole.RECORDER,

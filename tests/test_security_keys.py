@@ -14,12 +14,12 @@ import pytest
 import zmq
 
 from flexsheet.launch.plans.documents import BadInputError, read_document
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.keys import KEYS_VARIABLE, install
 from flexsheet.launch.running.supervisor import RunningGraph
-from flexsheet.launch.running.tools import subscriber_to
+from flexsheet.launch.running.tools import make_subscriber
 from flexsheet.messages.security import (
     SecurityError,
     is_key,
@@ -122,7 +122,7 @@ def test_any_key_can_stand_in_a_launch_file(tmp_path: Path, first: str) -> None:
     key = f"{first}0000{ONE[5:]}"
     install(file, "main", key)
     install(file, "main", key)
-    assert load_plan(file).keys == {"main": key}
+    assert load_graph(file).keys == {"main": key}
 
 
 def test_no_new_public_key_looks_like_an_option(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,7 +161,7 @@ def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:
     install(file, "left", keys_tried[0])
     for key in keys_tried[1:]:
         install(file, "main", key)
-        assert load_plan(file).keys == {"main": key, "left": keys_tried[0]}
+        assert load_graph(file).keys == {"main": key, "left": keys_tried[0]}
     text = file.read_text()
     assert "# the lab" in text
     assert "# upstairs" in text
@@ -177,11 +177,11 @@ def test_keys_are_no_part_of_the_plan_s_hash(tmp_path: Path) -> None:
     hashes = set()
     for _ in range(2):
         given = {name: {**host, "key": new_key_pair()[0]} for name, host in HOSTS.items()}
-        hashes.add(load_plan(write(tmp_path, {"beacon": beacon()}, hosts=given)).hash)
-    hashes.add(load_plan(write(tmp_path, {"beacon": beacon()}, hosts=HOSTS)).hash)
+        hashes.add(load_graph(write(tmp_path, {"beacon": beacon()}, hosts=given)).hash)
+    hashes.add(load_graph(write(tmp_path, {"beacon": beacon()}, hosts=HOSTS)).hash)
     assert len(hashes) == 1
     given = {**HOSTS, "left": {**HOSTS["left"], "may_reset_estop": True}}
-    hashes.add(load_plan(write(tmp_path, {"beacon": beacon()}, hosts=given)).hash)
+    hashes.add(load_graph(write(tmp_path, {"beacon": beacon()}, hosts=given)).hash)
     assert len(hashes) == 2
 
 
@@ -200,23 +200,23 @@ ONE, TWO = new_key_pair()[0], new_key_pair()[0]
 def test_keys_that_do_not_do(tmp_path: Path, main: str, left: str | None, said: str) -> None:
     given = {"main": {**HOSTS["main"], "key": main}, "left": {**HOSTS["left"], "key": left}}
     with pytest.raises(BadInputError, match=said):
-        load_plan(write(tmp_path, {"beacon": beacon()}, hosts=given))
+        load_graph(write(tmp_path, {"beacon": beacon()}, hosts=given))
 
 
 def test_an_arm_s_own_protocol_does_not_cross_the_network(tmp_path: Path) -> None:
     given = {"main": {"address": "192.0.2.1"}, "left": {"address": "192.0.2.2"}}
     twin = {"type": "twin_arms", "parameters": {"host": "192.0.2.2"}, "topics": {"scene": None}}
     with pytest.raises(BadInputError, match=r"parameters.host: .*192.0.2.2 is beyond loopback"):
-        load_plan(write(tmp_path, {"twin": twin}, hosts=given))
+        load_graph(write(tmp_path, {"twin": twin}, hosts=given))
     bridge = {
         "type": "arm_bridge",
         "parameters": {"side": "left", "host": "192.0.2.2"},
         "topics": {"arm": "arm_left", "other_arm": None, "sheet_target": None, "scene": None},
     }
     with pytest.raises(BadInputError, match=r'192.0.2.2 is host "left".*run bridge there'):
-        load_plan(write(tmp_path, {"bridge": bridge}, hosts=given))
+        load_graph(write(tmp_path, {"bridge": bridge}, hosts=given))
     bridge["host"] = "left"
-    load_plan(write(tmp_path, {"bridge": bridge}, hosts=given))
+    load_graph(write(tmp_path, {"bridge": bridge}, hosts=given))
 
 
 def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_path: Path) -> None:
@@ -230,7 +230,7 @@ def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_
     file.write_text(LAB)
     assert command("keys", "install", file, "left").code == 0
     assert command("keys", "install", file, "main", ONE).code == 0
-    assert load_plan(file).keys == {"left": made["public"], "main": ONE}
+    assert load_graph(file).keys == {"left": made["public"], "main": ONE}
     (keys / "left.secret").chmod(0o644)
     shown = command("keys", "show", "--json")
     assert shown.code == 1
@@ -238,11 +238,11 @@ def test_the_command_makes_shows_and_installs(command: Command, keys: Path, tmp_
     assert command("keys", "new", "Left Arm").code == 2
 
 
-async def heard(plan: Plan, graph: RunningGraph) -> None:
+async def heard(plan: ResolvedGraph, graph: RunningGraph) -> None:
     """Until a tool on main has heard the beacon on left."""
     fingers: list[TwinFinger] = []
     said: list[str] = []
-    subscriber = subscriber_to(
+    subscriber = make_subscriber(
         "twin/finger", plan, graph.run, lambda message, _: fingers.append(message),
         on_problem=said.append,
     )  # fmt: skip
@@ -253,10 +253,10 @@ async def heard(plan: Plan, graph: RunningGraph) -> None:
         subscriber.close()
 
 
-def plan_with_keys(folder: Path, public: dict[str, str], **more: Any) -> Plan:
+def plan_with_keys(folder: Path, public: dict[str, str], **more: Any) -> ResolvedGraph:
     given = {name: {**host, "key": public[name]} for name, host in HOSTS.items()}
     nodes = {"beacon": beacon(host="left"), "listener": LISTENER}
-    return load_plan(write(folder, nodes, hosts=given, **more))
+    return load_graph(write(folder, nodes, hosts=given, **more))
 
 
 async def test_a_graph_with_keys_and_a_new_key_while_it_runs(tmp_path: Path, keys: Path) -> None:
@@ -279,7 +279,7 @@ async def test_a_graph_with_keys_and_a_new_key_while_it_runs(tmp_path: Path, key
         await until(lambda: any("is not the key that the launch file has" in line for line in said))
         install(Path(plan.launch_file), "left", new)
         await until(lambda: sum("keys of" in line for line in said) >= 2)
-        plan = load_plan(Path(plan.launch_file))
+        plan = load_graph(Path(plan.launch_file))
         await heard(plan, main)
         assert main.pids | left.pids == pids, "nothing was started anew"
 

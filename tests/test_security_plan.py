@@ -14,8 +14,8 @@ import pytest
 import structlog
 from ruamel.yaml import YAML
 
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs
 from flexsheet.launch.running.keys import KEYS_VARIABLE, make_rings
 from flexsheet.launch.running.supervisor import node_config
@@ -60,7 +60,7 @@ def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 @pytest.mark.parametrize("name", ["three.yaml", "lab.yaml"])
 def test_the_plans_that_come_with_it_believe_each_host_its_own_writers_only(name: str) -> None:
-    plan = load_plan(LAUNCH / name)
+    plan = load_graph(LAUNCH / name)
     hosts_of = {topic: {one.host for one in writers} for topic, writers in plan.writers.items()}
     allowed = ("sheet_target", "arm_left", "arm_right", "stereo", "fingertip")
     assert [hosts_of[topic] for topic in allowed] == [
@@ -78,7 +78,7 @@ def test_the_plans_that_come_with_it_believe_each_host_its_own_writers_only(name
                 assert one.host is not None or one.endpoint.startswith("ipc:"), "no key is asked"
 
 
-def lab(folder: Path, **left: Any) -> Plan:
+def lab(folder: Path, **left: Any) -> ResolvedGraph:
     """launch/three.yaml on loopback with keys, and a hand on the left arm's computer."""
     spec = YAML(typ="safe").load(LAUNCH / "three.yaml")
     spec["scene"] = str(LAUNCH / spec["scene"])
@@ -93,13 +93,13 @@ def lab(folder: Path, **left: Any) -> Plan:
     spec["hosts"]["left"] |= left
     path = folder / "three.yaml"
     path.write_text(json.dumps(spec))  # JSON is YAML
-    return load_plan(path)
+    return load_graph(path)
 
 
 class Street:
     """The right arm's bridge as its runner connects it, and whoever speaks to it."""
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: ResolvedGraph) -> None:
         self.plan, run = plan, runs.create_run()
         self.rings = make_rings(plan, run, None)
         config = node_config(plan, plan.nodes[BRIDGE], run)
@@ -161,7 +161,7 @@ class Street:
 
 
 @contextmanager
-def street_of(plan: Plan, monkeypatch: pytest.MonkeyPatch) -> Iterator[Street]:
+def street_of(plan: ResolvedGraph, monkeypatch: pytest.MonkeyPatch) -> Iterator[Street]:
     monkeypatch.setattr(bus, "GIVEN_UP_S", 0.02)
     street = Street(plan)
     monkeypatch.setattr(street.bridge, "deliver", street.hear)

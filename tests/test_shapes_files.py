@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from flexsheet.launch.objects.meshes import MOST_BYTES, read_mesh
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan, load_scene
+from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Mesh, Scene, UnfitGeometryError, cylinder_of
 from flexsheet.messages.topics import TOPICS
@@ -71,7 +71,7 @@ def test_a_plan_holds_the_mesh_for_all_hosts(tmp_path: Path) -> None:
     launch_file.write_text(
         "scene: scene.yaml\nnodes:\n  finger: {type: twin_finger}\n  camera: {type: camera}\n"
     )
-    plan = load_plan(launch_file)
+    plan = load_graph(launch_file)
     scene = plan.scene_message()
     assert scene is not None
     assert isinstance(scene.object.geometry, Mesh)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.types import ArmState
 from tests.lab import HOSTS, Lab
 from tests.lab_bags import Span, gaps, held, read_arm, wanted
@@ -139,7 +139,7 @@ async def last_weeks_plan_is_refused(lab: Lab) -> None:
     """One computer is started with an old launch file; both sides say so, and it is mended."""
     old = lab.launch_file.with_name("last-week.yaml")
     old.write_text(lab.launch_file.read_text().replace("watchdog_s: 0.8", "watchdog_s: 0.7"))
-    theirs, ours = load_plan(old).hash, lab.plan().hash
+    theirs, ours = load_graph(old).hash, lab.plan().hash
     assert theirs != ours
     lab.start("main", "left")
     lab.start("right", launch_file=old)

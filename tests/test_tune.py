@@ -479,7 +479,7 @@ SCENE_BARE = SCENE.model_copy(update={"methods": Methods()})
 def test_a_force_table_that_nobody_made_is_stood_in_for_and_that_is_said(tmp_path: Path) -> None:
     law, told = law_by(SCENE, "table", tmp_path)
     assert law.name == "scaled"
-    assert "flexsheet prepare" in told
+    assert "flexsheet precompute" in told
     assert law_by(SCENE, "linear", tmp_path)[0].name == "linear"
 
 

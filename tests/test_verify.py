@@ -11,8 +11,8 @@ import psutil
 import pytest
 
 from flexsheet.launch.bags.replay import Verification, refusal, verify
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.bag import BagError, BagReader, BagWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
@@ -31,16 +31,16 @@ FRAMES = 24
 NODES = ("camera", "triangulator", "planner", "fem_solver")
 
 
-def plan_of(folder: Path) -> Plan:
+def plan_of(folder: Path) -> ResolvedGraph:
     settings = ["fem_solver.skin_spacing_m=0.007", f"fem_solver.cache_dir={folder}/cache"]
-    return load_plan(ROOT / "launch" / "demo.yaml", settings=settings, record=folder / "x.mcap")
+    return load_graph(ROOT / "launch" / "demo.yaml", settings=settings, record=folder / "x.mcap")
 
 
 @dataclass
 class Live:
     """Nodes of the demo on one clock, each late now and then, and a recorder that is not."""
 
-    plan: Plan
+    plan: ResolvedGraph
     writer: BagWriter
     clock: VirtualClock = field(default_factory=lambda: VirtualClock(START_NS, clock_id="lab"))
     nodes: dict[str, Node] = field(default_factory=dict)
@@ -196,7 +196,7 @@ def test_nodes_that_cannot_be_stepped_say_why(bag: Path, name: str, why: str) ->
 
 def test_devices_windows_and_pages_are_not_replayed_either(tmp_path: Path) -> None:
     settings = ["camera.source={kind: opencv, left: /dev/video0}", "renderer.output=window"]
-    plan = load_plan(ROOT / "launch" / "demo.yaml", settings=settings, console=True)
+    plan = load_graph(ROOT / "launch" / "demo.yaml", settings=settings, console=True)
     assert "reads a device" in refusal(plan.nodes["camera"])
     assert "in a window" in refusal(plan.nodes["renderer"])
     assert "serves a page" in refusal(plan.nodes["console"])
@@ -209,7 +209,7 @@ async def test_a_clock_node_measures_the_same_again(tmp_path: Path) -> None:
         "hosts: {main: {address: 127.0.0.1}}\n"
         "nodes:\n  clock: {type: clock, host: main, topics: {clock_ping_out: clock_ping}}\n"
     )
-    plan = load_plan(file, settings=[], record=tmp_path / "x.mcap")
+    plan = load_graph(file, settings=[], record=tmp_path / "x.mcap")
     name = next(name for name, node in plan.nodes.items() if node.host == "main")
     bag = tmp_path / "clocks.mcap"
     with BagWriter(bag, {"recording": {"clock_id": "lab"}}) as writer:

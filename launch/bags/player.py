@@ -7,9 +7,9 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.runs import Run
-from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter, topics_for_tools
+from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter, topics_for_tools
 from flexsheet.messages.bag import BagError, BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import SystemClock
@@ -37,7 +37,9 @@ class Selection:
     left_out: dict[str, str]
 
 
-def select_topics(recorded: Collection[str], plan: Plan, wanted: Collection[str]) -> Selection:
+def select_topics(
+    recorded: Collection[str], plan: ResolvedGraph, wanted: Collection[str]
+) -> Selection:
     """Topics of the bag that tools may write in the plan; BagError for wanted ones not so."""
     writable = topics_for_tools(plan)
     left_out = {}
@@ -61,7 +63,7 @@ def select_topics(recorded: Collection[str], plan: Plan, wanted: Collection[str]
 
 async def play(
     bag: Path,
-    plan: Plan,
+    plan: ResolvedGraph,
     run: Run,
     *,
     topics: Collection[str],
@@ -79,7 +81,7 @@ async def play(
     total_s = max(0.0, summary.duration_s - start_s)
     clock = SystemClock()
     recorded_clock = summary.metadata.get("recording", {}).get("clock_id")
-    writer = ToolsWriter(plan, run, topics)
+    writer = GraphWriter(plan, run, topics)
     sent = 0
 
     def send(name: str, message: Message, header: Header, log_ns: int, due_ns: int) -> None:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from flexsheet.launch.plans.documents import did_you_mean
-from flexsheet.launch.plans.planned import Plan, PlannedNode
+from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
 from flexsheet.messages.bag import BagError, BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.clock import VirtualClock
@@ -172,9 +172,9 @@ def verify(
     )
 
 
-def _plan_of(reader: BagReader) -> Plan:
+def _plan_of(reader: BagReader) -> ResolvedGraph:
     try:
-        return Plan.model_validate_json(reader.attachment("plan.json"))
+        return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except ValidationError as error:
         raise BagError(
             f"{reader.path}: its plan.json is no plan of today's code; verify it with the code of "
@@ -182,13 +182,13 @@ def _plan_of(reader: BagReader) -> Plan:
         ) from error
 
 
-def refusal(node: PlannedNode) -> str:
+def refusal(node: ResolvedNode) -> str:
     """Say why a node cannot be stepped through a bag; empty: it can."""
     class_ = node_class(node.type)
     return class_.replay_refusal(parameters_of(class_).model_validate(node.parameters))
 
 
-async def replay(bag: Path, planned: PlannedNode, progress: Progress = _untold) -> Pass:
+async def replay(bag: Path, planned: ResolvedNode, progress: Progress = _untold) -> Pass:
     """Step a node through its inputs in the bag."""
     result = Pass()
     lives = lives_in(bag, planned.name)
@@ -208,7 +208,7 @@ def _told_with(progress: Progress, before: int, total: int, step: int) -> None:
         progress(before + step, total)
 
 
-def _node_of(planned: PlannedNode, clock: VirtualClock, result: Pass) -> Node:
+def _node_of(planned: ResolvedNode, clock: VirtualClock, result: Pass) -> Node:
     """The node, built as a launcher would; what it sends is kept."""
 
     def keep(topic: Topic, message: Message, header: Header) -> None:
@@ -239,7 +239,7 @@ async def _set_up(node: Node, result: Pass) -> AsyncIterator[None]:
 
 
 async def _replay_in_order(
-    bag: Path, planned: PlannedNode, result: Pass, progress: Progress
+    bag: Path, planned: ResolvedNode, result: Pass, progress: Progress
 ) -> None:
     """Hand it all its inputs, in the recorder's order."""
     ports: dict[str, list[str]] = {}
@@ -267,7 +267,7 @@ async def _replay_in_order(
 
 
 async def _replay_life(
-    bag: Path, planned: PlannedNode, life: Life, result: Pass, told: Callable[[int], None]
+    bag: Path, planned: ResolvedNode, life: Life, result: Pass, told: Callable[[int], None]
 ) -> None:
     """Hand it what it took, from one start of it to its end."""
     clock = VirtualClock(int(life.steps[0, 3]), clock_id=life.clock_id)
@@ -414,7 +414,7 @@ class Timers:
 
 
 def compare(
-    bag: Path, node: PlannedNode, replayed: Pass, tolerance: float
+    bag: Path, node: ResolvedNode, replayed: Pass, tolerance: float
 ) -> dict[str, Comparison]:
     """What the node published live against what it publishes now, for all its recorded outputs."""
     outputs = {port.topic for port in node.outputs} - {"status"}
@@ -474,7 +474,7 @@ def _distance(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.where(np.isnan(apart), np.inf, apart).max(initial=0.0))
 
 
-def _check_inputs(bag: Path, reader: BagReader, plan: Plan, node: PlannedNode) -> None:
+def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: ResolvedNode) -> None:
     """Every input must have been recorded (an input on which nothing came is no lack)."""
     recorded = set(reader.topics)
     for other in plan.nodes.values():

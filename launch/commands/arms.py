@@ -23,10 +23,10 @@ from flexsheet.nodes import NodeRole
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
     from flexsheet.launch.running.stopping import StopAttempt
-    from flexsheet.launch.running.tools import ToolsWriter
+    from flexsheet.launch.running.tools import GraphWriter
     from flexsheet.messages.base import Message
     from flexsheet.messages.bus import Subscriber
     from flexsheet.messages.types import ArmState, EStop
@@ -157,7 +157,7 @@ def reset(
     raise typer.Exit(code)
 
 
-def _what_moves(plan: Plan) -> str:
+def _what_moves(plan: ResolvedGraph) -> str:
     """What the arms of a plan do after a reset, by their bridges' `arming`."""
     arming = {
         str(node.arm_side): node.parameters.get("arming")
@@ -180,21 +180,21 @@ def _what_moves(plan: Plan) -> str:
 class _Arms:
     """The arms of a running graph, as their bridges publish them; use as an async context."""
 
-    def __init__(self, plan: Plan, run: Run) -> None:
+    def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
         self._loop = asyncio.get_running_loop()
         self._came_s: dict[str, float] = {}
         self._subscribers: list[Subscriber] = []
-        self._writer: ToolsWriter | None = None
+        self._writer: GraphWriter | None = None
         self.states: dict[str, ArmState] = {}
         self.problems: list[str] = []
 
     async def __aenter__(self) -> Self:
-        from flexsheet.launch.running.tools import subscriber_to
+        from flexsheet.launch.running.tools import make_subscriber
 
         for topic in TOPICS:
             self._subscribers.append(
-                subscriber_to(
+                make_subscriber(
                     topic, self._plan, self._run, self._take, on_problem=self.problems.append
                 )
             )
@@ -212,21 +212,21 @@ class _Arms:
 
     async def publish(self, topic: str, message: Message) -> None:
         """Send it once readers have connected, and once only: a person means now."""
-        from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter
+        from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
-        self._writer = ToolsWriter(self._plan, self._run, [topic])
+        self._writer = GraphWriter(self._plan, self._run, [topic])
         await asyncio.sleep(READER_RECONNECT_S)
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
         """Send it at once: it is latched, and readers get it as they connect."""
         from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
-        from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter
+        from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
         from flexsheet.messages.bus import BusError
 
         begun_s, outcome = self._loop.time(), StopOutcome.PUBLISHED
         try:
-            self._writer = ToolsWriter(self._plan, self._run, ["estop"])
+            self._writer = GraphWriter(self._plan, self._run, ["estop"])
             self._writer.publish("estop", estop)
             # The last reader may be a launcher, which is to keep it.
             await asyncio.sleep(READER_RECONNECT_S)
@@ -253,10 +253,10 @@ async def _say(
     as_json: bool,
 ) -> int:
     """Say a word to both arms and wait until it holds; show how they are then."""
-    from flexsheet.launch.running.tools import host_of
+    from flexsheet.launch.running.tools import tools_host
 
     plan, run = running_graph(run_directory)
-    _refuse_reset_from_elsewhere(plan, host_of(run), word)
+    _refuse_reset_from_elsewhere(plan, tools_host(run), word)
     async with _Arms(plan, run) as arms:
         if word is not None:
             await arms.publish(*word)
@@ -269,8 +269,10 @@ async def _say(
     return 0 if good else FAILED
 
 
-def _refuse_reset_from_elsewhere(plan: Plan, host: str, word: tuple[str, Message] | None) -> None:
-    from flexsheet.launch.plans.planned import tools_on
+def _refuse_reset_from_elsewhere(
+    plan: ResolvedGraph, host: str, word: tuple[str, Message] | None
+) -> None:
+    from flexsheet.launch.plans.plan_model import tools_on
     from flexsheet.messages.types import EStop
 
     if word is None or not isinstance(word[1], EStop) or word[1].engaged:

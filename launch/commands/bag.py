@@ -27,7 +27,7 @@ from flexsheet.launch.commands.output import (
 
 if TYPE_CHECKING:
     from flexsheet.launch.bags.replay import Verification
-    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
 
 SHOWN_EVERY_S = 0.2
@@ -112,7 +112,7 @@ def play(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Play a bag into a graph: the topics that its launch file leaves to tools (from_tools)."""
+    """Play a bag into a graph: the topics of `external_topics` in its launch file."""
     how = Playing(bag, tuple(topics or ()), rate, start, loop, as_json)
     raise typer.Exit(run_interruptible(_play(how, into, run)))
 
@@ -342,13 +342,13 @@ async def _record(
     *,
     topics: list[str],
     also: list[str],
-    running: tuple[Plan, Run],
+    running: tuple[ResolvedGraph, Run],
     seconds: float | None,
 ) -> int:
     """Run a recorder node in this process, connected to the running graph."""
-    from flexsheet.launch.plans.planned import RUN_DIRECTORY
+    from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
     from flexsheet.launch.running.runs import local_sources, ring_file
-    from flexsheet.launch.running.tools import host_of
+    from flexsheet.launch.running.tools import tools_host
     from flexsheet.messages.topics import TOPICS
     from flexsheet.nodes.recorder.node import Recorder
     from flexsheet.nodes.recorder.parameters import RUN_FILES, RecorderParameters
@@ -375,13 +375,13 @@ async def _record(
             PortConfig(
                 port=f"in/{name}",
                 topic=name,
-                endpoints=local_sources(run, plan.sources_to_read(name, host_of(run))),
+                endpoints=local_sources(run, plan.sources_to_read(name, tools_host(run))),
             )
             for name in wanted
         ),
         outputs=(),
         plan_hash=plan.hash,
-        keys_file=ring_file(run, host_of(run)) if plan.keys else None,
+        keys_file=ring_file(run, tools_host(run)) if plan.keys else None,
         run_dir=str(run.directory),
     )
     words.print(f"recording {len(wanted)} topics; Ctrl-C ends", markup=False)
@@ -423,20 +423,20 @@ class Playing:
 
 
 async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> int:
-    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.supervisor import RunningGraph
 
     if into is None:
         plan, run = running_graph(run_directory)
         return await _play_into(how, plan, run)
-    plan = load_plan(into)
+    plan = load_graph(into)
     async with RunningGraph(plan) as graph:
         with words.status(f"starting {into}"):
             await graph.wait_ready()
         return await _play_into(how, plan, graph.run)
 
 
-async def _play_into(how: Playing, plan: Plan, run: Run) -> int:
+async def _play_into(how: Playing, plan: ResolvedGraph, run: Run) -> int:
     from flexsheet.launch.bags.player import play as play_bag
     from flexsheet.launch.bags.player import select_topics
     from flexsheet.messages.bag import BagReader

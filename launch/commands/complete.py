@@ -26,11 +26,11 @@ def node_types(incomplete: str) -> list[str]:
 def hosts(context: typer.Context, incomplete: str) -> list[str]:
     """Hosts of the launch file that is named already."""
     from flexsheet.launch.plans.documents import BadInputError
-    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.plans.plan import load_graph
 
     file = next((word for word in context.args if word.endswith((".yaml", ".yml"))), None)
     try:
-        return [] if file is None else _fitting(load_plan(Path(file)).hosts, incomplete)
+        return [] if file is None else _fitting(load_graph(Path(file)).hosts, incomplete)
     except BadInputError:
         return []
 

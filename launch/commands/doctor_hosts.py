@@ -23,10 +23,10 @@ from flexsheet.launch.commands.output import (
 
 if TYPE_CHECKING:
     from flexsheet.launch.health.doctor_hosts import HostFinding
-    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
 
-PATIENCE_S = 4.0
+TIMEOUT_S = 4.0
 
 
 def register(app: typer.Typer) -> None:
@@ -59,7 +59,7 @@ def hosts(
     ] = None,
     patience: Annotated[
         float, typer.Option(metavar="SECONDS", help="How long to wait for answers.", min=1.5)
-    ] = PATIENCE_S,
+    ] = TIMEOUT_S,
     as_json: JsonOption = False,
 ) -> None:
     """Ask all hosts of a launch file; exit code 1 when something must be put right.
@@ -71,7 +71,7 @@ def hosts(
     if run is not None and run.host not in (None, here):
         run = None
     with words.status("asking all hosts"):
-        findings = asyncio.run(examine(plan, here, run, patience))
+        findings = asyncio.run(check_hosts(plan, here, run, patience))
     if as_json:
         print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
     else:
@@ -81,26 +81,26 @@ def hosts(
         raise typer.Exit(FAILED)
 
 
-def ask_running(patience_s: float = PATIENCE_S) -> list[HostFinding]:
+def ask_running(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
     """Findings about all hosts of the graph that runs here; none where it has one alone."""
     from flexsheet.launch.running.runs import live_runs
-    from flexsheet.launch.running.tools import host_of
+    from flexsheet.launch.running.tools import tools_host
 
     if not any(run.plan_file.is_file() for run in live_runs()):
         return []
     plan, run = running_graph(None)
     if len(plan.hosts) == 1:
         return []
-    return asyncio.run(examine(plan, host_of(run), run, patience_s))
+    return asyncio.run(check_hosts(plan, tools_host(run), run, timeout_s))
 
 
-def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
+def _graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
     """The plan, and the graph of that launch file that runs here."""
-    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.plans.plan import load_graph
 
     if launch_file is None:
         return running_graph(None)
-    plan = load_plan(launch_file)
+    plan = load_graph(launch_file)
     try:
         running, run = running_graph(None)
     except CommandError:
@@ -109,12 +109,12 @@ def _graph(launch_file: Path | None) -> tuple[Plan, Run | None]:
     return plan, run if same or running.hash == plan.hash else None
 
 
-def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
+def host_here(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
     """Which host of the plan this computer is; CommandError where that cannot be told."""
     from flexsheet.launch.health.doctor_hosts import own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
-    from flexsheet.launch.plans.planned import MAIN
-    from flexsheet.launch.running.tools import host_of
+    from flexsheet.launch.plans.plan_model import MAIN
+    from flexsheet.launch.running.tools import tools_host
 
     if wanted is not None:
         if wanted not in plan.hosts:
@@ -124,7 +124,7 @@ def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
             )
         return wanted
     if run is not None:
-        return host_of(run)
+        return tools_host(run)
     own = own_addresses()
     found = [name for name, address in plan.hosts.items() if address in own]
     if MAIN in found or len(found) == 1:
@@ -136,26 +136,32 @@ def host_here(plan: Plan, run: Run | None, wanted: str | None) -> str:
     )
 
 
-async def examine(plan: Plan, here: str, run: Run | None, patience_s: float) -> list[HostFinding]:
+async def check_hosts(
+    plan: ResolvedGraph, here: str, run: Run | None, timeout_s: float
+) -> list[HostFinding]:
     """All findings: what this computer sees, and what the others say."""
     import tempfile
 
-    from flexsheet.launch.health.doctor_hosts import before_start, judge, own_key_problem
-    from flexsheet.launch.health.visits import visit_all
+    from flexsheet.launch.health.doctor_hosts import (
+        check_before_start,
+        evaluate_probes,
+        find_key_problem,
+    )
+    from flexsheet.launch.health.probe import probe_all
     from flexsheet.launch.running.keys import secret_file
     from flexsheet.messages.security import KeyRing, write_ring
 
-    key_problem = await asyncio.to_thread(own_key_problem, plan, here)
+    key_problem = await asyncio.to_thread(find_key_problem, plan, here)
     with tempfile.TemporaryDirectory(prefix="flexsheet-") as folder:
         keys = None
         if plan.keys and key_problem is None:
             file = Path(folder) / "ring.json"
             write_ring(file, host=here, secret_file=secret_file(here), public=plan.keys)
             keys = KeyRing(file)
-        visits = await visit_all(plan, here=here, keys=keys, run=run, patience_s=patience_s)
-    findings = judge(plan, here, visits)
-    if visits[here].status is None:
-        seen = await asyncio.to_thread(lambda: list(before_start(plan, here, key_problem)))
+        probes = await probe_all(plan, here=here, keys=keys, run=run, timeout_s=timeout_s)
+    findings = evaluate_probes(plan, here, probes)
+    if probes[here].status is None:
+        seen = await asyncio.to_thread(lambda: list(check_before_start(plan, here, key_problem)))
         first = next((i for i, one in enumerate(findings) if one.host == here), 0)
         last = first + sum(one.host == here for one in findings)
         findings[last:last] = seen

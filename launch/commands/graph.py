@@ -15,7 +15,7 @@ from flexsheet.launch.commands.output import BAD_INPUT, CommandError
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
-    from flexsheet.launch.plans.planned import Plan
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run
 
 RunOption = Annotated[
@@ -29,9 +29,9 @@ RunOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
-def running_graph(directory: Path | None) -> tuple[Plan, Run]:
-    """The Plan and the Run of the graph in `directory`, or of the newest that is alive."""
-    from flexsheet.launch.plans.planned import Plan
+def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
+    """The ResolvedGraph and the Run of the graph in `directory`, or of the newest that is alive."""
+    from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run, live_runs
 
     if directory is not None:
@@ -43,7 +43,7 @@ def running_graph(directory: Path | None) -> tuple[Plan, Run]:
         if not ready:
             raise CommandError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]
-    return Plan.model_validate_json(run.plan_file.read_text()), run
+    return ResolvedGraph.model_validate_json(run.plan_file.read_text()), run
 
 
 def run_interruptible(work: Coroutine[Any, Any, int]) -> int:

@@ -24,7 +24,7 @@ from flexsheet.launch.commands.output import (
 from flexsheet.nodes.signals import handle_signals
 
 if TYPE_CHECKING:
-    from flexsheet.launch.plans.planned import Plan, PlannedNode
+    from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
     from flexsheet.launch.running.runs import Run
     from flexsheet.launch.running.supervisor import RunningGraph
 
@@ -75,9 +75,9 @@ def launch(
 
     Exit codes: 0 stopped as asked, 1 a node failed for good, 2 the input is wrong.
     """
-    from flexsheet.launch.plans.plan import load_plan
+    from flexsheet.launch.plans.plan import load_graph
 
-    plan = load_plan(file, settings=settings or (), record=record, console=console)
+    plan = load_graph(file, settings=settings or (), record=record, console=console)
     if dry_run:
         if as_json:
             print_json(plan.model_dump(mode="json"))
@@ -92,14 +92,14 @@ def launch(
     raise typer.Exit(asyncio.run(run_graph(plan, host, duration, when_ready=ready)))
 
 
-def about_run(plan: Plan, run: Run, host: str | None) -> dict[str, Any]:
+def about_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
     """What a script wants to know of a graph that is ready."""
     nodes = [node.name for node in plan.nodes_on(host)]
     return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes}
 
 
 async def run_graph(
-    plan: Plan,
+    plan: ResolvedGraph,
     host: str | None,
     duration_s: float | None,
     *,
@@ -113,7 +113,7 @@ async def run_graph(
 
     def on_signal() -> None:
         if asked_to_stop.is_set():
-            graph.hurry()
+            graph.kill_all()
         asked_to_stop.set()
 
     with handle_signals(on_signal, *_ending_signals()):
@@ -189,7 +189,7 @@ def _say(node: str, line: str) -> None:
     words.print(f"{node:>16} | {text}", style=style, markup=False)
 
 
-def _settings(node: PlannedNode) -> str:
+def _settings(node: ResolvedNode) -> str:
     """The parameters that are not what they would be without the launch file."""
     from pydantic_core import to_jsonable_python
 
@@ -210,7 +210,7 @@ def _settings(node: PlannedNode) -> str:
     )
 
 
-def _print_plan(plan: Plan, host: str | None) -> None:
+def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
     words.print(f"plan {plan.hash} of {plan.launch_file}, scene {plan.scene_file or 'none'}")
     print_table(
         (

@@ -192,7 +192,9 @@ def pub(
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Publish into the graph that runs: to topics that many may write, and those of from_tools.
+    """Publish a message to the running graph.
+
+    Topics with any number of writers and those of `external_topics` are open to it.
 
     A latched message is kept for late subscribers only while this command runs.
     """
@@ -384,12 +386,12 @@ def listener(
     topic: Topic, run_directory: Path | None, handler: Handler, *, unopened: bool = False
 ) -> Subscriber:
     """A subscriber to the topic in the graph that runs; CommandError when nothing writes it."""
-    from flexsheet.launch.running.tools import subscriber_to
+    from flexsheet.launch.running.tools import make_subscriber
 
     plan, run = running_graph(run_directory)
     if not plan.endpoints_to_read(topic.name):
         raise CommandError(f'nobody writes "{topic.name}" in the graph that runs ({run.directory})')
-    return subscriber_to(
+    return make_subscriber(
         topic.name,
         plan,
         run,
@@ -434,10 +436,10 @@ async def _publish(
     times: int | None,
     told: Callable[[int], None],
 ) -> int:
-    from flexsheet.launch.running.tools import READER_RECONNECT_S, ToolsWriter
+    from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
     plan, found = running_graph(run)
-    writer = ToolsWriter(plan, found, [topic.name])
+    writer = GraphWriter(plan, found, [topic.name])
     try:
         await asyncio.sleep(READER_RECONNECT_S)
         sent = 0

@@ -49,13 +49,13 @@ def try_it(
     Starts the demo's graph with a console and prints its address; Ctrl-C ends it.  From another
     computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address there.
     """
-    from flexsheet.launch.plans.plan import load_plan
-    from flexsheet.launch.running.prepare import prepare_plan
+    from flexsheet.launch.plans.plan import load_graph
+    from flexsheet.launch.running.precompute import precompute_graph
 
     page = [f"console.page_port={port}"]
-    plan = load_plan(launch_file, settings=[*page, *(settings or ())], console=True)
+    plan = load_graph(launch_file, settings=[*page, *(settings or ())], console=True)
     with keyboard_interrupts(), progress_words() as progress:
-        prepare_plan(plan, progress)
+        precompute_graph(plan, progress)
     given = plan.nodes["console"].parameters
     url = f"http://{given['address']}:{given['page_port']}/"
 

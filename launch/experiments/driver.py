@@ -16,9 +16,9 @@ from typing import Self
 import numpy as np
 
 from flexsheet.launch.experiments import ExperimentError
-from flexsheet.launch.plans.planned import TOOLS, Plan
+from flexsheet.launch.plans.plan_model import TOOLS, ResolvedGraph
 from flexsheet.launch.running.runs import Run
-from flexsheet.launch.running.tools import ToolsWriter, subscriber_to
+from flexsheet.launch.running.tools import GraphWriter, make_subscriber
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
 from flexsheet.messages.types import (
@@ -52,9 +52,9 @@ BUSY = 3.0
 class Driver:
     """See the module's text; use as an async context manager."""
 
-    def __init__(self, plan: Plan, run: Run) -> None:
+    def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
-        self._writer: ToolsWriter | None = None
+        self._writer: GraphWriter | None = None
         self._subscribers: list[Subscriber] = []
         self._newest: dict[str, Message] = {}
         self._notes: dict[str, str] = {}
@@ -62,9 +62,9 @@ class Driver:
         self._settled_since = 0
 
     async def __aenter__(self) -> Self:
-        self._writer = ToolsWriter(self._plan, self._run, WRITTEN)
+        self._writer = GraphWriter(self._plan, self._run, WRITTEN)
         for name in READ:
-            subscriber = subscriber_to(
+            subscriber = make_subscriber(
                 name,
                 self._plan,
                 self._run,

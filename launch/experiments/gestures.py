@@ -19,7 +19,7 @@ from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.lag import lag_s
 from flexsheet.launch.experiments.run import Procedure, Progress
 from flexsheet.launch.plans.documents import did_you_mean
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Scene, UnfitGeometryError
 from flexsheet.messages.types import FingerPath, Fingertip, TwinFinger
@@ -72,7 +72,7 @@ def chosen(names: str | None) -> list[str]:
 
 def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
     """The path of a gesture, or of a recorded finger, in the launch file's scene."""
-    scene = load_plan(launch_file).scene_message()
+    scene = load_graph(launch_file).scene_message()
     if scene is None:
         raise ExperimentError(f'{launch_file}: key "scene": the finger needs a scene; name one')
     if name_or_file in GESTURES:

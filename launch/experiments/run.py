@@ -11,9 +11,9 @@ from typing import Any
 
 from flexsheet.launch.experiments import ExperimentError, image, stroke
 from flexsheet.launch.experiments.driver import Driver
-from flexsheet.launch.plans.plan import load_plan
-from flexsheet.launch.plans.planned import Plan
-from flexsheet.launch.running.prepare import prepare_plan
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import RunningGraph
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, FingerPath, Shading
@@ -35,7 +35,7 @@ def new_folder(name: str, parent: Path = RUNS) -> Path:
     return folder
 
 
-async def drive(plan: Plan, procedure: Procedure, progress: Progress) -> None:
+async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
     """Start the plan's graph, run the procedure on it, stop it.
 
     Raises what the procedure raises, or NodeFailedError as soon as a node has failed for good.
@@ -84,8 +84,8 @@ def run_experiment(
     progress: Progress,
 ) -> None:
     """Run a procedure on a launch file's graph and record it to `bag`."""
-    plan = load_plan(launch_file, settings=settings, record=bag)
-    prepare_plan(plan, progress)
+    plan = load_graph(launch_file, settings=settings, record=bag)
+    precompute_graph(plan, progress)
     try:
         asyncio.run(_interruptible(drive(plan, procedure, progress)))
     except ExperimentError as error:
@@ -109,7 +109,7 @@ def settings_of_type(launch_file: Path, node_type: str, setting: str) -> list[st
     wanted = node_class(node_type)
     return [
         f"{node.name}.{setting}"
-        for node in load_plan(launch_file).nodes.values()
+        for node in load_graph(launch_file).nodes.values()
         if issubclass(node_class(node.type), wanted)
     ]
 

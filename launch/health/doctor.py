@@ -15,7 +15,7 @@ from typing import Literal
 
 from flexsheet.launch.health.system import OPENGL, opengl_problem
 from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_plan
+from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
 from flexsheet.launch.running.runs import is_free, live_runs, orphans, root
 from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
@@ -23,8 +23,8 @@ from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressu
 DEMO = Path(__file__).parent.parent / "demo.yaml"
 CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
 QUICK_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "xen")
-LEAST_DISK_BYTES = 2 << 30
-LEAST_CORES = 2
+MIN_FREE_DISK_BYTES = 2 << 30
+MIN_CORES = 2
 PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
 """Duration of the check of the load; period and processor time of an arm's bridge."""
 
@@ -128,15 +128,15 @@ def check_opengl() -> Finding:
 
 def check_cores() -> Finding:
     cores = len(os.sched_getaffinity(0))
-    if cores < LEAST_CORES:
-        return Finding("cores", "warning", str(cores), f"the demo wants {LEAST_CORES}")
+    if cores < MIN_CORES:
+        return Finding("cores", "warning", str(cores), f"the demo wants {MIN_CORES}")
     return Finding("cores", "ok", str(cores))
 
 
 def check_disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
     text = f"{free / 2**30:.1f} GiB free at {Path.cwd()}"
-    if free < LEAST_DISK_BYTES:
+    if free < MIN_FREE_DISK_BYTES:
         return Finding("disk", "warning", text, "bags need room: 37 MB a second with pictures")
     return Finding("disk", "ok", text)
 
@@ -182,7 +182,7 @@ def check_leftovers() -> Finding:
 def check_demo() -> Finding:
     """The demo's launch file resolves, and the ports that its nodes listen on are free."""
     try:
-        plan = load_plan(DEMO)
+        plan = load_graph(DEMO)
     except BadInputError as error:
         return Finding("demo", "failed", str(error))
     taken = [port for _, port in plan.listening_nodes(None) if not is_free("127.0.0.1", port)]

@@ -1,7 +1,6 @@
-"""What the hosts' answers mean: one finding for each host and check, with the remedy.
+"""Evaluate host probes: one finding for each host and check, with a remedy.
 
-Plain functions of what was heard (`launch.health.visits`) and of what this computer can see of
-itself.
+The findings come from the probes (`launch.health.probe`) and from checks of this computer.
 """
 
 from __future__ import annotations
@@ -16,16 +15,20 @@ from typing import Literal
 
 import psutil
 
-from flexsheet.launch.health.doctor import LEAST_DISK_BYTES, check_libraries
+from flexsheet.launch.health.doctor import MIN_FREE_DISK_BYTES, check_libraries
+from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.health.system import OPENGL, opengl_problem
-from flexsheet.launch.health.visits import Reach, Visit
 from flexsheet.launch.plans.hosts import is_loopback
-from flexsheet.launch.plans.planned import Plan, PlannedNode
-from flexsheet.launch.plans.wires import FIRST_PORT, PORTS
-from flexsheet.launch.running.host import devices_of, folder_of, python_version, software
+from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
+from flexsheet.launch.plans.routing import FIRST_PORT, PORTS
+from flexsheet.launch.running.host import (
+    list_device_files,
+    python_version,
+    recording_folder,
+    software,
+)
 from flexsheet.launch.running.keys import secret_file
 from flexsheet.launch.running.runs import is_free
-from flexsheet.messages.bus import HANDSHAKE_FAILED
 from flexsheet.messages.busy import BUSY_REMEDY, describe_busy, is_busy
 from flexsheet.messages.security import SecurityError, public_of, read_secret
 from flexsheet.messages.topics import TOPICS
@@ -33,17 +36,17 @@ from flexsheet.messages.types import HostStatus, PortStatus
 from flexsheet.nodes import NodeRole
 
 State = Literal["ok", "warning", "failed", "not asked"]
-SLACK = 0.1
-"""Rates are of one second, in which a message more or less says nothing."""
+RATE_TOLERANCE_RATIO = 0.1
+"""Rates are measured over one second, so one message more or less is no fault."""
 
-LEAST_MEMORY_BYTES = 256 << 20
+MIN_FREE_MEMORY_BYTES = 256 << 20
 CONTROLLER_S = 2.0
-NAMES_SHOWN = 3
+MAX_NAMES_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
 class HostFinding:
-    """One check of one host; `remedy` says what to do where it is not ok."""
+    """Hold the result of one check of one host; `remedy` is what to do unless it is ok."""
 
     host: str
     check: str
@@ -52,97 +55,101 @@ class HostFinding:
     remedy: str = ""
 
 
-WAYS: dict[Reach, tuple[str, str]] = {
-    "no way": (
-        "this computer has no way to {address}",
-        "look at its own network: ip address; is the cable in?",
+NETWORK_FAULTS: dict[Reachability, tuple[str, str]] = {
+    Reachability.NO_ROUTE: (
+        "this computer has no route to {address}",
+        "check the network of this computer (ip address) and its cable",
     ),
-    "absent": (
-        "nobody has the address {address}",
-        "is {host} on, its cable in, and {address} its address? there: ip address",
+    Reachability.UNREACHABLE: (
+        "no computer has the address {address}",
+        "check that {host} is on and connected, and that its address is {address} (ip address)",
     ),
-    "dropped": (
-        "no answer from {address}, not even a refusal",
-        "is {host} on and {address} its address? or a firewall there drops everything",
+    Reachability.NO_REPLY: (
+        "no reply from {address}",
+        "check that {host} is on, that its address is {address}, and its firewall",
     ),
-    "blocked": (
-        "{address} is on, but the ports of flexsheet are barred",
-        "a firewall: let TCP {first}-{last} of {address} through to the other hosts",
-    ),
-}
-"""Nothing there can be asked."""
-
-SILENCES: dict[Reach, tuple[str, str, str]] = {
-    "closed": (
-        "launcher",
-        "it is on, and nothing of flexsheet runs there",
-        "there: flexsheet launch {file} --host {host}; under systemd: journalctl -u "
-        "flexsheet@{host}; if it runs, its launch file gives it another address",
-    ),
-    "silent": (
-        "launcher",
-        "takes connections and says nothing",
-        "its launcher hangs, or something else has its ports; there: flexsheet doctor",
-    ),
-    "mute": (
-        "launcher",
-        "the keys fit, but nothing can be understood",
-        "its launcher hangs, or is of another version; see what was refused",
-    ),
-    "other key": (
-        "keys",
-        "it has not the key that the launch file here has for {host}",
-        "there: flexsheet keys show {host}; here: flexsheet keys install {file} {host} 'KEY'",
-    ),
-    "refuses us": (
-        "keys",
-        "it refuses the key of {here}: its launch file has none or another for {here}",
-        "copy {file} from here to {host}; its launcher takes it over by itself",
-    ),
-    "no keys": (
-        "keys",
-        "it speaks without keys, or something else has its ports",
-        "copy {file} from here to {host} and start it there again",
-    ),
-    "unasked": (
-        "keys",
-        "it takes connections, but the key of {here} cannot be used",
-        "put this computer's key right first, see {here}",
+    Reachability.BLOCKED: (
+        "{address} is on, but its firewall blocks the ports of flexsheet",
+        "open the TCP ports {first}-{last} of {address} for the other hosts in the firewall",
     ),
 }
-"""It is there, and this is what hinders the rest."""
+"""Finding and remedy when the host cannot be reached."""
+
+LAUNCHER_FAULTS: dict[Reachability, tuple[str, str, str]] = {
+    Reachability.CLOSED: (
+        "launcher",
+        "the host is on, but no launcher runs there",
+        "on {host}: flexsheet launch {file} --host {host}; under systemd: journalctl -u "
+        "flexsheet@{host}; if it runs, compare the addresses in the launch files",
+    ),
+    Reachability.HANDSHAKE_TIMEOUT: (
+        "launcher",
+        "accepts connections, but does not answer",
+        "its launcher hangs or another program uses its ports; on {host}: flexsheet doctor",
+    ),
+    Reachability.NO_RESPONSE: (
+        "launcher",
+        "the keys match, but no valid message arrived",
+        "its launcher hangs or has another version; see the refused messages",
+    ),
+    Reachability.KEY_MISMATCH: (
+        "keys",
+        "its key is not the one in the launch file of this computer",
+        "on {host}: flexsheet keys show {host}; here: flexsheet keys install {file} {host} 'KEY'",
+    ),
+    Reachability.KEY_REJECTED: (
+        "keys",
+        "it rejects the key of {here}: its launch file has none or another for {here}",
+        "copy {file} from here to {host}; its launcher reads it again by itself",
+    ),
+    Reachability.UNENCRYPTED: (
+        "keys",
+        "it does not encrypt, or another program uses its ports",
+        "copy {file} from here to {host} and restart the launcher there",
+    ),
+    Reachability.OWN_KEY_INVALID: (
+        "keys",
+        "it accepts connections, but the key of {here} cannot be used",
+        "correct the key of this computer first; see the findings of {here}",
+    ),
+}
+"""Check, finding and remedy when the host is on, but its launcher does not report."""
 
 
-def judge(plan: Plan, here: str, visits: Mapping[str, Visit]) -> list[HostFinding]:
-    """All findings, host by host, about what the visits brought."""
+def evaluate_probes(
+    plan: ResolvedGraph, here: str, probes: Mapping[str, HostProbe]
+) -> list[HostFinding]:
+    """Return the findings of all probes, host by host."""
     found: list[HostFinding] = []
-    own = visits[here].status
+    own = probes[here].status
     reference = (
         (python_version(), software(), "") if own is None else (own.python, own.software, own.code)
     )
-    running = any(visit.status is not None for visit in visits.values())
-    for host, visit in visits.items():
-        if visit.status is not None:
-            # First, since it explains most of what else may be wrong.
-            found.append(_load(visit.status))
-        found += _way(plan, here, visit, running=running)
-        if visit.status is None:
+    running = any(probe.status is not None for probe in probes.values())
+    for host, probe in probes.items():
+        if probe.status is not None:
+            # First, because a busy computer explains most other faults.
+            found.append(_check_load(probe.status))
+        found += _check_reachability(plan, here, probe, running=running)
+        if probe.status is None:
             continue
-        found += _plan(plan, here, visit)
+        found += _check_plan(plan, here, probe)
         if plan.keys:
-            found.append(_keys(plan, visit))
-        found.append(_software(visit, reference))
+            found.append(_check_keys(plan, probe))
+        found.append(_check_software(probe, reference))
         if len(plan.hosts) > 1:
-            found.append(_clocks(plan, visit, visits))
-        found.append(_nodes(plan, visit))
-        found.append(_rates(visit))
-        found += _parts(plan.nodes_on(host), visit)
-        found += _room(visit)
+            found.append(_check_clocks(plan, probe, probes))
+        found.append(_check_nodes(plan, probe))
+        found.append(_check_rates(probe))
+        found += _check_devices(plan.nodes_on(host), probe)
+        found += _check_resources(probe)
     return found
 
 
-def _way(plan: Plan, here: str, visit: Visit, *, running: bool) -> Iterator[HostFinding]:
-    host, address = visit.host, plan.hosts[visit.host]
+def _check_reachability(
+    plan: ResolvedGraph, here: str, probe: HostProbe, *, running: bool
+) -> Iterator[HostFinding]:
+    host, address = probe.host, plan.hosts[probe.host]
     words = {
         "host": host,
         "here": here,
@@ -151,18 +158,18 @@ def _way(plan: Plan, here: str, visit: Visit, *, running: bool) -> Iterator[Host
         "first": FIRST_PORT,
         "last": FIRST_PORT + PORTS - 1,
     }
-    if visit.reach in WAYS:
-        what, remedy = WAYS[visit.reach]
+    if probe.reachability in NETWORK_FAULTS:
+        what, remedy = NETWORK_FAULTS[probe.reachability]
         yield HostFinding(host, "reachable", "failed", what.format(**words), remedy.format(**words))
-        yield HostFinding(host, "all else", "not asked", "it cannot be reached")
+        yield HostFinding(host, "all else", "not asked", "the host cannot be reached")
         return
     yield HostFinding(
         host, "reachable", "ok", f"{address}, {'this computer' if host == here else 'by TCP'}"
     )
-    if visit.status is not None:
-        up = f"up for {visit.status.uptime_s:.0f} s, run {visit.status.run}"
+    if probe.status is not None:
+        up = f"up for {probe.status.uptime_s:.0f} s, run {probe.status.run}"
         yield HostFinding(host, "launcher", "ok", up)
-    elif visit.reach == "itself":
+    elif probe.reachability == Reachability.LOCAL:
         yield HostFinding(
             host,
             "launcher",
@@ -171,71 +178,75 @@ def _way(plan: Plan, here: str, visit: Visit, *, running: bool) -> Iterator[Host
             f"flexsheet launch {plan.launch_file} --host {host}",
         )
     else:
-        check, what, remedy = SILENCES[visit.reach]
-        # Before anything is started it is no fault that nothing runs.
-        state: State = "warning" if visit.reach == "closed" and not running else "failed"
+        check, what, remedy = LAUNCHER_FAULTS[probe.reachability]
+        # Before any graph is started, a closed port is no fault.
+        state: State = (
+            "warning" if probe.reachability == Reachability.CLOSED and not running else "failed"
+        )
         yield HostFinding(host, check, state, what.format(**words), remedy.format(**words))
-        yield HostFinding(host, "all else", "not asked", "its launcher would say")
-    for text in visit.refused[:NAMES_SHOWN]:
-        if text.endswith(tuple(HANDSHAKE_FAILED.values())):
-            # Its keys were right when it was asked first.
-            yield HostFinding(host, "keys", "warning", text, "it is very busy, or far: ask again")
-            continue
+        yield HostFinding(host, "all else", "not asked", "its launcher does not report")
+    for text in probe.failed_handshakes[:MAX_NAMES_SHOWN]:
+        # The first handshake of this probe succeeded, so the keys are right.
+        remedy = "the host is very busy or the network slow; run this again"
+        yield HostFinding(host, "keys", "warning", text, remedy)
+    for text in probe.refused[:MAX_NAMES_SHOWN]:
         yield HostFinding(
             host,
             "messages",
             "failed",
             text,
-            "the same commit on all hosts? git pull, make setup, and start again",
+            "use the same commit on all hosts: git pull, make setup, and start again",
         )
 
 
-def _plan(plan: Plan, here: str, visit: Visit) -> Iterator[HostFinding]:
-    assert visit.status is not None
-    if visit.status.plan_hash == plan.hash:
-        yield HostFinding(visit.host, "plan", "ok", plan.hash)
+def _check_plan(plan: ResolvedGraph, here: str, probe: HostProbe) -> Iterator[HostFinding]:
+    assert probe.status is not None
+    if probe.status.plan_hash == plan.hash:
+        yield HostFinding(probe.host, "plan", "ok", plan.hash)
     else:
-        remedy = "launch file, scene and --set the same on all hosts, then start again"
-        if visit.host == here:
+        remedy = "use the same launch file, scene and --set on all hosts, then start again"
+        if probe.host == here:
             remedy = (
-                "the file was changed since, or started with --set: start again, or, to ask about "
-                "what runs: flexsheet doctor hosts"
+                "the file was changed after the start, or --set was used: start again; to check "
+                "the running graph: flexsheet doctor hosts"
             )
         yield HostFinding(
-            visit.host,
+            probe.host,
             "plan",
             "failed",
-            f"runs {visit.status.plan_hash}, {plan.launch_file} is {plan.hash}",
+            f"runs plan {probe.status.plan_hash}; {plan.launch_file} resolves to {plan.hash}",
             remedy,
         )
-    if visit.status.estop is not None:
+    if probe.status.estop is not None:
         yield HostFinding(
-            visit.host,
+            probe.host,
             "e-stop",
             "warning",
-            f"kept: {visit.status.estop}",
-            "when the danger is over, on a host that may: flexsheet arms reset",
+            f"engaged: {probe.status.estop}",
+            "when it is safe, on a host that may reset: flexsheet arms reset",
         )
 
 
-def _keys(plan: Plan, visit: Visit) -> HostFinding:
-    assert visit.status is not None
-    theirs = {one.host: one.key for one in visit.status.keys}
+def _check_keys(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
+    assert probe.status is not None
+    theirs = {one.host: one.key for one in probe.status.keys}
     names = sorted(theirs.keys() | plan.keys.keys())
     other = [name for name in names if theirs.get(name) != plan.keys.get(name)]
     if other:
         return HostFinding(
-            visit.host,
+            probe.host,
             "keys",
             "failed",
             f"has other keys than this launch file for {', '.join(other)}",
-            f"copy {plan.launch_file} to {visit.host}; its launcher takes it over by itself",
+            f"copy {plan.launch_file} to {probe.host}; its launcher reads it again by itself",
         )
-    return HostFinding(visit.host, "keys", "ok", f"lets in {', '.join(names)}, as here")
+    return HostFinding(
+        probe.host, "keys", "ok", f"accepts {', '.join(names)}, as this computer does"
+    )
 
 
-def _software(visit: Visit, reference: tuple[str, str, str]) -> HostFinding:
-    status = visit.status
+def _check_software(probe: HostProbe, reference: tuple[str, str, str]) -> HostFinding:
+    status = probe.status
     assert status is not None
     python, versions, code = reference
     what = f"python {status.python}, {status.software}, commit {status.code}"
@@ -249,27 +260,29 @@ def _software(visit: Visit, reference: tuple[str, str, str]) -> HostFinding:
         if theirs != ours
     ]
     if other:
-        remedy = "the same commit on all hosts: git pull, make setup, and start again"
-        what += f"; not as here: {', '.join(other)}"
-        return HostFinding(visit.host, "software", "warning", what, remedy)
-    return HostFinding(visit.host, "software", "ok", what)
+        remedy = "use the same commit on all hosts: git pull, make setup, and start again"
+        what += f"; different from this computer: {', '.join(other)}"
+        return HostFinding(probe.host, "software", "warning", what, remedy)
+    return HostFinding(probe.host, "software", "ok", what)
 
 
-def _clocks(plan: Plan, visit: Visit, visits: Mapping[str, Visit]) -> HostFinding:
-    """The other hosts' clocks as this one's clock node knows them, against the plan's limit."""
-    remedy = "docs/clocks.md: chrony, and is the network quiet?"
-    if visit.clocks is None:
+def _check_clocks(
+    plan: ResolvedGraph, probe: HostProbe, probes: Mapping[str, HostProbe]
+) -> HostFinding:
+    """Compare the measured offsets of the other hosts' clocks with the limit of the graph."""
+    remedy = "check chrony and the load of the network: docs/clocks.md"
+    if probe.clocks is None:
         return HostFinding(
-            visit.host, "clocks", "failed", "its clock node says nothing", "see its log"
+            probe.host, "clocks", "failed", "its clock node does not publish", "see its log"
         )
-    limit_s = visit.clocks.max_offset_uncertainty_s
-    known = {one.clock_id: one for one in visit.clocks.offsets}
+    limit_s = probe.clocks.max_offset_uncertainty_s
+    known = {one.clock_id: one for one in probe.clocks.offsets}
     words, bad = [], False
-    for name, other in visits.items():
-        if name == visit.host or not other.clock_id:
+    for name, other in probes.items():
+        if name == probe.host or not other.clock_id:
             continue
         offset = known.get(other.clock_id)
-        if other.clock_id == visit.clock_id:
+        if other.clock_id == probe.clock_id:
             words.append(f"{name}: the same clock")
         elif offset is None:
             bad = True
@@ -282,173 +295,187 @@ def _clocks(plan: Plan, visit: Visit, visits: Mapping[str, Visit]) -> HostFindin
                 + (f", stepped {offset.resets} times" if offset.resets else "")
             )
     if not words:
-        return HostFinding(visit.host, "clocks", "not asked", "no other host speaks")
-    what = f"{'; '.join(words)}; {1e3 * limit_s:g} ms are allowed"
+        return HostFinding(probe.host, "clocks", "not asked", "no other host reports")
+    what = f"{'; '.join(words)}; {1e3 * limit_s:g} ms allowed"
     if bad:
-        return HostFinding(visit.host, "clocks", "failed", what, remedy)
-    return HostFinding(visit.host, "clocks", "ok", what)
+        return HostFinding(probe.host, "clocks", "failed", what, remedy)
+    return HostFinding(probe.host, "clocks", "ok", what)
 
 
-def _nodes(plan: Plan, visit: Visit) -> HostFinding:
-    assert visit.status is not None
-    nodes = visit.status.nodes
-    away = [one.name for one in nodes if one.state != "ready"]
-    again = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
-    log = f"{visit.status.run}/logs in its folder of runs"
-    if away:
+def _check_nodes(plan: ResolvedGraph, probe: HostProbe) -> HostFinding:
+    assert probe.status is not None
+    nodes = probe.status.nodes
+    missing = [one.name for one in nodes if one.state != "ready"]
+    restarted = [f"{one.name} {one.restarts}" for one in nodes if one.restarts]
+    log = f"{probe.status.run}/logs in the folder of runs on {probe.host}"
+    if missing:
         return HostFinding(
-            visit.host, "nodes", "failed", f"not ready: {', '.join(away)}", f"see {log}"
+            probe.host, "nodes", "failed", f"not ready: {', '.join(missing)}", f"see {log}"
         )
-    if again:
-        what = f"{len(nodes)} ready; started again so many times: {', '.join(again)}"
-        return HostFinding(visit.host, "nodes", "warning", what, f"see {log}")
-    return HostFinding(visit.host, "nodes", "ok", f"{len(nodes)} ready")
+    if restarted:
+        what = f"{len(nodes)} ready; restarts: {', '.join(restarted)}"
+        return HostFinding(probe.host, "nodes", "warning", what, f"see {log}")
+    return HostFinding(probe.host, "nodes", "ok", f"{len(nodes)} ready")
 
 
-def _rates(visit: Visit) -> HostFinding:
-    """Topics that the table expects at a rate, as each node sent and heard them."""
+def _check_rates(probe: HostProbe) -> HostFinding:
+    """Compare the rates of the nodes' ports with the table of topics."""
     odd, right, refused = [], 0, []
-    for name, status in visit.nodes.items():
-        ports = [(one, "sends") for one in status.outputs]
-        ports += [(one, "hears") for one in status.inputs]
+    for name, status in probe.nodes.items():
+        ports = [(one, "publishes") for one in status.outputs]
+        ports += [(one, "receives") for one in status.inputs]
         for port, verb in ports:
             if port.rejected:
                 refused.append(f"{name} {port.rejected} of {port.topic}")
-            wrong = rate_problem(port)
-            topic = TOPICS.get(port.topic)  # a host with other code may have others
+            wrong = find_rate_problem(port)
+            topic = TOPICS.get(port.topic)  # another version may have other topics
             if wrong:
                 odd.append(f"{name} {verb} {wrong}")
             elif topic is not None and topic.rate_hz is not None:
                 right += 1
     if odd or refused:
-        words = _shown(odd)
+        words = _shorten(odd)
         if refused:
-            words.append(f"refused: {', '.join(_shown(refused))}")
-        remedy = "what is silent upstream comes first; see status and log of these nodes"
-        return HostFinding(visit.host, "rates", "warning", "; ".join(words), remedy)
+            words.append(f"refused: {', '.join(_shorten(refused))}")
+        remedy = "begin with the first node upstream; see status and log of these nodes"
+        return HostFinding(probe.host, "rates", "warning", "; ".join(words), remedy)
     if not right:
-        return HostFinding(visit.host, "rates", "not asked", "its nodes say nothing of rates yet")
-    return HostFinding(visit.host, "rates", "ok", f"{right} ports at their topic's rate")
+        return HostFinding(probe.host, "rates", "not asked", "its nodes report no rates yet")
+    return HostFinding(probe.host, "rates", "ok", f"{right} ports at the rate of their topic")
 
 
-def rate_problem(port: PortStatus) -> str | None:
-    """What is wrong with a port's rate, by the table of topics; None: nothing."""
+def find_rate_problem(port: PortStatus) -> str | None:
+    """Return why a port's rate is outside the range of its topic; None if it is inside."""
     topic = TOPICS.get(port.topic)
     if topic is None or topic.rate_hz is None or topic.many_writers:
         return None
     low, high = topic.rate_hz
     if port.rate_hz == 0.0:
         return f"no {port.topic}"
-    if not low * (1 - SLACK) - 1 <= port.rate_hz <= high * (1 + SLACK) + 1:
+    if (
+        not low * (1 - RATE_TOLERANCE_RATIO) - 1
+        <= port.rate_hz
+        <= high * (1 + RATE_TOLERANCE_RATIO) + 1
+    ):
         return f"{port.topic} at {port.rate_hz:.0f} Hz, expected {low:g} to {high:g}"
     return None
 
 
-def _parts(nodes: Sequence[PlannedNode], visit: Visit) -> Iterator[HostFinding]:
-    """What the host is there for: cameras, projector, its arm."""
-    assert visit.status is not None
-    host, missing = visit.host, visit.status.missing_devices
-    devices = devices_of(list(nodes))
+OUTPUT_CHECKS: dict[NodeRole | None, tuple[str, str]] = {
+    NodeRole.CAMERA: ("camera", "check whether another program uses the camera: docs/camera.md"),
+    NodeRole.RENDERER: (
+        "picture",
+        f"check OpenGL on that host: flexsheet doctor; on Debian: {OPENGL.manual}",
+    ),
+}
+"""Check and remedy of the nodes that must publish, by role."""
+
+
+def _check_devices(nodes: Sequence[ResolvedNode], probe: HostProbe) -> Iterator[HostFinding]:
+    """Check the cameras, the projector and the arm of a host."""
+    assert probe.status is not None
+    host, missing = probe.host, probe.status.missing_devices
+    devices = list_device_files(nodes)
     if missing:
         yield HostFinding(
             host,
             "devices",
             "failed",
-            f"not there: {', '.join(missing)}",
-            "is it plugged in? else another number: v4l2-ctl --list-devices",
+            f"missing: {', '.join(missing)}",
+            "check that it is plugged in, and its number: v4l2-ctl --list-devices",
         )
     elif devices:
         yield HostFinding(host, "devices", "ok", ", ".join(devices))
     for node in nodes:
-        check = {"camera": "camera", "renderer": "picture"}.get(node.type)
-        if check is None:
+        if node.role not in OUTPUT_CHECKS:
             continue
-        status = visit.nodes.get(node.name)
+        check, remedy = OUTPUT_CHECKS[node.role]
+        status = probe.nodes.get(node.name)
         if status is None:
-            yield HostFinding(host, check, "failed", f"{node.name} is silent", "see its log")
+            yield HostFinding(host, check, "failed", f"{node.name} does not report", "see its log")
             continue
         sent = max((one.rate_hz for one in status.outputs if one.topic != "status"), default=0.0)
-        what = f"{sent:.0f} Hz; {status.note or 'nothing to say'}"
+        what = f"{sent:.0f} Hz; {status.note or 'no note'}"
         if sent > 0.0:
             yield HostFinding(host, check, "ok", what)
         else:
-            remedy = {
-                "camera": "docs/camera.md; does another program hold it?",
-                "picture": f"OpenGL: there, flexsheet doctor; on Debian: {OPENGL.manual}",
-            }[check]
             yield HostFinding(host, check, "failed", what, remedy)
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
-            yield _arm(node, visit)
+            yield _check_arm(node, probe)
 
 
-def _arm(node: PlannedNode, visit: Visit) -> HostFinding:
-    arm = visit.arms.get(str(node.arm_side))
+def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
+    arm = probe.arms.get(str(node.arm_side))
     check = f"arm {node.arm_side}"
     if arm is None:
-        return _silent_arm(node, visit, check)
+        return _check_silent_arm(node, probe, check)
     what = ", ".join(filter(None, (arm.mode, arm.reason, "; ".join(arm.faults))))
     if arm.mode == "disconnected":
         where = "" if node.device_address is None else f" at {node.device_address}"
-        remedy = f"is the controller{where} on, and its program running? docs/modbus.md"
-        return HostFinding(visit.host, check, "failed", what, remedy)
+        remedy = f"check that the controller{where} is on and its program runs: docs/modbus.md"
+        return HostFinding(probe.host, check, "failed", what, remedy)
     if arm.faults:
-        remedy = "when the cause is mended: flexsheet arms reset"
-        return HostFinding(visit.host, check, "warning", what, remedy)
+        remedy = "when the cause is fixed: flexsheet arms reset"
+        return HostFinding(probe.host, check, "warning", what, remedy)
     by_itself = node.parameters.get("arming") == "by_itself"
-    moves = "moves as soon as nothing hinders it"
+    moves = "moves as soon as no interlock inhibits it"
     waits = moves if by_itself else "flexsheet arms ready lets it move"
     ready = "ready" if arm.ready else waits
-    return HostFinding(visit.host, check, "ok", f"{what}; {ready}")
+    return HostFinding(probe.host, check, "ok", f"{what}; {ready}")
 
 
-def _silent_arm(node: PlannedNode, visit: Visit, check: str) -> HostFinding:
-    """Tell an arm that its bridge waits for from a bridge that does not report."""
-    status = visit.nodes.get(node.name)
+def _check_silent_arm(node: ResolvedNode, probe: HostProbe, check: str) -> HostFinding:
+    """Distinguish a bridge that waits for its arm from one that does not report."""
+    status = probe.nodes.get(node.name)
     if status is None:
-        return HostFinding(visit.host, check, "failed", f"{node.name} is silent", "see its log")
-    assert visit.status is not None
-    starts = any(one.state == "starting" for one in visit.status.nodes)
-    where = f"{node.parameters['host']}:{node.parameters['port']}"
-    remedy = f"is the controller at {where} on, and its program running? see its log"
-    return HostFinding(visit.host, check, "warning" if starts else "failed", status.note, remedy)
+        return HostFinding(
+            probe.host, check, "failed", f"{node.name} does not report", "see its log"
+        )
+    assert probe.status is not None
+    starts = any(one.state == "starting" for one in probe.status.nodes)
+    where = "" if node.device_address is None else f" at {node.device_address}"
+    remedy = f"check that the controller{where} is on and its program runs; see its log"
+    return HostFinding(probe.host, check, "warning" if starts else "failed", status.note, remedy)
 
 
-def _room(visit: Visit) -> Iterator[HostFinding]:
-    status = visit.status
+def _check_resources(probe: HostProbe) -> Iterator[HostFinding]:
+    status = probe.status
     assert status is not None
-    yield _disk(visit.host, status.disk_free_bytes)
+    yield _check_disk(probe.host, status.disk_free_bytes)
     what = f"{status.memory_free_bytes / 2**30:.1f} GiB free"
-    if status.memory_free_bytes < LEAST_MEMORY_BYTES:
-        yield HostFinding(visit.host, "memory", "warning", what, "what else runs there? top")
+    if status.memory_free_bytes < MIN_FREE_MEMORY_BYTES:
+        yield HostFinding(
+            probe.host, "memory", "warning", what, "find the largest programs on that host: top"
+        )
     else:
-        yield HostFinding(visit.host, "memory", "ok", what)
+        yield HostFinding(probe.host, "memory", "ok", what)
 
 
-def _load(status: HostStatus) -> HostFinding:
-    """Whether the processors of a host leave its nodes enough time."""
+def _check_load(status: HostStatus) -> HostFinding:
+    """Check whether the nodes of a host get enough processor time."""
     if is_busy(status):
         return HostFinding(status.host, "load", "warning", describe_busy(status), BUSY_REMEDY)
-    what = f"{status.load_ratio:.2f} processes per core want to run"
+    what = f"load {status.load_ratio:.2f} per core"
     if status.cpu is not None:
-        what += f"; {status.cpu.node} waits longest, {status.cpu.wait_ratio:.0%} of the time"
+        what += f"; {status.cpu.node} waits for a processor {status.cpu.wait_ratio:.0%} of the time"
     return HostFinding(status.host, "load", "ok", what)
 
 
-def _disk(host: str, free_bytes: int) -> HostFinding:
+def _check_disk(host: str, free_bytes: int) -> HostFinding:
     what = f"{free_bytes / 2**30:.1f} GiB free"
-    if free_bytes < LEAST_DISK_BYTES:
-        return HostFinding(host, "disk", "warning", what, "bags need room: make some")
+    if free_bytes < MIN_FREE_DISK_BYTES:
+        return HostFinding(host, "disk", "warning", what, "free some disk space for bags")
     return HostFinding(host, "disk", "ok", what)
 
 
-def _shown(texts: Sequence[str]) -> list[str]:
-    more = len(texts) - NAMES_SHOWN
-    return [*texts[:NAMES_SHOWN], *([f"and {more} more"] if more > 0 else [])]
+def _shorten(texts: Sequence[str]) -> list[str]:
+    more = len(texts) - MAX_NAMES_SHOWN
+    return [*texts[:MAX_NAMES_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
 
-def own_key_problem(plan: Plan, here: str) -> str | None:
-    """Why this computer's key cannot be used for a host of the plan; None: it can."""
+def find_key_problem(plan: ResolvedGraph, here: str) -> str | None:
+    """Return why the key of this computer cannot be used for a host; None if it can."""
     if not plan.keys:
         return None
     file = secret_file(here)
@@ -458,34 +485,36 @@ def own_key_problem(plan: Plan, here: str) -> str | None:
         return str(error)
     if own != plan.keys[here]:
         return (
-            f"{file} belongs to another public key than hosts.{here}.key of {plan.launch_file}; "
-            f"the file's: {plan.keys[here]}, here: {own}"
+            f"{file} does not match hosts.{here}.key of {plan.launch_file}: "
+            f"public key {own} here, {plan.keys[here]} in the launch file"
         )
     return None
 
 
-def before_start(plan: Plan, here: str, key_problem: str | None) -> Iterator[HostFinding]:
-    """What this computer can say of itself as a host of the plan while no graph runs on it."""
+def check_before_start(
+    plan: ResolvedGraph, here: str, key_problem: str | None
+) -> Iterator[HostFinding]:
+    """Check this computer as a host of the graph before the graph is started."""
     address, nodes = plan.hosts[here], plan.nodes_on(here)
     if is_loopback(address) or address in own_addresses():
-        yield HostFinding(here, "address", "ok", f"{address} is this computer's")
+        yield HostFinding(here, "address", "ok", f"{address} is an address of this computer")
     else:
         yield HostFinding(
             here,
             "address",
             "failed",
-            f"{address} is none of this computer's: {', '.join(sorted(own_addresses()))}",
-            "is this the host that you mean (--host)? else mend the launch file on all hosts",
+            f"{address} is not an address of this computer: {', '.join(sorted(own_addresses()))}",
+            "name the right host with --host, or correct the launch file on all hosts",
         )
     if key_problem is not None:
         remedy = f"flexsheet keys install {plan.launch_file} {here}, then copy it to all hosts"
         yield HostFinding(here, "keys", "failed", key_problem, remedy)
     elif plan.keys:
-        what = f"{secret_file(here)} fits the launch file, and only its owner can read it"
+        what = f"{secret_file(here)} matches the launch file; only its owner can read it"
         yield HostFinding(here, "keys", "ok", what)
     elif not all(map(is_loopback, plan.hosts.values())):
         remedy = "flexsheet keys new on each host, flexsheet keys install for each: docs/deploy.md"
-        yield HostFinding(here, "keys", "failed", "the launch file has none", remedy)
+        yield HostFinding(here, "keys", "failed", "the launch file has no keys", remedy)
     libraries = check_libraries()
     yield HostFinding(
         here,
@@ -494,29 +523,29 @@ def before_start(plan: Plan, here: str, key_problem: str | None) -> Iterator[Hos
         f"python {python_version()}, {software()}; {libraries.what}",
         libraries.remedy,
     )
-    yield _ports(plan, here)
-    devices = devices_of(nodes)
+    yield _check_ports(plan, here)
+    devices = list_device_files(nodes)
     missing = [one for one in devices if not os.path.exists(one)]
     if missing:
-        remedy = "is it plugged in? else another number: v4l2-ctl --list-devices"
-        what = f"not there: {', '.join(missing)}"
+        remedy = "check that it is plugged in, and its number: v4l2-ctl --list-devices"
+        what = f"missing: {', '.join(missing)}"
         yield HostFinding(here, "devices", "failed", what, remedy)
     elif devices:
         yield HostFinding(here, "devices", "ok", ", ".join(devices))
     if any(node.role is NodeRole.RENDERER for node in nodes):
         problem = opengl_problem()
         if problem is None:
-            yield HostFinding(here, "opengl", "ok", "a headless context can be made (EGL)")
+            yield HostFinding(here, "opengl", "ok", "a headless context can be created (EGL)")
         else:
             yield HostFinding(here, "opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
     for node in nodes:
         if node.role is NodeRole.ARM_BRIDGE:
-            yield _controller(here, node)
-    folder = folder_of(nodes)
-    yield _disk(here, shutil.disk_usage(folder if folder.is_dir() else Path.cwd()).free)
+            yield _check_controller(here, node)
+    folder = recording_folder(nodes)
+    yield _check_disk(here, shutil.disk_usage(folder if folder.is_dir() else Path.cwd()).free)
 
 
-def _ports(plan: Plan, here: str) -> HostFinding:
+def _check_ports(plan: ResolvedGraph, here: str) -> HostFinding:
     address = plan.hosts[here]
     wanted = [
         int(writer.tcp.rpartition(":")[2])
@@ -528,33 +557,33 @@ def _ports(plan: Plan, here: str) -> HostFinding:
     taken = [port for port in wanted if mine and not is_free(address, port)]
     taken += [port for _, port in plan.listening_nodes(here) if not is_free("127.0.0.1", port)]
     if taken:
-        remedy = "ss -ltnp says who; does a graph run here that is another user's?"
+        remedy = "find the program with ss -ltnp; another user may run a graph"
         what = f"in use: {', '.join(map(str, sorted(taken)))}"
         return HostFinding(here, "ports", "failed", what, remedy)
     return HostFinding(here, "ports", "ok", f"{len(wanted)} are free")
 
 
-def _controller(here: str, node: PlannedNode) -> HostFinding:
-    """Whether an arm's controller takes connections; a graph that runs holds the only one."""
+def _check_controller(here: str, node: ResolvedNode) -> HostFinding:
+    """Check that an arm's controller accepts connections, while no graph uses the only one."""
     check = f"arm {node.arm_side}"
     if node.device_address is None:
-        return HostFinding(here, check, "not asked", f"{node.name} has a driver of its own")
-    address, port = str(node.parameters["host"]), int(node.parameters["port"])
+        return HostFinding(here, check, "not asked", f"{node.name} uses its own driver")
+    address, _, port = node.device_address.rpartition(":")
     if is_loopback(address):
-        what = f"{address}:{port}: the twin's, which starts with the graph"
+        what = f"{address}:{port} is simulated and starts with the graph"
         return HostFinding(here, check, "not asked", what)
     if node.parameters.get("driver") != "modbus":
-        return HostFinding(here, check, "not asked", f"{address}:{port} speaks UDP")
+        return HostFinding(here, check, "not asked", f"{address}:{port} uses UDP")
     try:
-        socket.create_connection((address, port), CONTROLLER_S).close()
+        socket.create_connection((address, int(port)), CONTROLLER_S).close()
     except OSError as error:
-        remedy = f"is the controller on, {address} its address, and its Modbus server running?"
+        remedy = f"check that the controller is on at {address} and its Modbus server runs"
         return HostFinding(here, check, "failed", f"{address}:{port}: {error}", remedy)
-    return HostFinding(here, check, "ok", f"{address}:{port} takes connections")
+    return HostFinding(here, check, "ok", f"{address}:{port} accepts connections")
 
 
 def own_addresses() -> set[str]:
-    """The IP addresses of this computer."""
+    """Return the IP addresses of this computer."""
     families = (socket.AF_INET, socket.AF_INET6)
     return {
         one.address.partition("%")[0]

@@ -62,7 +62,7 @@ class MeshFile(LimitedModel):
     )
 
 
-def scene_of(document: Document) -> Scene:
+def scene_from_document(document: Document) -> Scene:
     """The scene of a scene file, with the mesh that it names; raises BadInputError."""
     name = _shape_name(document)
     if name is not None and name not in SHAPE_NAMES:

@@ -37,6 +37,7 @@ from ruamel.yaml.tokens import (
 
 from flexsheet.launch.plans.renamed_keys import LAUNCH_KEYS, NODE_PARAMETERS, SCENE_KEYS, VALUES
 from flexsheet.messages.scene import Scene
+from flexsheet.nodes import NODES
 
 M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
@@ -329,9 +330,7 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
         renamed = _renamed_keys(model, document, key).get(str(name))
         remedy = f'it is now "{renamed}"' if renamed else did_you_mean(name, known)
         return document.problem(key, f'unknown key "{name}"', remedy)
-    # Pydantic names the option of a union of literals, which is no key of the file.
-    path = [part for part in _walk(model, location)[0] if not str(part).startswith("literal[")]
-    key = (*at, *path)
+    key = _existing_part(document, (*at, *_walk(model, location)[0]))
     if error["type"] in MAPPING_WANTED:
         return document.problem(
             key, f"is {_kind_name(error['input'])}", "it must hold keys and values"
@@ -340,15 +339,32 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
     if renamed is not None:
         what = f"{_shown(error['input'])} does not fit"
         return document.problem(key, what, f'it is now "{renamed}"')
-    message = error["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    raised = error.get("ctx", {}).get("error")
+    message = str(raised) if isinstance(raised, Exception) else error["msg"]
     return document.problem(key, f"{_shown(error['input'])} does not fit", message)
+
+
+def _existing_part(document: Document, key: Key) -> Key:
+    """Return the longest beginning of `key` that the document holds.
+
+    Pydantic's locations also name options of unions and parts of keys, which no file holds.
+    """
+    values: Any = document.values
+    for number, part in enumerate(key):
+        try:
+            values = values[part]
+        except (KeyError, IndexError, TypeError):
+            return key[:number]
+    return key
 
 
 def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mapping[str, str]:
     """Return old to new names of the keys beside `key`."""
     if key[0] == "nodes" and key[2:3] == ("parameters",):
         node_type = document.values["nodes"][key[1]].get("type")
-        return NODE_PARAMETERS.get(node_type, {})
+        # A launch file may name a shipped node by its class, too.
+        names = [name for name, path in NODES.items() if node_type in (name, path)]
+        return NODE_PARAMETERS.get(names[0], {}) if names else {}
     return SCENE_KEYS if issubclass(model, Scene) else LAUNCH_KEYS
 
 

@@ -14,7 +14,7 @@ from flexsheet.launch.plans.documents import (
     validate,
 )
 from flexsheet.launch.plans.launch_file import HostSpec, LaunchFile
-from flexsheet.launch.plans.planned import LAUNCHER, MAIN
+from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN
 from flexsheet.messages.security import is_key
 
 

@@ -15,7 +15,7 @@ from flexsheet.launch.plans.documents import (
     did_you_mean,
     parse_value,
 )
-from flexsheet.launch.plans.planned import MAIN, RestartSpec, Strict
+from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, Strict
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import role_of
 
@@ -85,7 +85,7 @@ class LaunchFile(Strict):
     scene: str | None = Field(default=None, description="scene file, relative to this one")
     hosts: dict[Name, HostSpec] = Field(default={MAIN: HostSpec(address="127.0.0.1")})
     nodes: dict[Name, NodeSpec]
-    from_tools: list[str] = Field(
+    external_topics: list[str] = Field(
         default=[], description="topics that a tool writes into the graph, as `bag play` does"
     )
     clocks: ClocksSpec = ClocksSpec()

@@ -1,8 +1,8 @@
-"""A launch file, checked and resolved: which node runs where, with what, and who talks to whom.
+"""Check a launch file and resolve it: which node runs where, with which parameters and endpoints.
 
-The launch file is the graph.  `load_plan` turns it into a `Plan` in which every endpoint is known
-before any process starts; everything that is wrong with the file is reported at once.  Every host
-computes the same plan from the same file, and the plan's hash says so.
+`load_graph` returns a `ResolvedGraph`, in which every endpoint is known before any process starts.
+All errors of the file are reported at once.  Every host resolves the same file to the same graph;
+hosts compare its hash.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
 
-from flexsheet.launch.objects.meshes import scene_of
+from flexsheet.launch.objects.meshes import scene_from_document
 from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
@@ -27,32 +30,39 @@ from flexsheet.launch.plans.launch_file import (
     apply_record,
     apply_setting,
 )
-from flexsheet.launch.plans.members import (
-    Member,
-    check_calibrations,
-    check_wires,
-    in_full,
-    members_of,
-    resolve_member,
+from flexsheet.launch.plans.plan_model import (
+    MAIN,
+    ResolvedGraph,
+    ResolvedNode,
+    ResolvedPort,
+    Writer,
 )
-from flexsheet.launch.plans.planned import MAIN, Plan, PlannedNode, PlannedPort, Writer
-from flexsheet.launch.plans.wires import (
+from flexsheet.launch.plans.resolve_nodes import (
+    NodeEntry,
+    check_calibrations,
+    check_device_hosts,
+    collect_entries,
+    dump_parameters,
+    resolve_entry,
+)
+from flexsheet.launch.plans.routing import (
     check_inputs,
-    endpoints_of,
+    list_writers,
+    make_endpoints,
     resolve_further_inputs,
-    writers_of,
 )
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.node import listen_ports, role_of
+from flexsheet.nodes.node import NodeParameters, role_of
+from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 
-def load_plan(
+def load_graph(
     path: Path,
     *,
     settings: Sequence[str] = (),
     record: Path | None = None,
     console: bool = False,
-) -> Plan:
+) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
     settings: "node.parameter=value" each, value in YAML, over what the file says.
@@ -71,21 +81,21 @@ def load_plan(
     problems: list[Problem] = []
     check_hosts(spec.hosts, document, problems)
     scene_document, scene = _load_scene(spec, document, problems)
-    members = members_of(spec, document, problems)
-    for member in members:
-        resolve_member(member, document, problems)
-    writers = writers_of(spec, members, document, problems, has_scene=scene is not None)
-    resolve_further_inputs(members, writers, document, problems)
-    check_inputs(members, writers, document, problems)
-    check_calibrations(members, scene, document, problems)
-    check_wires(members, spec, document, problems)
+    entries = collect_entries(spec, document, problems)
+    for entry in entries:
+        resolve_entry(entry, document, problems)
+    writers = list_writers(spec, entries, document, problems, has_scene=scene is not None)
+    resolve_further_inputs(entries, writers, document, problems)
+    check_inputs(entries, writers, document, problems)
+    check_calibrations(entries, scene, document, problems)
+    check_device_hosts(entries, spec, document, problems)
     if problems:
         raise BadInputError(problems)
 
     addresses = {name: host.address for name, host in spec.hosts.items()}
-    endpoints = endpoints_of(writers, addresses)
+    endpoints = make_endpoints(writers, addresses)
     nodes = {
-        member.name: _planned(member, endpoints, document, resolve_paths=True) for member in members
+        entry.name: _planned(entry, endpoints, document, resolve_paths=True) for entry in entries
     }
     scene_values = None if scene is None else scene.model_dump(mode="json")
     resetters = tuple(
@@ -98,11 +108,11 @@ def load_plan(
         "estop_resetters": resetters,
         "scene": scene_values,
         "nodes": [
-            _planned(member, endpoints, document, resolve_paths=False).model_dump(mode="json")
-            for member in sorted(members, key=lambda member: member.name)
+            _planned(entry, endpoints, document, resolve_paths=False).model_dump(mode="json")
+            for entry in sorted(entries, key=lambda entry: entry.name)
         ],
     }
-    return Plan(
+    return ResolvedGraph(
         launch_file=str(path),
         launch_text=document.text,
         scene_file=None if scene_document is None else str(scene_document.path),
@@ -132,7 +142,7 @@ def _load_scene(
         return None, None
     try:
         scene_document = read_document(path)
-        return scene_document, scene_of(scene_document)
+        return scene_document, scene_from_document(scene_document)
     except BadInputError as error:
         problems.extend(error.problems)
         return None, None
@@ -140,46 +150,77 @@ def _load_scene(
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file; raises BadInputError."""
-    return scene_of(read_document(path))
+    return scene_from_document(read_document(path))
 
 
 def _planned(
-    member: Member,
+    entry: NodeEntry,
     endpoints: dict[str, tuple[Writer, ...]],
     document: Document,
     *,
     resolve_paths: bool,
-) -> PlannedNode:
-    host = member.spec.host
-    return PlannedNode(
-        name=member.name,
-        type=member.spec.type,
-        listen_ports=() if member.parameters is None else listen_ports(member.parameters),
-        role=None if member.type is None else role_of(member.type),
+) -> ResolvedNode:
+    host = entry.spec.host
+    assert entry.type is not None  # a entry without a class is a problem
+    assert entry.parameters is not None
+    parameters = dump_parameters(entry, document, resolve_paths=resolve_paths)
+    return ResolvedNode(
+        name=entry.name,
+        type=entry.spec.type,
+        listen_ports=tuple(filter(None, _marked(entry.parameters, ParameterMark.LISTEN_PORT))),
+        device_address=_device_address(entry.parameters),
+        device_files=_device_files(entry.parameters),
+        calibrations={
+            ".".join(map(str, key)): str(_value_at(parameters, key))
+            for mark in (ParameterMark.CAMERA_CALIBRATION, ParameterMark.SHEET_CALIBRATION)
+            for key in find_marked(entry.parameters, mark)
+        },
+        role=role_of(entry.type),
         host=host,
-        parameters=in_full(member, document, resolve_paths=resolve_paths),
+        parameters=parameters,
         inputs=tuple(
-            PlannedPort(
+            ResolvedPort(
                 port=port,
                 topic=topic.name,
                 endpoints=tuple(one.endpoint_for(host) for one in endpoints[topic.name]),
             )
-            for port, topic in member.topics("input")
+            for port, topic in entry.topics("input")
         )
-        + member.unconnected_ports("input"),
+        + entry.unconnected_ports("input"),
         outputs=tuple(
-            PlannedPort(
+            ResolvedPort(
                 port=port,
                 topic=topic.name,
                 endpoints=next(
-                    one.endpoints for one in endpoints[topic.name] if one.name == member.name
+                    one.endpoints for one in endpoints[topic.name] if one.name == entry.name
                 ),
             )
-            for port, topic in member.topics("output")
+            for port, topic in entry.topics("output")
         )
-        + member.unconnected_ports("output"),
-        restart=member.spec.restart,
-        start_deadline_s=member.spec.start_deadline_s,
-        liveness_s=member.spec.liveness_s,
-        nice=member.spec.nice,
+        + entry.unconnected_ports("output"),
+        restart=entry.spec.restart,
+        start_deadline_s=entry.spec.start_deadline_s,
+        liveness_s=entry.spec.liveness_s,
+        nice=entry.spec.nice,
     )
+
+
+def _marked(parameters: NodeParameters, mark: ParameterMark) -> list[Any]:
+    return list(find_marked(parameters, mark).values())
+
+
+def _device_address(parameters: NodeParameters) -> str | None:
+    """Return "host:port" of the device; None unless exactly one host and one port are marked."""
+    hosts = _marked(parameters, ParameterMark.DEVICE_HOST)
+    ports = _marked(parameters, ParameterMark.DEVICE_PORT)
+    return f"{hosts[0]}:{ports[0]}" if len(hosts) == len(ports) == 1 else None
+
+
+def _device_files(parameters: NodeParameters) -> tuple[str, ...]:
+    """Return the marked paths, sorted, without URLs of streams."""
+    files = _marked(parameters, ParameterMark.DEVICE_FILE)
+    return tuple(sorted({file for file in files if not urlsplit(file).scheme}))
+
+
+def _value_at(values: Any, key: tuple[str | int, ...]) -> Any:
+    return reduce(lambda inner, part: inner[part], key, values)

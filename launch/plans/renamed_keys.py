@@ -36,7 +36,7 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """Old to new keys of scene files."""
 
-LAUNCH_KEYS: Mapping[str, str] = {"waits": "start_paused"}
+LAUNCH_KEYS: Mapping[str, str] = {"from_tools": "external_topics", "waits": "start_paused"}
 """Old to new keys of launch files, those of `record` among them."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {

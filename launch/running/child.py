@@ -27,7 +27,7 @@ GRACE_S = 3.0
 _PR_SET_PDEATHSIG = 1
 
 
-def follow_launcher() -> None:
+def exit_with_parent() -> None:
     """End with the launcher, however it ends: asked to first, killed after `GRACE_S`.
 
     The kernel's death signal reaches a process that hangs in its loop; the lifeline's thread also
@@ -50,7 +50,7 @@ def _end_with(lifeline: int) -> None:
     os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
-def give_way() -> None:
+def apply_niceness() -> None:
     """Be nicer than the launcher by what the launcher allows this node, and so its session.
 
     Less than 0 takes precedence.  OSError where the system does not let it.

@@ -11,16 +11,15 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
 
 import psutil
 import zmq
 
 from flexsheet.launch.plans.hosts import clock_node, launcher_on
-from flexsheet.launch.plans.planned import Plan, PlannedNode, tools_on
+from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode, tools_on
 from flexsheet.launch.running.cpu import BACKGROUND_NICE, CpuWatch
 from flexsheet.launch.running.estop_file import EStopFile
 from flexsheet.messages.base import Header, Message
@@ -37,7 +36,6 @@ from flexsheet.nodes.stop_socket import StopSocket
 
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
-DEVICES = "/dev/"
 REASON_LENGTH = 1000
 """What is longer is cut: an e-stop must fit into every message that repeats it."""
 
@@ -52,7 +50,7 @@ Endpoints = Callable[[tuple[str, ...]], tuple[str, ...]]
 Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
-class HostVoice:
+class HostAgent:
     """The launcher's part in the graph, for one host; use between `start` and `close`.
 
     endpoints, sources: fill in the run's directory.  code: the commit, for `HostStatus`.
@@ -62,7 +60,7 @@ class HostVoice:
 
     def __init__(
         self,
-        plan: Plan,
+        plan: ResolvedGraph,
         host: str,
         *,
         run_id: str,
@@ -101,7 +99,7 @@ class HostVoice:
         self._kept: EStop | None = None
         self._engaged_ns = 0
         self._resetting: asyncio.Task[None] | None = None
-        self._file = EStopFile(host, arms_of(plan)) if waits_for_a_person(plan) else None
+        self._file = EStopFile(host, list_arms(plan)) if has_manual_arming(plan) else None
         self._stop_socket = (
             None
             if run_directory is None
@@ -110,7 +108,7 @@ class HostVoice:
         self._unwritten = False
         self._untold = ""
         nodes = plan.nodes_on(host)
-        self._devices, self._folder = devices_of(nodes), folder_of(nodes)
+        self._devices, self._folder = list_device_files(nodes), recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
@@ -129,13 +127,13 @@ class HostVoice:
             for source in self._plan.sources_to_read("estop", self._host)
             if source.writer != self._name
         ]
-        self._heard.append(self._hear("estop", others, self._keep))
+        self._heard.append(self._hear("estop", others, self._latch_estop))
         measured = self._plan.writer("clocks", clock_node(self._host))
         if measured is not None:
             source = measured.source_for(self._host)
             take = self._clock_table.update
             self._heard.append(self._hear("clocks", [source], lambda clocks, _: take(clocks)))
-        self._task = asyncio.create_task(self._speak(), name=f"host {self._host}")
+        self._task = asyncio.create_task(self._publish_loop(), name=f"host {self._host}")
 
     def _hear(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
         subscriber = Subscriber(
@@ -176,7 +174,7 @@ class HostVoice:
         self._on_problem(f"e-stop of {writer}, kept until it is reset")
         self._engage(EStop(engaged=True, reason=reason), self._clock.now_ns())
 
-    def _keep(self, estop: EStop, header: Header) -> None:
+    def _latch_estop(self, estop: EStop, header: Header) -> None:
         now_ns = self._clock.now_ns()
         _, header, clock_trouble = self._clock_table.localised(estop, header, now_ns)
         if estop.engaged:
@@ -279,7 +277,7 @@ class HostVoice:
         )
         self.publishers[topic].send(message, header)
 
-    async def _speak(self) -> None:
+    async def _publish_loop(self) -> None:
         while True:
             try:
                 status = self._status()
@@ -337,13 +335,13 @@ def shows_estop(state: ArmState) -> bool:
     return state.mode == "estop" or any(fault.startswith("e-stop: ") for fault in state.faults)
 
 
-def arms_of(plan: Plan) -> list[str]:
+def list_arms(plan: ResolvedGraph) -> list[str]:
     """List the plan's arms by the address of each; a bridge without one counts by its name."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
 
-def waits_for_a_person(plan: Plan) -> bool:
+def has_manual_arming(plan: ResolvedGraph) -> bool:
     """Whether arms move at a person's word only; those that go by themselves are simulated."""
     return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
 
@@ -361,21 +359,12 @@ def software() -> str:
     return f"flexsheet {own}, pyzmq {zmq.pyzmq_version()}, libzmq {zmq.zmq_version()}"
 
 
-def devices_of(nodes: list[PlannedNode]) -> list[str]:
-    """Device files that the nodes' parameters name."""
-
-    def texts(value: Any) -> list[str]:
-        if isinstance(value, str):
-            return [value]
-        if isinstance(value, dict):
-            value = list(value.values())
-        return [text for one in value for text in texts(one)] if isinstance(value, list) else []
-
-    found = [text for node in nodes for text in texts(node.parameters)]
-    return sorted({text for text in found if text.startswith(DEVICES)})
+def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
+    """Return the device files that the nodes open, sorted."""
+    return sorted({file for node in nodes for file in node.device_files})
 
 
-def folder_of(nodes: list[PlannedNode]) -> Path:
+def recording_folder(nodes: list[ResolvedNode]) -> Path:
     """Where the host's recorder writes; the working folder where there is none, or not yet."""
     for node in nodes:
         if node.role is NodeRole.RECORDER:

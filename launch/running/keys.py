@@ -17,7 +17,7 @@ from ruamel.yaml.scalarstring import SingleQuotedScalarString
 
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean, read_document
 from flexsheet.launch.plans.hosts import load_keys
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running.runs import Run, ring_file
 from flexsheet.messages.files import write_file
 from flexsheet.messages.security import KeyChange, KeyRing, SecurityError, is_key, write_ring
@@ -38,7 +38,7 @@ def secret_file(host: str) -> Path:
     return directory() / f"{host}.secret"
 
 
-def make_rings(plan: Plan, run: Run, host: str | None) -> dict[str, KeyRing]:
+def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
     """The keys of one host of a plan, or of all, checked; BadInputError."""
     rings = {}
     problems = []
@@ -57,7 +57,7 @@ def make_rings(plan: Plan, run: Run, host: str | None) -> dict[str, KeyRing]:
 class KeyWatch:
     """Passes on to a run's processes what changes about the keys in its launch file."""
 
-    def __init__(self, plan: Plan, run: Run, rings: dict[str, KeyRing]) -> None:
+    def __init__(self, plan: ResolvedGraph, run: Run, rings: dict[str, KeyRing]) -> None:
         self._launch_file, self._run, self._rings = Path(plan.launch_file), run, rings
         self._public = plan.keys
         self._read_ns = 0

@@ -7,7 +7,7 @@ import resource
 from collections.abc import Sequence
 from pathlib import Path
 
-from flexsheet.launch.plans.planned import PlannedNode
+from flexsheet.launch.plans.plan_model import ResolvedNode
 
 MIN_NICE = -20
 CAP_SYS_NICE = 23
@@ -29,7 +29,7 @@ def _may_take_any() -> bool:
     return bool(int(effective, 16) >> CAP_SYS_NICE & 1)
 
 
-def precedence_problem(nodes: Sequence[PlannedNode]) -> str | None:
+def precedence_problem(nodes: Sequence[ResolvedNode]) -> str | None:
     """Say which nodes cannot take the precedence that their launch file gives; None: all can."""
     least = min_nice_step()
     names = [node.name for node in nodes if node.nice < least]

@@ -86,14 +86,14 @@ def ring_file(run: Run, host: str) -> Path:
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
     """Endpoints of a plan with the run's directory filled in."""
-    from flexsheet.launch.plans.planned import RUN_DIRECTORY
+    from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
     """Sources of a plan with the run's directory filled in."""
-    from flexsheet.launch.plans.planned import RUN_DIRECTORY
+    from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(
         replace(one, endpoint=one.endpoint.replace(RUN_DIRECTORY, str(run.directory)))

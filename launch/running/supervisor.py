@@ -27,17 +27,17 @@ from typing import Any, Self
 from flexsheet.launch.plans.documents import BadInputError, Problem, read_document
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.plan import load_scene
-from flexsheet.launch.plans.planned import (
+from flexsheet.launch.plans.plan_model import (
     LAUNCHER,
     MAIN,
     RUN_DIRECTORY,
-    Plan,
-    PlannedNode,
-    PlannedPort,
+    ResolvedGraph,
+    ResolvedNode,
+    ResolvedPort,
 )
 from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PARENT_VARIABLE
 from flexsheet.launch.running.code_state import git_state
-from flexsheet.launch.running.host import HostVoice
+from flexsheet.launch.running.host import HostAgent
 from flexsheet.launch.running.keys import KeyWatch, make_rings
 from flexsheet.launch.running.priority import min_nice_step, precedence_problem
 from flexsheet.launch.running.runs import (
@@ -235,7 +235,7 @@ class RunningGraph:
     """
 
     def __init__(
-        self, plan: Plan, *, host: str | None = None, report: Report | None = None
+        self, plan: ResolvedGraph, *, host: str | None = None, report: Report | None = None
     ) -> None:
         self.plan, self._host, self._report_to = plan, host, report
         self.nodes = plan.nodes_on(host)
@@ -245,10 +245,10 @@ class RunningGraph:
         self.failure: NodeFailedError | None = None
         self._run: Run | None = None
         self._children: dict[str, Child] = {}
-        self._keepers: dict[str, asyncio.Task[None]] = {}
+        self._supervisors: dict[str, asyncio.Task[None]] = {}
         self._ready = {node.name: asyncio.Event() for node in self.nodes}
         self._publishers: list[Publisher] = []
-        self._voices: dict[str, HostVoice] = {}
+        self._agents: dict[str, HostAgent] = {}
         self._rings: dict[str, KeyRing] = {}
         self._keys_watch: asyncio.Task[None] | None = None
         self._lifeline: tuple[int, int] | None = None
@@ -313,25 +313,25 @@ class RunningGraph:
     async def wait_ready_again(self, node: str, restarts: int) -> None:
         """Until the node was restarted `restarts` times in all and is ready."""
         while self.restarts[node] < restarts or not self._ready[node].is_set():
-            if self._keepers[node].done():
-                self._keepers[node].result()
+            if self._supervisors[node].done():
+                self._supervisors[node].result()
                 raise NodeFailedError(f"{node} has ended")
             await asyncio.sleep(0.02)
 
     async def wait(self) -> None:
         """Until every node has ended by itself; raises NodeFailedError when one failed for good."""
-        pending: set[asyncio.Task[None]] = set(self._keepers.values())
+        pending: set[asyncio.Task[None]] = set(self._supervisors.values())
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
-            for keeper in done:
-                if not keeper.cancelled():
-                    keeper.result()
+            for supervisor in done:
+                if not supervisor.cancelled():
+                    supervisor.result()
 
     def kill(self, node: str, number: int = signal.SIGKILL) -> None:
         """Send a signal to a node's process, as trouble would."""
         os.kill(self.pids[node], number)
 
-    def hurry(self) -> None:
+    def kill_all(self) -> None:
         """Kill all nodes at once, for somebody who will not wait for `stop`."""
         for child in self._children.values():
             child.signal(signal.SIGKILL)
@@ -340,10 +340,10 @@ class RunningGraph:
         """End all nodes (SIGINT, SIGTERM, SIGKILL) and remove sockets; may be called twice."""
         self._stopping = True
         watches = [] if self._keys_watch is None else [self._keys_watch]
-        for task in (*self._keepers.values(), *watches):
+        for task in (*self._supervisors.values(), *watches):
             task.cancel()
         try:
-            await asyncio.gather(*self._keepers.values(), *watches, return_exceptions=True)
+            await asyncio.gather(*self._supervisors.values(), *watches, return_exceptions=True)
             await self._end_children()
         finally:
             for child in self._children.values():
@@ -353,8 +353,8 @@ class RunningGraph:
             for publisher in self._publishers:
                 publisher.close()
             self._publishers.clear()
-            for voice in self._voices.values():
-                await voice.close()
+            for agent in self._agents.values():
+                await agent.close()
             if self._lifeline is not None:
                 for fd in self._lifeline:
                     os.close(fd)
@@ -388,12 +388,14 @@ class RunningGraph:
         if self._host in (None, MAIN):
             self._publish_scene()
         for host in self.plan.hosts if self._host is None else [self._host]:
-            self._start_voice(host)
+            self._start_agent(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
         if problem := precedence_problem(self.nodes):
             self._report(LAUNCHER, problem)
         for node in self.nodes:
-            self._keepers[node.name] = asyncio.create_task(self._keep(node), name=node.name)
+            self._supervisors[node.name] = asyncio.create_task(
+                self._supervise(node), name=node.name
+            )
 
     def _publish_scene(self) -> None:
         scene = self.plan.scene_message()
@@ -422,9 +424,9 @@ class RunningGraph:
             ),
         )
 
-    def _start_voice(self, host: str) -> None:
+    def _start_agent(self, host: str) -> None:
         git = json.loads((self.run.directory / "git.json").read_text())
-        voice = HostVoice(
+        agent = HostAgent(
             self.plan,
             host,
             run_id=self.run.id,
@@ -437,8 +439,8 @@ class RunningGraph:
             on_problem=partial(self._report, LAUNCHER),
             run_directory=self.run.directory,
         )
-        self._voices[host] = voice
-        voice.start()
+        self._agents[host] = agent
+        agent.start()
 
     def _processes(self, host: str) -> tuple[NodeProcess, ...]:
         return tuple(
@@ -475,10 +477,10 @@ class RunningGraph:
                 if host == MAIN:
                     for publisher in self._publishers:
                         publisher.renew_keys(change)
-                if host in self._voices:
-                    self._voices[host].renew_keys(change)
+                if host in self._agents:
+                    self._agents[host].renew_keys(change)
 
-    async def _keep(self, node: PlannedNode) -> None:
+    async def _supervise(self, node: ResolvedNode) -> None:
         """Run the node again and again, as its policy says; NodeFailedError when for good."""
         policy = node.restart
         recent: deque[float] = deque()
@@ -506,7 +508,7 @@ class RunningGraph:
             await asyncio.sleep(delay_s)
             self.restarts[node.name] += 1
 
-    async def _run_once(self, node: PlannedNode) -> str | None:
+    async def _run_once(self, node: ResolvedNode) -> str | None:
         """One life of a node; returns what was wrong with its end, None if nothing was."""
         child = self._spawn(node)
         await asyncio.wait(
@@ -532,7 +534,7 @@ class RunningGraph:
             return f"hung: no sign of life for {node.liveness_s:g} s; its log shows where"
         return describe_exit(code)
 
-    async def _outlives(self, child: Child, node: PlannedNode) -> bool:
+    async def _outlives(self, child: Child, node: ResolvedNode) -> bool:
         """Whether the process hangs, and so has to be ended; False when it ends by itself."""
         if node.liveness_s is None:
             return False
@@ -554,8 +556,8 @@ class RunningGraph:
             child.end_hanging()
         return hangs
 
-    def _spawn(self, node: PlannedNode) -> Child:
-        assert self._lifeline is not None  # made before any keeper
+    def _spawn(self, node: ResolvedNode) -> Child:
+        assert self._lifeline is not None  # made before any supervisor
         environment = {
             **os.environ,
             RUN_VARIABLE: self.run.id,
@@ -620,10 +622,10 @@ async def _end(children: list[Child]) -> None:
         await asyncio.wait([child.exited for child in alive], timeout=STOP_GRACE_S)
 
 
-def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
+def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
     """What a node's process is told, with the run's directory filled in."""
 
-    def outputs(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
+    def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
             PortConfig(
                 port=port.port, topic=port.topic, endpoints=local_endpoints(run, port.endpoints)
@@ -631,7 +633,7 @@ def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
             for port in planned
         )
 
-    def inputs(planned: tuple[PlannedPort, ...]) -> tuple[PortConfig, ...]:
+    def inputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
             PortConfig(
                 port=port.port,
@@ -662,7 +664,7 @@ def node_config(plan: Plan, node: PlannedNode, run: Run) -> NodeConfig:
     )
 
 
-def _clocks_port(plan: Plan, host: str, run: Run) -> PortConfig | None:
+def _clocks_port(plan: ResolvedGraph, host: str, run: Run) -> PortConfig | None:
     writer = plan.writer("clocks", clock_node(host))
     if writer is None:
         return None
@@ -689,7 +691,7 @@ def _fill_run(value: Any, run: Run) -> Any:
     return value
 
 
-def _refuse_open_network(plan: Plan, host: str | None) -> None:
+def _refuse_open_network(plan: ResolvedGraph, host: str | None) -> None:
     if host is not None and host not in plan.hosts:
         raise BadInputError(
             [Problem("--host", (), f'unknown host "{host}"', f"there are: {', '.join(plan.hosts)}")]
@@ -708,7 +710,7 @@ def _refuse_open_network(plan: Plan, host: str | None) -> None:
             )
 
 
-def _check_ports(plan: Plan, host: str | None) -> None:
+def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
     """Every TCP port that this launcher's processes will listen on must be free."""
     wanted = [
         (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))

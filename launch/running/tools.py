@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from flexsheet.launch.plans.planned import MAIN, Plan, tools_on
+from flexsheet.launch.plans.plan_model import MAIN, ResolvedGraph, tools_on
 from flexsheet.launch.running.runs import Run, local_endpoints, local_sources, ring_file
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Handler, Problem, Publisher, Subscriber
@@ -38,24 +38,24 @@ class Counts:
     rejected: int = 0
 
 
-def host_of(run: Run) -> str:
+def tools_host(run: Run) -> str:
     """The host whose tools we are."""
     return run.host or MAIN
 
 
-def topics_for_tools(plan: Plan, host: str = MAIN) -> list[str]:
+def topics_for_tools(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
     """Topics that a tool on a host may write in this plan."""
     return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
 
-def keys_of(plan: Plan, run: Run) -> KeyRing | None:
+def load_tool_keys(plan: ResolvedGraph, run: Run) -> KeyRing | None:
     """The keys of the host where we are; None where the plan has none."""
-    return KeyRing(ring_file(run, host_of(run))) if plan.keys else None
+    return KeyRing(ring_file(run, tools_host(run))) if plan.keys else None
 
 
-def subscriber_to(
+def make_subscriber(
     topic: str,
-    plan: Plan,
+    plan: ResolvedGraph,
     run: Run,
     on_message: Handler,
     *,
@@ -66,12 +66,12 @@ def subscriber_to(
     wanted = topic_named(topic)
     return Subscriber(
         wanted,
-        local_sources(run, plan.sources_to_read(topic, host_of(run))),
+        local_sources(run, plan.sources_to_read(topic, tools_host(run))),
         on_message,
         Counts(),
         on_problem=on_problem,
         unopened=unopened,
-        keys=keys_of(plan, run),
+        keys=load_tool_keys(plan, run),
         # Who does not run our plan must be seen most of all.
         plan=None if wanted.message in (Status, HostStatus) else plan.hash,
     )
@@ -89,7 +89,7 @@ async def read_topic(
     import structlog
 
     arrived: asyncio.Queue[tuple[Message, Header]] = asyncio.Queue()
-    subscriber = subscriber_to(
+    subscriber = make_subscriber(
         topic,
         graph.plan,
         graph.run,
@@ -104,19 +104,19 @@ async def read_topic(
         subscriber.close()
 
 
-class ToolsWriter:
+class GraphWriter:
     """Publishers for some topics of a running graph; needs a running loop.
 
     Raises BadInputError for a topic that is a node's, BusError when another tool writes it now.
     """
 
-    def __init__(self, plan: Plan, run: Run, topics: Iterable[str]) -> None:
+    def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
         self._clock = SystemClock()
         self._epoch, self._plan = self._clock.now_ns(), plan.hash
-        keys = keys_of(plan, run)
+        keys = load_tool_keys(plan, run)
         self._sequences: dict[str, int] = {}
         self._publishers: dict[str, Publisher] = {}
-        self._name, host = tools_on(host_of(run)), host_of(run)
+        self._name, host = tools_on(tools_host(run)), tools_host(run)
         try:
             for name in topics:
                 writer = plan.writer(name, self._name)
@@ -150,7 +150,7 @@ class ToolsWriter:
             publisher.close()
 
 
-def _refusal(plan: Plan, topic: str, host: str) -> BadInputError:
+def _refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
     """Why tools on a host do not write a topic, and who may."""
     from flexsheet.launch.plans import documents
 
@@ -160,9 +160,9 @@ def _refusal(plan: Plan, topic: str, host: str) -> BadInputError:
         what = f'topic "{topic}" is not for tools on this computer, host "{host}"'
         remedy = f'say it on host "{MAIN}" ({plan.hosts[MAIN]}); from here: {may}'
     else:
-        key = ("from_tools",)
+        key = ("external_topics",)
         owners = ", ".join(one.name for one in plan.writers.get(topic, ()))
         what = f'topic "{topic}" '
         what += f"is written by {owners}" if owners else "is not part of the graph"
-        remedy = f'list it in "from_tools"; open are: {may}'
+        remedy = f'list it in "external_topics"; open are: {may}'
     return documents.BadInputError([documents.Problem(plan.launch_file, key, what, remedy)])

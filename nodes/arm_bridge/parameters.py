@@ -11,12 +11,13 @@ from flexsheet.messages.scene import NonNegative, Positive
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.link_drivers import Driver
 from flexsheet.nodes.node import NodeParameters
+from flexsheet.nodes.parameter_marks import DeviceHost, DevicePort
 
 
 class ArmBridgeParameters(NodeParameters):
     side: Side
-    host: str = "127.0.0.1"
-    port: int = Field(default=5020, ge=1, le=65535)
+    host: DeviceHost = "127.0.0.1"
+    port: DevicePort = 5020
     rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0)
     resting_rate_hz: float = Field(
         default=40.0, ge=20.0, le=1000.0, description="while idle, until it is made ready"

@@ -11,6 +11,7 @@ from pydantic import Field
 from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Positive, Scene, StereoCamera
 from flexsheet.messages.types import StereoPair
+from flexsheet.nodes import NodeRole
 from flexsheet.nodes.camera.devices import ReaderThread, open_reader
 from flexsheet.nodes.camera.image_pair import (
     DeviceError,
@@ -45,6 +46,7 @@ class CameraParameters(NodeParameters):
 class Camera(Node):
     """Publish stereo pairs with the time of their exposure."""
 
+    role: ClassVar[NodeRole | None] = NodeRole.CAMERA
     opens_devices: ClassVar[bool] = True
 
     parameters: CameraParameters

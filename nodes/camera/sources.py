@@ -9,6 +9,7 @@ from pydantic import BeforeValidator, ConfigDict, Field
 
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.scene import Finite, NonNegative, Positive
+from flexsheet.nodes.parameter_marks import DeviceFile
 
 
 class Source(LimitedModel):
@@ -31,8 +32,12 @@ class OpenCvSource(Source):
     """
 
     kind: Literal["opencv"]
-    left: int | str = Field(description="the left camera, or the one that gives both side by side")
-    right: int | str | None = Field(default=None, description="null: left gives both side by side")
+    left: int | DeviceFile = Field(
+        description="the left camera, or the one that gives both side by side"
+    )
+    right: int | DeviceFile | None = Field(
+        default=None, description="null: left gives both side by side"
+    )
     api: Literal["v4l2", "ximea", "aravis", "any"] | None = Field(
         default=None,
         description="OpenCV's backend; null: v4l2 for numbers and paths under /dev, else any",

@@ -22,7 +22,8 @@ from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.guard import Guard, read_token, start_server
 from flexsheet.nodes.console.newest import Newest
 from flexsheet.nodes.console.operator import Operator
-from flexsheet.nodes.node import Input, ListenPort, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.parameter_marks import ListenPort
 
 SHOWN = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),

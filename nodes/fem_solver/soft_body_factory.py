@@ -111,7 +111,7 @@ class SoftBodyFactory:
         if not waits_for_table or self.friction_ratio > 0.0 or len(made) > 1:
             return ""
         return (
-            "; the scene's nonlinear table is not computed yet (flexsheet prepare SCENE "
+            "; the scene's nonlinear table is not computed yet (flexsheet precompute SCENE "
             f"--skin-spacing {self.skin_spacing_m:g})"
         )
 

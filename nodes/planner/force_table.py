@@ -94,5 +94,5 @@ def law_by(
     if table is None:
         return ScaledSheetModel(
             rubber
-        ), "scaled; there is no table of the sheet's force: run flexsheet prepare"
+        ), "scaled; there is no table of the sheet's force: run flexsheet precompute"
     return table, method

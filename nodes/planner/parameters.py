@@ -11,6 +11,7 @@ from flexsheet.messages.methods import SheetForceMethod
 from flexsheet.messages.scene import NonNegative, Positive
 from flexsheet.nodes.models.motion import SheetBounds
 from flexsheet.nodes.node import NodeParameters
+from flexsheet.nodes.parameter_marks import SheetCalibrationFile
 from flexsheet.nodes.planner.easing import JerkBounds
 from flexsheet.nodes.planner.motion import PlanSettings
 from flexsheet.nodes.planner.yielding import Presents
@@ -30,7 +31,7 @@ class PlannerParameters(NodeParameters):
         description="of the object: its force curve, by stretch and by yielding along the normal; "
         "or its stiffness, by stretch alone, as the paper does",
     )
-    sheet_calibration: Path | None = Field(
+    sheet_calibration: SheetCalibrationFile | None = Field(
         default=None, description="from calibrate sheet; null: ideal rubber of the scene's modulus"
     )
     sheet_force: SheetForceMethod | Literal["auto"] = Field(

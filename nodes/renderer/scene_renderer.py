@@ -61,7 +61,7 @@ MIN_REPORTED_FRACTION = 0.005
 """A smaller occluded fraction is not reported."""
 NO_SHAPES_NOTE = (
     "no deflection shapes in the cache: a pushed sheet is drawn as four triangles "
-    "(flexsheet prepare)"
+    "(flexsheet precompute)"
 )
 
 GRID_WINDOW = ScreenRectangle(-0.151, -0.151, 0.302, 0.302)

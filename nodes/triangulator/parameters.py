@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -10,12 +9,13 @@ from pydantic import Field
 from flexsheet.messages.methods import MarkerMethod, TrackingMethod, TriangulationMethod
 from flexsheet.messages.scene import Positive
 from flexsheet.nodes.node import NodeParameters
+from flexsheet.nodes.parameter_marks import CameraCalibrationFile
 
 
 class TriangulatorParameters(NodeParameters):
     """Hold how the marker is detected, triangulated and tracked."""
 
-    calibration: Path | None = Field(
+    calibration: CameraCalibrationFile | None = Field(
         default=None,
         description="file of `flexsheet calibrate stereo`; null takes the scene's optics",
     )

@@ -13,7 +13,8 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import ArmSpec, NonNegative, Positive, Scene
 from flexsheet.messages.types import TwinArms
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
-from flexsheet.nodes.node import Input, ListenPort, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.parameter_marks import ListenPort
 from flexsheet.nodes.twin.arms import (
     RANGE_RAD,
     ArmServer,

@@ -114,8 +114,7 @@ def _graph(session: Session) -> dict[str, Any] | None:
     calibrations = {
         f"{node.name}.{key}": value
         for node in plan.nodes.values()
-        for key, value in node.parameters.items()
-        if "calibration" in key and value
+        for key, value in node.calibrations.items()
     }
     return {
         "launch_file": plan.launch_file,

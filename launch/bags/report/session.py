@@ -17,7 +17,7 @@ from flexsheet.launch.bags.report.album import Album
 from flexsheet.launch.bags.report.series import Events, Grid, Moments, Places, Range, Spread, States
 from flexsheet.launch.bags.report.strokes import SheetErrors
 from flexsheet.launch.experiments.stroke import events_of
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.bag import BagError, BagInfo, BagReader
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.busy import is_busy
@@ -435,9 +435,9 @@ def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -
     return session
 
 
-def _plan_of(reader: BagReader) -> Plan | None:
+def _plan_of(reader: BagReader) -> ResolvedGraph | None:
     try:
-        return Plan.model_validate_json(reader.attachment("plan.json"))
+        return ResolvedGraph.model_validate_json(reader.attachment("plan.json"))
     except (BagError, ValidationError):
         return None  # a bag of one's own making, or of other code: the page says that it is missing
 

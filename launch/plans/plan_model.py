@@ -27,6 +27,7 @@ RUN_DIRECTORY = "@run"
 
 ROLES_OF_TYPES = {
     "arm_bridge": NodeRole.ARM_BRIDGE,
+    "camera": NodeRole.CAMERA,
     "clock": NodeRole.CLOCK,
     "console": NodeRole.CONSOLE,
     "recorder": NodeRole.RECORDER,
@@ -34,6 +35,10 @@ ROLES_OF_TYPES = {
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
 """Roles of the node types that plans in bags name, from before plans held roles."""
+
+
+OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
+"""Parameters that hold calibration files in plans from before plans listed calibrations."""
 
 
 class Strict(LimitedModel):
@@ -77,7 +82,7 @@ class Writer(Strict):
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
 
 
-class PlannedPort(Strict):
+class ResolvedPort(Strict):
     """A port, its topic, and the endpoints: bound for an output, connected to for an input."""
 
     port: str
@@ -85,18 +90,23 @@ class PlannedPort(Strict):
     endpoints: tuple[str, ...]
 
 
-class PlannedNode(Strict):
+class ResolvedNode(Strict):
     """All that is needed to start one node."""
 
     name: str
     type: str
     host: str
     parameters: dict[str, Any]
-    inputs: tuple[PlannedPort, ...]
-    outputs: tuple[PlannedPort, ...]
+    inputs: tuple[ResolvedPort, ...]
+    outputs: tuple[ResolvedPort, ...]
     restart: RestartSpec
     start_deadline_s: float
     listen_ports: tuple[int, ...] = Field(default=(), description="TCP, on loopback")
+    device_address: str | None = Field(
+        default=None, description='"host:port" of the device that the node controls'
+    )
+    device_files: tuple[str, ...] = Field(default=(), description="paths that the node opens")
+    calibrations: dict[str, str] = Field(default={}, description="file by parameter")
     role: NodeRole | None = Field(default=None, description="declared by the node's class")
     liveness_s: float | None = Field(default=None, description="none in bags from before")
     nice: int = Field(default=0, description="bags from before there was one have none")
@@ -107,22 +117,25 @@ class PlannedNode(Strict):
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
 
-    @property
-    def device_address(self) -> str | None:
-        """Where the node reaches its device, "host:port"; None: its parameters do not say."""
-        host, port = self.parameters.get("host"), self.parameters.get("port")
-        return None if host is None or port is None else f"{host}:{port}"
-
     @model_validator(mode="before")
     @classmethod
-    def _add_role(cls, values: Any) -> Any:
-        """Give nodes of plans from before there were roles the role of their type."""
-        if isinstance(values, dict) and "role" not in values:
-            return {**values, "role": ROLES_OF_TYPES.get(str(values.get("type")))}
-        return values
+    def _add_missing_fields(cls, values: Any) -> Any:
+        """Derive the fields that plans in older bags lack: role, device address, calibrations."""
+        if not isinstance(values, dict):
+            return values
+        derived: dict[str, Any] = {"role": ROLES_OF_TYPES.get(str(values.get("type")))}
+        parameters = values.get("parameters")
+        if isinstance(parameters, dict):
+            host, port = parameters.get("host"), parameters.get("port")
+            if host is not None and port is not None:
+                derived["device_address"] = f"{host}:{port}"
+            derived["calibrations"] = {
+                name: parameters[name] for name in OLD_CALIBRATIONS if parameters.get(name)
+            }
+        return {**derived, **values}
 
 
-class Plan(Strict):
+class ResolvedGraph(Strict):
     """A resolved launch file."""
 
     launch_file: str
@@ -131,7 +144,7 @@ class Plan(Strict):
     scene_text: str
     scene: dict[str, Any] | None
     hosts: dict[str, str] = Field(description="address by name")
-    nodes: dict[str, PlannedNode]
+    nodes: dict[str, ResolvedNode]
     writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
     keys: dict[str, str] = Field(default={}, description="public key by host; no part of the hash")
     estop_resetters: tuple[str, ...] = Field(default=(MAIN,), description="hosts that may")
@@ -157,7 +170,7 @@ class Plan(Strict):
             if writer.host in self.estop_resetters
         )
 
-    def nodes_on(self, host: str | None) -> list[PlannedNode]:
+    def nodes_on(self, host: str | None) -> list[ResolvedNode]:
         """The nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 

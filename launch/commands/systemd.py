@@ -1,4 +1,4 @@
-"""`flexsheet service`: run one host of a launch file under systemd."""
+"""`flexsheet systemd`: run one host of a launch file under systemd."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ USER_PATTERN = "abcdefghijklmnopqrstuvwxyz0123456789_-"
 
 
 @app.callback()
-def service() -> None:
-    """One host of a launch file as a systemd service."""
+def systemd() -> None:
+    """Run one host of a launch file as a systemd service."""
 
 
 @app.command(
     epilog=examples(
-        "flexsheet service install /etc/flexsheet/lab.yaml --host arm_left --dry-run",
-        "sudo flexsheet service install /etc/flexsheet/lab.yaml --host arm_left",
+        "flexsheet systemd install /etc/flexsheet/lab.yaml --host arm_left --dry-run",
+        "sudo flexsheet systemd install /etc/flexsheet/lab.yaml --host arm_left",
     )
 )
 def install(
@@ -45,10 +45,10 @@ def install(
     as_json: JsonOption = False,
 ) -> None:
     """Write flexsheet@.service, the host's environment and settings for TCP; start nothing."""
-    from flexsheet.launch.plans.plan import load_plan
-    from flexsheet.launch.running.service import STATE, bags_of, files_of
+    from flexsheet.launch.plans.plan import load_graph
+    from flexsheet.launch.running.systemd_unit import STATE, files_of, list_bags
 
-    plan = load_plan(launch_file)
+    plan = load_graph(launch_file)
     if host not in plan.hosts:
         raise CommandError(
             f'{launch_file}: there is no host "{host}"; there are: {", ".join(plan.hosts)}',
@@ -56,7 +56,7 @@ def install(
         )
     if not user or set(user) - set(USER_PATTERN):
         raise CommandError(f'--user "{user}" is no name of a user', BAD_INPUT)
-    for bag in bags_of(plan, host):
+    for bag in list_bags(plan, host):
         if not bag.is_relative_to(STATE):
             words.print(
                 f"{bag} cannot be recorded: the service may write to {STATE} only; change the "

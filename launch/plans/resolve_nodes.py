@@ -18,7 +18,7 @@ from flexsheet.launch.plans.documents import (
 )
 from flexsheet.launch.plans.hosts import clock_node, is_loopback
 from flexsheet.launch.plans.launch_file import RECORDER_NICE, ClocksSpec, LaunchFile, NodeSpec
-from flexsheet.launch.plans.planned import LAUNCHER, RUN_DIRECTORY, TOOLS, PlannedPort, tools_on
+from flexsheet.launch.plans.plan_model import LAUNCHER, RUN_DIRECTORY, TOOLS, ResolvedPort, tools_on
 from flexsheet.messages.calibration import load_calibration, refuse_other_camera
 from flexsheet.messages.calibration_file import CalibrationFileError, CalibrationMismatchError
 from flexsheet.messages.scene import Scene
@@ -26,6 +26,7 @@ from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.nodes import NODES, UnknownNodeError, node_class
 from flexsheet.nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
+from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
 """What a run's directory has files of, beside one named after each node."""
@@ -34,7 +35,7 @@ _PARAMETERS_THEMSELVES: tuple[Key, ...] = (("record",), ("clocks",))
 """Keys of the launch file that hold a node's parameters; other nodes have them one key deeper."""
 
 
-class Member:
+class NodeEntry:
     """A node under check: its spec, class, ports with their topics, and validated parameters."""
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
@@ -51,18 +52,20 @@ class Member:
             found += [(f"in/{topic.name}", topic) for topic in self.further_inputs]
         return found
 
-    def unconnected_ports(self, direction: str) -> tuple[PlannedPort, ...]:
+    def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:
         return tuple(
-            PlannedPort(port=port.name, topic=topic.name, endpoints=())
+            ResolvedPort(port=port.name, topic=topic.name, endpoints=())
             for port, topic in self.unconnected
             if port.direction == direction
         )
 
 
-def members_of(spec: LaunchFile, document: Document, problems: list[Problem]) -> list[Member]:
-    members = []
+def collect_entries(
+    spec: LaunchFile, document: Document, problems: list[Problem]
+) -> list[NodeEntry]:
+    entries = []
     for name, node_spec in spec.nodes.items():
-        members.append(Member(name, node_spec, ("nodes", name)))
+        entries.append(NodeEntry(name, node_spec, ("nodes", name)))
         taken = (*map(tools_on, spec.hosts), *map(clock_node, spec.hosts), TOOLS, *RUN_FILES)
         if name in taken or name.partition("_")[0] == LAUNCHER:
             problems.append(
@@ -76,7 +79,7 @@ def members_of(spec: LaunchFile, document: Document, problems: list[Problem]) ->
                     did_you_mean(node_spec.host, list(spec.hosts)),
                 )
             )
-    if not members:
+    if not entries:
         problems.append(document.problem(("nodes",), "there is no node", "add one"))
     if spec.record is not None:
         if "recorder" in spec.nodes:
@@ -89,26 +92,26 @@ def members_of(spec: LaunchFile, document: Document, problems: list[Problem]) ->
             )
         else:
             recorder = NodeSpec(type="recorder", parameters=spec.record, nice=RECORDER_NICE)
-            members.append(Member("recorder", recorder, ("record",)))
+            entries.append(NodeEntry("recorder", recorder, ("record",)))
     if len(spec.hosts) > 1:
-        members += [_clock_member(host, spec.clocks) for host in spec.hosts]
-    return members
+        entries += [_clock_entry(host, spec.clocks) for host in spec.hosts]
+    return entries
 
 
-def _clock_member(host: str, clocks: ClocksSpec) -> Member:
+def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
     node_spec = NodeSpec(
         type="clock",
         host=host,
         parameters=clocks.model_dump(),
         topics={"clock_ping_out": "clock_ping"},
     )
-    return Member(clock_node(host), node_spec, ("clocks",))
+    return NodeEntry(clock_node(host), node_spec, ("clocks",))
 
 
-def resolve_member(member: Member, document: Document, problems: list[Problem]) -> None:
-    """Find the member's class, connect its ports to topics, check its parameters."""
-    key = member.key
-    type_name = member.spec.type
+def resolve_entry(entry: NodeEntry, document: Document, problems: list[Problem]) -> None:
+    """Find the entry's class, connect its ports to topics, check its parameters."""
+    key = entry.key
+    type_name = entry.spec.type
     try:
         class_ = node_class(type_name)
     except UnknownNodeError:
@@ -130,14 +133,14 @@ def resolve_member(member: Member, document: Document, problems: list[Problem]) 
     if not (isinstance(class_, type) and issubclass(class_, Node)):
         problems.append(document.problem((*key, "type"), f'"{type_name}" is no node class'))
         return
-    member.type = class_
-    _connect_ports(member, class_, document, problems)
+    entry.type = class_
+    _connect_ports(entry, class_, document, problems)
 
     parameters_key = key if key in _PARAMETERS_THEMSELVES else (*key, "parameters")
     try:
-        member.parameters = parameters_of(class_).model_validate(member.spec.parameters)
+        entry.parameters = parameters_of(class_).model_validate(entry.spec.parameters)
     except ValidationError:
-        _put(document, parameters_key, member.spec.parameters)
+        _put(document, parameters_key, entry.spec.parameters)
         try:
             validate(parameters_of(class_), document, at=parameters_key)
         except BadInputError as error:
@@ -153,28 +156,28 @@ def _put(document: Document, key: Key, value: dict[str, Any]) -> None:
 
 
 def _connect_ports(
-    member: Member, class_: type[Node], document: Document, problems: list[Problem]
+    entry: NodeEntry, class_: type[Node], document: Document, problems: list[Problem]
 ) -> None:
     ports = ports_of(class_)
-    for name in member.spec.topics:
+    for name in entry.spec.topics:
         if name not in ports:
             problems.append(
                 document.problem(
-                    (*member.key, "topics", name),
-                    f'"{member.spec.type}" has no port "{name}"',
+                    (*entry.key, "topics", name),
+                    f'"{entry.spec.type}" has no port "{name}"',
                     did_you_mean(name, list(ports)),
                 )
             )
     for port in ports.values():
-        topic_name = member.spec.topics.get(port.name, port.name.replace("__", "/"))
+        topic_name = entry.spec.topics.get(port.name, port.name.replace("__", "/"))
         fitting = [one for one in TOPICS.values() if one.message is port.message]
         if topic_name is None and fitting:
-            member.unconnected.append((port, fitting[0]))
+            entry.unconnected.append((port, fitting[0]))
             continue
         topic_name = str(topic_name)
-        key = (*member.key, "topics", port.name)
+        key = (*entry.key, "topics", port.name)
         topic = TOPICS.get(topic_name)
-        if topic is None and port.name in member.spec.topics:
+        if topic is None and port.name in entry.spec.topics:
             problems.append(
                 document.problem(
                     key, f'unknown topic "{topic_name}"', did_you_mean(topic_name, list(TOPICS))
@@ -199,33 +202,33 @@ def _connect_ports(
                 )
             )
         else:
-            member.ports.append((port, topic))
+            entry.ports.append((port, topic))
 
 
-def check_wires(
-    members: list[Member], spec: LaunchFile, document: Document, problems: list[Problem]
+def check_device_hosts(
+    entries: list[NodeEntry], spec: LaunchFile, document: Document, problems: list[Problem]
 ) -> None:
-    """A device's own protocol knows no keys: it stays on the wire of the host it belongs to."""
-    for member in members:
-        address = getattr(member.parameters, "host", None)
-        if member.type is None or not member.type.opens_devices or not isinstance(address, str):
+    """Check that no device is reached across the network: device protocols are not encrypted."""
+    for entry in entries:
+        if entry.parameters is None:
             continue
-        for name, host in spec.hosts.items():
-            if host.address == address and name != member.spec.host and not is_loopback(address):
+        marked = find_marked(entry.parameters, ParameterMark.DEVICE_HOST)
+        for (key, address), (name, host) in product(marked.items(), spec.hosts.items()):
+            if host.address == address and name != entry.spec.host and not is_loopback(address):
                 problems.append(
                     document.problem(
-                        (*member.key, "parameters", "host"),
-                        f'{address} is host "{name}": what it says would cross the network '
-                        "without keys",
-                        f"run {member.name} there (host: {name})",
+                        (*entry.key, "parameters", *key),
+                        f'{address} is host "{name}": its data would cross the network '
+                        "without encryption",
+                        f"run {entry.name} there (host: {name})",
                     )
                 )
 
 
 def check_calibrations(
-    members: list[Member], scene: Scene | None, document: Document, problems: list[Problem]
+    entries: list[NodeEntry], scene: Scene | None, document: Document, problems: list[Problem]
 ) -> None:
-    """Parameters that name a calibration's file are read, and held against the scene."""
+    """Read the calibration files that parameters name, and compare them with the scene."""
 
     def check_camera(path: Path) -> None:
         measured = load_calibration(path)
@@ -237,30 +240,34 @@ def check_calibrations(
         if scene is not None:
             refuse_other_sheet(measured, scene.sheet)
 
-    checks = {"calibration": check_camera, "sheet_calibration": check_sheet}
-    for member, (name, check) in product(members, checks.items()):
-        calibration = getattr(member.parameters, name, None)
-        if not isinstance(calibration, Path):
+    checks = {
+        ParameterMark.CAMERA_CALIBRATION: check_camera,
+        ParameterMark.SHEET_CALIBRATION: check_sheet,
+    }
+    for entry, (mark, check) in product(entries, checks.items()):
+        if entry.parameters is None:
             continue
-        key = (*member.key, "parameters", name)
-        path = Path(_absolute(calibration, _base(document, key)))
-        try:
-            check(path)
-        except (CalibrationFileError, CalibrationMismatchError) as error:
-            said = str(error) if str(path) in str(error) else f"{path}: {error}"
-            problems.append(document.problem(key, said))
+        for marked, calibration in find_marked(entry.parameters, mark).items():
+            key = (*entry.key, "parameters", *marked)
+            path = Path(_absolute(calibration, _base(document, key)))
+            try:
+                check(path)
+            except CalibrationFileError as error:
+                problems.append(document.problem(key, str(error)))
+            except CalibrationMismatchError as error:
+                problems.append(document.problem(key, f"{path}: {error}"))
 
 
-def in_full(member: Member, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
+def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
     """The parameters in full, defaults too; paths that the file gives are relative to the file."""
-    assert member.parameters is not None  # a member without parameters is a problem
-    values = member.parameters.model_dump(mode="json")
+    assert entry.parameters is not None  # a entry without parameters is a problem
+    values = entry.parameters.model_dump(mode="json")
     if not resolve_paths:
         return values
-    section = member.key if member.key in _PARAMETERS_THEMSELVES else (*member.key, "parameters")
-    for name in member.parameters.model_fields_set:
+    section = entry.key if entry.key in _PARAMETERS_THEMSELVES else (*entry.key, "parameters")
+    for name in entry.parameters.model_fields_set:
         base = _base(document, (*section, name))
-        values[name] = _with_absolute_paths(getattr(member.parameters, name), values[name], base)
+        values[name] = _with_absolute_paths(getattr(entry.parameters, name), values[name], base)
     return values
 
 

@@ -1,4 +1,4 @@
-"""`flexsheet prepare`: works out beforehand what a scene's nodes keep in the cache."""
+"""`flexsheet precompute`: works out beforehand what a scene's nodes keep in the cache."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ app = typer.Typer(add_completion=False)
 
 @app.command(
     epilog=examples(
-        "flexsheet prepare launch/scenes/cylinder.yaml",
-        "flexsheet prepare launch/scenes/cylinder.yaml --skin-spacing 0.005",
+        "flexsheet precompute launch/scenes/cylinder.yaml",
+        "flexsheet precompute launch/scenes/cylinder.yaml --skin-spacing 0.005",
     )
 )
-def prepare(
+def precompute(
     scene_file: Annotated[
         Path,
         typer.Argument(metavar="SCENE", help="Scene file.", autocompletion=complete.yaml_files),
@@ -59,23 +59,23 @@ def prepare(
     Of a scene whose methods say sheet_force: table, that table as well: a minute or two.
     """
     from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.launch.running.prepare import (
+    from flexsheet.launch.running.precompute import (
         NoSoftBodyError,
-        prepare_dents,
-        prepare_force_table,
-        prepare_soft_body,
+        precompute_deflection_shapes,
+        precompute_force_table,
+        precompute_soft_body,
     )
 
     if scheduler is not None and skin_spacing_m is None:
         raise typer.BadParameter("is for the table of --skin-spacing", param_hint="--scheduler")
     scene = load_scene(scene_file)
     with progress_words() as progress:
-        files = {"dent_shapes": prepare_dents(scene, cache, progress)}
+        files = {"deflection_shapes": precompute_deflection_shapes(scene, cache, progress)}
         if scene.methods.sheet_force == "table":
-            files["force_table"] = prepare_force_table(scene, cache, progress)
+            files["force_table"] = precompute_force_table(scene, cache, progress)
         if skin_spacing_m is not None:
             try:
-                files["soft_body"] = prepare_soft_body(
+                files["soft_body"] = precompute_soft_body(
                     scene, skin_spacing_m, cache, scheduler, progress
                 )
             except NoSoftBodyError as error:

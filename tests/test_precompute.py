@@ -1,4 +1,4 @@
-"""`flexsheet prepare`: dents and the soft body's table, made before a scene is shown."""
+"""`flexsheet precompute`: dents and the soft body's table, made before a scene is shown."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ def scene_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
     monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
     monkeypatch.setattr(
-        "flexsheet.launch.running.prepare.prepare_dents", lambda scene, cache, progress: cache
+        "flexsheet.launch.running.precompute.precompute_deflection_shapes",
+        lambda scene, cache, progress: cache,
     )
     # other processes take seconds to start
     monkeypatch.setattr(precompute_table, "local_processes", lambda count: nullcontext(Here()))

@@ -9,8 +9,8 @@ from itertools import product
 from flexsheet.launch.plans.documents import Document, Problem, did_you_mean
 from flexsheet.launch.plans.hosts import launcher_on
 from flexsheet.launch.plans.launch_file import LaunchFile
-from flexsheet.launch.plans.members import Member
-from flexsheet.launch.plans.planned import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
+from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN, RUN_DIRECTORY, TOOLS, Writer, tools_on
+from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
 SAID_FROM_ANYWHERE = ("estop",)
@@ -23,9 +23,9 @@ FIRST_PORT, PORTS = 20_000, 10_000
 """TCP ports lie below the range that Linux gives to outgoing connections (32768 and up)."""
 
 
-def writers_of(
+def list_writers(
     spec: LaunchFile,
-    members: list[Member],
+    entries: list[NodeEntry],
     document: Document,
     problems: list[Problem],
     *,
@@ -33,33 +33,35 @@ def writers_of(
 ) -> dict[str, list[tuple[str, str]]]:
     """(writer, host) of every topic, in the order of the file."""
     writers: dict[str, list[tuple[str, str]]] = {}
-    has_editor = any(topic.name == "scene" for one in members for _, topic in one.topics("output"))
+    has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
     if has_scene and not has_editor:
         writers["scene"] = [(LAUNCHER, MAIN)]
-    for member in members:
-        for port_name, topic in member.topics("output"):
+    for entry in entries:
+        for port_name, topic in entry.topics("output"):
             others = [name for name, _ in writers.get(topic.name, [])]
-            if others and (not topic.many_writers or member.name in others):
+            if others and (not topic.many_writers or entry.name in others):
                 problems.append(
                     document.problem(
-                        (*member.key, "topics", port_name),
+                        (*entry.key, "topics", port_name),
                         f'topic "{topic.name}" is written by "{others[0]}" already',
                         "a topic has one writer",
                     )
                 )
             else:
-                writers.setdefault(topic.name, []).append((member.name, member.spec.host))
-    for i, name in enumerate(spec.from_tools):
+                writers.setdefault(topic.name, []).append((entry.name, entry.spec.host))
+    for i, name in enumerate(spec.external_topics):
         if name not in TOPICS:
             problems.append(
                 document.problem(
-                    ("from_tools", i), f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
+                    ("external_topics", i),
+                    f'unknown topic "{name}"',
+                    did_you_mean(name, list(TOPICS)),
                 )
             )
         elif name in writers and not TOPICS[name].many_writers:
             problems.append(
                 document.problem(
-                    ("from_tools", i),
+                    ("external_topics", i),
                     f'topic "{name}" is written by "{writers[name][0][0]}" already',
                     "a topic has one writer",
                 )
@@ -78,52 +80,52 @@ def writers_of(
 
 
 def resolve_further_inputs(
-    members: list[Member],
+    entries: list[NodeEntry],
     writers: dict[str, list[tuple[str, str]]],
     document: Document,
     problems: list[Problem],
 ) -> None:
-    """Ask the members that subscribe by their parameters (the recorder) which topics they want."""
+    """Ask the entries that subscribe by their parameters (the recorder) which topics they want."""
     written = [topic for topic in TOPICS.values() if topic.name in writers]
-    for member in members:
-        if member.type is None or member.parameters is None:
+    for entry in entries:
+        if entry.type is None or entry.parameters is None:
             continue
-        for name in member.type.further_inputs(member.parameters, written):
+        for name in entry.type.further_inputs(entry.parameters, written):
             if name in TOPICS:
-                member.further_inputs.append(TOPICS[name])
+                entry.further_inputs.append(TOPICS[name])
             else:
                 problems.append(
                     document.problem(
-                        member.key, f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
+                        entry.key, f'unknown topic "{name}"', did_you_mean(name, list(TOPICS))
                     )
                 )
 
 
 def check_inputs(
-    members: list[Member],
+    entries: list[NodeEntry],
     writers: dict[str, list[tuple[str, str]]],
     document: Document,
     problems: list[Problem],
 ) -> None:
-    for member in members:
-        for port_name, topic in member.topics("input"):
+    for entry in entries:
+        for port_name, topic in entry.topics("input"):
             if topic.name not in writers:
                 remedy = (
                     'name a scene file in "scene"'
                     if topic.name == "scene"
-                    else 'add the node that does, list it in "from_tools" for a tool to write, '
-                    f"or leave the port out with topics: {{{port_name}: null}}"
+                    else 'add a node that writes it, list it in "external_topics" if a tool '
+                    f"writes it, or disconnect the port with topics: {{{port_name}: null}}"
                 )
                 problems.append(
                     document.problem(
-                        (*member.key, "topics", port_name),
-                        f'nobody writes topic "{topic.name}"',
+                        (*entry.key, "topics", port_name),
+                        f'no node writes topic "{topic.name}"',
                         remedy,
                     )
                 )
 
 
-def endpoints_of(
+def make_endpoints(
     writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
 ) -> dict[str, tuple[Writer, ...]]:
     """The endpoints of every writer: ipc for its host, tcp where there are others.

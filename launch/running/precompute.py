@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.methods import SheetShapeMethod, chosen
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole
@@ -25,14 +25,14 @@ class NoSoftBodyError(RuntimeError):
     """The soft body of a scene cannot be computed; the text gives the reason and a remedy."""
 
 
-def prepare_plan(plan: Plan, progress: Progress) -> None:
+def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
     """Compute the deflection shapes of the plan's scene, for each of its renderers."""
     scene = plan.scene_message()
     if scene is None:
         return
     for node in plan.nodes.values():
         if node.role is NodeRole.RENDERER and _takes_dents(scene, node.parameters["sheet_shape"]):
-            prepare_dents(scene, node.parameters["cache_dir"], progress)
+            precompute_deflection_shapes(scene, node.parameters["cache_dir"], progress)
 
 
 def _takes_dents(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
@@ -41,7 +41,9 @@ def _takes_dents(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) ->
     return shape == "reduced_order"
 
 
-def prepare_dents(scene: Scene, cache_dir: Path | str | None, progress: Progress) -> Path:
+def precompute_deflection_shapes(
+    scene: Scene, cache_dir: Path | str | None, progress: Progress
+) -> Path:
     """Return the file with the deflection shapes of a scene's sheet, computed if it does not exist.
 
     Where the membrane has no equilibrium, that is reported, and the renderer uses four triangles.
@@ -71,7 +73,7 @@ def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]
     return on_progress
 
 
-def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
+def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
     """Return the file with the table of a scene's sheet force, computed if it does not exist.
 
     Raises NoEquilibriumError for a sheet of which the membrane finds none.
@@ -83,7 +85,7 @@ def prepare_force_table(scene: Scene, cache_dir: Path | None, progress: Progress
     return force_table.table_cache(scene).path(cache_dir)
 
 
-def prepare_soft_body(
+def precompute_soft_body(
     scene: Scene,
     skin_spacing_m: float,
     cache_dir: Path | None,

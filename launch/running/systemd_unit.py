@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from flexsheet.launch.plans.planned import Plan
+from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.nodes import NodeRole
 
 TEMPLATE = Path(__file__).parent.parent / "systemd" / "flexsheet@.service"
@@ -19,7 +19,7 @@ STATE = Path("/var/lib/flexsheet")
 """Where the service may write and what is there stays."""
 
 
-def bags_of(plan: Plan, host: str) -> Iterator[Path]:
+def list_bags(plan: ResolvedGraph, host: str) -> Iterator[Path]:
     """Where a host's recorders put what they record."""
     for node in plan.nodes_on(host):
         if node.role is NodeRole.RECORDER:

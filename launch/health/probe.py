@@ -1,0 +1,267 @@
+"""Probe every host of a graph over the network, from one of them.
+
+A running launcher reports the state of its host on the topics `host`, `status`, `clocks` and its
+arm's.  For a host that does not report, the probe finds how far a connection gets.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import socket
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Any
+
+import zmq
+from zmq.utils.monitor import parse_monitor_message
+
+from flexsheet.launch.plans.hosts import is_loopback, launcher_on
+from flexsheet.launch.plans.plan_model import ResolvedGraph, Writer
+from flexsheet.launch.running.runs import Run, local_sources
+from flexsheet.messages.base import Header
+from flexsheet.messages.bus import Source, Subscriber
+from flexsheet.messages.security import KeyRing
+from flexsheet.messages.topics import topic_named
+from flexsheet.messages.types import ArmState, Clocks, HostStatus, Status
+from flexsheet.nodes import NodeRole
+from flexsheet.nodes.node import PortCounts
+
+CONNECT_S = 4.0
+"""Exceeds the three seconds after which the kernel reports that no host has the address."""
+
+HANDSHAKE_S = 3.0
+MIN_LISTEN_S = 1.2
+"""Nodes publish the rates of their last second once a second."""
+
+POLL_PERIOD_S = 0.02
+SSH_PORT = 22
+"""A reply from this port, open or closed, shows that the host is on."""
+
+
+class Reachability(StrEnum):
+    """How far a connection to a host's launcher gets."""
+
+    RESPONDING = "responding"
+    LOCAL = "local"
+    """This computer, where no graph runs."""
+    NO_ROUTE = "no_route"
+    UNREACHABLE = "unreachable"
+    """No host has the address."""
+    NO_REPLY = "no_reply"
+    BLOCKED = "blocked"
+    """The host is on, but a firewall drops packets to the port."""
+    CLOSED = "closed"
+    HANDSHAKE_TIMEOUT = "handshake_timeout"
+    KEY_MISMATCH = "key_mismatch"
+    """The host does not have the key that the launch file gives for it."""
+    KEY_REJECTED = "key_rejected"
+    """The host does not accept our key."""
+    UNENCRYPTED = "unencrypted"
+    NO_RESPONSE = "no_response"
+    """The handshake succeeded, but no host status arrived."""
+    OWN_KEY_INVALID = "own_key_invalid"
+    """Our own key cannot be used, so the host was not asked."""
+
+
+HANDSHAKES: dict[int, Reachability] = {
+    zmq.EVENT_HANDSHAKE_SUCCEEDED: Reachability.RESPONDING,
+    zmq.EVENT_HANDSHAKE_FAILED_AUTH: Reachability.KEY_REJECTED,
+    zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL: Reachability.UNENCRYPTED,
+    zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL: Reachability.KEY_MISMATCH,
+}
+
+
+@dataclass(slots=True)
+class HostProbe:
+    """Hold what one host reported, and the problems that reading it met.
+
+    refused: messages that were not accepted.  failed_handshakes: connections that did not prove
+    their key though an earlier one did.
+    """
+
+    host: str
+    reachability: Reachability
+    status: HostStatus | None = None
+    clock_id: str = ""
+    nodes: dict[str, Status] = field(default_factory=dict)
+    clocks: Clocks | None = None
+    arms: dict[str, ArmState] = field(default_factory=dict)
+    refused: list[str] = field(default_factory=list)
+    failed_handshakes: list[str] = field(default_factory=list)
+
+
+async def probe_all(
+    plan: ResolvedGraph, *, here: str, keys: KeyRing | None, run: Run | None, timeout_s: float
+) -> dict[str, HostProbe]:
+    """Probe all hosts at once and return the results by host.
+
+    here: the host that asks.  keys: its keys; None if there are none or they cannot be used.
+    run: its running graph; None if none runs.
+    """
+    probes = await asyncio.gather(
+        *(
+            _probe_local(plan, host, run, timeout_s)
+            if host == here
+            else _probe_remote(plan, host, here, keys, timeout_s)
+            for host in plan.hosts
+        )
+    )
+    return {probe.host: probe for probe in probes}
+
+
+async def _probe_local(
+    plan: ResolvedGraph, host: str, run: Run | None, timeout_s: float
+) -> HostProbe:
+    if run is None:
+        return HostProbe(host, Reachability.LOCAL)
+
+    def find_source(writer: Writer) -> Source:
+        return local_sources(run, [writer.source_for(host)])[0]
+
+    probe = HostProbe(host, Reachability.RESPONDING)
+    await _listen(plan, probe, None, find_source, timeout_s)
+    return probe
+
+
+async def _probe_remote(
+    plan: ResolvedGraph, host: str, here: str, keys: KeyRing | None, timeout_s: float
+) -> HostProbe:
+    writer = plan.writer("host", launcher_on(host))
+    # A graph of several hosts has a TCP endpoint for each writer.
+    assert writer is not None
+    assert writer.tcp is not None
+    address, port = plan.hosts[host], int(writer.tcp.rpartition(":")[2])
+    reachability = await probe_port(address, port)
+    if reachability is not Reachability.RESPONDING:
+        return HostProbe(host, reachability)
+    if keys is None and (plan.keys or not is_loopback(address)):
+        return HostProbe(host, Reachability.OWN_KEY_INVALID)
+    probe = HostProbe(host, await _try_handshake(writer.tcp, host, keys))
+    if probe.reachability is Reachability.RESPONDING:
+        await _listen(plan, probe, keys, lambda one: one.source_for(here), timeout_s)
+    return probe
+
+
+async def probe_port(address: str, port: int) -> Reachability:
+    """Return how far a TCP connection to a port gets; RESPONDING if it is accepted."""
+    number = await _connect(address, port)
+    if number == 0:
+        return Reachability.RESPONDING
+    if number == errno.ECONNREFUSED:
+        return Reachability.CLOSED
+    if number == errno.ENETUNREACH:
+        return Reachability.NO_ROUTE
+    if await _connect(address, SSH_PORT) in (0, errno.ECONNREFUSED):
+        return Reachability.BLOCKED
+    return Reachability.UNREACHABLE if number == errno.EHOSTUNREACH else Reachability.NO_REPLY
+
+
+async def _connect(address: str, port: int) -> int:
+    """Return the error number of a TCP connection attempt; 0 if it succeeded."""
+    family = socket.AF_INET6 if ":" in address else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            async with asyncio.timeout(CONNECT_S):
+                await asyncio.get_running_loop().sock_connect(probe, (address, port))
+        except OSError as error:
+            # TimeoutError is an OSError without a number.
+            return error.errno or errno.ETIMEDOUT
+    return 0
+
+
+async def _try_handshake(endpoint: str, host: str, keys: KeyRing | None) -> Reachability:
+    """Return whether both ends prove their keys."""
+    opened: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.SUB)
+    opened.setsockopt(zmq.LINGER, 0)
+    monitor = opened.get_monitor_socket(sum(HANDSHAKES))
+    try:
+        if keys is not None:
+            keys.seek(opened, host)
+        opened.connect(endpoint)
+        for _ in range(round(HANDSHAKE_S / POLL_PERIOD_S)):
+            try:
+                event = parse_monitor_message(monitor.recv_multipart(zmq.NOBLOCK))
+            except zmq.Again:
+                await asyncio.sleep(POLL_PERIOD_S)
+                continue
+            return HANDSHAKES[int(event["event"])]
+    finally:
+        opened.disable_monitor()
+        monitor.close(linger=0)
+        opened.close(linger=0)
+    return Reachability.HANDSHAKE_TIMEOUT
+
+
+async def _listen(
+    plan: ResolvedGraph,
+    probe: HostProbe,
+    keys: KeyRing | None,
+    find_source: Callable[[Writer], Source],
+    timeout_s: float,
+) -> None:
+    """Read what a host publishes until all expected messages arrived, at most `timeout_s`.
+
+    Without a host status the probe becomes NO_RESPONSE.
+    """
+
+    def on_host(status: HostStatus, header: Header) -> None:
+        probe.status, probe.clock_id = status, header.clock_id
+
+    def on_status(status: Status, _: Header) -> None:
+        probe.nodes[status.node] = status
+
+    def on_clocks(clocks: Clocks, _: Header) -> None:
+        probe.clocks = clocks
+
+    def on_arm(arm: ArmState, _: Header) -> None:
+        probe.arms[arm.side] = arm
+
+    handlers: dict[str, Callable[[Any, Header], None]] = {
+        "host": on_host,
+        "status": on_status,
+        "clocks": on_clocks,
+        "arm_left": on_arm,
+        "arm_right": on_arm,
+    }
+    subscribers = []
+    for topic, handler in handlers.items():
+        own = [one for one in plan.writers.get(topic, ()) if one.host == probe.host]
+        if own:
+            subscribers.append(
+                Subscriber(
+                    topic_named(topic),
+                    [find_source(one) for one in own],
+                    handler,
+                    PortCounts(),
+                    on_problem=probe.refused.append,
+                    on_handshake_failed=probe.failed_handshakes.append,
+                    keys=keys,
+                )
+            )
+    try:
+        for subscriber in subscribers:
+            subscriber.start()
+        await asyncio.sleep(MIN_LISTEN_S)
+        for _ in range(round(max(0.0, timeout_s - MIN_LISTEN_S) / POLL_PERIOD_S)):
+            if _is_complete(plan, probe):
+                break
+            await asyncio.sleep(POLL_PERIOD_S)
+    finally:
+        for subscriber in subscribers:
+            subscriber.close()
+    if probe.status is None:
+        probe.reachability = Reachability.NO_RESPONSE
+
+
+def _is_complete(plan: ResolvedGraph, probe: HostProbe) -> bool:
+    """Return whether all that the host's nodes publish for the doctor has arrived."""
+    nodes = plan.nodes_on(probe.host)
+    return (
+        probe.status is not None
+        and all(node.name in probe.nodes for node in nodes)
+        and (probe.clocks is not None or all(node.role is not NodeRole.CLOCK for node in nodes))
+        and len(probe.arms) >= sum(node.role is NodeRole.ARM_BRIDGE for node in nodes)
+    )
