@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Lens as SceneLens
 from flexsheet.messages.scene import Pose, Scene
@@ -72,8 +73,11 @@ TWIN_BASE_M, TWIN_BASE_RAD, TWIN_JOINT_RAD = 0.005, 0.01, 2e-4
 """How far the twin's bases stand off the scene's, and its joints off what they say (deviations)."""
 
 
-class PlacesError(ValueError):
+class PlacesError(FlexsheetError, ValueError):
     """A folder of places that cannot be used; the message names file, row and column."""
+
+    code = "arm-poses"
+    remedy = "Correct the row of joints.csv that the text names, or measure that pose again."
 
 
 def rig_of(scene: Scene, calibration: StereoCalibration | None) -> Rig:

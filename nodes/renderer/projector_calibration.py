@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, Pose, Projector, StereoCamera
 from flexsheet.nodes.models.camera import camera_matrix, normalize, project
 from flexsheet.nodes.models.rigid import (
@@ -44,8 +45,11 @@ TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
 length (relative), principal point (px). Only the ratios count."""
 
 
-class ProjectorError(ValueError):
+class ProjectorError(FlexsheetError, ValueError):
     """Images or points that give no calibration; the message gives the remedy."""
+
+    code = "projector-calibration"
+    remedy = "Take images in more poses, with the whole pattern on the sheet."
 
 
 @dataclass(frozen=True, slots=True)

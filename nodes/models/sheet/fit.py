@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
@@ -29,8 +30,11 @@ MAX_RELATIVE_DEVIATION = 0.5
 """A parameter with a larger relative standard deviation is undetermined."""
 
 
-class SheetModelFitError(ValueError):
+class SheetModelFitError(FlexsheetError, ValueError):
     """Raised for rows that do not determine the model; the message names what is missing."""
+
+    code = "sheet-model-fit"
+    remedy = "Add pushes at other stretches and depths."
 
 
 @dataclass(frozen=True, slots=True)
