@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel, make_model
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 
@@ -72,25 +72,6 @@ class SheetModelFit:
     residual_ratio: Floats
     rms_ratio: float
     worst_ratio: float
-
-
-def make_model(
-    nominal: Rubber,
-    *,
-    modulus_thickness_n_per_m: float,
-    slack_width_m: float,
-    cubic_ratio: float,
-    mooney_share: float,
-) -> ScaledSheetModel:
-    """Make the scaled model of a sheet with these parameters, for stretch ratios over the nominal
-    width."""
-    rubber = replace(
-        nominal,
-        width_m=slack_width_m,
-        young_modulus_pa=modulus_thickness_n_per_m / nominal.thickness_m,
-        mooney_share=mooney_share,
-    )
-    return ScaledSheetModel(rubber, cubic_ratio, nominal.width_m / slack_width_m)
 
 
 NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_share")

@@ -19,14 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.calibration import Board, StereoCalibration
-from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.files import write_file
-from flexsheet.messages.scene import Lens as SceneLens
-from flexsheet.messages.scene import Pose, Scene
-from flexsheet.messages.types import Side
-from flexsheet.nodes.arm_bridge.hand_eye import Lens, Rig, Sighting, View
-from flexsheet.nodes.camera.corners import (
+from flexsheet.launch.calibration.corners import (
     BoardPair,
     CornerFinder,
     Progress,
@@ -34,6 +27,13 @@ from flexsheet.nodes.camera.corners import (
     find_pairs,
     match_views,
 )
+from flexsheet.launch.calibration.hand_eye import Lens, Rig, Sighting, View
+from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import Lens as SceneLens
+from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.types import Side
 from flexsheet.nodes.camera.image_pair import encode_png
 from flexsheet.nodes.models.camera import camera_matrix, project
 from flexsheet.nodes.models.rigid import (

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.corners import BoardPair, View
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.nodes.camera.corners import BoardPair, View
 from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from flexsheet.launch.calibration.gray_code import DecodeError, Image, decode_patterns, find_pixels
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, Pose, Projector, StereoCamera
 from flexsheet.nodes.models.camera import camera_matrix, normalize, project
@@ -26,7 +27,6 @@ from flexsheet.nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from flexsheet.nodes.renderer.gray_code import DecodeError, Image, decode_patterns, find_pixels
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
