@@ -111,13 +111,10 @@ limits: setup $(DEV_STAMP)
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.soft_body_limits
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.tracking_limits
 
-# What is written from the code; after a change of a message, parameter, command or error.
+# Pages and pictures of docs/ that are generated from the code: messages, parameters, commands,
+# errors, registers, the graph.
 pages: setup
-	$(BIN)/python -m flexsheet.messages.reference > docs/messages.md
-	$(BIN)/python -m flexsheet.launch.reference.cli > docs/cli.md
-	$(BIN)/python -m flexsheet.launch.reference.parameters > docs/parameters.md
-	$(BIN)/python -m flexsheet.launch.reference.errors > docs/errors.md
-	$(BIN)/python -m flexsheet.launch.reference.registers
+	$(BIN)/python -m website.pages
 
 # docs/charts: every method of every family, on this machine; half an hour.
 charts: setup

@@ -20,18 +20,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.calibration import Board
-from flexsheet.nodes.camera.bundle import fit_rig, linearize, pose_transform
-from flexsheet.nodes.camera.check import (
+from flexsheet.launch.calibration.bundle import fit_rig, linearize, pose_transform
+from flexsheet.launch.calibration.check import (
     Rig,
     calibrate_plain_opencv,
     find_plain_corners,
     measure_board,
     triangulated,
 )
-from flexsheet.nodes.camera.corners import BoardPair, CornerFinder, board_points, find_pairs
-from flexsheet.nodes.camera.selection import fit_pairs
+from flexsheet.launch.calibration.corners import BoardPair, CornerFinder, board_points, find_pairs
+from flexsheet.launch.calibration.selection import fit_pairs
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.calibration import Board
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import make_true_camera

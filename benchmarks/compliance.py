@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.bench.twin_sheet import twin_force
+from flexsheet.launch.calibration.simulated_sheet import twin_force
 from flexsheet.launch.health.compliance import LINEAR_DEPTH_M, front_curve, scene_compliance
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene

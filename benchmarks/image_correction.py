@@ -22,7 +22,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.bench.twin_sheet import true_sheet
+from flexsheet.launch.calibration.simulated_sheet import true_sheet
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display

@@ -157,7 +157,8 @@ async def refuse_writing(lab: Lab, seconds: float, span: Span) -> None:
     _, hard = resource.prlimit(process, resource.RLIMIT_FSIZE)
     span.begin()
     resource.prlimit(process, resource.RLIMIT_FSIZE, (0, hard))
-    await asyncio.sleep(seconds)
+    # The recorder notices at its next write, at the latest after a flush period.
+    await asyncio.sleep(max(seconds, 2.0 * FLUSH_PERIOD_S))
     resource.prlimit(process, resource.RLIMIT_FSIZE, (hard, hard))
     span.end()
     await lab.until(lambda: len(bags(lab.folder, "main")) > before, "the next bag")

@@ -18,7 +18,9 @@ import typer
 from typer.core import TyperGroup
 from typer.main import get_command
 
-from flexsheet.launch.commands.output import CommandError, examples, words
+from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError, examples, words
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.files import DISK_ERRORS, FileWriteError, write_error
 
 COMMANDS: dict[str, tuple[str, ...]] = {
     "launch": ("launching",),
@@ -144,31 +146,22 @@ def main() -> None:
 
 def error_text(error: Exception) -> str:
     """The sentence about an error; for one of the disk, with path and remedy."""
-    from flexsheet.messages.files import FileWriteError, write_error
-
     if not isinstance(error, OSError) or isinstance(error, FileWriteError):
         return str(error)
     return str(write_error(Path(error.filename or "standard output"), error))
 
 
 def explained_by(error: Exception) -> str | None:
-    """The command that says more about an error; None where its sentence has the remedy in it."""
-    # Imported only now: a command that goes well should not wait for it.
-    from flexsheet.launch.commands.failures import FAILURES
-
-    if not isinstance(error, FAILURES) or isinstance(error.__cause__, FileNotFoundError):
+    """Return the command that explains an error; None if the error's text contains the remedy."""
+    if not isinstance(error, FlexsheetError) or isinstance(error, CommandError):
         return None
-    return f"flexsheet explain {type(error).__name__}"
+    if error.exit_code == BAD_INPUT or isinstance(error.__cause__, FileNotFoundError):
+        return None
+    return f"flexsheet explain {error.code}"
 
 
 def exit_code(error: Exception) -> int | None:
-    """The exit code of an error that is the user's to put right; None for an error of ours."""
-    if isinstance(error, CommandError):
-        return error.code
-    # Imported only now: a command that goes well should not wait for these.
-    from flexsheet.launch.commands.failures import BAD_INPUTS, is_failure
-    from flexsheet.launch.commands.output import BAD_INPUT, FAILED
-
-    if isinstance(error, BAD_INPUTS):
-        return BAD_INPUT
-    return FAILED if is_failure(error) else None
+    """Return the exit code of an error that the user can put right; None for a program error."""
+    if isinstance(error, FlexsheetError):
+        return error.exit_code
+    return FAILED if isinstance(error, OSError) and error.errno in DISK_ERRORS else None

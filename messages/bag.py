@@ -39,6 +39,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_error
 from flexsheet.messages.migrations import Migration, migration_for
 from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
@@ -55,8 +56,14 @@ _RECORD_HEAD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQ")
 
 
-class BagError(Exception):
+class BagError(FlexsheetError):
     """A bag that cannot be written or read; the sentence names the file and says what is wrong."""
+
+    code = "bag"
+    remedy = (
+        "`flexsheet bag info BAG` reports how much can be read. `flexsheet bag recover` makes a "
+        "whole bag of it."
+    )
 
 
 def join_frames(frames: Sequence[Any]) -> bytes:

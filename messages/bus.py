@@ -33,6 +33,7 @@ import zmq
 from zmq.utils.monitor import parse_monitor_message
 
 from flexsheet.messages.base import Header, Message
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.security import Gatekeeper, KeyChange, KeyRing
 from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.wire import Envelope, WireError, encode, read_envelope
@@ -96,8 +97,11 @@ COMING_BACK = (zmq.EVENT_CONNECTED, zmq.EVENT_CONNECT_DELAYED, zmq.EVENT_CONNECT
 WATCHED = zmq.EVENT_DISCONNECTED | sum(COMING_BACK) | sum(HANDSHAKE_FAILED)
 
 
-class BusError(RuntimeError):
+class BusError(FlexsheetError, RuntimeError):
     """A socket that cannot be had; the sentence names topic and endpoint."""
+
+    code = "bus"
+    remedy = "Another graph has the endpoint. End that graph, or run `flexsheet doctor --sweep`."
 
 
 class Counts(Protocol):

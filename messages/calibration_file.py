@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import AliasEvent, CollectionEndEvent, CollectionStartEvent
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Part
 
@@ -21,12 +22,18 @@ MAX_CALIBRATION_BYTES = 1 << 20
 MAX_CALIBRATION_DEPTH = 12
 
 
-class CalibrationFileError(ValueError):
+class CalibrationFileError(FlexsheetError, ValueError):
     """A calibration file that cannot be used; the message names file, key and remedy."""
 
+    code = "calibration-file"
+    remedy = "Calibrate again, or name another calibration file."
 
-class CalibrationMismatchError(ValueError):
+
+class CalibrationMismatchError(FlexsheetError, ValueError):
     """A calibration of something else than the scene's: another camera, another sheet."""
+
+    code = "calibration-mismatch"
+    remedy = "Name the calibration of the scene's own device, or the scene of the calibration."
 
 
 def write_calibration(calibration: Part, path: Path, *, title: str, comment: str) -> None:

@@ -7,12 +7,17 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from flexsheet.messages.errors import FlexsheetError
+
 DISK_ERRORS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO})
 """Numbers of errors that are the disk's, wherever they come up."""
 
 
-class FileWriteError(OSError):
+class FileWriteError(FlexsheetError, OSError):
     """A file that cannot be written; the sentence names path, cause, needed and free space."""
+
+    code = "file-write"
+    remedy = "Free space on the disk, create the folder, or name another file."
 
     def __str__(self) -> str:
         return str(self.strerror)

@@ -1,7 +1,4 @@
-"""Writes docs/messages.md from the topic table and the message types.
-
-python -m flexsheet.messages.reference > docs/messages.md
-"""
+"""Writes docs/messages.md from the topic table and the message types."""
 
 from __future__ import annotations
 
@@ -22,7 +19,7 @@ from flexsheet.messages.topics import TOPICS, Topic
 INTRODUCTION = """\
 # Messages
 
-<!-- Written by `python -m flexsheet.messages.reference > docs/messages.md`; a test compares. -->
+<!-- Written by `make pages`; a test compares. -->
 
 What nodes say to one another.  Numbers are SI and radians; positions and directions are in the
 world frame (origin at the centre of the imaginary screen, x right, y up, z towards the user) unless
@@ -197,7 +194,3 @@ def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 def _table(heads: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [heads, tuple("---" for _ in heads), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines) + "\n"
-
-
-if __name__ == "__main__":
-    print(reference(), end="")

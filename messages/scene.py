@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from flexsheet.messages.arrays import ColorImage, Transform, Triangles, Vector3, Vertices
 from flexsheet.messages.base import Message, MessagePart
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.limits import LimitedModel
 from flexsheet.messages.methods import Methods
 
@@ -356,8 +357,11 @@ class Scene(Message):
     )
 
 
-class UnfitGeometryError(ValueError):
+class UnfitGeometryError(FlexsheetError, ValueError):
     """A scene whose object has a shape that the asker cannot handle."""
+
+    code = "unfit-geometry"
+    remedy = "Choose an object of a shape that this command supports."
 
 
 def cylinder_of(scene: Scene) -> Cylinder:

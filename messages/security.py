@@ -24,6 +24,7 @@ from typing import Any, ClassVar
 import zmq
 from zmq.utils import z85
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_error, write_file
 
 KEY_LENGTH = 40
@@ -35,8 +36,14 @@ Refused = Callable[[str], None]
 """Told in a sentence of a connection that was refused."""
 
 
-class SecurityError(RuntimeError):
+class SecurityError(FlexsheetError, RuntimeError):
     """Keys that cannot be used; the sentence names file or host, and the remedy."""
+
+    code = "keys"
+    remedy = (
+        "Run `flexsheet keys new HOST` on that host, and enter its public key in the launch file "
+        "on every host."
+    )
 
 
 def new_key_pair() -> tuple[str, str]:

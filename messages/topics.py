@@ -12,6 +12,7 @@ from enum import StrEnum
 
 from flexsheet.messages import scene, types
 from flexsheet.messages.base import Message
+from flexsheet.messages.errors import FlexsheetError
 
 
 class Delivery(StrEnum):
@@ -98,11 +99,11 @@ _ROWS = (
 TOPICS: dict[str, Topic] = {topic.name: topic for topic in _ROWS}
 
 
-class UnknownTopicError(KeyError):
+class UnknownTopicError(FlexsheetError, KeyError):
     """A name that is not in the table; the message suggests one that is."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+    code = "unknown-topic"
+    remedy = "`flexsheet topic list` prints all names."
 
 
 def topic_named(name: str) -> Topic:

@@ -36,6 +36,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ValidationError
 
 from flexsheet.messages.base import Header, Message, schema_fingerprint
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.topics import Topic
 
 Buffer: TypeAlias = bytes | memoryview
@@ -65,12 +66,15 @@ _MAX_INTEGER = 2**63 - 1
 _extension = tuple.__new__
 
 
-class WireError(ValueError):
+class WireError(FlexsheetError, ValueError):
     """Bytes that are not the message that was expected, or a message that has no bytes.
 
     `cause` is a word for counting: "malformed", "type", "fingerprint", "frames", "size" or "field";
     a subscriber refuses more: "writer", "plan", "replayed" or "forbidden".
     """
+
+    code = "wire"
+    remedy = "Run the same version of flexsheet on all hosts. The topic `status` has the count."
 
     def __init__(self, cause: str, text: str) -> None:
         super().__init__(text)

@@ -11,6 +11,8 @@ from enum import StrEnum
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from flexsheet.messages.errors import FlexsheetError
+
 if TYPE_CHECKING:
     from flexsheet.nodes.node import Node
 
@@ -47,11 +49,11 @@ NODES: dict[str, str] = {
 }
 
 
-class UnknownNodeError(KeyError):
+class UnknownNodeError(FlexsheetError, KeyError):
     """A node name that is not in the table; the message suggests one that is."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+    code = "unknown-node"
+    remedy = "`flexsheet node list` prints all names."
 
 
 def node_class(name: str) -> type[Node]:

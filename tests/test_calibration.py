@@ -13,6 +13,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.check import check_stereo, cross_check, rigid_fit_residuals
+from flexsheet.launch.calibration.corners import (
+    BoardPair,
+    CalibrationError,
+    board_points,
+    find_pairs,
+    same_order,
+)
+from flexsheet.launch.calibration.selection import fit_pairs
+from flexsheet.launch.calibration.stereo import calibrate_stereo
+from flexsheet.launch.calibration.uncertainty import position_slopes, view_of_work
 from flexsheet.messages.calibration import (
     Board,
     StereoCalibration,
@@ -21,17 +32,6 @@ from flexsheet.messages.calibration import (
 )
 from flexsheet.messages.calibration_file import CalibrationFileError
 from flexsheet.messages.scene import Lens
-from flexsheet.nodes.camera.calibration import calibrate_stereo
-from flexsheet.nodes.camera.check import check_stereo, cross_check, rigid_fit_residuals
-from flexsheet.nodes.camera.corners import (
-    BoardPair,
-    CalibrationError,
-    board_points,
-    find_pairs,
-    same_order,
-)
-from flexsheet.nodes.camera.selection import fit_pairs
-from flexsheet.nodes.camera.uncertainty import position_slopes, view_of_work
 from flexsheet.nodes.models import camera, rigid
 
 Floats = NDArray[np.float64]

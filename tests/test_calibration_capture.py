@@ -16,23 +16,23 @@ from rich.console import Console
 from ruamel.yaml import YAML
 
 from flexsheet.launch import cli
-from flexsheet.launch.commands.capture import coverage_view, take_pairs
-from flexsheet.launch.plans.documents import BadInputError
-from flexsheet.launch.plans.plan import load_graph
-from flexsheet.messages.calibration import Board, load_calibration
-from flexsheet.messages.scene import Scene, StereoCamera
-from flexsheet.nodes.camera.bundle import pose_vector
-from flexsheet.nodes.camera.calibration import calibrate_stereo
-from flexsheet.nodes.camera.capture import TILTS, Bin, Capture, classify_tilt, needed, place
-from flexsheet.nodes.camera.check import check_stereo
-from flexsheet.nodes.camera.corners import (
+from flexsheet.launch.calibration.bundle import pose_vector
+from flexsheet.launch.calibration.capture import TILTS, Bin, Capture, classify_tilt, needed, place
+from flexsheet.launch.calibration.check import check_stereo
+from flexsheet.launch.calibration.corners import (
     BoardPair,
     CalibrationError,
     CornerFinder,
     board_points,
     match_views,
 )
-from flexsheet.nodes.camera.printing import raster, svg, write_board
+from flexsheet.launch.calibration.printing import raster, svg, write_board
+from flexsheet.launch.calibration.stereo import calibrate_stereo
+from flexsheet.launch.commands.capture import coverage_view, take_pairs
+from flexsheet.launch.plans.documents import BadInputError
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.messages.calibration import Board, load_calibration
+from flexsheet.messages.scene import Scene, StereoCamera
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import make_true_camera

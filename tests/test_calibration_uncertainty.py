@@ -12,20 +12,26 @@ from numpy.typing import NDArray
 from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
-from flexsheet.launch.plans.plan import load_graph
-from flexsheet.messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
-from flexsheet.messages.scene import Lens, Scene, StereoCamera
-from flexsheet.nodes.camera import bundle
-from flexsheet.nodes.camera.calibration import state_uncertainty
-from flexsheet.nodes.camera.check import Rig, triangulated
-from flexsheet.nodes.camera.corners import BoardPair, CornerFinder, View, board_points, match_views
-from flexsheet.nodes.camera.selection import Selection, fit_pairs, fit_selection
-from flexsheet.nodes.camera.uncertainty import (
+from flexsheet.launch.calibration import bundle
+from flexsheet.launch.calibration.check import Rig, triangulated
+from flexsheet.launch.calibration.corners import (
+    BoardPair,
+    CornerFinder,
+    View,
+    board_points,
+    match_views,
+)
+from flexsheet.launch.calibration.selection import Selection, fit_pairs, fit_selection
+from flexsheet.launch.calibration.stereo import state_uncertainty
+from flexsheet.launch.calibration.uncertainty import (
     jackknife_covariance,
     position_slopes,
     position_spread,
     view_of_work,
 )
+from flexsheet.launch.plans.plan import load_graph
+from flexsheet.messages.calibration import Board, StereoCalibration, Uncertainty, load_calibration
+from flexsheet.messages.scene import Lens, Scene, StereoCamera
 from flexsheet.nodes.models import rigid
 from flexsheet.nodes.twin.board import TwinBoard
 from flexsheet.nodes.twin.rig import make_true_camera

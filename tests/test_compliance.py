@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from typer.testing import CliRunner
 
-from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.launch.calibration.simulated_sheet import twin_push
 from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.plans.plan import load_scene

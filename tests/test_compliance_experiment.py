@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flexsheet.launch.bench.twin_sheet import twin_force
+from flexsheet.launch.calibration.simulated_sheet import twin_force
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.compliance import (
     DEPTH_SHARES,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from flexsheet.launch import cli
-from flexsheet.launch.bench.arm_places import (
+from flexsheet.launch.calibration.arm_poses import (
     STILL_S,
     TABLE,
     PlacesError,
@@ -27,18 +27,18 @@ from flexsheet.launch.bench.arm_places import (
     rig_of,
     true_base,
 )
-from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.arms_calibration import load_arms_calibration
-from flexsheet.messages.calibration import Board
-from flexsheet.messages.calibration_file import CalibrationFileError
-from flexsheet.messages.types import Side
-from flexsheet.nodes.arm_bridge.hand_eye import (
+from flexsheet.launch.calibration.hand_eye import (
     BaseFit,
     HandEyeError,
     Sighting,
     View,
     calibrate_base,
 )
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.arms_calibration import load_arms_calibration
+from flexsheet.messages.calibration import Board
+from flexsheet.messages.calibration_file import CalibrationFileError
+from flexsheet.messages.types import Side
 from flexsheet.nodes.models.rigid import (
     apply,
     inverse,

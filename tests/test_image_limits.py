@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flexsheet.launch.bench.twin_sheet import true_sheet
+from flexsheet.launch.calibration.simulated_sheet import true_sheet
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.types import Display
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform

@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
-from flexsheet.launch.reference import registers
 from flexsheet.nodes.arm_bridge.link import ArmAnswerError, ArmRefusedError, ArmSilentError
 from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
@@ -32,17 +31,17 @@ from flexsheet.nodes.twin import arms as twin_arms
 from flexsheet.nodes.twin.arms import ArmServer, Controller, Fault
 from tests.network import Cut
 from tests.waiting import DEADLINE_S
+from website import registers_page
 
 JOINTS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
-def test_the_document_has_the_map_of_the_code() -> None:
-    text = registers.PAGE.read_text()
-    assert registers.page(text) == text, "run: python -m flexsheet.launch.reference.registers"
-    assert "| 8–19 | `joints_rad` | float32 × 6 |" in text
-    assert registers.page(text.replace("| 16 | servo |", "| 16 | motor |")) == text
+def test_the_register_map_is_written_between_its_marks() -> None:
+    stale = f"# A page\n{registers_page.BEGIN}stale\n{registers_page.END}rest\n"
+    assert "| 8–19 | `joints_rad` | float32 × 6 |" in registers_page.page(stale)
+    assert "stale" not in registers_page.page(stale)
     with pytest.raises(ValueError, match="needs the marks"):
-        registers.page("# A page")
+        registers_page.page("# A page")
 
 
 def status_registers(**changed: int | float) -> list[int]:

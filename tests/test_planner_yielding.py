@@ -10,15 +10,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.launch.calibration.simulated_sheet import twin_push
 from flexsheet.messages.types import SheetTarget, SoftBody
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import moved
-from flexsheet.nodes.models.sheet.fit import make_model
 from flexsheet.nodes.models.sheet.force_models import (
     LinearSheetModel,
     ScaledSheetModel,
     SheetForceModel,
+    make_model,
 )
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.planner.compliance import GOOD_RATIO, UnfitCurveError

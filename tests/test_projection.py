@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 
-from flexsheet.launch.bench.twin_sheet import twin_points
+from flexsheet.launch.calibration.simulated_sheet import twin_points
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.types import Correction, Display
 from flexsheet.nodes.cache import load_cached

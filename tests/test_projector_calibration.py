@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from flexsheet.launch.cli import app
-from flexsheet.launch.commands.calibrate_projector import write_scene
-from flexsheet.launch.plans.plan import load_scene
-from flexsheet.messages.scene import Lens, Projector, Scene, StereoCamera
-from flexsheet.nodes.renderer.gray_code import (
+from flexsheet.launch.calibration.gray_code import (
     MIN_STRIPE_PX,
     DecodeError,
     decode_patterns,
     find_pixels,
     patterns,
 )
-from flexsheet.nodes.renderer.projector_calibration import (
+from flexsheet.launch.calibration.projector import (
     ProjectorError,
     ProjectorPoints,
     calibrate_projector,
@@ -28,6 +24,10 @@ from flexsheet.nodes.renderer.projector_calibration import (
     measure_points,
     project_points,
 )
+from flexsheet.launch.cli import app
+from flexsheet.launch.commands.calibrate_projector import write_scene
+from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.scene import Lens, Projector, Scene, StereoCamera
 from flexsheet.nodes.twin.eye import TrueProjector
 from flexsheet.nodes.twin.projector import (
     LitSheet,

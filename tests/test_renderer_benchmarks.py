@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flexsheet.launch.bench.twin_sheet import twin_errors
+from flexsheet.launch.calibration.simulated_sheet import twin_errors
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.nodes.methods import Point, measure, pareto_front
 from flexsheet.nodes.renderer import benchmarks, deflection_cache

@@ -12,8 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from flexsheet.launch.bench.sheet_rows import read_rows, twin_rows
-from flexsheet.launch.bench.twin_sheet import twin_force
+from flexsheet.launch.calibration.sheet_fit import (
+    MeasuredPush,
+    SheetModelFitError,
+    fit_sheet_model,
+    tabulate_pushes,
+)
+from flexsheet.launch.calibration.sheet_rows import read_rows, twin_rows
+from flexsheet.launch.calibration.simulated_sheet import twin_force
 from flexsheet.launch.cli import app
 from flexsheet.launch.commands.calibrate_sheet import fitted
 from flexsheet.launch.commands.output import CommandError
@@ -25,14 +31,7 @@ from flexsheet.messages.sheet_calibration import (
     load_sheet_calibration,
     save_sheet_calibration,
 )
-from flexsheet.nodes.models.sheet.fit import (
-    MeasuredPush,
-    SheetModelFitError,
-    fit_sheet_model,
-    make_model,
-    tabulate_pushes,
-)
-from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel
+from flexsheet.nodes.models.sheet.force_models import CENTRE, ScaledSheetModel, make_model
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 from flexsheet.nodes.planner.sheet_force import law_for, rubber_of
 

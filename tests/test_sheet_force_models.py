@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.launch.calibration.simulated_sheet import twin_push
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.sheet.force_models import (
     CENTRE,

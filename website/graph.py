@@ -1,15 +1,12 @@
-"""The pictures of the graph: `python -m website.graph docs/images` writes them.
+"""Draws the node graph as SVG.
 
-Boxes and the ways of arrows are placed by hand; which arrows there are is told by launch files, and
-a test compares.
+Positions of boxes and arrows are set by hand.  A test compares the arrows with the launch files.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 Place = tuple[float, float]
 
@@ -203,13 +200,3 @@ def svg(picture: Picture) -> str:
         (x, y), label = arrow.label_at, arrow.wire or ", ".join(arrow.topics)
         lines.append(f'<text class="label" x="{x}" y="{y}">{label}</text>')
     return "\n".join([*lines, "</svg>", ""])
-
-
-def main(folder: Path) -> None:
-    """Write all pictures."""
-    for name, picture in PICTURES.items():
-        (folder / name).write_text(svg(picture))
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

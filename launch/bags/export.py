@@ -31,6 +31,7 @@ from scipy.spatial.transform import Rotation
 
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Message
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import free_bytes, write_error
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
@@ -63,8 +64,11 @@ MIN_FREE_BYTES = 4 << 20
 """On the disk of an export; more than the library holds back before it writes."""
 
 
-class ExportError(RuntimeError):
+class ExportError(FlexsheetError, RuntimeError):
     """An export that cannot be made; the sentence says what to do."""
+
+    code = "export"
+    remedy = "Install the package that the text names, or choose another output file."
 
 
 @dataclass(slots=True)

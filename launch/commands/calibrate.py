@@ -105,12 +105,12 @@ def stereo(
 
     From pictures (--left, --right), from a device (--device-source, --scene) or from the twin.
     """
+    from flexsheet.launch.calibration.capture import Capture
+    from flexsheet.launch.calibration.corners import CalibrationError
+    from flexsheet.launch.calibration.stereo import calibrate_stereo
     from flexsheet.launch.commands import capture
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.calibration import save_calibration
-    from flexsheet.nodes.camera.calibration import calibrate_stereo
-    from flexsheet.nodes.camera.capture import Capture
-    from flexsheet.nodes.camera.corners import CalibrationError
 
     if not output.parent.is_dir():
         raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
@@ -163,7 +163,7 @@ def stereo(
     save_calibration(calibrated.calibration, output, comment=shlex.join(made))
     page: Path | None = None
     if report is not None:
-        from flexsheet.nodes.camera.report import write_report
+        from flexsheet.launch.calibration.report import write_report
 
         page = write_report(calibrated, report)
     _tell(calibrated.calibration, output, page, as_json)
@@ -232,10 +232,10 @@ def check(
     as_json: JsonOption = False,
 ) -> None:
     """Measure a board of known size with a calibration, on pictures that did not make it."""
+    from flexsheet.launch.calibration.check import check_stereo
+    from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.messages.calibration import load_calibration
     from flexsheet.messages.calibration_file import CalibrationFileError
-    from flexsheet.nodes.camera.check import check_stereo
-    from flexsheet.nodes.camera.corners import CalibrationError
 
     try:
         with _progress("measuring the board") as progress:
@@ -279,8 +279,8 @@ def cross_check(
     as_json: JsonOption = False,
 ) -> None:
     """Leave pairs out in turn, measure them with what the rest gives, beside plain OpenCV."""
-    from flexsheet.nodes.camera import check
-    from flexsheet.nodes.camera.corners import CalibrationError
+    from flexsheet.launch.calibration import check
+    from flexsheet.launch.calibration.corners import CalibrationError
 
     try:
         with _progress("leaving pairs out") as progress:
@@ -328,8 +328,8 @@ def print_board(
     as_json: JsonOption = False,
 ) -> None:
     """Write a board to print at true size: a chessboard, or with --marker-mm a ChArUco board."""
-    from flexsheet.nodes.camera.corners import CalibrationError
-    from flexsheet.nodes.camera.printing import caption, write_board
+    from flexsheet.launch.calibration.corners import CalibrationError
+    from flexsheet.launch.calibration.printing import caption, write_board
 
     if not output.parent.is_dir():
         raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)

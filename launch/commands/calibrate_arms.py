@@ -36,12 +36,12 @@ from flexsheet.launch.commands.output import (
 from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
-    from flexsheet.launch.bench.arm_places import PlaceTaker
+    from flexsheet.launch.calibration.arm_poses import PlaceTaker
+    from flexsheet.launch.calibration.hand_eye import BaseFit, Sighting
     from flexsheet.messages.arms_calibration import ArmBase, ArmsCalibration
     from flexsheet.messages.calibration import Board, StereoCalibration
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.types import Side
-    from flexsheet.nodes.arm_bridge.hand_eye import BaseFit, Sighting
 
 SceneOption = Annotated[
     Path, typer.Option("--scene", metavar="SCENE", help="Scene with the camera's place.")
@@ -193,7 +193,7 @@ def capture(
     Move the arm by its teach pendant.  A place is taken when the arm rests and the board is seen
     somewhere new; Ctrl-C ends.
     """
-    from flexsheet.launch.bench.arm_places import PlaceTaker, rig_of
+    from flexsheet.launch.calibration.arm_poses import PlaceTaker, rig_of
     from flexsheet.launch.plans.plan import load_scene
 
     if side not in SIDES:
@@ -284,7 +284,7 @@ def _made_up(
     scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
 ) -> Path:
     """A folder with the twin's places."""
-    from flexsheet.launch.bench.arm_places import twin_places
+    from flexsheet.launch.calibration.arm_poses import twin_places
     from flexsheet.nodes.twin.board import BoardError
 
     mine = folder / side
@@ -301,9 +301,9 @@ def _made_up(
 def _fit(
     folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
 ) -> tuple[BaseFit, list[tuple[str, str]]]:
-    from flexsheet.launch.bench.arm_places import PlacesError, read_sightings, rig_of
-    from flexsheet.nodes.arm_bridge.hand_eye import HandEyeError, calibrate_base
-    from flexsheet.nodes.camera.corners import CalibrationError
+    from flexsheet.launch.calibration.arm_poses import PlacesError, read_sightings, rig_of
+    from flexsheet.launch.calibration.corners import CalibrationError
+    from flexsheet.launch.calibration.hand_eye import HandEyeError, calibrate_base
 
     rig = rig_of(scene, optics)
     size = (scene.camera.width_px, scene.camera.height_px)
@@ -407,7 +407,7 @@ def _true_errors(scene: Scene, side: Side, fit: BaseFit, seed: int) -> dict[str,
     """How far the found base of the twin is off, at the world's origin."""
     import numpy as np
 
-    from flexsheet.launch.bench.arm_places import true_base
+    from flexsheet.launch.calibration.arm_poses import true_base
     from flexsheet.nodes.models.rigid import inverse, vector_from_rotation
 
     off = true_base(scene, side, seed=seed) @ inverse(fit.world_from_base)

@@ -21,9 +21,9 @@ from flexsheet.launch.commands.output import (
 from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
+    from flexsheet.launch.calibration.gray_code import Image
+    from flexsheet.launch.calibration.projector import ProjectorFit
     from flexsheet.messages.scene import Projector, Scene, StereoCamera
-    from flexsheet.nodes.renderer.gray_code import Image
-    from flexsheet.nodes.renderer.projector_calibration import ProjectorFit
 
     Views = tuple[list[Image], list[Image]]
 
@@ -85,13 +85,13 @@ def projector(
     From pictures of Gray code on the sheet, seen by the stereo camera in three poses or more
     (--pictures), from four corners found by hand (--corners), or in the twin (--twin).
     """
-    from flexsheet.launch.plans.plan import load_scene
-    from flexsheet.nodes.renderer import gray_code
-    from flexsheet.nodes.renderer.projector_calibration import (
+    from flexsheet.launch.calibration import gray_code
+    from flexsheet.launch.calibration.projector import (
         ProjectorError,
         calibrate_projector,
         measure_points,
     )
+    from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
     size = scene.projector.width_px, scene.projector.height_px
@@ -146,7 +146,7 @@ def _write_patterns(patterns: Sequence[Image], folder: Path) -> None:
 
 
 def _read_views(folder: Path, count: int) -> Iterator[Views]:
-    from flexsheet.nodes.camera.corners import CalibrationError, read_gray
+    from flexsheet.launch.calibration.corners import CalibrationError, read_gray
 
     poses = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
     if not poses:
@@ -172,7 +172,7 @@ def _twin_views(scene: Scene, true: Projector, poses: int, seed: int) -> Iterato
     """What the twin's true rig sees of the patterns on the sheet, in one pose after the other."""
     from rich.progress import track
 
-    from flexsheet.nodes.renderer.gray_code import patterns
+    from flexsheet.launch.calibration.gray_code import patterns
     from flexsheet.nodes.twin.projector import LitSheet, sheet_poses
     from flexsheet.nodes.twin.rig import make_true_camera
 
@@ -207,7 +207,7 @@ def _camera(scene: Scene, calibration: Path | None) -> StereoCamera:
 def _by_corners(scene: Scene, corners: str, rectangle_mm: str) -> ProjectorFit:
     import numpy as np
 
-    from flexsheet.nodes.renderer.projector_calibration import keystone
+    from flexsheet.launch.calibration.projector import keystone
 
     try:
         pixels = np.array([[float(x) for x in pair.split(",")] for pair in corners.split()])

@@ -20,9 +20,9 @@ from flexsheet.launch.commands.output import (
 )
 
 if TYPE_CHECKING:
+    from flexsheet.launch.calibration.sheet_fit import MeasuredPush
     from flexsheet.messages.scene import Scene
     from flexsheet.messages.sheet_calibration import SheetCalibration
-    from flexsheet.nodes.models.sheet.fit import MeasuredPush
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
 
@@ -68,10 +68,10 @@ def sheet(
 
     From measured rows of a CSV (--rows, --scene) or from the twin (--twin).
     """
-    from flexsheet.launch.bench.sheet_rows import read_rows
+    from flexsheet.launch.calibration.sheet_fit import SheetModelFitError
+    from flexsheet.launch.calibration.sheet_rows import read_rows
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.messages.sheet_calibration import save_sheet_calibration
-    from flexsheet.nodes.models.sheet.fit import SheetModelFitError
 
     if not output.parent.is_dir():
         raise CommandError(f"-o {output}: the folder {output.parent} does not exist", BAD_INPUT)
@@ -115,13 +115,13 @@ def fitted(
     """The calibration that pushes give; SheetModelFitError where they do not determine one."""
     from importlib.metadata import version
 
+    from flexsheet.launch.calibration.sheet_fit import fit_sheet_model, tabulate_pushes
     from flexsheet.messages.sheet_calibration import (
         Fitted,
         LeftOutRow,
         SheetCalibration,
         SheetTable,
     )
-    from flexsheet.nodes.models.sheet.fit import fit_sheet_model, tabulate_pushes
     from flexsheet.nodes.planner.sheet_force import rubber_of
 
     fit = fit_sheet_model(pushes, rubber_of(scene.sheet), with_mooney=with_mooney)
@@ -172,7 +172,7 @@ def fitted(
 def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[MeasuredPush]:
     from rich.progress import Progress
 
-    from flexsheet.launch.bench.sheet_rows import twin_rows
+    from flexsheet.launch.calibration.sheet_rows import twin_rows
 
     with Progress(console=words.console, transient=True) as bar:
         task = bar.add_task("pushing the twin's sheet", total=None)

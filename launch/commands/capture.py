@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import RenderableType
 
+    from flexsheet.launch.calibration.capture import Capture
     from flexsheet.messages.calibration import Board
     from flexsheet.messages.scene import Scene
-    from flexsheet.nodes.camera.capture import Capture
     from flexsheet.nodes.camera.sources import AnySource
 
     Views = tuple[NDArray[np.uint8], NDArray[np.uint8]]
@@ -142,7 +142,7 @@ def coverage_view(capture: Capture, hint: str) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    from flexsheet.nodes.camera.capture import COLUMNS, DISTANCES, ROWS, TILTS, Bin
+    from flexsheet.launch.calibration.capture import COLUMNS, DISTANCES, ROWS, TILTS, Bin
 
     def count(one: Bin) -> Text:
         have, often = capture.counts[one], capture.needed.get(one, 0)

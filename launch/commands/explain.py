@@ -1,45 +1,127 @@
-"""`flexsheet explain`: what an error message means, and what to do."""
+"""`flexsheet explain`: what an error or a note means, and what to do."""
 
 from __future__ import annotations
 
+import pkgutil
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
 from typing import Annotated
 
 import typer
 
 from flexsheet.launch.commands.graph import JsonOption
 from flexsheet.launch.commands.output import CommandError, examples, print_fields, print_json
+from flexsheet.messages.errors import FlexsheetError
 
 app = typer.Typer(add_completion=False)
 
-SHOWN = 3
+PACKAGES = ("messages", "nodes", "launch")
+MAX_ENTRIES = 3
+MIN_WORD_LETTERS = 3
+MIN_SHARED_WORDS = 2
+"""Words that a text and an entry must share to be a close match."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One kind of error or note.
+
+    name: name of the class.  phrase: part of every text of the kind.  Empty where there is none.
+    """
+
+    code: str
+    meaning: str
+    remedy: str
+    name: str = ""
+    phrase: str = ""
+
+
+@cache
+def entries() -> tuple[Entry, ...]:
+    """Return the errors of all packages by code, the notes, and the reasons of fingertips."""
+    from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
+
+    for package in PACKAGES:
+        root = import_module(f"flexsheet.{package}")
+        for module in pkgutil.walk_packages(root.__path__, f"{root.__name__}."):
+            import_module(module.name)
+    errors = {kind.code: kind for kind in _subclasses(FlexsheetError)}
+    return (
+        *(
+            Entry(code, _meaning(kind), kind.remedy, name=kind.__name__)
+            for code, kind in sorted(errors.items())
+        ),
+        *(Entry(note.code, note.phrase, note.remedy, phrase=note.phrase) for note in NodeNote),
+        *(Entry(reason, "", remedy) for reason, remedy in FINGERTIP_REMEDIES.items()),
+    )
+
+
+def _subclasses(kind: type[FlexsheetError]) -> Iterator[type[FlexsheetError]]:
+    """Yield the project's classes that derive from an error, without those of tests and users."""
+    for derived in kind.__subclasses__():
+        if derived.__module__.startswith("flexsheet."):
+            yield derived
+        yield from _subclasses(derived)
+
+
+def _meaning(kind: type[FlexsheetError]) -> str:
+    return " ".join((kind.__doc__ or "").split("\n\n")[0].split())
+
+
+def find_entries(text: str) -> list[Entry]:
+    """Return the entries for a code, a class name, or the text of an error; the best one first.
+
+    A text matches an entry whose class it names or whose phrase it contains. Otherwise, those
+    entries match that share `MIN_SHARED_WORDS` words with it; rare words count more.
+    """
+    if exact := [entry for entry in entries() if text in (entry.code, entry.name)]:
+        return exact
+    words = _words(text)
+    named = [entry for entry in entries() if entry.name and entry.name.lower() in words]
+    contained = [entry for entry in entries() if entry.phrase and entry.phrase in text]
+    if named or contained:
+        return named + contained
+    known = {entry: _words(f"{entry.code} {entry.meaning} {entry.remedy}") for entry in entries()}
+    frequency = Counter(word for one in known.values() for word in one)
+    near = {
+        entry: sum(1 / frequency[word] for word in shared)
+        for entry, one in known.items()
+        if len(shared := words & one) >= MIN_SHARED_WORDS
+    }
+    return sorted(near, key=lambda entry: -near[entry])
+
+
+def _words(text: str) -> set[str]:
+    return {word for word in re.findall(r"\w+", text.lower()) if len(word) >= MIN_WORD_LETTERS}
 
 
 @app.command(
     epilog=examples(
-        "flexsheet explain 'no graph is running; start one with: flexsheet launch FILE'",
+        "flexsheet explain bag",
         "flexsheet explain saturated --json",
+        "flexsheet explain 'topic arm_left: host left refuses our key'",
     )
 )
 def explain(
     message: Annotated[
-        str,
-        typer.Argument(
-            help="As it was said, or 8 letters of it; a kind, as BagError; a fingertip's reason."
-        ),
+        str, typer.Argument(help="Code of an error or note, name of its class, or its text.")
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Say what an error message means and what to do; all of them are in docs/errors.md."""
-    from flexsheet.launch.reference.errors import explained
-
-    found = explained(message)[:SHOWN]
+    """Print what an error or a note means and what to do; docs/errors.md lists all of them."""
+    found = [
+        {"code": one.code, "means": one.meaning, "what to do": one.remedy}
+        for one in find_entries(message)[:MAX_ENTRIES]
+    ]
     if as_json:
         print_json(found)
-    for number, one in enumerate(() if as_json else found):
+    for number, entry in enumerate(() if as_json else found):
         if number:
             print()
-        print_fields(one.items())
+        print_fields(entry.items())
     if not found:
-        raise CommandError(
-            f'"{message}" is no message that is known; give more of it, or look into docs/errors.md'
-        )
+        raise CommandError(f'"{message}" matches no error or note; docs/errors.md lists all codes')

@@ -29,6 +29,13 @@ RunOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 
 
+class NoGraphError(CommandError):
+    """No graph is running on this computer."""
+
+    code = "no-graph"
+    remedy = "Start a graph with `flexsheet launch FILE`, or name the directory of its run (--run)."
+
+
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
     """The ResolvedGraph and the Run of the graph in `directory`, or of the newest that is alive."""
     from flexsheet.launch.plans.plan_model import ResolvedGraph
@@ -41,7 +48,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
     else:
         ready = [run for run in live_runs() if run.plan_file.is_file()]
         if not ready:
-            raise CommandError("no graph is running; start one with: flexsheet launch FILE")
+            raise NoGraphError("no graph is running; start one with: flexsheet launch FILE")
         run = ready[0]
     return ResolvedGraph.model_validate_json(run.plan_file.read_text()), run
 

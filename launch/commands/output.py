@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.finite import finite
+from flexsheet.messages.errors import FlexsheetError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,12 +20,15 @@ if TYPE_CHECKING:
 FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
 
 
-class CommandError(Exception):
+class CommandError(FlexsheetError):
     """Ends a command with a sentence and an exit code."""
 
-    def __init__(self, text: str, code: int = FAILED) -> None:
+    code = "command"
+    remedy = "The text names the option or file, and what to give instead."
+
+    def __init__(self, text: str, exit_code: int = FAILED) -> None:
         super().__init__(text)
-        self.code = code
+        self.exit_code = exit_code
 
 
 class Words:

@@ -18,6 +18,7 @@ from flexsheet.launch.methods.finite import finite
 from flexsheet.launch.methods.machine import machine_name
 from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
 from flexsheet.launch.running.code_state import git_state
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.cache import EtaEstimator
@@ -47,11 +48,11 @@ OVERVIEW = "README.md"
 TITLE_WIDTH = 95
 
 
-class UnknownFamilyError(KeyError):
+class UnknownFamilyError(FlexsheetError, KeyError):
     """A family name that is not in the table; the message suggests one that is."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+    code = "unknown-family"
+    remedy = "Choose one of the names in the text (`flexsheet chart --help`)."
 
 
 def family_named(name: str) -> Family:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from flexsheet.launch.bench.twin_sheet import twin_errors, twin_force, twin_points
+from flexsheet.launch.calibration.simulated_sheet import twin_errors, twin_force, twin_points
 from flexsheet.launch.experiments.stroke import stroke_path
 from flexsheet.messages.scene import Cylinder, Scene
 from flexsheet.messages.types import FingerPath

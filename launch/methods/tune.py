@@ -27,6 +27,7 @@ from flexsheet.launch.methods.charts import duration, family_at, git_commit, mea
 from flexsheet.launch.methods.machine import machine_name
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.launch.plans.plan import load_scene
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import DISK_ERRORS, write_error
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Family, Point, Trial
@@ -42,11 +43,11 @@ Measure = Callable[[Family, Scene, Callable[[Trial], bool]], Sequence[Point]]
 Setting = str | dict[str, Any]
 
 
-class UnknownTunableError(KeyError):
+class UnknownTunableError(FlexsheetError, KeyError):
     """A family that no node takes a choice of; the message says which there are."""
 
-    def __str__(self) -> str:
-        return str(self.args[0])
+    code = "unknown-tunable"
+    remedy = "Choose one of the names in the text (docs/tune.md)."
 
 
 @dataclass(frozen=True, slots=True)

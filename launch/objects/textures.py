@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.plans.documents import BadInputError, Document, Key
+from flexsheet.messages.errors import FlexsheetError
 
 APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
@@ -25,8 +26,11 @@ MOST_PX = 2048
 """A side's; the projector has fewer."""
 
 
-class TextureError(ValueError):
+class TextureError(FlexsheetError, ValueError):
     """A file that is no texture; the text says why, and what helps."""
+
+    code = "texture"
+    remedy = "Name a PNG or JPEG file, and a mesh with texture coordinates."
 
 
 def put_image(document: Document) -> None:

@@ -36,6 +36,7 @@ from ruamel.yaml.tokens import (
 )
 
 from flexsheet.launch.plans.renamed_keys import LAUNCH_KEYS, NODE_PARAMETERS, SCENE_KEYS, VALUES
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NODES
 
@@ -84,8 +85,14 @@ class Problem:
         return ": ".join(parts) + (f"; {self.remedy}" if self.remedy else "")
 
 
-class BadInputError(ValueError):
+class BadInputError(FlexsheetError, ValueError):
     """Input that cannot be used; `problems` holds all that was found."""
+
+    code = "bad-input"
+    exit_code = 2
+    remedy = (
+        "Open the file at the line in the text. Check it with `flexsheet launch FILE --dry-run`."
+    )
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         super().__init__("\n".join(str(problem) for problem in problems))

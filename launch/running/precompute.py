@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from flexsheet.launch.plans.plan_model import ResolvedGraph
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import SheetShapeMethod, chosen
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole
@@ -21,8 +22,11 @@ TOLD_SHARE = 0.1
 """Steps in which progress is reported."""
 
 
-class NoSoftBodyError(RuntimeError):
+class NoSoftBodyError(FlexsheetError, RuntimeError):
     """The soft body of a scene cannot be computed; the text gives the reason and a remedy."""
+
+    code = "no-soft-body"
+    remedy = "Follow the remedy in the text; see docs/meshing.md and docs/soft-body.md."
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
@@ -41,8 +42,11 @@ _BEGUN_PREFIX = ".begun-"
 _count = itertools.count(1)
 
 
-class RunDirectoryError(RuntimeError):
+class RunDirectoryError(FlexsheetError, RuntimeError):
     """The directory of runs cannot be used."""
+
+    code = "run-directory"
+    remedy = "Set `FLEXSHEET_RUNS` to a folder of your own."
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,6 +55,7 @@ from flexsheet.launch.running.starvation import ProcessorTime, starved_s
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher
 from flexsheet.messages.clock import SystemClock
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
 from flexsheet.messages.security import KeyRing, SecurityError
 from flexsheet.messages.topics import topic_named
@@ -74,8 +75,14 @@ Report = Callable[[str, str], None]
 """Gets each line of a node's log, and the launcher's own words as those of "launch"."""
 
 
-class NodeFailedError(RuntimeError):
+class NodeFailedError(FlexsheetError, RuntimeError):
     """A node failed for good: it ended, or was not ready in time, more often than it may."""
+
+    code = "node-failed"
+    remedy = (
+        "Read the node's log above the text, or in the folder `logs` of the run. Its first error "
+        "is the cause."
+    )
 
 
 class Child:

@@ -18,6 +18,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import KinematicsMethod
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Family, Trial
@@ -107,11 +108,14 @@ BRANCHES = tuple(
 """In the order of what `branches` returns."""
 
 
-class UnreachableError(ValueError):
+class UnreachableError(FlexsheetError, ValueError):
     """No joint angles within the ranges give the wanted flange pose.
 
     limit: what keeps the arm from there: "reach", or the joint of the branch that comes nearest.
     """
+
+    code = "unreachable"
+    remedy = "`flexsheet doctor scene SCENE` lists what is out of reach and what would help."
 
     def __init__(self, text: str, limit: str) -> None:
         super().__init__(text)

@@ -11,6 +11,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
+
 Floats = NDArray[np.float64]
 
 JOINTS = 6
@@ -22,20 +24,37 @@ exchanges may see the same counters; 50 ms are seven such cycles."""
 _CIRCLE = 2**32
 
 
-class ArmLinkError(Exception):
+class ArmLinkError(FlexsheetError):
     """The exchange with an arm failed; the text says how, in one line."""
+
+    code = "arm-link"
+    remedy = "Check the arm's address, power, cable and program."
 
 
 class ArmSilentError(ArmLinkError):
     """No connection, or no answer in time."""
 
+    code = "arm-silent"
+    remedy = (
+        "First check whether the computer is busy (`flexsheet doctor`, row `load`): the usual "
+        "cause with simulated arms. Then check the arm's address, power, cable and program."
+    )
+
 
 class ArmRefusedError(ArmLinkError):
     """The arm answered that it does not take the command."""
 
+    code = "arm-refused"
+    remedy = "Read the reason on the controller's teach pendant: enabled, no alarm, in remote mode?"
+
 
 class ArmAnswerError(ArmLinkError):
     """The answer is not of this protocol, is damaged, or belongs to another command."""
+
+    code = "arm-answer"
+    remedy = (
+        "Check whether another program controls the same arm, and the version of the arm's program."
+    )
 
 
 class Freshness(StrEnum):

@@ -14,6 +14,7 @@ from itertools import pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import (
@@ -325,11 +326,14 @@ class Step:
     right_rad: Floats
 
 
-class PathError(ValueError):
+class PathError(FlexsheetError, ValueError):
     """The arms cannot carry the sheet that way; side, limit (of `LIMITS`, or "leap") and where.
 
     share: of the straight way, 0..1.
     """
+
+    code = "path"
+    remedy = "Move the arms nearer to the sheet by hand, then enable them again."
 
     def __init__(
         self, why: str, *, side: Side, limit: str, share: float, world_from_sheet: Floats

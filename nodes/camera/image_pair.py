@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import StereoCamera
 from flexsheet.messages.types import StereoPair
 
@@ -22,8 +23,14 @@ Image = NDArray[np.uint8]
 Now = Callable[[], int]
 
 
-class DeviceError(RuntimeError):
+class DeviceError(FlexsheetError, RuntimeError):
     """Raised for a device or file that cannot be read; the message names it and what to do."""
+
+    code = "device"
+    remedy = (
+        "Check the plug, the device's name and the calibration file. Another program may use the "
+        "camera."
+    )
 
 
 class Region(NamedTuple):

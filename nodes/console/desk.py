@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.base import Message
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import chosen
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import Correction, Display, EStop, Frame, Moment, Recording, TwinEye
@@ -292,8 +293,14 @@ class Files:
     kept: Path
 
 
-class ReleaseError(ValueError):
+class ReleaseError(FlexsheetError, ValueError):
     """An e-stop that this console's host may not reset; the sentence says whose hosts may."""
+
+    code = "release"
+    remedy = (
+        "Reset the e-stop on a host that the text names, or set `hosts.NAME.may_reset_estop` for "
+        "this host in the launch file on all hosts."
+    )
 
 
 class Desk:

@@ -28,6 +28,7 @@ from websockets.datastructures import Headers, MultipleValuesError
 from websockets.exceptions import InvalidHandshake, InvalidMessage
 from websockets.http11 import Request, Response
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.console.dress import dressed
 
 LEAST_TOKEN = 16
@@ -52,8 +53,11 @@ CLOSE_TIMEOUT_S = 1.0
 PageRequest = Callable[[Any, Request], Response | None]
 
 
-class ConsoleError(RuntimeError):
+class ConsoleError(FlexsheetError, RuntimeError):
     """A page that cannot be served; the sentence says why and what to do."""
+
+    code = "console"
+    remedy = "Choose another port, or set a token if the page is open to the network."
 
 
 def read_token(path: Path) -> str:

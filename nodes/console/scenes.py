@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
 from flexsheet.nodes.models.rigid import rotation_from_rpy
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
@@ -22,8 +23,11 @@ MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
 """Of the slider."""
 
 
-class SceneChoiceError(ValueError):
+class SceneChoiceError(FlexsheetError, ValueError):
     """A scene that cannot be shown; the sentence says why."""
+
+    code = "scene-choice"
+    remedy = "Choose a scene with the devices of the running one."
 
 
 def first_scene(plan_file: Path) -> Scene:

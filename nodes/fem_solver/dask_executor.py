@@ -30,6 +30,9 @@ class SchedulerError(precompute_table.WorkersError):
     """The scheduler's workers cannot be used; the text names the parameter, its value and a
     remedy."""
 
+    code = "scheduler"
+    remedy = "Check the scheduler's address, and that its workers run the same version."
+
     def __init__(self, address: str, what: str, remedy: str) -> None:
         super().__init__(
             f'scheduler "{address}": {what}; {remedy}, or set scheduler to null, for the '

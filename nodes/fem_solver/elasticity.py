@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.fem_solver.mesh import EDGES
 
 if TYPE_CHECKING:
@@ -27,8 +28,11 @@ MIN_VOLUME_RATIO = 1e-6
 rounding."""
 
 
-class SolidMeshError(ValueError):
+class SolidMeshError(FlexsheetError, ValueError):
     """A mesh that cannot be computed: inverted elements, or a body without sufficient support."""
+
+    code = "solid-mesh"
+    remedy = "Increase skin_spacing_m, or fix more of the object; see docs/meshing.md."
 
 
 def lame_constants(young_modulus_pa: float, poisson_ratio: float) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.fem_solver.elasticity import (
     jacobians,
     lame_constants,
@@ -34,8 +35,11 @@ NODE_COORDINATES: Floats = np.vstack([CORNERS, CORNERS[EDGES].mean(axis=1)])
 """The ten nodes (10, 3) on the unit tetrahedron."""
 
 
-class InvertedElementError(ArithmeticError):
+class InvertedElementError(FlexsheetError, ArithmeticError):
     """A displacement that inverts an element: it has no energy."""
+
+    code = "inverted-element"
+    remedy = "Use smaller load steps. Deep pushes may have no solution."
 
 
 class NeoHookeanSolid:

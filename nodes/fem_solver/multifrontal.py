@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 
 Floats = NDArray[np.float64]
@@ -26,8 +27,11 @@ MAX_RUNS = 40
 NO_CHILDREN: tuple[int, ...] = ()
 
 
-class IndefiniteError(ArithmeticError):
+class IndefiniteError(FlexsheetError, ArithmeticError):
     """The stiffness is not positive definite."""
+
+    code = "indefinite"
+    remedy = "Fix the body at its base. Check that Poisson's ratio is below 0.5."
 
 
 @dataclass(frozen=True, slots=True)

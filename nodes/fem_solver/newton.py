@@ -21,6 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.fem_solver.contact import POINT_SPACING_RATIO, sample_triangle
 from flexsheet.nodes.fem_solver.elasticity import degrees_of_freedom, scatter_add
 from flexsheet.nodes.fem_solver.hyperelastic import NeoHookeanSolid
@@ -48,8 +49,11 @@ TOLERANCE = 1e-8
 """Residual forces, as a fraction of the largest force in the body."""
 
 
-class NewtonNotConvergedError(ArithmeticError):
+class NewtonNotConvergedError(FlexsheetError, ArithmeticError):
     """A load step did not converge."""
+
+    code = "newton"
+    remedy = "Reduce the push, refine the mesh, or choose the linear method."
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,6 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.background import enter_background
 from flexsheet.nodes.cache import CheckpointStore, Specification, cached, encode_fields
 from flexsheet.nodes.fem_solver import precompute, snapshots
@@ -113,12 +114,18 @@ def _solve(job: snapshots.SnapshotJob) -> snapshots.Snapshot:
     return snapshots.solve_snapshot(job, stop_requested.get())
 
 
-class WorkersError(RuntimeError):
+class WorkersError(FlexsheetError, RuntimeError):
     """The workers that were to solve snapshots cannot be used."""
+
+    code = "workers"
+    remedy = "Follow the remedy in the text."
 
 
 class LostWorkersError(WorkersError):
     """The workers are gone; finished snapshots are stored."""
+
+    code = "lost-workers"
+    remedy = "Start the workers again and repeat the command. Finished results are stored."
 
 
 def code_version() -> str:

@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline, PchipInterpolator
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import SheetSpec
 from flexsheet.nodes.models.sheet import (
     edge_force_for_stiffness,
@@ -76,8 +77,11 @@ CANDIDATES = 17
 """Stretches that are tried between the least and the largest."""
 
 
-class UnfitCurveError(ValueError):
+class UnfitCurveError(FlexsheetError, ValueError):
     """A force curve that is no curve; the message says what is wrong with it."""
+
+    code = "force-curve"
+    remedy = "Give force over depth from zero, rising, without repeated depths."
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,7 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import Phase
 from flexsheet.nodes.models.rigid import inverse
 from flexsheet.nodes.models.shapes import Nearest, Shape, projection_jacobian, tightest_curvature
@@ -87,8 +88,11 @@ class Presentation:
     push_depth_m: float
 
 
-class UnpresentableError(ValueError):
+class UnpresentableError(FlexsheetError, ValueError):
     """An object that no sheet can be presented to; the message says why and what to change."""
+
+    code = "unpresentable"
+    remedy = "Make the object larger or smoother, or the sheet wider."
 
 
 class Encounter:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Scene, SheetSpec
 from flexsheet.messages.sheet_calibration import SheetCalibration, refuse_other_sheet
 from flexsheet.nodes.methods import Family, Trial, clip_range
-from flexsheet.nodes.models.sheet.fit import make_model
 from flexsheet.nodes.models.sheet.force_models import (
     LinearSheetModel,
     MembraneSheetModel,
@@ -20,6 +19,7 @@ from flexsheet.nodes.models.sheet.force_models import (
     ScaledSheetModel,
     SheetForce,
     SheetForceModel,
+    make_model,
 )
 from flexsheet.nodes.models.sheet.membrane import push_path
 from flexsheet.nodes.models.sheet.rubber import Rubber

@@ -12,6 +12,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.renderer.correction import (
     GRAZING_SINE,
     NEAR_M,
@@ -34,8 +35,11 @@ RAMP_AXES = {"coordinate_ramp_x": 1, "coordinate_ramp_y": 2}
 MARK_RADIUS_M = 0.003
 
 
-class NoOpenGLError(RuntimeError):
+class NoOpenGLError(FlexsheetError, RuntimeError):
     """No OpenGL 3.3 context could be created; the message names the packages to install."""
+
+    code = "no-opengl"
+    remedy = "`flexsheet doctor` names the packages for EGL."
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,8 @@ from typing import Any
 
 import glfw
 
+from flexsheet.messages.errors import FlexsheetError
+
 PLAIN_CONTEXT = {
     glfw.CONTEXT_VERSION_MAJOR: 3,
     glfw.CONTEXT_VERSION_MINOR: 3,
@@ -23,8 +25,11 @@ ON_A_PROJECTOR = {
 }
 
 
-class WindowError(RuntimeError):
+class WindowError(FlexsheetError, RuntimeError):
     """The requested window cannot be opened; the message gives the remedy."""
+
+    code = "window"
+    remedy = "Set the monitor to one that the text lists, or run headless."
 
 
 @contextmanager

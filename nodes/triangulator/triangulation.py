@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.calibration import StereoCalibration, refuse_other_camera
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.messages.types import StereoPair
 from flexsheet.nodes.models import camera, rigid
@@ -95,8 +96,11 @@ def _matrix(lens: Lens) -> Floats:
     return camera.camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px)
 
 
-class ImageMismatchError(ValueError):
+class ImageMismatchError(FlexsheetError, ValueError):
     """Raised for images of another device, or larger than the sensor of the scene's camera."""
+
+    code = "image-mismatch"
+    remedy = "Name in the scene the camera that took the images."
 
 
 def check_images(pair: StereoPair, geometry: StereoGeometry) -> None:

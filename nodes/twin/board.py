@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.calibration import Board
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, StereoCamera
 from flexsheet.nodes.models.rigid import apply, rotation_from_vector, transform
 from flexsheet.nodes.twin.pixels import Sensor, quantize
@@ -43,8 +44,11 @@ CHARUCO_NEARER = 1.2
 """Factor by which a ChArUco board is shown nearer, since its markers are small."""
 
 
-class BoardError(ValueError):
+class BoardError(FlexsheetError, ValueError):
     """Raised for a board that cannot be rendered; the message says what to change."""
+
+    code = "board"
+    remedy = "Choose a board that fits into the images: fewer or smaller squares."
 
 
 @dataclass(frozen=True, slots=True)

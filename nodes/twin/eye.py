@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Projector, Scene
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.twin import rig
@@ -48,9 +49,12 @@ GLOW, DARKENING, HALF_DARK_M = np.array([0.16, 0.03, 0.02]), np.array([0.8, 1.0,
 """Appearance of a soft object in this light; see docs/renderer.md."""
 
 
-class NotMeasurableError(ValueError):
+class NotMeasurableError(FlexsheetError, ValueError):
     """Raised when an image does not show what is to be measured; the message says what is
     missing."""
+
+    code = "not-measurable"
+    remedy = "Render a nearer pose: the quantity to measure must be in view."
 
 
 @dataclass(frozen=True, slots=True)

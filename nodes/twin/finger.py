@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.types import PathJoin
 
 Floats = NDArray[np.float64]
@@ -30,8 +31,11 @@ WANDER_BAND_HZ = (0.15, 1.2)
 TREMOR_BAND_HZ = (8.0, 12.0)
 
 
-class FingerPathError(ValueError):
+class FingerPathError(FlexsheetError, ValueError):
     """Raised for a path that the finger cannot follow; the message says why and what to change."""
+
+    code = "finger-path"
+    remedy = "Slow the path down, or correct the row that the text names."
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from flexsheet.messages.errors import FlexsheetError
+
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
 Bools = NDArray[np.bool_]
@@ -40,8 +42,11 @@ MAX_STEP_RADII = 0.7
 MAX_ITERATIONS = 80
 
 
-class NotConvergedError(RuntimeError):
+class NotConvergedError(FlexsheetError, RuntimeError):
     """The membrane's equilibrium was not found; the message gives the residual."""
+
+    code = "membrane"
+    remedy = "Reduce the push: it is beyond the simulated membrane's range."
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import (
     CONTROLLER_CYCLE_S,
@@ -47,8 +48,11 @@ STEP_CYCLES = 2.0
 """A set-point may be as far from the one before as full speed goes in so many cycles."""
 
 
-class MxtError(Exception):
+class MxtError(FlexsheetError):
     """Why the robot program ends."""
+
+    code = "mxt-program"
+    remedy = "No action is needed: the simulated controller's program restarts."
 
 
 class MxtController:

@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -23,8 +25,11 @@ SUBTRIANGLES = np.array([[0, 3, 5], [3, 1, 4], [5, 4, 2], [3, 4, 5]])
 """A six-node triangle as four linear ones over the same nodes."""
 
 
-class UnfitMeshError(ValueError):
+class UnfitMeshError(FlexsheetError, ValueError):
     """An object cannot be meshed as specified; the text gives the reason and the remedy."""
+
+    code = "unfit-mesh"
+    remedy = "Choose a coarser or finer spacing, or repair the surface."
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
+
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
@@ -20,8 +22,11 @@ MAX_DIHEDRAL_RAD = np.radians(175.0)
 """Neighbours with a larger angle between their normals are folded onto one another."""
 
 
-class MeshError(ValueError):
+class MeshError(FlexsheetError, ValueError):
     """Raised for a mesh that bounds no solid; the message says why and what to do."""
+
+    code = "mesh"
+    remedy = "Repair the mesh: closed, outward, no inverted elements; see docs/meshing.md."
 
 
 def check_mesh(vertices: Floats, triangles: Indices) -> None:

@@ -11,7 +11,7 @@ By increasing cost: `LinearSheetModel`, `ScaledSheetModel`,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from typing import Protocol
 
@@ -366,3 +366,22 @@ def interpolated_inverse(grid: Floats, values: Floats, wanted: Floats) -> Floats
     before = places[0] + power * (asked - logs[0])
     result[some] = np.exp(np.where(asked < logs[0], before, np.interp(asked, logs, places)))
     return result
+
+
+def make_model(
+    nominal: Rubber,
+    *,
+    modulus_thickness_n_per_m: float,
+    slack_width_m: float,
+    cubic_ratio: float,
+    mooney_share: float,
+) -> ScaledSheetModel:
+    """Make the scaled model of a sheet with these parameters, for stretch ratios over the nominal
+    width."""
+    rubber = replace(
+        nominal,
+        width_m=slack_width_m,
+        young_modulus_pa=modulus_thickness_n_per_m / nominal.thickness_m,
+        mooney_share=mooney_share,
+    )
+    return ScaledSheetModel(rubber, cubic_ratio, nominal.width_m / slack_width_m)

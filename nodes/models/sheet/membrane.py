@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.models.sheet.rubber import Rubber
 
 Floats = NDArray[np.float64]
@@ -45,9 +46,12 @@ TOLERANCE = 1e-7
 """Residual at equilibrium, in E t width."""
 
 
-class NoEquilibriumError(ArithmeticError):
+class NoEquilibriumError(FlexsheetError, ArithmeticError):
     """Raised when no equilibrium of the membrane is found; the message has position and
     residual."""
+
+    code = "no-equilibrium"
+    remedy = "Reduce the push or the tilt: it is beyond the sheet's range."
 
 
 @dataclass(frozen=True, slots=True)

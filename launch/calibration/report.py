@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.bundle import PARAMETERS, pose_transform
+from flexsheet.launch.calibration.check import Rig
+from flexsheet.launch.calibration.corners import board_points, describe
+from flexsheet.launch.calibration.stereo import CalibrationResult
 from flexsheet.messages.files import write_file
-from flexsheet.nodes.camera.bundle import PARAMETERS, pose_transform
-from flexsheet.nodes.camera.calibration import CalibrationResult
-from flexsheet.nodes.camera.check import Rig
-from flexsheet.nodes.camera.corners import board_points, describe
 from flexsheet.nodes.models import rigid
 
 if TYPE_CHECKING:

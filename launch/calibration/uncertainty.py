@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.camera.bundle import (
+from flexsheet.launch.calibration.bundle import (
     LEFT,
     PARAMETERS,
     RIGHT,
@@ -24,7 +24,7 @@ from flexsheet.nodes.camera.bundle import (
     lens_arrays,
     pose_transform,
 )
-from flexsheet.nodes.camera.corners import BoardPair, Progress, ignore_progress
+from flexsheet.launch.calibration.corners import BoardPair, Progress, ignore_progress
 from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]

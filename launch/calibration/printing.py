@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.corners import CalibrationError, charuco_board, describe
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.files import write_file
-from flexsheet.nodes.camera.corners import CalibrationError, charuco_board, describe
 
 Floats = NDArray[np.float64]
 

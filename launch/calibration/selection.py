@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.camera.bundle import (
+from flexsheet.launch.calibration.bundle import (
     NotDeterminedError,
     RigFit,
     board_pose,
@@ -22,7 +22,7 @@ from flexsheet.nodes.camera.bundle import (
     pose_transform,
     pose_vector,
 )
-from flexsheet.nodes.camera.corners import BoardPair, CalibrationError, View
+from flexsheet.launch.calibration.corners import BoardPair, CalibrationError, View
 from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.nodes.models.sheet.force_models import ScaledSheetModel, SheetForceModel, make_model
 from flexsheet.nodes.models.sheet.rubber import Rubber
 from flexsheet.nodes.models.sheet.tabulated import TabulatedSheetModel
 
@@ -29,8 +30,11 @@ MAX_RELATIVE_DEVIATION = 0.5
 """A parameter with a larger relative standard deviation is undetermined."""
 
 
-class SheetModelFitError(ValueError):
+class SheetModelFitError(FlexsheetError, ValueError):
     """Raised for rows that do not determine the model; the message names what is missing."""
+
+    code = "sheet-model-fit"
+    remedy = "Add pushes at other stretches and depths."
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,25 +72,6 @@ class SheetModelFit:
     residual_ratio: Floats
     rms_ratio: float
     worst_ratio: float
-
-
-def make_model(
-    nominal: Rubber,
-    *,
-    modulus_thickness_n_per_m: float,
-    slack_width_m: float,
-    cubic_ratio: float,
-    mooney_share: float,
-) -> ScaledSheetModel:
-    """Make the scaled model of a sheet with these parameters, for stretch ratios over the nominal
-    width."""
-    rubber = replace(
-        nominal,
-        width_m=slack_width_m,
-        young_modulus_pa=modulus_thickness_n_per_m / nominal.thickness_m,
-        mooney_share=mooney_share,
-    )
-    return ScaledSheetModel(rubber, cubic_ratio, nominal.width_m / slack_width_m)
 
 
 NAMES = ("modulus_thickness_n_per_m", "slack_width_m", "cubic_ratio", "mooney_share")

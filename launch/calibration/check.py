@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.calibration import Board, StereoCalibration
-from flexsheet.nodes.camera.bundle import (
+from flexsheet.launch.calibration.bundle import (
     LEFT,
     RIGHT,
     STAND,
@@ -23,7 +22,7 @@ from flexsheet.nodes.camera.bundle import (
     lens_arrays,
     pose_transform,
 )
-from flexsheet.nodes.camera.corners import (
+from flexsheet.launch.calibration.corners import (
     BoardPair,
     CalibrationError,
     Progress,
@@ -35,7 +34,8 @@ from flexsheet.nodes.camera.corners import (
     read_gray,
     same_order,
 )
-from flexsheet.nodes.camera.selection import MIN_PAIRS, Selection, fit_selection
+from flexsheet.launch.calibration.selection import MIN_PAIRS, Selection, fit_selection
+from flexsheet.messages.calibration import Board, StereoCalibration
 
 Floats = NDArray[np.float64]
 

@@ -19,13 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.calibration import Board, StereoCalibration
-from flexsheet.messages.files import write_file
-from flexsheet.messages.scene import Lens as SceneLens
-from flexsheet.messages.scene import Pose, Scene
-from flexsheet.messages.types import Side
-from flexsheet.nodes.arm_bridge.hand_eye import Lens, Rig, Sighting, View
-from flexsheet.nodes.camera.corners import (
+from flexsheet.launch.calibration.corners import (
     BoardPair,
     CornerFinder,
     Progress,
@@ -33,6 +27,13 @@ from flexsheet.nodes.camera.corners import (
     find_pairs,
     match_views,
 )
+from flexsheet.launch.calibration.hand_eye import Lens, Rig, Sighting, View
+from flexsheet.messages.calibration import Board, StereoCalibration
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.files import write_file
+from flexsheet.messages.scene import Lens as SceneLens
+from flexsheet.messages.scene import Pose, Scene
+from flexsheet.messages.types import Side
 from flexsheet.nodes.camera.image_pair import encode_png
 from flexsheet.nodes.models.camera import camera_matrix, project
 from flexsheet.nodes.models.rigid import (
@@ -72,8 +73,11 @@ TWIN_BASE_M, TWIN_BASE_RAD, TWIN_JOINT_RAD = 0.005, 0.01, 2e-4
 """How far the twin's bases stand off the scene's, and its joints off what they say (deviations)."""
 
 
-class PlacesError(ValueError):
+class PlacesError(FlexsheetError, ValueError):
     """A folder of places that cannot be used; the message names file, row and column."""
+
+    code = "arm-poses"
+    remedy = "Correct the row of joints.csv that the text names, or measure that pose again."
 
 
 def rig_of(scene: Scene, calibration: StereoCalibration | None) -> Rig:

@@ -1,13 +1,9 @@
-"""Writes the register map into docs/modbus.md, between its marks, from the code that speaks it.
-
-python -m flexsheet.launch.reference.registers
-"""
+"""Writes the register map into docs/modbus.md, between its marks, from the code that speaks it."""
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from pathlib import Path
 
 from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
@@ -19,11 +15,7 @@ from flexsheet.nodes.arm_bridge.modbus import (
     register_count,
 )
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "modbus.md"
-BEGIN = (
-    "<!-- registers: written by `python -m flexsheet.launch.reference.registers`; "
-    "a test compares -->\n"
-)
+BEGIN = "<!-- registers: written by `make pages`; a test compares -->\n"
 END = "<!-- end of registers -->\n"
 KINDS = {"H": "u16", "I": "u32", "f": "float32"}
 
@@ -60,7 +52,3 @@ def _block(title: str, address: int, block: Sequence[Field]) -> str:
         lines.append(f"| {span} | `{field.name}` | {kind} | {field.about} |")
         address += length
     return "\n".join(lines) + "\n"
-
-
-if __name__ == "__main__":
-    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")

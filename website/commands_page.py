@@ -1,7 +1,4 @@
-"""Writes docs/cli.md: every command with its arguments, options and examples.
-
-python -m flexsheet.launch.reference.cli > docs/cli.md
-"""
+"""Writes docs/cli.md: every command with its arguments, options and examples."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from flexsheet.launch.commands.output import examples_in
 INTRODUCTION = """\
 # Command line
 
-<!-- Written by `python -m flexsheet.launch.reference.cli > docs/cli.md`; a test compares. -->
+<!-- Written by `make pages`; a test compares. -->
 
 Data goes to stdout, words to stderr; `--json` makes the data JSON.  Exit codes: 0 done, 1 failed,
 2 the input is wrong, 3 a replay differs from what was live, or `tune` found no method good enough.
@@ -83,7 +80,3 @@ def _words(parameter: Any) -> str:
     if "/launch/" in default:
         default = "launch/" + default.rpartition("/launch/")[2]
     return f"{words} Default: `{default}`."
-
-
-if __name__ == "__main__":
-    print(reference(), end="")

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.nodes.camera.corners import BoardPair, View
+from flexsheet.launch.calibration.corners import BoardPair, View
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]
@@ -35,8 +36,11 @@ CONVERGED_COST_CHANGE = 1e-9
 """Relative change of the cost that ends the iteration."""
 
 
-class NotDeterminedError(ValueError):
+class NotDeterminedError(FlexsheetError, ValueError):
     """Raised when the pairs do not determine all of the rig's numbers."""
+
+    code = "not-determined"
+    remedy = "Add image pairs that differ in tilt and distance."
 
 
 @dataclass(frozen=True, slots=True)

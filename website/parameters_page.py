@@ -1,7 +1,4 @@
-"""Writes docs/parameters.md: what can be set of each node in a launch file.
-
-python -m flexsheet.launch.reference.parameters > docs/parameters.md
-"""
+"""Writes docs/parameters.md: what can be set of each node in a launch file."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from flexsheet.messages.reference import field_type, parts_of, type_section
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.node import parameters_of
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parent.parent
 UNITS = {
     "_m_per_s3": "m/s³", "_rad_per_s3": "rad/s³", "_per_s3": "1/s³", "_m_per_s2": "m/s²",
     "_rad_per_s2": "rad/s²", "_per_s2": "1/s²", "_m_per_s": "m/s", "_rad_per_s": "rad/s",
@@ -26,7 +23,7 @@ UNITS = {
 INTRODUCTION = """\
 # Parameters
 
-<!-- Written by `python -m flexsheet.launch.reference.parameters`; a test compares. -->
+<!-- Written by `make pages`; a test compares. -->
 
 What can be set of each node: in a launch file under `nodes: NAME: parameters:`, or on the command
 line by `--set NAME.PARAMETER=VALUE`.  Units are in the names.  `flexsheet node describe NODE`
@@ -67,7 +64,3 @@ def _default(field: Any) -> str:
         value = value.model_dump(mode="json")
     text = "null" if value is None else str(value)
     return f"`{text.replace(f'{ROOT}/', '')}`"
-
-
-if __name__ == "__main__":
-    print(reference(), end="")

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.arm_bridge.kinematics import forward
 from flexsheet.nodes.models.camera import project
 from flexsheet.nodes.models.rigid import (
@@ -93,8 +94,11 @@ STARTED = 1e-6
 """The same for what is only a start."""
 
 
-class HandEyeError(ValueError):
+class HandEyeError(FlexsheetError, ValueError):
     """Places that do not fix where the base stands; the message says why and what to do."""
+
+    code = "hand-eye"
+    remedy = "Measure more poses, with the board rotated about at least two axes."
 
 
 @dataclass(frozen=True, slots=True)

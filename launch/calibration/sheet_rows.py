@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from flexsheet.launch.bench.twin_sheet import twin_push
+from flexsheet.launch.calibration.sheet_fit import MeasuredPush
+from flexsheet.launch.calibration.simulated_sheet import twin_push
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.messages.scene import Scene, SheetSpec
-from flexsheet.nodes.models.sheet.fit import MeasuredPush
 
 NEEDED = ("depth_mm", "force_n")
 STRETCH = ("edge_distance_mm", "stretch_ratio")

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.calibration.bundle import board_pose, pose_transform
+from flexsheet.launch.calibration.corners import BoardPair, CornerFinder, board_points, match_views
 from flexsheet.messages.calibration import Board
 from flexsheet.messages.scene import Lens
-from flexsheet.nodes.camera.bundle import board_pose, pose_transform
-from flexsheet.nodes.camera.corners import BoardPair, CornerFinder, board_points, match_views
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]

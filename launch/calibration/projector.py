@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from flexsheet.launch.calibration.gray_code import DecodeError, Image, decode_patterns, find_pixels
+from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Lens, Pose, Projector, StereoCamera
 from flexsheet.nodes.models.camera import camera_matrix, normalize, project
 from flexsheet.nodes.models.rigid import (
@@ -25,7 +27,6 @@ from flexsheet.nodes.models.rigid import (
     transform_from_rpy,
     vector_from_rotation,
 )
-from flexsheet.nodes.renderer.gray_code import DecodeError, Image, decode_patterns, find_pixels
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -44,8 +45,11 @@ TYPICAL_ERRORS = np.array([0.01] * 3 + [0.01] * 3 + [0.02] + [20.0] * 2)
 length (relative), principal point (px). Only the ratios count."""
 
 
-class ProjectorError(ValueError):
+class ProjectorError(FlexsheetError, ValueError):
     """Images or points that give no calibration; the message gives the remedy."""
+
+    code = "projector-calibration"
+    remedy = "Take images in more poses, with the whole pattern on the sheet."
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,9 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.messages.calibration import Board, PairResidual, StereoCalibration, Uncertainty
-from flexsheet.messages.scene import Lens
-from flexsheet.nodes.camera.bundle import (
+from flexsheet.launch.calibration.bundle import (
     LEFT,
     PARAMETERS,
     RIGHT,
@@ -26,7 +24,7 @@ from flexsheet.nodes.camera.bundle import (
     RigFit,
     pose_transform,
 )
-from flexsheet.nodes.camera.corners import (
+from flexsheet.launch.calibration.corners import (
     BoardPair,
     Progress,
     board_points,
@@ -34,14 +32,16 @@ from flexsheet.nodes.camera.corners import (
     find_pairs,
     ignore_progress,
 )
-from flexsheet.nodes.camera.selection import Selection, fit_selection, not_determined
-from flexsheet.nodes.camera.uncertainty import (
+from flexsheet.launch.calibration.selection import Selection, fit_selection, not_determined
+from flexsheet.launch.calibration.uncertainty import (
     jackknife_covariance,
     position_slopes,
     position_spread,
     right_from_left_of,
     view_of_work,
 )
+from flexsheet.messages.calibration import Board, PairResidual, StereoCalibration, Uncertainty
+from flexsheet.messages.scene import Lens
 
 Floats = NDArray[np.float64]
 

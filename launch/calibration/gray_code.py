@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.messages.errors import FlexsheetError
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Image = NDArray[np.uint8]
@@ -34,8 +36,11 @@ MAX_FIT_RMS_PX = 0.6
 """A fit that leaves more than this (rms, camera pixels) spans an edge or a fold of the sheet."""
 
 
-class DecodeError(ValueError):
+class DecodeError(FlexsheetError, ValueError):
     """The images do not show the patterns; the message gives the reason."""
+
+    code = "gray-code"
+    remedy = "Take all images in order, exposed neither too dark nor too bright."
 
 
 def patterns(width_px: int, height_px: int) -> list[Image]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.calibration import Board
+from flexsheet.messages.errors import FlexsheetError
 
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -45,9 +46,15 @@ corners."""
 REFINEMENT = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-6)
 
 
-class CalibrationError(ValueError):
+class CalibrationError(FlexsheetError, ValueError):
     """Raised for images that cannot be used for calibration; the message says which and what to
     do."""
+
+    code = "calibration"
+    remedy = (
+        "Take sharp images of the whole board in many tilts. Check `--board` (inner corners) and "
+        "`--square-mm`."
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,1 @@
+"""Calibrate cameras, arms, projector and sheet offline, from files or from the simulator."""

@@ -1,0 +1,113 @@
+"""Notes of nodes that need an action, and what to do."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+from flexsheet.messages.types import FingertipReason
+
+BUSY_FIRST = "First check whether the computer is busy: `flexsheet doctor`, row `load`. "
+
+
+class NodeNote(Enum):
+    """Notes, reasons and warnings of nodes that need an action, by their constant phrase."""
+
+    COMPUTER_BUSY = (
+        "is busy:",
+        "Nodes wait for a processor. End other programs, or give the graph more cores.",
+    )
+    TARGET_OR_ARM_LATE = (
+        "sheet target or other arm late",
+        BUSY_FIRST + "Then check the network, and the rate of each topic: `flexsheet topic hz`.",
+    )
+    OTHER_ARM_SILENT = (
+        "the other arm is silent",
+        BUSY_FIRST + "Then check the log of the other bridge, and the network.",
+    )
+    NO_SHEET_TARGET = (
+        "no sheet target",
+        BUSY_FIRST + "Then check camera, triangulator and planner: `flexsheet topic hz`.",
+    )
+    ARM_WATCHDOG = (
+        "the arm's watchdog stopped it",
+        BUSY_FIRST + "Then read the log of the arm's bridge, which sent no command for 100 ms.",
+    )
+    NO_PATH = (
+        "no way:",
+        "Move the arms nearer to the sheet by hand, or the sheet to another position "
+        "(docs/arms.md).",
+    )
+    NOT_RECORDING = (
+        "NOT RECORDING:",
+        "Free space on the disk, or record to another one. With space, the next bag starts "
+        "by itself.",
+    )
+    NODE_HUNG = (
+        "hung: no sign of life",
+        "The node is restarted. The end of `logs/NODE.log` of the run shows where it stood. "
+        "`liveness_s` of the launch file sets how long it may be silent.",
+    )
+    KEY_REFUSED = (
+        "refuses our key",
+        "The launch file there has no key or another key for this host. Copy the newest launch "
+        "file to all hosts; `flexsheet doctor hosts` lists which differ.",
+    )
+    NO_KEYS_THERE = (
+        "does not speak with our keys",
+        "Start that host with a launch file that has keys, the same on all hosts.",
+    )
+    KEY_NOT_PROVED = (
+        "did not prove that it has its key",
+        "The secret key there does not belong to the public key in the launch file, or another "
+        "program uses its address: `flexsheet doctor hosts`.",
+    )
+    READER_TOO_SLOW = (
+        "a reader or the network is too slow",
+        "`flexsheet topic echo status` shows which port drops messages. Give that node more "
+        "processor time, or the link more bandwidth.",
+    )
+    MAY_NOT_RESET = (
+        "may not reset an e-stop",
+        "Reset it on a host for which the launch file sets `hosts.NAME.may_reset_estop`.",
+    )
+    CLOCK_NOT_MEASURED = (
+        "is not measured",
+        "Wait some seconds after a start. If it remains, the clock node or the network of that "
+        "host is down (docs/clocks.md).",
+    )
+    CLOCK_UNCERTAIN = (
+        "ms are allowed",
+        "Reduce the traffic of the network, set up chrony, or allow more (docs/clocks.md).",
+    )
+    ESTOP_KEPT = (
+        "kept until it is reset",
+        "Reset it when the danger is over: `flexsheet arms reset`.",
+    )
+    LAST_SHEET_PLANE = (
+        "keeping the last valid sheet plane",
+        "The arms are silent, or the sheet faces away. The renderer recovers by itself.",
+    )
+
+    def __init__(self, phrase: str, remedy: str) -> None:
+        self.phrase = phrase
+        self.remedy = remedy
+
+    @property
+    def code(self) -> str:
+        """Return the name as `flexsheet explain` accepts it."""
+        return self.name.lower().replace("_", "-")
+
+
+FINGERTIP_REMEDIES: dict[FingertipReason, str] = {
+    "no_marker": "Move the finger into the view, replace a lost marker, or expose longer.",
+    "marker_in_one_view": "One camera is occluded or sees less far: move the finger or the camera.",
+    "two_markers": "Cover reflections, and show one marked finger only.",
+    "merged": "Remove the bright spot that touches the marker's image.",
+    "blurred": "The finger is too fast for the exposure: expose shorter, with more light.",
+    "saturated": "The marker is overexposed: expose shorter.",
+    "outside_volume": "Move the finger into the working range of the scene.",
+    "inconsistent": "The rays of both views do not meet: calibrate the camera again.",
+    "too_fast": "A jump faster than a finger is usually a reflection: cover it.",
+    "unconfirmed": "Wait: a new marker is accepted after a few images.",
+}
+"""Remedies by `reason` of the topic `fingertip`, for all reasons but "ok"."""

@@ -1,0 +1,89 @@
+"""Errors of users: each kind has a code and a remedy, and `flexsheet explain` finds it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import get_args
+
+import pytest
+
+from flexsheet.launch import cli
+from flexsheet.launch.commands.explain import Entry, entries, find_entries
+from flexsheet.launch.commands.output import BAD_INPUT, FAILED, CommandError
+from flexsheet.launch.plans.documents import BadInputError, Problem
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.notes import FINGERTIP_REMEDIES, NodeNote
+from flexsheet.messages.topics import UnknownTopicError, topic_named
+from flexsheet.messages.types import FingertipReason
+
+
+def kinds_of(kind: type[FlexsheetError]) -> list[type[FlexsheetError]]:
+    """All classes of the project that derive from an error; `entries` imports their modules."""
+    derived = [one for one in kind.__subclasses__() if one.__module__.startswith("flexsheet.")]
+    return derived + [below for one in derived for below in kinds_of(one)]
+
+
+def test_every_kind_of_error_has_its_own_code_and_remedy() -> None:
+    codes = Counter(entry.code for entry in entries())
+    assert set(codes.values()) == {1}
+    for kind in kinds_of(FlexsheetError):
+        assert {"code", "remedy"} <= set(vars(kind)), f"{kind.__name__} lacks a code or a remedy"
+        assert kind.__doc__
+
+
+def test_every_reason_of_an_invalid_fingertip_has_a_remedy() -> None:
+    assert set(FINGERTIP_REMEDIES) == set(get_args(FingertipReason)) - {"ok"}
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("bag", "bag"),
+        ("BagError", "bag"),
+        ("saturated", "saturated"),
+        ("handler failed: UnreachableError: no joint angles", "unreachable"),
+        (f'topic "arm_left": host left {NodeNote.KEY_REFUSED.phrase}', "key-refused"),
+        ('unknown topic "fingr"; did you mean "finger"?', "unknown-topic"),
+        ("a.mcap: exists already; a bag is never written over", "bag"),
+        ("no graph is running; start one with: flexsheet launch FILE", "no-graph"),
+    ],
+)
+def test_a_code_a_class_or_a_text_is_explained(text: str, code: str) -> None:
+    first = find_entries(text)[0]
+    assert first.code == code
+    assert first.remedy
+
+
+def test_nothing_is_explained_without_a_match() -> None:
+    assert find_entries("xyzzy plugh") == []
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (UnknownTopicError("so"), FAILED),
+        (BadInputError([Problem("a.yaml:1", (), "so")]), BAD_INPUT),
+        (CommandError("so", BAD_INPUT), BAD_INPUT),
+        (ValueError("so"), None),
+    ],
+)
+def test_errors_of_users_end_a_command_with_a_code(error: Exception, code: int | None) -> None:
+    assert cli.exit_code(error) == code
+
+
+def test_the_text_of_an_error_is_not_quoted() -> None:
+    with pytest.raises(UnknownTopicError) as raised:
+        topic_named("fingr")
+    assert str(raised.value).startswith('unknown topic "fingr"')
+
+
+def test_an_entry_of_an_error_has_the_first_paragraph_of_its_class() -> None:
+    assert (
+        Entry(
+            code="unknown-topic",
+            meaning=" ".join((UnknownTopicError.__doc__ or "").split()),
+            remedy=UnknownTopicError.remedy,
+            name="UnknownTopicError",
+        )
+        in entries()
+    )

@@ -1,0 +1,46 @@
+"""Writes docs/errors.md from the classes of the errors and from the catalogue of notes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from flexsheet.launch.commands.explain import entries
+from flexsheet.messages.notes import FINGERTIP_REMEDIES
+
+INTRODUCTION = """\
+# Errors
+
+<!-- Written by `make pages`; a test compares. -->
+
+Every error text names what is wrong, where, and what to do.  The tables below add what each kind of
+error means.  `flexsheet explain CODE` prints an entry, and `flexsheet explain 'THE TEXT'` finds it.
+Exit codes: 0 success, 1 failure, 2 invalid input, 3 a replay that differs from the recording, or
+`tune` without a sufficient method.
+
+Notes of nodes are in the log of `flexsheet launch`, in the topic `status`
+(`flexsheet topic echo status`) and in the console.
+"""
+
+
+def reference() -> str:
+    """Return the whole page."""
+    errors = [entry for entry in entries() if entry.name]
+    notes = [entry for entry in entries() if entry.phrase]
+    return "\n".join(
+        [
+            INTRODUCTION,
+            "## Errors of commands and nodes\n",
+            _table("code", ((entry.code, entry.meaning, entry.remedy) for entry in errors)),
+            "## Notes of nodes\n",
+            _table("code", ((entry.code, f"`{entry.phrase}`", entry.remedy) for entry in notes)),
+            "## Reasons of an invalid fingertip\n",
+            _table("`reason`", FINGERTIP_REMEDIES.items()),
+        ]
+    )
+
+
+def _table(first: str, rows: Iterable[tuple[str, ...]]) -> str:
+    cells = [(f"`{code}`", *rest) for code, *rest in rows]
+    titles = (first, "meaning", "what to do") if len(cells[0]) == 3 else (first, "what to do")
+    lines = [titles, ("---",) * len(titles), *cells]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"

@@ -1,0 +1,36 @@
+"""Writes the pages and pictures of docs/ that are generated from the code.
+
+python -m website.pages [DOCS]
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from flexsheet.messages import reference as messages_page
+from website import commands_page, errors_page, parameters_page, registers_page
+from website.graph import PICTURES, svg
+
+DOCS = Path(__file__).resolve().parent.parent / "docs"
+
+
+def generate(docs: Path) -> dict[Path, str]:
+    """Return the contents of all generated files by their path relative to the folder of pages.
+
+    docs: folder with modbus.md, of which only a part is generated.
+    """
+    return {
+        Path("messages.md"): messages_page.reference(),
+        Path("cli.md"): commands_page.reference(),
+        Path("parameters.md"): parameters_page.reference(),
+        Path("errors.md"): errors_page.reference(),
+        Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
+        **{Path("images") / name: svg(picture) for name, picture in PICTURES.items()},
+    }
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else DOCS
+    for path, text in generate(folder).items():
+        (folder / path).write_text(text, encoding="utf-8")
