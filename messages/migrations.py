@@ -12,6 +12,7 @@ fields to those of the type that came after.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, get_args
 
@@ -51,7 +52,18 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
 }
 """By model and today's field name: recorded literal values and those of today."""
 
-MIGRATIONS: dict[tuple[str, str], Migration] = {}
+_STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
+
+
+def _add_stroke_duration(fields: Fields) -> Fields:
+    """Add a stroke's moving time, which recorded messages hold in the path's label only."""
+    found = _STROKE_LABEL.fullmatch(fields["path_label"])
+    return {**fields, "path_stroke_s": None if found is None else float(found[1])}
+
+
+MIGRATIONS: dict[tuple[str, str], Migration] = {
+    ("TwinFinger", "c1881b3029f02367"): _add_stroke_duration,
+}
 
 _IGNORED = frozenset({"title", "description", "default", "discriminator", "$defs"})
 _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf", "oneOf",

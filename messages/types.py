@@ -448,6 +448,9 @@ class FingerPath(Message):
         description="rounded_lines: the points are corners, rounded over +-40 ms; spline: they are "
         "samples of a smooth motion that begins and ends at rest",
     )
+    stroke_s: Positive | None = Field(
+        default=None, description="moving time, if the path is a stroke of the experiment"
+    )
 
 
 class TwinFinger(Message):
@@ -456,6 +459,7 @@ class TwinFinger(Message):
     path_label: str
     path_done: bool
     path_time_s: Finite = Field(description="since the path began; negative while easing to it")
+    path_stroke_s: Positive | None = Field(default=None, description="`stroke_s` of the path")
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
 

@@ -238,6 +238,11 @@ def ports_of(node_class: type[Node]) -> dict[str, Port]:
     return ports
 
 
+def further_port(topic_name: str) -> str:
+    """Name the port of a topic that `Node.further_inputs` returned."""
+    return f"in/{topic_name}"
+
+
 def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
     """The declared type of a node class's `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
@@ -298,8 +303,11 @@ class Node:
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
-        """Topics to subscribe to beside the declared ports, for a node whose inputs depend on its
-        parameters and on what the graph writes; such a port is named "in/" and the topic."""
+        """Name the topics to subscribe to beside the declared ports.
+
+        For a node whose inputs depend on its parameters and on the topics that the graph writes.
+        The ports of these topics are named by `further_port`.
+        """
         return ()
 
     def __init__(
@@ -331,7 +339,8 @@ class Node:
         self._steps = Steps(clock)
         if epoch is None:
             epoch = self.started_ns
-        for port in ports_of(type(self)).values():
+        declared = ports_of(type(self))
+        for port in declared.values():
             topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(
@@ -349,6 +358,9 @@ class Node:
                     topic, clock, send, writer=name, epoch=epoch, plan=plan_hash
                 )
                 setattr(self, port.name, self.outputs[port.name])
+        for further, topic_name in (topics or {}).items():
+            if further not in declared:
+                self.inputs[further] = Input(topic_named(topic_name), clock)
         self._mailboxes = {
             port: Mailbox(self, port)
             for port in self.inputs

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,10 +70,10 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
         file.write_text(load_plan(graph, **options).model_dump_json())
         return GraphFacts.from_plan(file, "console")
 
-    on_request = GraphFacts(records=True, records_on_request=True)
+    on_request = GraphFacts(recorders=("recorder",), records_on_request=True, consoles=("console",))
     assert facts(console=True) == on_request
     always = facts(console=True, record=tmp_path / "a.mcap")
-    assert always == GraphFacts(records=True, records_on_request=False)
+    assert always == replace(on_request, records_on_request=False)
 
 
 def test_a_picture_that_somebody_waits_for_has_the_priority_of_a_frame() -> None:

@@ -350,6 +350,7 @@ async def _record(
     from flexsheet.launch.running.runs import local_sources, ring_file
     from flexsheet.launch.running.tools import host_of
     from flexsheet.messages.topics import TOPICS
+    from flexsheet.nodes.node import further_port
     from flexsheet.nodes.recorder.node import Recorder
     from flexsheet.nodes.recorder.parameters import RUN_FILES, RecorderParameters
     from flexsheet.nodes.runner import NodeConfig, PortConfig, run_node
@@ -373,7 +374,7 @@ async def _record(
         parameters=parameters.model_dump(mode="json"),
         inputs=tuple(
             PortConfig(
-                port=f"in/{name}",
+                port=further_port(name),
                 topic=name,
                 endpoints=local_sources(run, plan.sources_to_read(name, host_of(run))),
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, replace
 from enum import Enum, auto
@@ -31,7 +32,6 @@ SETTLE_S = 0.4
 
 LOOK_EVERY_S = 6.0
 PIXELS_EVERY = 3
-LOOK_LABEL = "console"
 MAX_DRAWING_S = 5.0
 """The renderer draws many frames in that time, or none."""
 
@@ -40,6 +40,9 @@ CAPTURE_S = 1.0
 
 MAX_TRACING_S = 120.0
 """A picture that takes longer never comes."""
+
+MAX_LABELS = 64
+"""Number of requested labels whose late pictures are still shown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,12 +156,14 @@ class Look:
         self._by_scene = scene.methods.correction
         self._holds = self._borrowed = False
         self._number = 0
+        self._labels: deque[str] = deque(maxlen=MAX_LABELS)
         self._since_s, self._again_s = 0.0, 0.0
         self._others: Display | None = None
 
     @property
     def label(self) -> str:
-        return f"{LOOK_LABEL} {self._number}"
+        """Label of the newest request."""
+        return f"console {self._number}"
 
     @property
     def correction(self) -> Correction:
@@ -175,10 +180,9 @@ class Look:
         if self._holds and not self._borrowed:
             self._put_back()
 
-    def heed(self, display: Display) -> None:
-        """Another one's display message."""
-        if not display.label.startswith(f"{LOOK_LABEL} "):
-            self._others, self._holds = display, False
+    def on_others_display(self, display: Display) -> None:
+        """Store the display message of another writer, to restore it after the next picture."""
+        self._others, self._holds = display, False
 
     def advance(self, now_s: float) -> None:
         """Ask for the next picture if it is time, or give the last one up."""
@@ -198,6 +202,7 @@ class Look:
 
     def _ask(self, now_s: float) -> None:
         self._number += 1
+        self._labels.append(self.label)
         self._enter(LookState.DRAWING, now_s)
         self._borrowed = True
         self._publish(
@@ -221,10 +226,9 @@ class Look:
 
     def got(self, eye: TwinEye, now_s: float) -> bool:
         """A picture has come; says whether it was for the console, however late."""
-        ours = eye.label.startswith(f"{LOOK_LABEL} ")
         if eye.label == self.label and self.state is not LookState.RESTING:
             self._rest(now_s)
-        return ours
+        return eye.label in self._labels
 
     def _enter(self, state: LookState, now_s: float) -> None:
         self.state, self._since_s = state, now_s

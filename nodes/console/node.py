@@ -12,7 +12,7 @@ from pydantic import Field, field_validator, model_validator
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Positive, Scene
-from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
 from flexsheet.messages.wire import WireError
 from flexsheet.nodes import NodeRole
@@ -22,7 +22,7 @@ from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.guard import Guard, read_token, start_server
 from flexsheet.nodes.console.newest import Newest
 from flexsheet.nodes.console.operator import Operator
-from flexsheet.nodes.node import Input, ListenPort, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.node import ListenPort, Node, NodeParameters, Output, further_port, periodic
 
 SHOWN = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),
@@ -90,14 +90,6 @@ class Console(Node):
     ) -> Sequence[str]:
         return [topic.name for topic in written if topic.name in SHOWN]
 
-    def __init__(
-        self, parameters: ConsoleParameters, *, topics: dict[str, str] | None = None, **rest: Any
-    ) -> None:
-        super().__init__(parameters, topics=topics, **rest)
-        for port, topic in (topics or {}).items():
-            if port.startswith("in/"):
-                self.inputs[port] = Input(topic_named(topic), self.clock)
-
     async def setup(self) -> None:
         given = self.parameters
         token = None if given.token_file is None else read_token(given.token_file)
@@ -110,8 +102,15 @@ class Console(Node):
         files = Files(given.plan, given.scenes, given.bags, given.kept)
         facts = GraphFacts.from_plan(given.plan, self.name)
         desk = Desk(self._publish, files, finger, self.log.warning, facts)
-        has = {"with_finger": given.drives_finger, "with_eye": "in/twin/eye" in self.inputs}
-        self.operator = Operator(self._server, self._newest, desk, self._ask, **has)
+        self.operator = Operator(
+            self._server,
+            self._newest,
+            desk,
+            self._ask,
+            name=self.name,
+            with_finger=given.drives_finger,
+            with_eye=further_port("twin/eye") in self.inputs,
+        )
         desk.begin()
         self.note = f"{self.url}, nobody looks"
 
@@ -161,5 +160,5 @@ class Console(Node):
             self.operator.fail(error)
 
     def _refused(self, topic: Topic, error: WireError) -> None:
-        self.inputs[f"in/{topic.name}"].counts.rejected += 1
+        self.inputs[further_port(topic.name)].counts.rejected += 1
         self.log.warning("input", problem=str(error))

@@ -22,6 +22,7 @@ class RecordTab:
 
     def __init__(self, gui: Any, ask: Ask) -> None:
         self._ask = ask
+        self._seconds_by_option: dict[str, float] = {}
         with gui.add_folder("Record"):
             self._record = gui.add_button("Start recording", icon=viser.Icon.PLAYER_RECORD)
             self._label = gui.add_text("Name", "", hint="What to call the moment")
@@ -48,10 +49,10 @@ class RecordTab:
         command = gui.add_command("Mark this moment", hotkey="M")
         command.on_trigger(lambda _: ask("mark", self._label.value))
 
-    def _go_to_moment(self, told: str) -> None:
-        seconds, _, rest = told.partition(" s")
-        if rest:
-            self._ask("seek", float(seconds))
+    def _go_to_moment(self, option: str) -> None:
+        seconds = self._seconds_by_option.get(option)
+        if seconds is not None:
+            self._ask("seek", seconds)
             # So that the same can be chosen again.
             self._moments.value = NO_MOMENT
 
@@ -77,9 +78,11 @@ class RecordTab:
                 handle.visible = timeline is not None
             if timeline is not None:
                 self._time.max = max(round(timeline.duration_s, 1), 0.1)
-                marked = [f"{seconds:.2f} s {label}" for seconds, label in timeline.moments]
-                self._moments.options = (NO_MOMENT, *marked)
-                self._moments.visible = bool(marked)
+                self._seconds_by_option = {
+                    f"{seconds:.2f} s {label}": seconds for seconds, label in timeline.moments
+                }
+                self._moments.options = (NO_MOMENT, *self._seconds_by_option)
+                self._moments.visible = bool(self._seconds_by_option)
         if timeline is not None:
             self._time.value = round(timeline.seconds, 2)
             self._play.label = "Pause" if replay.playing else "Play"
