@@ -17,9 +17,9 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
     ArmState,
+    Bookmark,
     EStop,
     Frame,
-    Moment,
     PortStatus,
     SheetTarget,
     Side,
@@ -48,7 +48,7 @@ OFF_M, TURNED_RAD = 2e-4, 3e-3
 """By so much the sheet is wrong, all the time."""
 
 LATENCY_S = 0.008
-FAULT_S, ESTOP_S, SILENCE_S, MOMENT_S = 2.0, 2.1, (1.0, 1.8), 1.5
+FAULT_S, ESTOP_S, SILENCE_S, BOOKMARK_S = 2.0, 2.1, (1.0, 1.8), 1.5
 ENDS_S = 3.0
 SCENE: Scene = load_scene(Path("launch/scenes/cylinder.yaml"))
 
@@ -129,7 +129,7 @@ def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
         for i in range(round(ENDS_S * RATE_HZ)):
             seconds = i / RATE_HZ
             _write_step(desk, i, seconds, begin_s, finish_s)
-        desk.write("moment", Moment(label="<b>first touch</b>"), MOMENT_S)
+        desk.write("bookmark", Bookmark(label="<b>first touch</b>"), BOOKMARK_S)
         desk.write("estop", EStop(engaged=True, reason="a person"), ESTOP_S, writer="console")
         port = PortStatus(topic="fingertip", rate_hz=50.0, age_s=0.01, messages=90, dropped=5,
                           gaps=2, rejected=1)  # fmt: skip

@@ -34,10 +34,10 @@ def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
     assert plan.nodes["console"].nice > 0
     assert plan.nodes["console"].parameters["page_port"] == 8123
     assert plan.listening_nodes(None) == [("console", 8123)]
-    assert plan.nodes["console"].parameters["drives_finger"]
+    assert plan.nodes["console"].parameters["control_finger"]
     assert plan.nodes["recorder"].parameters["start_paused"]
     # In the run's directory NAME.json is what the launcher tells the node of that name.
-    assert plan.nodes["console"].parameters["kept"].removeprefix("@run/") not in {
+    assert plan.nodes["console"].parameters["state_file"].removeprefix("@run/") not in {
         f"{name}.json" for name in plan.nodes
     }
     read = {port.topic for port in plan.nodes["console"].inputs}

@@ -37,7 +37,7 @@ from tests.arm_states import arm_state
 from tests.colours import luminance
 
 LONELY = ("scene", "fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "status",
-          "twin/finger", "stereo", "twin/eye", "frame", "moment", "estop")  # fmt: skip
+          "twin/finger", "stereo", "twin/eye", "frame", "bookmark", "estop")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -337,7 +337,7 @@ def test_pictures_are_the_sessions(page: str) -> None:
     assert sum("what it should see" in text for text, _ in images) == 3
     assert sum("projector" in text for text, _ in images) == 3
     # The first shot after the moment at 1.5 s is the one of 2.2 s.
-    assert re.search(r"2\.21 s\.[^<]*<strong>Moment: &lt;b&gt;first touch", page)
+    assert re.search(r"2\.21 s\.[^<]*<strong>Bookmark: &lt;b&gt;first touch", page)
 
 
 @pytest.mark.parametrize("scheme", COLOURS)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flexsheet.messages.base import Message
 from flexsheet.messages.methods import chosen
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Correction, Display, EStop, Frame, Moment, Recording, TwinEye
+from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
 from flexsheet.nodes.console.aim import Aim
 from flexsheet.nodes.console.finger import Finger
@@ -41,6 +41,7 @@ CAPTURE_S = 1.0
 MAX_TRACING_S = 120.0
 """A picture that takes longer never comes."""
 
+DEFAULT_BOOKMARK = "bookmark"
 MAX_LABELS = 64
 """Number of requested labels whose late pictures are still shown."""
 
@@ -353,8 +354,11 @@ class Desk:
         self._publish(Recording(running=running))
         self.keep()
 
-    def mark(self, label: str) -> None:
-        self._publish(Moment(label=label.strip() or "moment"))
+    def add_bookmark(self, label: str) -> str:
+        """Publish a bookmark, and return its label."""
+        label = label.strip() or DEFAULT_BOOKMARK
+        self._publish(Bookmark(label=label))
+        return label
 
     def _send_scene(self, scene: Scene) -> None:
         self._publish(scene)

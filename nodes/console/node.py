@@ -13,7 +13,7 @@ from pydantic import Field, field_validator, model_validator
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Positive, Scene
 from flexsheet.messages.topics import Delivery, Topic
-from flexsheet.messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
+from flexsheet.messages.types import Bookmark, Display, EStop, FingerPath, Recording, Skin
 from flexsheet.messages.wire import WireError
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.console.desk import Desk, Files
@@ -41,12 +41,15 @@ class ConsoleParameters(NodeParameters):
     )
     rate_hz: Positive = Field(default=25.0, description="of the 3D view")
     tables_hz: Positive = Field(default=2.0, description="of tables and charts")
-    drives_finger: bool = Field(default=True, description="the mouse moves the twin's finger")
+    control_finger: bool = Field(default=True, description="the mouse moves the twin's finger")
     finger_speed_m_per_s: Positive = 0.15
     bags: Path = Field(default=Path("runs"), description="folder whose bags can be replayed")
     plan: Path = Field(default=Path("@run/plan.json"), description="holds the first scene")
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
-    kept: Path = Field(default=Path("@run/console-kept.json"), description="what it takes up again")
+    state_file: Path = Field(
+        default=Path("@run/console-kept.json"),
+        description="state that a restarted console continues with",
+    )
 
     @field_validator("address")
     @classmethod
@@ -77,7 +80,7 @@ class Console(Node):
     display: Output[Display]
     estop: Output[EStop]
     recording: Output[Recording]
-    moment: Output[Moment]
+    bookmark: Output[Bookmark]
     twin__finger_path: Output[FingerPath]
 
     @classmethod
@@ -99,7 +102,7 @@ class Console(Node):
         self._server = start_server(given.address, given.page_port, guard, "flexsheet")
         self.url = f"http://{given.address}:{self._server.get_port()}/"
         finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
-        files = Files(given.plan, given.scenes, given.bags, given.kept)
+        files = Files(given.plan, given.scenes, given.bags, given.state_file)
         facts = GraphFacts.from_plan(given.plan, self.name)
         desk = Desk(self._publish, files, finger, self.log.warning, facts)
         self.operator = Operator(
@@ -108,7 +111,7 @@ class Console(Node):
             desk,
             self._ask,
             name=self.name,
-            with_finger=given.drives_finger,
+            with_finger=given.control_finger,
             with_eye=further_port("twin/eye") in self.inputs,
         )
         desk.begin()

@@ -48,7 +48,7 @@ LONGEST_STEP_S = 0.2
 """After a pause the finger and the replay go on from where they were."""
 
 SIDES = ("left", "right")
-MARKS_SHOWN = 5
+BOOKMARKS_SHOWN = 5
 REPLAYED = (
     "what you see is a replay, and the finger is that of the running graph: press "
     '"Back to the running graph" in Record first'
@@ -94,7 +94,7 @@ class Operator:
         self._bags_s = -BAGS_EVERY_S
         self._finger_shown_s = 0.0
         self._looked_s: float | None = None
-        self._marked: tuple[str, ...] = ()
+        self._bookmarks: tuple[str, ...] = ()
         self._bags_before: set[str] = set()
         self._awaits_bag = False
         self._take_up_scene()
@@ -111,7 +111,7 @@ class Operator:
             "look": self._look,
             "correct": self._correct,
             "record": self._record,
-            "mark": self._mark,
+            "bookmark": self._bookmark,
             "open_bag": self._open_bag,
             "leave": self._leave,
             "play": self._play,
@@ -259,7 +259,9 @@ class Operator:
             self._statuses[name] for name in desk.facts.recorders if name in self._statuses
         ]
         note = recorders[0][0].note if recorders else None
-        self._page.record.show_state(panels.recorder(note, self._marked), recording=desk.recording)
+        self._page.record.show_state(
+            panels.recorder(note, self._bookmarks), recording=desk.recording
+        )
 
     def _solver_note(self) -> str:
         """What the soft body's solver reports while it has no skin of this scene; else nothing."""
@@ -334,7 +336,7 @@ class Operator:
             self._awaits_bag = True
             self._show_bags()
         else:
-            self._marked, self._bags_before = (), set(self.desk.replay.bags())
+            self._bookmarks, self._bags_before = (), set(self.desk.replay.bags())
             self._awaits_bag = False
             self.desk.record(True)
 
@@ -345,16 +347,16 @@ class Operator:
         self._page.record.show_bags(bags, made if self._awaits_bag else None)
         self._awaits_bag = self._awaits_bag and made is None
 
-    def _mark(self, label: str) -> None:
+    def _bookmark(self, label: str) -> None:
         facts = self.desk.facts
         if not facts.recorders:
             raise ValueError(NO_RECORDER)
         if facts.records_on_request and not self.desk.recording:
             raise ValueError(
-                "nothing is recorded now, so there is nothing to mark: start recording"
+                "nothing is recorded now, so a bookmark would be lost: start recording first"
             )
-        self.desk.mark(label)
-        self._marked = (*self._marked, label.strip() or "moment")[-MARKS_SHOWN:]
+        label = self.desk.add_bookmark(label)
+        self._bookmarks = (*self._bookmarks, label)[-BOOKMARKS_SHOWN:]
 
     def _open_bag(self, name: str) -> None:
         if name == NO_BAG:

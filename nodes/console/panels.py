@@ -213,12 +213,12 @@ def eye(
             return words(f"Taken {ago_s:.0f} s ago, the next one follows within six seconds.")
 
 
-def recorder(note: str | None, marked: tuple[str, ...]) -> str:
-    """What the recorder says of itself, and the moments that were marked; None: there is none."""
+def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
+    """Return the recorder's note and the newest bookmarks.  note: None without a recorder."""
     if note is None:
         return words(_mark(WARN, "this graph has no recorder"))
-    moments = f"<br>Marked: {escape(', '.join(marked))}." if marked else ""
-    return words(f"Recorder: {escape(note)}.{moments}")
+    listed = f"<br>Bookmarks: {escape(', '.join(bookmarks))}." if bookmarks else ""
+    return words(f"Recorder: {escape(note)}.{listed}")
 
 
 def problem(text: str) -> str:

@@ -45,7 +45,7 @@ class Recorder(Node):
     ) -> Sequence[str]:
         wanted = parameters.topics or [topic.name for topic in written if topic.logged]
         told = ("recording",) if parameters.start_paused else ()
-        return list(dict.fromkeys((*wanted, *parameters.also, *told)))
+        return list(dict.fromkeys((*wanted, *parameters.include, *told)))
 
     def __init__(self, parameters: RecorderParameters, **rest: Any) -> None:
         super().__init__(parameters, **rest)
