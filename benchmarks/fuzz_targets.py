@@ -377,7 +377,7 @@ def bag_seeds() -> list[bytes]:
             with BagWriter(path, {"recording": {"clock_id": "x"}}, compress=compress) as bag:
                 bag.add_attachment("launch.yaml", b"nodes: {}\n", "text/yaml")
                 for sequence in range(1, 4):
-                    for name in ("fingertip", "estop", "moment"):
+                    for name in ("fingertip", "estop", "bookmark"):
                         header = Header(sequence, 10, 20, "clock", "planner", 1, "plan")
                         bag.write(TOPICS[name], example(TOPICS[name].message), header, sequence)
             found.append(path.read_bytes())

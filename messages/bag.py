@@ -41,7 +41,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 from flexsheet.messages.base import Header, Message, schema_fingerprint
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_error
-from flexsheet.messages.migrations import Migration, migration_for
+from flexsheet.messages.migrations import RENAMED_TOPICS, RENAMED_TYPES, Migration, migration_for
 from flexsheet.messages.topics import TOPICS, Topic, UnknownTopicError, topic_named
 from flexsheet.messages.wire import PROTOCOL, WireError, encode, read_envelope
 
@@ -262,6 +262,16 @@ class Chunk:
 
 
 @dataclass(frozen=True, slots=True)
+class Reading:
+    """How the messages of one channel are read: the type as recorded, and how to migrate it."""
+
+    topic: Topic
+    recorded_type: str
+    fingerprint: bytes
+    migrate: Migration
+
+
+@dataclass(frozen=True, slots=True)
 class TopicInfo:
     """What a bag holds of one topic.
 
@@ -324,7 +334,9 @@ class BagReader:
         self.complete = False
         self.problem = ""
         self.metadata: dict[str, dict[str, str]] = {}
-        self._topics = None if topics is None else frozenset(topics)
+        self._topics = (
+            None if topics is None else frozenset(RENAMED_TOPICS.get(name, name) for name in topics)
+        )
         self._start_ns, self._end_ns = start_ns, end_ns
         self.channels: dict[int, mcap_records.Channel] = {}
         self.schemas: dict[int, mcap_records.Schema] = {}
@@ -347,16 +359,25 @@ class BagReader:
             channel.topic: self._reading_of(channel) for channel in self._selected().values()
         }
         for number, (name, frames, log_time_ns) in enumerate(self.frames()):
-            topic, fingerprint, migrate = readable[name]
+            reading = readable[name]
             try:
-                envelope = read_envelope(frames, topic, fingerprint=fingerprint)
-                envelope.fields = migrate(envelope.fields)
-                message, header = envelope.open(), envelope.header
+                message, header = _open(frames, reading)
             except WireError as error:
                 raise BagError(
                     f'{self.path}: topic "{name}", message {number} at {log_time_ns} ns: {error}'
                 ) from error
             yield name, message, header, log_time_ns
+
+    def open_record(
+        self, channel: mcap_records.Channel, record: mcap_records.Message
+    ) -> tuple[Message, Header]:
+        """Decode one record of `records` or `read_chunk`, as iterating does; BagError."""
+        try:
+            return _open(split_frames(record.data), self._reading_of(channel))
+        except WireError as error:
+            raise BagError(
+                f'{self.path}: topic "{channel.topic}" at {record.log_time} ns: {error}'
+            ) from error
 
     def frames(self) -> Iterator[tuple[str, list[memoryview], int]]:
         """(topic name, frames, log_time_ns), as recorded, whatever the types are today."""
@@ -398,9 +419,7 @@ class BagReader:
     @property
     def topics(self) -> dict[str, str]:
         """The recorded topics and their types' names."""
-        return {
-            channel.topic: channel.metadata.get("type", "") for channel in self.channels.values()
-        }
+        return {channel.topic: _type_of(channel) for channel in self.channels.values()}
 
     def attachment(self, name: str) -> bytes:
         """The newest attachment of that name; raises BagError if there is none."""
@@ -425,7 +444,7 @@ class BagReader:
             topics.append(
                 TopicInfo(
                     name=channel.topic,
-                    type=channel.metadata.get("type", ""),
+                    type=_type_of(channel),
                     count=len(stamps),
                     rate_hz=(len(stamps) - 1) / span_s if span_s > 0.0 else 0.0,
                     readable=self._migration_of(channel) is not None,
@@ -517,8 +536,7 @@ class BagReader:
                     f'{self.path}: an MCAP file of profile "{profile[:40]}", not of flexsheet'
                 )
         elif opcode == Opcode.CHANNEL:
-            channel = mcap_records.Channel.read(stream)
-            self.channels[channel.id] = channel
+            self._add_channel(mcap_records.Channel.read(stream))
         elif opcode == Opcode.SCHEMA:
             schema = mcap_records.Schema.read(stream)
             self.schemas[schema.id] = schema
@@ -528,6 +546,11 @@ class BagReader:
         elif self.chunks:
             index = mcap_records.MessageIndex.read(stream)
             self.chunks[-1].times_ns[index.channel_id] = [time for time, _ in index.records]
+
+    def _add_channel(self, channel: mcap_records.Channel) -> None:
+        """Store a channel under the name that its topic has today."""
+        channel.topic = RENAMED_TOPICS.get(channel.topic, channel.topic)
+        self.channels[channel.id] = channel
 
     def _fill_in_what_the_index_lacks(self, file: IO[bytes]) -> None:
         """Read the chunks of a cut bag whose channels or message times are known no other way.
@@ -547,7 +570,7 @@ class BagReader:
             times: dict[int, list[int]] = {}
             for record in records:
                 if isinstance(record, mcap_records.Channel):
-                    self.channels[record.id] = record
+                    self._add_channel(record)
                 elif isinstance(record, mcap_records.Schema):
                     self.schemas[record.id] = record
                 elif isinstance(record, mcap_records.Message):
@@ -594,8 +617,8 @@ class BagReader:
             return None  # damaged
         return migration_for(topic.message, fingerprint, recorded)
 
-    def _reading_of(self, channel: mcap_records.Channel) -> tuple[Topic, bytes, Migration]:
-        """Topic, fingerprint and migration of a channel's messages."""
+    def _reading_of(self, channel: mcap_records.Channel) -> Reading:
+        """Return how a channel's messages are read; BagError where no migration is known."""
         if channel.topic not in TOPICS:
             raise BagError(
                 f'{self.path}: topic "{channel.topic}" does not exist any more; '
@@ -609,8 +632,27 @@ class BagReader:
                 "messages/migrations.py says how to follow; read it with the code of that time, or "
                 "leave the topic out (`BagReader.frames` gives its bytes)"
             )
-        fingerprint = bytes.fromhex(channel.metadata["fingerprint"])
-        return TOPICS[channel.topic], fingerprint, migration
+        return Reading(
+            TOPICS[channel.topic],
+            channel.metadata.get("type", TOPICS[channel.topic].message.__name__),
+            bytes.fromhex(channel.metadata["fingerprint"]),
+            migration,
+        )
+
+
+def _type_of(channel: mcap_records.Channel) -> str:
+    """Return the name that a channel's message type has today."""
+    recorded = channel.metadata.get("type", "")
+    return RENAMED_TYPES.get(recorded, recorded)
+
+
+def _open(frames: list[memoryview], reading: Reading) -> tuple[Message, Header]:
+    """Decode a message as of today; WireError."""
+    envelope = read_envelope(
+        frames, reading.topic, fingerprint=reading.fingerprint, type_name=reading.recorded_type
+    )
+    envelope.fields = reading.migrate(envelope.fields)
+    return envelope.open(), envelope.header
 
 
 def info(path: Path | str) -> BagInfo:

@@ -12,6 +12,7 @@ fields to those of the type that came after.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from typing import Any, get_args
 
@@ -24,6 +25,12 @@ Migration = Callable[[Fields], Fields]
 Schema = Mapping[str, Any]
 
 
+RENAMED_TOPICS: dict[str, str] = {"moment": "bookmark"}
+"""Recorded topic names and those of today."""
+
+RENAMED_TYPES: dict[str, str] = {"Moment": "Bookmark"}
+"""Recorded names of message types and those of today."""
+
 RENAMED_FIELDS: dict[str, dict[str, str]] = {
     "Fingertip": {
         "ahead_world_m": "predicted_path_world_m",
@@ -31,6 +38,7 @@ RENAMED_FIELDS: dict[str, dict[str, str]] = {
     },
     "Frame": {"lost_share": "occluded_fraction"},
     "Methods": {"mark": "marker"},
+    "Status": {"taken": "execution_log"},
     "SoftBody": {"lead_s": "prediction_horizon_s"},
     "TwinEye": {"proper": "expected"},
 }
@@ -43,6 +51,7 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
         "two_marks": "two_markers",
     },
     ("Display", "pattern"): {"places_x": "coordinate_ramp_x", "places_y": "coordinate_ramp_y"},
+    ("NodeProcess", "state"): {"away": "exited"},
     ("Methods", "sheet_shape"): {"dents": "reduced_order", "flat": "four_triangles"},
     ("Methods", "triangulation"): {"midpoint": "dlt", "optimal": "dlt"},
     ("Methods", "tracking"): {"hand": "singer_tremor", "exponential": "one_euro"},
@@ -51,7 +60,18 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
 }
 """By model and today's field name: recorded literal values and those of today."""
 
-MIGRATIONS: dict[tuple[str, str], Migration] = {}
+_STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
+
+
+def _add_stroke_duration(fields: Fields) -> Fields:
+    """Add a stroke's moving time, which recorded messages hold in the path's label only."""
+    found = _STROKE_LABEL.fullmatch(fields["path_label"])
+    return {**fields, "path_stroke_s": None if found is None else float(found[1])}
+
+
+MIGRATIONS: dict[tuple[str, str], Migration] = {
+    ("TwinFinger", "c1881b3029f02367"): _add_stroke_duration,
+}
 
 _IGNORED = frozenset({"title", "description", "default", "discriminator", "$defs"})
 _COMPARED = frozenset({"$ref", "properties", "required", "enum", "const", "anyOf", "oneOf",
@@ -123,12 +143,20 @@ def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
         values = RENAMED_VALUES.get((model.__name__, key), {})
         if isinstance(value, str):
             renamed[key] = values.get(value, value)
-        elif isinstance(value, dict) and key in model.model_fields:
-            inner = _model_in(model.model_fields[key].annotation)
-            renamed[key] = value if inner is None else _rename_in_fields(inner, value)
+        elif isinstance(value, dict | list) and key in model.model_fields:
+            renamed[key] = _rename_in_parts(_model_in(model.model_fields[key].annotation), value)
         else:
             renamed[key] = value
     return renamed
+
+
+def _rename_in_parts(model: type[BaseModel] | None, value: Any) -> Any:
+    """Return the recorded fields of a part, or of each part of a list, with today's names."""
+    if model is not None and isinstance(value, dict):
+        return _rename_in_fields(model, value)
+    if model is not None and isinstance(value, list):
+        return [_rename_in_parts(model, part) for part in value]
+    return value
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

@@ -13,6 +13,7 @@ from enum import StrEnum
 from flexsheet.messages import scene, types
 from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.migrations import RENAMED_TOPICS
 
 
 class Delivery(StrEnum):
@@ -73,7 +74,8 @@ _ROWS = (
     Topic("estop", types.EStop, _LATCHED, None, True, "stop, latched", many_writers=True),
     Topic("recording", types.Recording, _LATCHED, None, True, "start and stop of a recording",
           many_writers=True),
-    Topic("moment", types.Moment, _EVERY, None, True, "moments to find again", many_writers=True),
+    Topic("bookmark", types.Bookmark, _EVERY, None, True, "positions in a bag to find again",
+          many_writers=True),
     Topic("arming", types.Arming, _EVERY, None, True, "the arms may move", many_writers=True),
     Topic("status", types.Status, _EVERY, (0.5, 3), True, "how each node is", many_writers=True),
     Topic("clock_ping", types.ClockPing, _EVERY, (1, 100), True, "among the hosts' clock nodes",
@@ -111,6 +113,10 @@ def topic_named(name: str) -> Topic:
     try:
         return TOPICS[name]
     except KeyError:
+        if name in RENAMED_TOPICS:
+            raise UnknownTopicError(
+                f'unknown topic "{name}"; it is now "{RENAMED_TOPICS[name]}"'
+            ) from None
         near = get_close_matches(name, TOPICS, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(TOPICS)}"
         raise UnknownTopicError(f'unknown topic "{name}"{hint}') from None

@@ -280,8 +280,8 @@ class Recording(Message):
     running: bool
 
 
-class Moment(Message):
-    """A moment that somebody wants to find again in a bag; the source stamp is when it was."""
+class Bookmark(Message):
+    """Mark a time to find again in a bag; the source stamp is that time."""
 
     label: str = Field(max_length=200)
 
@@ -361,11 +361,11 @@ class Status(Message):
     clock_offsets: tuple[ClockOffset, ...] = Field(
         default=(), description="of the other clocks that it hears, as it knows them"
     )
-    taken: Annotated[NDArray[np.int64], ArraySpec("<i8", ("steps", 4))] = Field(
+    execution_log: Annotated[NDArray[np.int64], ArraySpec("<i8", ("steps", 4))] = Field(
         default_factory=lambda: np.zeros((0, 4), np.int64),
-        description="what it handled since its last status (in its first seconds: since its "
-        "start), in order, for `bag verify`: which input, counted from 0, or of its timers -1, -2, "
-        "...; the message's sequence and its writer's epoch; when, ns",
+        description="handler calls since the last status (in the first seconds: since the "
+        "start), in order, for `bag verify`. Columns: input, counted from 0, or timer, -1, -2, "
+        "...; the message's sequence; its writer's epoch; time of the call, ns",
     )
 
 
@@ -373,8 +373,8 @@ class NodeProcess(MessagePart):
     """A node as its launcher knows it."""
 
     name: str
-    state: Literal["starting", "ready", "away"] = Field(
-        description="away: it has ended, and starts again unless it may not"
+    state: Literal["starting", "ready", "exited"] = Field(
+        description="exited: it has ended, and is restarted unless it may not"
     )
     restarts: int = Field(ge=0)
     hangs: int = Field(ge=0, description="restarts because it gave no sign of life")
@@ -448,6 +448,9 @@ class FingerPath(Message):
         description="rounded_lines: the points are corners, rounded over +-40 ms; spline: they are "
         "samples of a smooth motion that begins and ends at rest",
     )
+    stroke_s: Positive | None = Field(
+        default=None, description="moving time, if the path is a stroke of the experiment"
+    )
 
 
 class TwinFinger(Message):
@@ -456,6 +459,7 @@ class TwinFinger(Message):
     path_label: str
     path_done: bool
     path_time_s: Finite = Field(description="since the path began; negative while easing to it")
+    path_stroke_s: Positive | None = Field(default=None, description="`stroke_s` of the path")
     position_world_m: Vector3
     velocity_world_m_per_s: Vector3
 

@@ -165,13 +165,17 @@ class Envelope:
 
 
 def read_envelope(
-    frames: Sequence[Any], expected: Topic | type[Message], *, fingerprint: bytes | None = None
+    frames: Sequence[Any],
+    expected: Topic | type[Message],
+    *,
+    fingerprint: bytes | None = None,
+    type_name: str | None = None,
 ) -> Envelope:
     """Check everything but the values of the fields; raises WireError.
 
     frames: buffers (bytes, memoryview, zmq.Frame), header first.
     expected: the topic, whose size limit then holds, or the type alone.
-    fingerprint: of the type as it was recorded; None: as it is today.
+    fingerprint, type_name: of the type as it was recorded; None: as it is today.
     """
     if isinstance(expected, Topic):
         codec = codec_of(expected.message)
@@ -191,7 +195,7 @@ def read_envelope(
     plan = unpacked[9] if len(unpacked) == 11 else ""
     fields = unpacked[-1]
     # An array may stand anywhere, and is neither equal nor unequal to anything.
-    if type(name) is not str or name != codec.name:
+    if type(name) is not str or name != (type_name or codec.name):
         raise WireError("type", f"carries {_shown(name)}, wanted {codec.name}")
     if type(carried) is not bytes or carried != wanted:
         raise WireError(

@@ -53,9 +53,9 @@ Handler = Callable[[Any, Header], Awaitable[None] | None]
 
 RATE_WINDOW_NS = 1_000_000_000
 EVERY_QUEUE_LENGTH = 1000
-STEPS_KEPT = 20_000
-TOLD_AGAIN_NS = 5_000_000_000
-"""So long after its start a node tells all its steps each time: a recorder may come late."""
+MAX_LOG_ROWS = 20_000
+RESEND_NS = 5_000_000_000
+"""For this long after the start each status repeats the whole log, for late recorders."""
 
 
 class NodeParameters(LimitedModel):
@@ -100,27 +100,27 @@ class PortCounts:
         )
 
 
-class Steps:
-    """What a node handled, in order, until its status has told it; a replay goes by that.
+class ExecutionLog:
+    """Log the handler calls of a node, in order, for a replay.
 
-    Rows are those of `flexsheet.messages.types.Status.taken`.
+    Rows are those of `flexsheet.messages.types.Status.execution_log`.
     """
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._started_ns = clock.now_ns()
-        self._rows: deque[tuple[int, int, int, int]] = deque(maxlen=STEPS_KEPT)
+        self._rows: deque[tuple[int, int, int, int]] = deque(maxlen=MAX_LOG_ROWS)
 
-    def message(self, port: int, header: Header, at_ns: int) -> None:
+    def add_message(self, port: int, header: Header, at_ns: int) -> None:
         self._rows.append((port, header.sequence, header.epoch, at_ns))
 
-    def timer(self, number: int) -> None:
+    def add_timer(self, number: int) -> None:
         self._rows.append((-1 - number, 0, 0, self._clock.now_ns()))
 
-    def told(self) -> NDArray[np.int64]:
-        """The rows (n, 4), forgotten with that unless the node is young."""
+    def drain(self) -> NDArray[np.int64]:
+        """Return the rows (n, 4), and delete them once RESEND_NS have passed since the start."""
         rows = np.array(self._rows, dtype=np.int64).reshape(-1, 4)
-        if self._clock.now_ns() > self._started_ns + TOLD_AGAIN_NS:
+        if self._clock.now_ns() > self._started_ns + RESEND_NS:
             self._rows.clear()
         return rows
 
@@ -138,7 +138,7 @@ class Input(Generic[M]):
         self.received_ns: int = 0
         self.clock_trouble = ""
         self.counts = PortCounts()
-        self.noted: Callable[[Header, int], None] | None = None
+        self.on_accept: Callable[[Header, int], None] | None = None
         self._clock = clock
 
     def age_s(self) -> float:
@@ -154,8 +154,8 @@ class Input(Generic[M]):
         self.message, self.header, self.clock_trouble = message, header, clock_trouble
         self.received_ns = self._clock.now_ns()
         self.counts.count(header, self.received_ns)
-        if self.noted is not None:
-            self.noted(header, self.received_ns)
+        if self.on_accept is not None:
+            self.on_accept(header, self.received_ns)
 
 
 class Output(Generic[M]):
@@ -228,6 +228,11 @@ def ports_of(node_class: type[Node]) -> dict[str, Port]:
     return ports
 
 
+def further_port(topic_name: str) -> str:
+    """Name the port of a topic that `Node.further_inputs` returned."""
+    return f"in/{topic_name}"
+
+
 def parameters_of(node_class: type[Node]) -> type[NodeParameters]:
     """The declared type of a node class's `parameters`."""
     return get_type_hints(node_class)["parameters"]  # type: ignore[no-any-return]
@@ -278,8 +283,11 @@ class Node:
 
     @classmethod
     def further_inputs(cls, parameters: Any, written: Sequence[Topic]) -> Sequence[str]:
-        """Topics to subscribe to beside the declared ports, for a node whose inputs depend on its
-        parameters and on what the graph writes; such a port is named "in/" and the topic."""
+        """Name the topics to subscribe to beside the declared ports.
+
+        For a node whose inputs depend on its parameters and on the topics that the graph writes.
+        The ports of these topics are named by `further_port`.
+        """
         return ()
 
     def __init__(
@@ -305,13 +313,14 @@ class Node:
         self.outputs: dict[str, Output[Any]] = {}
         self.errors = 0
         self.last_error = ""
-        self.troubles_told = 0
+        self.reported_problems = 0
         self.note = ""
         self.started_ns = clock.now_ns()
-        self._steps = Steps(clock)
+        self._execution_log = ExecutionLog(clock)
         if epoch is None:
             epoch = self.started_ns
-        for port in ports_of(type(self)).values():
+        declared = ports_of(type(self))
+        for port in declared.values():
             topic = topic_named((topics or {}).get(port.name, port.name.replace("__", "/")))
             if topic.message is not port.message:
                 raise TypeError(
@@ -322,13 +331,18 @@ class Node:
                 self.inputs[port.name] = Input(topic, clock)
                 if not self.opens_devices:
                     number = len(self.inputs) - 1
-                    self.inputs[port.name].noted = partial(self._steps.message, number)
+                    self.inputs[port.name].on_accept = partial(
+                        self._execution_log.add_message, number
+                    )
                 setattr(self, port.name, self.inputs[port.name])
             else:
                 self.outputs[port.name] = Output(
                     topic, clock, send, writer=name, epoch=epoch, plan=plan_hash
                 )
                 setattr(self, port.name, self.outputs[port.name])
+        for further, topic_name in (topics or {}).items():
+            if further not in declared:
+                self.inputs[further] = Input(topic_named(topic_name), clock)
         self._mailboxes = {
             port: Mailbox(self, port)
             for port in self.inputs
@@ -384,14 +398,14 @@ class Node:
         except Exception as error:
             self.report_error(what, error)
 
-    def taken(self) -> NDArray[np.int64]:
-        """What was handled since this was asked last; see `messages.types.Status.taken`."""
-        return self._steps.told()
+    def drain_execution_log(self) -> NDArray[np.int64]:
+        """Return the handler calls since the last call; see `Status.execution_log`."""
+        return self._execution_log.drain()
 
     async def call_timer(self, number: int, timer: Timer) -> None:
         """Call the method of one of `timers_of` the node."""
         if not self.opens_devices:
-            self._steps.timer(number)
+            self._execution_log.add_timer(number)
         await self.call(timer.method, getattr(self, timer.method))
 
     def report_error(self, what: str, error: Exception) -> None:

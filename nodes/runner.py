@@ -240,12 +240,12 @@ def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
 
     Degraded: something went wrong since the last one.  A gap on a `latest` topic is none of it.
     """
-    troubles = node.errors + sum(
+    problems = node.errors + sum(
         port.counts.rejected + (0 if port.topic.delivery is Delivery.LATEST else port.counts.gaps)
         for port in node.inputs.values()
     )
-    degraded = state == "running" and troubles > node.troubles_told
-    node.troubles_told = troubles
+    degraded = state == "running" and problems > node.reported_problems
+    node.reported_problems = problems
     return Status(
         node=node.name,
         state="degraded" if degraded else state,
@@ -261,7 +261,7 @@ def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
         plan_hash=node.plan_hash,
         clock_id=node.clock.id,
         clock_offsets=tuple(node.clock_table.offsets.values()),
-        taken=node.taken(),
+        execution_log=node.drain_execution_log(),
     )
 
 

@@ -17,9 +17,9 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
     ArmState,
+    Bookmark,
     EStop,
     Frame,
-    Moment,
     PortStatus,
     SheetTarget,
     Side,
@@ -48,7 +48,7 @@ OFF_M, TURNED_RAD = 2e-4, 3e-3
 """By so much the sheet is wrong, all the time."""
 
 LATENCY_S = 0.008
-FAULT_S, ESTOP_S, SILENCE_S, MOMENT_S = 2.0, 2.1, (1.0, 1.8), 1.5
+FAULT_S, ESTOP_S, SILENCE_S, BOOKMARK_S = 2.0, 2.1, (1.0, 1.8), 1.5
 ENDS_S = 3.0
 SCENE: Scene = load_scene(Path("launch/scenes/cylinder.yaml"))
 
@@ -129,7 +129,7 @@ def write_session(path: Path, *, leave_out: Collection[str] = ()) -> Path:
         for i in range(round(ENDS_S * RATE_HZ)):
             seconds = i / RATE_HZ
             _write_step(desk, i, seconds, begin_s, finish_s)
-        desk.write("moment", Moment(label="<b>first touch</b>"), MOMENT_S)
+        desk.write("bookmark", Bookmark(label="<b>first touch</b>"), BOOKMARK_S)
         desk.write("estop", EStop(engaged=True, reason="a person"), ESTOP_S, writer="console")
         port = PortStatus(topic="fingertip", rate_hz=50.0, age_s=0.01, messages=90, dropped=5,
                           gaps=2, rejected=1)  # fmt: skip
@@ -146,7 +146,8 @@ def _write_step(desk: Desk, i: int, seconds: float, begin_s: float, finish_s: fl
     tip, pose = finger_at(angle_rad), sheet_at(angle_rad)
     recorded_s = seconds + LATENCY_S
     true = TwinFinger(path_label=stroke_label(STROKE_S), path_done=False, path_time_s=seconds,
-                      position_world_m=tip, velocity_world_m_per_s=np.zeros(3))  # fmt: skip
+                      path_stroke_s=STROKE_S, position_world_m=tip,
+                      velocity_world_m_per_s=np.zeros(3))  # fmt: skip
     desk.write("twin/finger", true, seconds)
     if not SILENCE_S[0] < seconds < SILENCE_S[1] - 1e-9:
         desk.write("fingertip", fingertip(tip), recorded_s, age_s=LATENCY_S)

@@ -437,7 +437,7 @@ def test_play_can_bring_its_graph_and_restores_latched_topics_first(
             reset = EStop(engaged=False, reason="then all was clear")
             writer.write(TOPICS["estop"], reset, header, 10**9 + i * 10**8)
     values = {**GRAPH, "external_topics": ["display"], "record": {"bag": "played.mcap"}}
-    said = flexsheet("bag", "play", bag, "--start", "0.25", "--into", write(tmp_path, values))
+    said = flexsheet("bag", "play", bag, "--start", "0.25", "--launch", write(tmp_path, values))
     assert said.code == 0, said.err
     assert "played 3 messages on display" in said.err
     entries = list(BagReader(tmp_path / "played.mcap", ["display", "estop"]))

@@ -137,7 +137,7 @@ def test_looking_into_a_graph_loads_little() -> None:
         ("flexsheet bag ver", "verify"),
         ("flexsheet topic echo --on", "--once"),
         ("flexsheet bag verify tri", "triangulator"),
-        ("flexsheet bag record a.mcap --also ste", "stereo"),
+        ("flexsheet bag record a.mcap --include ste", "stereo"),
         ("flexsheet launch launch/lab.yaml --host le", "left"),
         ("flexsheet tune a.yaml --family soft", "soft-body"),
         ("flexsheet demo --finger-path tap-", "tap-fast"),

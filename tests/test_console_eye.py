@@ -41,12 +41,11 @@ def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
     look.advance(1.0)
     assert not sent, "nobody wants to look"
     anothers = Display(correction="one_plane", stereo="anaglyph", label="mine")
-    look.heed(anothers)
+    look.on_others_display(anothers)
     look.wanted = True
     look.advance(2.0)
     asked = sent[0]
     assert (asked.stereo, asked.pixels_every > 0) == ("mono", True)
-    look.heed(asked)
     pixel = np.zeros((2, 2, 3), np.uint8)
     eye = TwinEye(label="x", correction="none", metres_per_px=1e-3, seen=pixel, expected=pixel)
     assert not look.got(eye, 2.5)
@@ -91,7 +90,6 @@ def test_after_a_look_each_scene_has_its_own_correction_until_one_is_picked(
     desk.look.advance(60.0)
     rested = sent[-1]
     assert isinstance(rested, Display)
-    desk.look.heed(rested)  # a console hears what it says
     assert corrections() == ["four_triangles", "four_triangles"]
     desk.scenes.choose("flat")
     desk.scenes.choose("silent")

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import (
+    Bookmark,
     EStop,
-    Moment,
 )
 from flexsheet.messages.wire import WireError
 from flexsheet.nodes.console.newest import Newest
@@ -32,4 +32,4 @@ def test_only_what_is_looked_at_is_opened() -> None:
     assert newest.newest("estop", EStop) == entry, "what came before still stands"
     assert [topic.name for topic, _ in refused] == ["estop"]
     with pytest.raises(TypeError):
-        newest.newest("estop", Moment)
+        newest.newest("estop", Bookmark)

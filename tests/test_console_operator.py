@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flexsheet.messages.base import Message
-from flexsheet.messages.types import FingerPath, Recording
-from flexsheet.nodes.console.desk import SETTLE_S, Desk, Files
+from flexsheet.messages.base import Header, Message
+from flexsheet.messages.types import Display, FingerPath, Recording, Status
+from flexsheet.nodes.console.desk import MAX_DRAWING_S, SETTLE_S, Desk, Files, LookState
 from flexsheet.nodes.console.finger import Finger
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.guard import Guard, start_server
@@ -89,9 +89,12 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     sent: list[Message] = []
     server = start_server("127.0.0.1", 0, Guard("127.0.0.1", None), "test")
     finger = Finger(sent.append, speed_m_per_s=0.15)
-    desk = Desk(sent.append, files, finger, pytest.fail, GraphFacts((), True, True))
+    facts = GraphFacts(recorders=("tape",), records_on_request=True, solvers=("body",))
+    desk = Desk(sent.append, files, finger, pytest.fail, facts)
     newest = Newest(lambda topic, error: pytest.fail(str(error)))
-    operator = Operator(server, newest, desk, pytest.fail, with_finger=True, with_eye=False)
+    operator = Operator(
+        server, newest, desk, pytest.fail, name="page", with_finger=True, with_eye=False
+    )
     bench = Bench(operator, files.bags, sent)
     await bench.know_object()
     yield bench
@@ -160,3 +163,47 @@ async def test_the_bag_that_was_recorded_is_chosen(bench: Bench) -> None:
     bench.bag.value = "old.mcap"
     bench.run(10.0)
     assert bench.bag.value == "old.mcap", "what a viewer chose stays chosen"
+
+
+def display(label: str) -> Display:
+    return Display(correction="one_plane", stereo="anaglyph", label=label)
+
+
+@pytest.mark.parametrize(("writer", "restored"), [("page", False), ("another", True)])
+async def test_own_display_messages_are_known_by_their_writer(
+    bench: Bench, writer: str, restored: bool
+) -> None:
+    """A label says nothing: another writer may use the console's words."""
+    look = bench.operator.desk.look
+    others = display("console 1")
+    bench.operator.hear(others, Header(1, 1, 1, "clock", writer, 1), 0.0)
+    look.wanted = True
+    bench.run(0.5)
+    assert look.state is LookState.DRAWING
+    bench.run(2.0 * MAX_DRAWING_S)
+    assert (bench.sent[-1] is others) == restored
+
+
+async def test_notes_come_from_the_nodes_of_the_plan_whatever_their_names(bench: Bench) -> None:
+    for name, note in (("tape", "records to a.mcap"), ("body", "meshes, 3 s left")):
+        bench.operator.hear(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
+    bench.run(0.5)
+    assert "records to a.mcap" in bench.operator._page.record._words._shown
+    assert "meshes, 3 s left" in bench.operator._page._state._shown
+
+
+def status(node: str, note: str) -> Status:
+    return Status(
+        node=node,
+        state="running",
+        pid=1,
+        uptime_s=1.0,
+        cpu_ratio=0.0,
+        resident_bytes=0,
+        inputs=(),
+        outputs=(),
+        errors=0,
+        last_error="",
+        note=note,
+        plan_hash="",
+    )

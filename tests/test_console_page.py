@@ -25,7 +25,7 @@ from flexsheet.messages.bag import BagReader, BagWriter
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Subscriber
 from flexsheet.messages.topics import topic_named
-from flexsheet.messages.types import EStop, FingerPath, Moment, Recording, TwinFinger
+from flexsheet.messages.types import Bookmark, EStop, FingerPath, Recording, TwinFinger
 from flexsheet.nodes.node import PortCounts
 from tests.browser import BROWSER_MARKS, CHROMIUM, DRAWN_WITHOUT_GPU, TWO_FRAMES
 from tests.fingertips import fingertip
@@ -146,15 +146,15 @@ async def visit(page: Page, session: Session, port: int) -> None:
 async def begin_recording(page: Page, heard: Heard) -> None:
     await page.get_by_role("tab", name="Record").click()
     await page.get_by_role("textbox", name="Name").fill("before anything")
-    await expect(page.get_by_role("button", name="Mark this moment")).to_be_visible()
-    await page.get_by_role("button", name="Mark this moment").click()
+    await expect(page.get_by_role("button", name="Add a bookmark")).to_be_visible()
+    await page.get_by_role("button", name="Add a bookmark").click()
     await expect(page.get_by_role("alert").last).to_contain_text("start recording")
     await expect(page.get_by_role("combobox", name="Bag")).to_have_value("older.mcap")
     await page.get_by_role("button", name="Start recording").click()
     await heard.until(lambda: heard.last("recording") == Recording(running=True), "recording")
     await page.get_by_role("textbox", name="Name").fill("first touch")
-    await page.get_by_role("button", name="Mark this moment").click()
-    await heard.until(lambda: heard.last("moment") is not None, "the moment")
+    await page.get_by_role("button", name="Add a bookmark").click()
+    await heard.until(lambda: heard.last("bookmark") is not None, "the moment")
 
 
 async def touch(page: Page, heard: Heard) -> None:
@@ -282,7 +282,7 @@ async def run_session(folder: Path) -> Session:
     port = free_port()
     settings = [f"console.page_port={port}", f"console.bags={folder}/bags"]
     plan = load_graph(file, console=True, settings=settings)
-    names = ("scene", "twin/finger_path", "twin/finger", "estop", "recording", "moment")
+    names = ("scene", "twin/finger_path", "twin/finger", "estop", "recording", "bookmark")
     async with async_playwright() as play:
         async with RunningGraph(plan) as graph:
             await graph.wait_ready(DEADLINE_S)
@@ -335,7 +335,9 @@ def test_the_bag_holds_what_was_done_to_the_page(session: Session) -> None:
         # The launcher keeps an e-stop, and says it again for those who come late.
         if topic != "estop" or header.writer == "console":
             by_topic.setdefault(topic, []).append(message)
-    assert [one.label for one in by_topic["moment"] if isinstance(one, Moment)] == ["first touch"]
+    assert [one.label for one in by_topic["bookmark"] if isinstance(one, Bookmark)] == [
+        "first touch"
+    ]
     stops = [(one.engaged, one.reason) for one in by_topic["estop"]]
     assert stops == [
         (True, "pressed at the console"),

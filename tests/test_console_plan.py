@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +34,10 @@ def test_a_console_is_added_and_writes_the_scene(graph: Path) -> None:
     assert plan.nodes["console"].nice > 0
     assert plan.nodes["console"].parameters["page_port"] == 8123
     assert plan.listening_nodes(None) == [("console", 8123)]
-    assert plan.nodes["console"].parameters["drives_finger"]
+    assert plan.nodes["console"].parameters["control_finger"]
     assert plan.nodes["recorder"].parameters["start_paused"]
     # In the run's directory NAME.json is what the launcher tells the node of that name.
-    assert plan.nodes["console"].parameters["kept"].removeprefix("@run/") not in {
+    assert plan.nodes["console"].parameters["state_file"].removeprefix("@run/") not in {
         f"{name}.json" for name in plan.nodes
     }
     read = {port.topic for port in plan.nodes["console"].inputs}
@@ -69,10 +70,10 @@ def test_the_console_knows_whether_something_records(graph: Path, tmp_path: Path
         file.write_text(load_graph(graph, **options).model_dump_json())
         return GraphFacts.from_plan(file, "console")
 
-    on_request = GraphFacts(records=True, records_on_request=True)
+    on_request = GraphFacts(recorders=("recorder",), records_on_request=True, consoles=("console",))
     assert facts(console=True) == on_request
     always = facts(console=True, record=tmp_path / "a.mcap")
-    assert always == GraphFacts(records=True, records_on_request=False)
+    assert always == replace(on_request, records_on_request=False)
 
 
 def test_a_picture_that_somebody_waits_for_has_the_priority_of_a_frame() -> None:

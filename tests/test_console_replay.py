@@ -14,9 +14,9 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
     ArmState,
+    Bookmark,
     EStop,
     Fingertip,
-    Moment,
 )
 from flexsheet.nodes.console.desk import Replay
 from flexsheet.nodes.console.replay import Timeline, bags_in
@@ -48,14 +48,14 @@ def bag(tmp_path: Path, scene: Scene) -> Path:
             at = np.array([0.0, 0.0, 1e-4 * tenth])
             write("fingertip", fingertip(at), 0.1 * tenth)
             if tenth == 40:
-                write("moment", Moment(label="touch"), 4.0)
+                write("bookmark", Bookmark(label="touch"), 4.0)
     return path
 
 
 def test_a_bag_is_shown_as_it_was_at_any_moment(bag: Path) -> None:
     timeline = Timeline(bag)
     assert timeline.duration_s == pytest.approx(10.0)
-    assert timeline.moments == [(pytest.approx(4.0), "touch")]
+    assert timeline.bookmarks == [(pytest.approx(4.0), "touch")]
     for seconds, height in ((0.05, 0.0), (10.0, 1e-2), (3.14, 3.1e-3), (0.0, 0.0)):
         timeline.seconds = seconds
         entry = timeline.newest("fingertip", Fingertip)

@@ -197,7 +197,7 @@ def test_words_of_the_tabs() -> None:
     assert "twin_eye" in panels.eye(wanted=True, possible=False, **resting)
     assert "Tick" in panels.eye(wanted=False, possible=True, **resting)
     assert "no recorder" in panels.recorder(None, ())
-    assert "Marked: one, &lt;b&gt;." in panels.recorder("waits", ("one", "<b>"))
+    assert "Bookmarks: one, &lt;b&gt;." in panels.recorder("waits", ("one", "<b>"))
 
 
 def colors_of(scheme: str) -> dict[str, str]:

@@ -182,7 +182,7 @@ FAULTS: dict[str, tuple[Any, tuple[str, str, str], str]] = {
     "code": (lambda v: changed(v["left"], code="def"), ("left", "software", "warning"), "git"),
     "away": (
         lambda v: changed(v["left"], nodes=(
-            NodeProcess(name="arm_left_bridge", state="away", restarts=2, hangs=0),)),
+            NodeProcess(name="arm_left_bridge", state="exited", restarts=2, hangs=0),)),
         ("left", "nodes", "failed"), "log",
     ),
     "device": (

@@ -21,7 +21,7 @@ from tests.test_cli import Command
 
 COMMANDS = ("info {bag}", "verify planner {bag}", "report {bag} -o {out}.html",
             "export {bag} {out}.mcap", "recover {bag} {out}-2.mcap",
-            "play {bag} --into {graph}")  # fmt: skip
+            "play {bag} --launch {graph}")  # fmt: skip
 GRAPH = "external_topics: [estop]\nnodes: {}\n"
 MAX_GROWTH_KB = 400_000
 

@@ -232,7 +232,7 @@ def test_settings_and_record_win_over_the_file(tmp_path: Path) -> None:
     assert recorder.parameters["compress"] is False
     assert {port.topic for port in recorder.inputs} == {
         "twin/finger", "arming", "estop", "host", "status", "display", "twin/finger_path", "eye",
-        "recording", "moment",
+        "recording", "bookmark",
     }  # fmt: skip
 
 

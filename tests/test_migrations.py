@@ -18,7 +18,7 @@ from flexsheet.messages.base import Header, Message, schema_fingerprint
 from flexsheet.messages.migrations import fits, migration_for
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS, Delivery, Topic
-from flexsheet.messages.types import Fingertip, Frame
+from flexsheet.messages.types import Fingertip, Frame, TwinFinger
 
 OLD_BAG = Path(__file__).parent / "recorded" / "before-migrations.mcap"
 HEADER = Header(1, 10, 11, "clock", "node", 5, "plan")
@@ -64,6 +64,15 @@ def test_renamed_fields_of_a_recorded_fingertip_are_read() -> None:
     assert isinstance(finger, Fingertip)
     assert len(finger.predicted_path_world_m) > 1
     assert finger.prediction_step_s > 0.0
+
+
+@pytest.mark.parametrize(("label", "seconds"), [("stroke 2.5 s", 2.5), ("push 30 mm", None)])
+def test_a_recorded_stroke_has_its_duration(label: str, seconds: float | None) -> None:
+    finger = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "twin/finger")
+    migration = migration_for(TwinFinger, "c1881b3029f02367", recorded_schema("TwinFinger"))
+    assert migration is not None
+    recorded = finger.model_dump(exclude={"path_stroke_s"}) | {"path_label": label}
+    assert TwinFinger.model_validate(migration(recorded)).path_stroke_s == seconds
 
 
 @pytest.mark.parametrize(

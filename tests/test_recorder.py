@@ -95,7 +95,7 @@ def test_which_topics_it_wants() -> None:
         return list(Recorder.further_inputs(RecorderParameters(bag="a", **parameters), written))
 
     assert wants() == ["scene", "fingertip"]
-    assert wants(also=("stereo", "scene")) == ["scene", "fingertip", "stereo"]
+    assert wants(include=("stereo", "scene")) == ["scene", "fingertip", "stereo"]
     assert wants(topics=("stereo",)) == ["stereo"]
 
 

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
+import numpy as np
 import pytest
+from pydantic import create_model
 from ruamel.yaml import YAML
 
+from flexsheet.launch.bags.replay import lives_in
 from flexsheet.launch.plans import renamed_keys
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages import migrations
-from flexsheet.messages.bag import BagReader
-from flexsheet.messages.base import Message
+from flexsheet.messages.bag import BagReader, BagWriter, recover
+from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import Display, Frame
+from flexsheet.messages.topics import TOPICS, Delivery, Topic, UnknownTopicError, topic_named
+from flexsheet.messages.types import Bookmark, Display, Frame, HostStatus, Status
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import parameters_of
 
@@ -122,3 +125,68 @@ def test_the_old_bag_is_read_with_todays_names() -> None:
     frames = [message for name, message, *_ in BagReader(OLD_BAG) if name == "frame"]
     assert frames
     assert all(isinstance(one, Frame) and one.occluded_fraction >= 0.0 for one in frames)
+
+
+class Moment(Bookmark):
+    """Hold a bookmark as bags recorded it, under its old name."""
+
+
+def with_old_names(message_type: type[Message], names: dict[str, str]) -> type[Message]:
+    """Make the type as it was recorded.  names: old names of fields by those of today."""
+    hints = get_type_hints(message_type, include_extras=True)
+    fields: dict[str, Any] = {
+        names.get(name, name): (hints[name], field)
+        for name, field in message_type.model_fields.items()
+    }
+    return create_model(message_type.__name__, __base__=Message, **fields)
+
+
+@pytest.fixture
+def bag_with_old_names(tmp_path: Path) -> Path:
+    path = tmp_path / "before.mcap"
+    header = Header(1, 10, 11, "clock", "planner", 5, "plan")
+    old_status = with_old_names(Status, {"execution_log": "taken"})
+    steps = np.array([[0, 1, 5, 20], [-1, 0, 0, 30]], dtype=np.int64)
+    status = old_status(
+        node="planner", state="running", pid=1, uptime_s=1.0, cpu_ratio=0.0, resident_bytes=0,
+        inputs=(), outputs=(), errors=0, last_error="", note="", plan_hash="", taken=steps,
+    )  # fmt: skip
+    with BagWriter(path, {"recording": {"clock_id": "clock"}}) as writer:
+        for topic, message in (("moment", Moment(label="touch")), ("status", status)):
+            row = Topic(topic, type(message), Delivery.EVERY, None, True, "as recorded then")
+            writer.write(row, message, header, 100)
+    return path
+
+
+def test_a_bag_with_old_topic_type_and_field_names_is_read_and_replayed(
+    bag_with_old_names: Path, tmp_path: Path
+) -> None:
+    repaired = tmp_path / "repaired.mcap"
+    recover(bag_with_old_names, repaired)
+    for path in (bag_with_old_names, repaired):
+        reader = BagReader(path)
+        assert reader.topics == {"bookmark": "Bookmark", "status": "Status"}
+        assert all(topic.readable for topic in reader.info().topics)
+        found = {name: message for name, message, *_ in reader}
+        assert found["bookmark"] == Bookmark(label="touch")
+        by_old_name = [message for _, message, *_ in BagReader(path, ["moment"])]
+        assert by_old_name == [Bookmark(label="touch")]
+        (life,) = lives_in(path, "planner")
+        assert life.steps.tolist() == [[0, 1, 5, 20], [-1, 0, 0, 30]]
+
+
+def test_a_recorded_value_within_a_list_of_parts_is_read() -> None:
+    recorded: dict[str, Any] = HostStatus.model_json_schema()
+    recorded["$defs"]["NodeProcess"]["properties"]["state"]["enum"] = ["starting", "ready", "away"]
+    migration = migrations.migration_for(HostStatus, "0" * 16, recorded)
+    assert migration is not None
+    nodes = [{"name": "one", "state": "away"}, {"name": "two", "state": "ready"}]
+    states = [one["state"] for one in migration({"nodes": nodes})["nodes"]]
+    assert states == ["exited", "ready"]
+
+
+@pytest.mark.parametrize(("old", "new"), migrations.RENAMED_TOPICS.items())
+def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -> None:
+    assert new in TOPICS
+    with pytest.raises(UnknownTopicError, match=f'unknown topic "{old}"; it is now "{new}"'):
+        topic_named(old)

@@ -25,19 +25,19 @@ from flexsheet.launch.bags.report.numbers import methods_of, numbers_of
 from flexsheet.launch.bags.report.page import COLOURS, MARK, SECTIONS, page_of
 from flexsheet.launch.bags.report.series import Events, Grid, Moments, Range, Spread, States
 from flexsheet.launch.bags.report.session import Port, read_session
-from flexsheet.launch.bags.report.strokes import seconds_of
+from flexsheet.launch.bags.report.strokes import SheetErrors
 from flexsheet.launch.bags.report.write import report, result_of
 from flexsheet.launch.cli import main
 from flexsheet.launch.experiments.stroke import read_recording, stroke_errors, summary
 from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.methods import Methods
-from flexsheet.messages.types import CpuPressure, HostStatus, PortStatus, ProgramCpu
+from flexsheet.messages.types import CpuPressure, HostStatus, PortStatus, ProgramCpu, TwinFinger
 from tests import sessions
 from tests.arm_states import arm_state
 from tests.colours import luminance
 
 LONELY = ("scene", "fingertip", "sheet_target", "arm_left", "arm_right", "soft_body", "status",
-          "twin/finger", "stereo", "twin/eye", "frame", "moment", "estop")  # fmt: skip
+          "twin/finger", "stereo", "twin/eye", "frame", "bookmark", "estop")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -134,11 +134,21 @@ def test_states_last_until_another_and_gaps_stay_white() -> None:
     assert states.seconds == {"wait": 1.0, "contact": 0.5}
 
 
-def test_labels_of_strokes_are_told_from_others() -> None:
-    assert seconds_of("stroke 10 s") == 10.0
-    assert seconds_of("stroke 2.5 s") == 2.5
-    for other in ("", "stroke", "stroke ten s", "push 30 mm", "stroke 10 mm", "a stroke 10 s"):
-        assert seconds_of(other) is None
+@pytest.mark.parametrize(("label", "stroke_s"), [("anything", 2.0), ("stroke 2 s", None)])
+def test_a_stroke_is_recognized_by_its_duration_not_by_its_label(
+    label: str, stroke_s: float | None
+) -> None:
+    errors = SheetErrors(Grid(0, 1.0, 1))
+    finger = TwinFinger(
+        path_label=label,
+        path_done=False,
+        path_time_s=0.5,
+        path_stroke_s=stroke_s,
+        position_world_m=np.zeros(3),
+        velocity_world_m_per_s=np.zeros(3),
+    )
+    errors.take(finger, 1_000_000_000)
+    assert [run.stroke_s for run in errors.runs] == [stroke_s]
 
 
 # What is told.
@@ -327,7 +337,7 @@ def test_pictures_are_the_sessions(page: str) -> None:
     assert sum("what it should see" in text for text, _ in images) == 3
     assert sum("projector" in text for text, _ in images) == 3
     # The first shot after the moment at 1.5 s is the one of 2.2 s.
-    assert re.search(r"2\.21 s\.[^<]*<strong>Moment: &lt;b&gt;first touch", page)
+    assert re.search(r"2\.21 s\.[^<]*<strong>Bookmark: &lt;b&gt;first touch", page)
 
 
 @pytest.mark.parametrize("scheme", COLOURS)

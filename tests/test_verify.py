@@ -154,7 +154,7 @@ def test_pictures_are_drawn_again_to_the_last_pixel(bag: Path) -> None:
 
 
 def test_without_the_nodes_word_the_recorders_order_is_another(bag: Path, tmp_path: Path) -> None:
-    old = rewritten(bag, tmp_path / "old.mcap", taken=False)
+    old = rewritten(bag, tmp_path / "old.mcap", log=False)
     result = verify(old, "planner")
     assert result.same_bytes
     assert not result.as_taken
@@ -167,14 +167,14 @@ def test_inputs_that_the_recorder_lost_are_counted(bag: Path, tmp_path: Path) ->
 
 
 def rewritten(
-    bag: Path, path: Path, *, taken: bool = True, without: tuple[str, int] | None = None
+    bag: Path, path: Path, *, log: bool = True, without: tuple[str, int] | None = None
 ) -> Path:
     reader = BagReader(bag)
     with BagWriter(path, reader.metadata) as writer:
         writer.add_attachment("plan.json", reader.attachment("plan.json"), "application/json")
         for topic, message, header, log_ns in reader:
-            if isinstance(message, Status) and not taken:
-                message = message.model_copy(update={"taken": np.zeros((0, 4), np.int64)})  # noqa: PLW2901
+            if isinstance(message, Status) and not log:
+                message = message.model_copy(update={"execution_log": np.zeros((0, 4), np.int64)})  # noqa: PLW2901
             if (topic, header.sequence) != without:
                 writer.write(TOPICS[topic], message, header, log_ns)
     return path

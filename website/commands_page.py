@@ -54,7 +54,7 @@ def _section(name: str, command: Any) -> str:
     rows = [
         f"| {_name(parameter)} | {_words(parameter)} |"
         for parameter in command.params
-        if "completion" not in parameter.name
+        if "completion" not in parameter.name and not getattr(parameter, "hidden", False)
     ]
     table = "\n".join(["| argument or option | what |", "| --- | --- |", *rows])
     text = inspect.cleandoc(command.help or "")

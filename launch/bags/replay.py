@@ -1,11 +1,11 @@
-"""Steps one node through its recorded inputs with a virtual clock, twice, and compares.
+"""Step one node through its recorded inputs with a virtual clock, twice, and compare the outputs.
 
-The node is built from the plan in the bag.  It has said in its status which messages it took, in
-which order and when (`messages.types.Status.taken`); by that it is stepped again, so that what a
-late reader skipped live is skipped here.  Where the bag has no such word (as of earlier code), each
-recorded input is handed to it in the order in which the recorder got it, and timers that came due
-are called before.  The same bag must give the same bytes each time.  Against what the node sent
-live, fields are compared with a tolerance.
+The node is built from the plan in the bag.  Its status messages hold which messages it handled, in
+which order and when (`messages.types.Status.execution_log`).  The replay follows this log, so that
+messages that the node skipped live are skipped again.  Bags of earlier code hold no such log.
+Then the node gets each recorded input in the order of the recorder, and its timers are called when
+they are due.  The same bag must give the same bytes each time.  The fields of the outputs are
+compared with those that the node sent live, with a tolerance.
 """
 
 from __future__ import annotations
@@ -297,7 +297,7 @@ async def _replay_life(
 
 @dataclass(frozen=True, slots=True)
 class Life:
-    """What a node took between one start and the next: rows of `Status.taken`, its host's clock."""
+    """Hold what a node handled between two starts: rows of its `Status.execution_log`."""
 
     clock_id: str
     steps: NDArray[np.int64]
@@ -310,12 +310,12 @@ def lives_in(bag: Path, name: str) -> list[Life]:
     if "status" not in BagReader(bag).topics:
         return []
     for _, message, header, _ in BagReader(bag, ["status"]):
-        if isinstance(message, Status) and message.node == name and len(message.taken):
+        if isinstance(message, Status) and message.node == name and len(message.execution_log):
             before = told.setdefault(header.epoch, [])
             # A young node tells all from its start again.
-            if before and (before[0][0] == message.taken[0]).all():
+            if before and (before[0][0] == message.execution_log[0]).all():
                 before.clear()
-            before.append(message.taken)
+            before.append(message.execution_log)
             clock_ids[header.epoch] = header.clock_id
     return [Life(clock_ids[epoch], np.concatenate(parts)) for epoch, parts in told.items()]
 
@@ -482,7 +482,7 @@ def _check_inputs(bag: Path, reader: BagReader, plan: ResolvedGraph, node: Resol
             recorded |= {port.topic for port in other.inputs}
     lacking = [port.topic for port in node.inputs if port.topic not in recorded]
     if lacking:
-        also = " ".join(f"--also {topic}" for topic in lacking)
+        also = " ".join(f"--include {topic}" for topic in lacking)
         raise BagError(
             f"{bag}: {node.name} reads {', '.join(lacking)}, which was not recorded; "
             f"record anew with: flexsheet bag record BAG {also}"

@@ -52,35 +52,39 @@ TopicsOption = Annotated[
     epilog=examples(
         "flexsheet bag record session.mcap",
         "flexsheet bag record fingers.mcap --topic fingertip --duration 10",
-        "flexsheet bag record with-pictures.mcap --also stereo",
+        "flexsheet bag record with-pictures.mcap --include stereo",
     )
 )
 def record(
     *,
     bag: BagArgument,
     topics: TopicsOption = None,
-    also: Annotated[
+    include: Annotated[
         list[str] | None,
         typer.Option(
-            "--also",
+            "--include",
             metavar="TOPIC",
-            help="Beside what is logged by default, as stereo; may be given again.",
+            help="Record this topic too, for example stereo; may be given again.",
             autocompletion=complete.topics,
         ),
     ] = None,
+    also: Annotated[
+        list[str] | None, typer.Option("--also", hidden=True, help="Old name of --include.")
+    ] = None,
     duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Stop by itself.")
+        float | None, typer.Option(metavar="SECONDS", help="Stop after this time.")
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Record the graph that runs, until Ctrl-C; without --topic all that is logged by default."""
+    """Record the running graph until Ctrl-C; without --topic all topics logged by default."""
     running = running_graph(run)
     if bag.exists():
         raise CommandError(f"{bag}: exists already; a bag is never written over", BAD_INPUT)
     logs_on_stderr()
+    included = [*(include or ()), *(also or ())]
     run_interruptible(
-        _record(bag, topics=topics or [], also=also or [], running=running, seconds=duration)
+        _record(bag, topics=topics or [], include=included, running=running, seconds=duration)
     )
     if as_json:
         print_json({"bag": str(bag)})
@@ -91,30 +95,36 @@ def record(
 @app.command(
     epilog=examples(
         "flexsheet bag play session.mcap --rate 0.5",
-        "flexsheet bag play session.mcap --topic twin/finger_path --into graph.yaml",
+        "flexsheet bag play session.mcap --topic twin/finger_path --launch graph.yaml",
     )
 )
 def play(
     *,
     bag: BagArgument,
-    rate: Annotated[float, typer.Option(help="So many times as fast.", min=0.01)] = 1.0,
-    start: Annotated[float, typer.Option(metavar="SECONDS", help="Begin here.", min=0.0)] = 0.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Again and again, until Ctrl-C.")] = False,
+    rate: Annotated[float, typer.Option(help="Speed factor.", min=0.01)] = 1.0,
+    start: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Start at this position in the bag.", min=0.0)
+    ] = 0.0,
+    loop: Annotated[bool, typer.Option("--loop", help="Repeat until Ctrl-C.")] = False,
     topics: TopicsOption = None,
-    into: Annotated[
+    launch: Annotated[
         Path | None,
         typer.Option(
+            "--launch",
             metavar="FILE",
-            help="Start this launch file for the time of playing.",
+            help="Start this launch file first, and end it after playing.",
             autocompletion=complete.yaml_files,
         ),
+    ] = None,
+    into: Annotated[
+        Path | None, typer.Option("--into", hidden=True, help="Old name of --launch.")
     ] = None,
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Play a bag into a graph: the topics of `external_topics` in its launch file."""
     how = Playing(bag, tuple(topics or ()), rate, start, loop, as_json)
-    raise typer.Exit(run_interruptible(_play(how, into, run)))
+    raise typer.Exit(run_interruptible(_play(how, launch or into, run)))
 
 
 @app.command(epilog=examples("flexsheet bag info session.mcap"))
@@ -341,7 +351,7 @@ async def _record(
     bag: Path,
     *,
     topics: list[str],
-    also: list[str],
+    include: list[str],
     running: tuple[ResolvedGraph, Run],
     seconds: float | None,
 ) -> int:
@@ -350,6 +360,7 @@ async def _record(
     from flexsheet.launch.running.runs import local_sources, ring_file
     from flexsheet.launch.running.tools import tools_host
     from flexsheet.messages.topics import TOPICS
+    from flexsheet.nodes.node import further_port
     from flexsheet.nodes.recorder.node import Recorder
     from flexsheet.nodes.recorder.parameters import RUN_FILES, RecorderParameters
     from flexsheet.nodes.runner import NodeConfig, PortConfig, run_node
@@ -358,14 +369,14 @@ async def _record(
     parameters = RecorderParameters(
         bag=bag,
         topics=tuple(topics),
-        also=tuple(also),
+        include=tuple(include),
         attach=tuple(run.directory / file.relative_to(RUN_DIRECTORY) for file in RUN_FILES),
     )
     written = [topic for topic in TOPICS.values() if topic.name in plan.writers]
     wanted = Recorder.further_inputs(parameters, written)
     for name in wanted:
         if name not in plan.writers:
-            option = "--also" if name in also else "--topic"
+            option = "--include" if name in include else "--topic"
             raise CommandError(f"{option} {name}: nobody writes it in the running graph", BAD_INPUT)
     config = NodeConfig(
         name="bag_record",
@@ -373,7 +384,7 @@ async def _record(
         parameters=parameters.model_dump(mode="json"),
         inputs=tuple(
             PortConfig(
-                port=f"in/{name}",
+                port=further_port(name),
                 topic=name,
                 endpoints=local_sources(run, plan.sources_to_read(name, tools_host(run))),
             )
@@ -422,16 +433,16 @@ class Playing:
     as_json: bool
 
 
-async def _play(how: Playing, into: Path | None, run_directory: Path | None) -> int:
+async def _play(how: Playing, launch: Path | None, run_directory: Path | None) -> int:
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.supervisor import RunningGraph
 
-    if into is None:
+    if launch is None:
         plan, run = running_graph(run_directory)
         return await _play_into(how, plan, run)
-    plan = load_graph(into)
+    plan = load_graph(launch)
     async with RunningGraph(plan) as graph:
-        with words.status(f"starting {into}"):
+        with words.status(f"starting {launch}"):
             await graph.wait_ready()
         return await _play_into(how, plan, graph.run)
 

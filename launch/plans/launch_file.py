@@ -144,7 +144,7 @@ def apply_console(document: Document) -> None:
     if NodeRole.CONSOLE not in roles:
         added: dict[str, Any] = {"type": "console", "nice": CONSOLE_NICE}
         if NodeRole.FINGER_SIMULATOR not in roles:
-            added["parameters"] = {"drives_finger": False}
+            added["parameters"] = {"control_finger": False}
         document.set(("nodes", "console"), added, origin)
     if NodeRole.RECORDER not in roles and "record" not in document.values:
         parameters = {"bag": str(RECORDINGS.absolute()), "start_paused": True}

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
+    "console": {"drives_finger": "control_finger", "kept": "state_file"},
     "fem_solver": {
         "largest_depth_m": "max_depth_m",
         "lead_s": "prediction_horizon_s",
     },
-    "recorder": {"waits": "start_paused"},
+    "recorder": {"also": "include", "waits": "start_paused"},
     "renderer": {
         "lead_s": "prediction_horizon_s",
         "light_s": "display_latency_s",
@@ -36,7 +37,11 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """Old to new keys of scene files."""
 
-LAUNCH_KEYS: Mapping[str, str] = {"from_tools": "external_topics", "waits": "start_paused"}
+LAUNCH_KEYS: Mapping[str, str] = {
+    "from_tools": "external_topics",
+    "also": "include",
+    "waits": "start_paused",
+}
 """Old to new keys of launch files, those of `record` among them."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {

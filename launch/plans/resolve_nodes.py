@@ -25,7 +25,14 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.sheet_calibration import load_sheet_calibration, refuse_other_sheet
 from flexsheet.messages.topics import TOPICS, Topic
 from flexsheet.nodes import NODES, UnknownNodeError, node_class
-from flexsheet.nodes.node import Node, NodeParameters, Port, parameters_of, ports_of
+from flexsheet.nodes.node import (
+    Node,
+    NodeParameters,
+    Port,
+    further_port,
+    parameters_of,
+    ports_of,
+)
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
@@ -49,7 +56,7 @@ class NodeEntry:
     def topics(self, direction: str) -> list[tuple[str, Topic]]:
         found = [(port.name, topic) for port, topic in self.ports if port.direction == direction]
         if direction == "input":
-            found += [(f"in/{topic.name}", topic) for topic in self.further_inputs]
+            found += [(further_port(topic.name), topic) for topic in self.further_inputs]
         return found
 
     def unconnected_ports(self, direction: str) -> tuple[ResolvedPort, ...]:

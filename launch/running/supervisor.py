@@ -457,7 +457,7 @@ class RunningGraph:
                 if self._ready[node.name].is_set()
                 else "starting"
                 if node.name in self.pids
-                else "away",
+                else "exited",
                 restarts=self.restarts[node.name],
                 hangs=self.hangs[node.name],
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, astuple, dataclass, replace
 from enum import Enum, auto
@@ -16,7 +17,7 @@ from flexsheet.messages.base import Message
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import chosen
 from flexsheet.messages.scene import Scene
-from flexsheet.messages.types import Correction, Display, EStop, Frame, Moment, Recording, TwinEye
+from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
 from flexsheet.nodes.console import scenes
 from flexsheet.nodes.console.aim import Aim
 from flexsheet.nodes.console.finger import Finger
@@ -32,7 +33,6 @@ SETTLE_S = 0.4
 
 LOOK_EVERY_S = 6.0
 PIXELS_EVERY = 3
-LOOK_LABEL = "console"
 MAX_DRAWING_S = 5.0
 """The renderer draws many frames in that time, or none."""
 
@@ -41,6 +41,10 @@ CAPTURE_S = 1.0
 
 MAX_TRACING_S = 120.0
 """A picture that takes longer never comes."""
+
+DEFAULT_BOOKMARK = "bookmark"
+MAX_LABELS = 64
+"""Number of requested labels whose late pictures are still shown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,12 +158,14 @@ class Look:
         self._by_scene = scene.methods.correction
         self._holds = self._borrowed = False
         self._number = 0
+        self._labels: deque[str] = deque(maxlen=MAX_LABELS)
         self._since_s, self._again_s = 0.0, 0.0
         self._others: Display | None = None
 
     @property
     def label(self) -> str:
-        return f"{LOOK_LABEL} {self._number}"
+        """Label of the newest request."""
+        return f"console {self._number}"
 
     @property
     def correction(self) -> Correction:
@@ -176,10 +182,9 @@ class Look:
         if self._holds and not self._borrowed:
             self._put_back()
 
-    def heed(self, display: Display) -> None:
-        """Another one's display message."""
-        if not display.label.startswith(f"{LOOK_LABEL} "):
-            self._others, self._holds = display, False
+    def on_others_display(self, display: Display) -> None:
+        """Store the display message of another writer, to restore it after the next picture."""
+        self._others, self._holds = display, False
 
     def advance(self, now_s: float) -> None:
         """Ask for the next picture if it is time, or give the last one up."""
@@ -199,6 +204,7 @@ class Look:
 
     def _ask(self, now_s: float) -> None:
         self._number += 1
+        self._labels.append(self.label)
         self._enter(LookState.DRAWING, now_s)
         self._borrowed = True
         self._publish(
@@ -222,10 +228,9 @@ class Look:
 
     def got(self, eye: TwinEye, now_s: float) -> bool:
         """A picture has come; says whether it was for the console, however late."""
-        ours = eye.label.startswith(f"{LOOK_LABEL} ")
         if eye.label == self.label and self.state is not LookState.RESTING:
             self._rest(now_s)
-        return ours
+        return eye.label in self._labels
 
     def _enter(self, state: LookState, now_s: float) -> None:
         self.state, self._since_s = state, now_s
@@ -356,8 +361,11 @@ class Desk:
         self._publish(Recording(running=running))
         self.keep()
 
-    def mark(self, label: str) -> None:
-        self._publish(Moment(label=label.strip() or "moment"))
+    def add_bookmark(self, label: str) -> str:
+        """Publish a bookmark, and return its label."""
+        label = label.strip() or DEFAULT_BOOKMARK
+        self._publish(Bookmark(label=label))
+        return label
 
     def _send_scene(self, scene: Scene) -> None:
         self._publish(scene)

@@ -1,35 +1,57 @@
-"""What the console has to know of the graph that it belongs to."""
+"""Read from the run's plan what the console must know of its graph."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
-RECORDER_TYPE = "recorder"
+from flexsheet.messages.topics import TOPICS
+from flexsheet.messages.types import Skin
+from flexsheet.nodes import NodeRole
 
 
 @dataclass(frozen=True, slots=True)
 class GraphFacts:
-    """Facts from the run's plan that hold as long as the console runs.
+    """Hold facts of the run's plan, which are constant while the console runs.
 
-    others_may_reset: hosts that may reset an e-stop where the console's own may not; empty: it may.
-    records: whether something records.  records_on_request: whether it waits to be asked to.
+    others_may_reset: hosts that may reset an e-stop; empty if the console's own host may.
+    recorders: names of the recorders.  records_on_request: whether one of them records only while
+    a message of the topic `recording` says so.  solvers: names of the nodes that publish the skin.
+    consoles: names of the consoles.
     """
 
     others_may_reset: tuple[str, ...] = ()
-    records: bool = False
+    recorders: tuple[str, ...] = ()
     records_on_request: bool = False
+    solvers: tuple[str, ...] = ()
+    consoles: tuple[str, ...] = ()
+
+    @property
+    def sampling_readers(self) -> tuple[str, ...]:
+        """Names of the nodes that skip messages by design."""
+        return self.consoles
 
     @classmethod
     def from_plan(cls, plan_file: Path, console: str) -> Self:
         """Read the plan of the run.  console: name of the console's node."""
         plan = json.loads(plan_file.read_text())
         nodes, hosts = plan["nodes"], tuple(plan["estop_resetters"])
-        recorders = [node for node in nodes.values() if node["type"] == RECORDER_TYPE]
+        skins = {name for name, topic in TOPICS.items() if topic.message is Skin}
+        recorders = _with_role(nodes, NodeRole.RECORDER)
         return cls(
             others_may_reset=() if nodes[console]["host"] in hosts else hosts,
-            records=bool(recorders),
-            records_on_request=any(one["parameters"]["start_paused"] for one in recorders),
+            recorders=recorders,
+            records_on_request=any(nodes[name]["parameters"]["start_paused"] for name in recorders),
+            solvers=tuple(
+                name
+                for name, node in nodes.items()
+                if any(port["topic"] in skins for port in node["outputs"])
+            ),
+            consoles=_with_role(nodes, NodeRole.CONSOLE),
         )
+
+
+def _with_role(nodes: dict[str, Any], role: NodeRole) -> tuple[str, ...]:
+    return tuple(name for name, node in nodes.items() if node["role"] == role)

@@ -12,8 +12,8 @@ from pydantic import Field, field_validator, model_validator
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.scene import Positive, Scene
-from flexsheet.messages.topics import Delivery, Topic, topic_named
-from flexsheet.messages.types import Display, EStop, FingerPath, Moment, Recording, Skin
+from flexsheet.messages.topics import Delivery, Topic
+from flexsheet.messages.types import Bookmark, Display, EStop, FingerPath, Recording, Skin
 from flexsheet.messages.wire import WireError
 from flexsheet.nodes import NodeRole
 from flexsheet.nodes.console.desk import Desk, Files
@@ -22,7 +22,7 @@ from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.console.guard import Guard, read_token, start_server
 from flexsheet.nodes.console.newest import Newest
 from flexsheet.nodes.console.operator import Operator
-from flexsheet.nodes.node import Input, Node, NodeParameters, Output, periodic
+from flexsheet.nodes.node import Node, NodeParameters, Output, further_port, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 
 SHOWN = {
@@ -42,12 +42,15 @@ class ConsoleParameters(NodeParameters):
     )
     rate_hz: Positive = Field(default=25.0, description="of the 3D view")
     tables_hz: Positive = Field(default=2.0, description="of tables and charts")
-    drives_finger: bool = Field(default=True, description="the mouse moves the twin's finger")
+    control_finger: bool = Field(default=True, description="the mouse moves the twin's finger")
     finger_speed_m_per_s: Positive = 0.15
     bags: Path = Field(default=Path("runs"), description="folder whose bags can be replayed")
     plan: Path = Field(default=Path("@run/plan.json"), description="holds the first scene")
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
-    kept: Path = Field(default=Path("@run/console-kept.json"), description="what it takes up again")
+    state_file: Path = Field(
+        default=Path("@run/console-kept.json"),
+        description="state that a restarted console continues with",
+    )
 
     @field_validator("address")
     @classmethod
@@ -78,7 +81,7 @@ class Console(Node):
     display: Output[Display]
     estop: Output[EStop]
     recording: Output[Recording]
-    moment: Output[Moment]
+    bookmark: Output[Bookmark]
     twin__finger_path: Output[FingerPath]
 
     @classmethod
@@ -91,14 +94,6 @@ class Console(Node):
     ) -> Sequence[str]:
         return [topic.name for topic in written if topic.name in SHOWN]
 
-    def __init__(
-        self, parameters: ConsoleParameters, *, topics: dict[str, str] | None = None, **rest: Any
-    ) -> None:
-        super().__init__(parameters, topics=topics, **rest)
-        for port, topic in (topics or {}).items():
-            if port.startswith("in/"):
-                self.inputs[port] = Input(topic_named(topic), self.clock)
-
     async def setup(self) -> None:
         given = self.parameters
         token = None if given.token_file is None else read_token(given.token_file)
@@ -108,11 +103,18 @@ class Console(Node):
         self._server = start_server(given.address, given.page_port, guard, "flexsheet")
         self.url = f"http://{given.address}:{self._server.get_port()}/"
         finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
-        files = Files(given.plan, given.scenes, given.bags, given.kept)
+        files = Files(given.plan, given.scenes, given.bags, given.state_file)
         facts = GraphFacts.from_plan(given.plan, self.name)
         desk = Desk(self._publish, files, finger, self.log.warning, facts)
-        has = {"with_finger": given.drives_finger, "with_eye": "in/twin/eye" in self.inputs}
-        self.operator = Operator(self._server, self._newest, desk, self._ask, **has)
+        self.operator = Operator(
+            self._server,
+            self._newest,
+            desk,
+            self._ask,
+            name=self.name,
+            with_finger=given.control_finger,
+            with_eye=further_port("twin/eye") in self.inputs,
+        )
         desk.begin()
         self.note = f"{self.url}, nobody looks"
 
@@ -162,5 +164,5 @@ class Console(Node):
             self.operator.fail(error)
 
     def _refused(self, topic: Topic, error: WireError) -> None:
-        self.inputs[f"in/{topic.name}"].counts.rejected += 1
+        self.inputs[further_port(topic.name)].counts.rejected += 1
         self.log.warning("input", problem=str(error))

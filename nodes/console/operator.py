@@ -48,9 +48,7 @@ LONGEST_STEP_S = 0.2
 """After a pause the finger and the replay go on from where they were."""
 
 SIDES = ("left", "right")
-MARKS_SHOWN = 5
-SOLVER = "fem_solver"
-RECORDER = "recorder"
+BOOKMARKS_SHOWN = 5
 REPLAYED = (
     "what you see is a replay, and the finger is that of the running graph: press "
     '"Back to the running graph" in Record first'
@@ -72,11 +70,16 @@ class Operator:
         desk: Desk,
         ask: Ask,
         *,
+        name: str,
         with_finger: bool,
         with_eye: bool,
     ) -> None:
-        """with_finger: the twin's, which the mouse moves.  with_eye: the twin's, which looks."""
-        self._live, self.desk = live, desk
+        """Build the page.
+
+        name: of the console's node.  with_finger: the graph simulates the finger, and the mouse
+        moves it.  with_eye: the graph simulates the eye.
+        """
+        self._name, self._live, self.desk = name, live, desk
         self._with_finger, self._with_eye = with_finger, with_eye
         self._page = Page(
             server, ask, with_finger=with_finger, others_may=desk.facts.others_may_reset
@@ -91,7 +94,7 @@ class Operator:
         self._bags_s = -BAGS_EVERY_S
         self._finger_shown_s = 0.0
         self._looked_s: float | None = None
-        self._marked: tuple[str, ...] = ()
+        self._bookmarks: tuple[str, ...] = ()
         self._bags_before: set[str] = set()
         self._awaits_bag = False
         self._take_up_scene()
@@ -108,7 +111,7 @@ class Operator:
             "look": self._look,
             "correct": self._correct,
             "record": self._record,
-            "mark": self._mark,
+            "bookmark": self._bookmark,
             "open_bag": self._open_bag,
             "leave": self._leave,
             "play": self._play,
@@ -144,7 +147,8 @@ class Operator:
         elif isinstance(message, EStop):
             self.desk.stopped = message.reason if message.engaged else None
         elif isinstance(message, Display):
-            self.desk.look.heed(message)
+            if header.writer != self._name:
+                self.desk.look.on_others_display(message)
         elif isinstance(message, TwinEye) and self.desk.look.got(message, now_s):
             self._looked_s = now_s
             for name, image in (("seen", message.seen), ("expected", message.expected)):
@@ -212,7 +216,11 @@ class Operator:
         ages = {name: (status, now_s - at_s) for name, (status, at_s) in self._statuses.items()}
         self._history.take(now_s, self._live)
         latencies = panels.latency_table(self._history.newest_and_worst())
-        tables = latencies + panels.topics_table(ages) + panels.nodes_table(ages)
+        tables = (
+            latencies
+            + panels.topics_table(ages, self.desk.facts.sampling_readers)
+            + panels.nodes_table(ages)
+        )
         self._page.graph.show(tables, self._history.columns())
         self._show_state()
         self._tell_eye(now_s)
@@ -247,15 +255,23 @@ class Operator:
             replay=None if timeline is None else timeline.path.name,
         )
         self._page.show_state(state)
-        recorder = self._statuses.get(RECORDER)
-        note = None if recorder is None else recorder[0].note
-        self._page.record.show_state(panels.recorder(note, self._marked), recording=desk.recording)
+        recorders = [
+            self._statuses[name] for name in desk.facts.recorders if name in self._statuses
+        ]
+        note = recorders[0][0].note if recorders else None
+        self._page.record.show_state(
+            panels.recorder(note, self._bookmarks), recording=desk.recording
+        )
 
     def _solver_note(self) -> str:
         """What the soft body's solver reports while it has no skin of this scene; else nothing."""
-        solver, skin = self._statuses.get(SOLVER), self._live.newest("skin", Skin)
-        pending = skin is None or skin[1].source_ns < self._sent_ns
-        return solver[0].note if solver is not None and pending else ""
+        skin = self._live.newest("skin", Skin)
+        if skin is not None and skin[1].source_ns >= self._sent_ns:
+            return ""
+        solvers = self.desk.facts.solvers
+        return next(
+            (self._statuses[name][0].note for name in solvers if name in self._statuses), ""
+        )
 
     def _tell_eye(self, now_s: float) -> None:
         look = self.desk.look
@@ -320,7 +336,7 @@ class Operator:
             self._awaits_bag = True
             self._show_bags()
         else:
-            self._marked, self._bags_before = (), set(self.desk.replay.bags())
+            self._bookmarks, self._bags_before = (), set(self.desk.replay.bags())
             self._awaits_bag = False
             self.desk.record(True)
 
@@ -331,16 +347,16 @@ class Operator:
         self._page.record.show_bags(bags, made if self._awaits_bag else None)
         self._awaits_bag = self._awaits_bag and made is None
 
-    def _mark(self, label: str) -> None:
+    def _bookmark(self, label: str) -> None:
         facts = self.desk.facts
-        if not facts.records:
+        if not facts.recorders:
             raise ValueError(NO_RECORDER)
         if facts.records_on_request and not self.desk.recording:
             raise ValueError(
-                "nothing is recorded now, so there is nothing to mark: start recording"
+                "nothing is recorded now, so a bookmark would be lost: start recording first"
             )
-        self.desk.mark(label)
-        self._marked = (*self._marked, label.strip() or "moment")[-MARKS_SHOWN:]
+        label = self.desk.add_bookmark(label)
+        self._bookmarks = (*self._bookmarks, label)[-BOOKMARKS_SHOWN:]
 
     def _open_bag(self, name: str) -> None:
         if name == NO_BAG:

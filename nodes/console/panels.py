@@ -5,7 +5,7 @@ The classes are those of page.css.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from html import escape
 from math import isnan
@@ -122,8 +122,14 @@ def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
     return _table("Nodes", ("node", "state", "CPU, %", "says"), rows, numbers=(2,))
 
 
-def topics_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
-    """Each topic with its rate, the oldest message among its readers, and what was lost."""
+def topics_table(
+    statuses: Mapping[str, tuple[Status, float]], sampling_readers: Collection[str] = ()
+) -> str:
+    """Return a table of the topics: rate, oldest message among the readers, losses.
+
+    statuses: as of `nodes_table`.  sampling_readers: nodes that skip messages by design and are
+    not counted as readers.
+    """
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}
     for node, (status, age_s) in statuses.items():
@@ -131,12 +137,11 @@ def topics_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
             continue
         for port in status.outputs:
             written.setdefault(port.topic, []).append(port)
-        # What the console and the recorder leave unread is meant to be.
-        for port in status.inputs if node != "console" else ():
+        for port in status.inputs if node not in sampling_readers else ():
             read.setdefault(port.topic, []).append(port)
     rows = []
     for name, topic in TOPICS.items():
-        if name not in written or name == "status":
+        if name not in written or topic.message is Status:
             continue
         rate_hz = sum(port.rate_hz for port in written[name])
         readers = read.get(name, [])
@@ -208,12 +213,12 @@ def eye(
             return words(f"Taken {ago_s:.0f} s ago, the next one follows within six seconds.")
 
 
-def recorder(note: str | None, marked: tuple[str, ...]) -> str:
-    """What the recorder says of itself, and the moments that were marked; None: there is none."""
+def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
+    """Return the recorder's note and the newest bookmarks.  note: None without a recorder."""
     if note is None:
         return words(_mark(WARN, "this graph has no recorder"))
-    moments = f"<br>Marked: {escape(', '.join(marked))}." if marked else ""
-    return words(f"Recorder: {escape(note)}.{moments}")
+    listed = f"<br>Bookmarks: {escape(', '.join(bookmarks))}." if bookmarks else ""
+    return words(f"Recorder: {escape(note)}.{listed}")
 
 
 def problem(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The tab to record, to mark moments, and to replay what was recorded."""
+"""Show the tab that records bags, adds bookmarks and replays bags."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexsheet.nodes.console.desk import Replay
 
 PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
 NO_BAG = "(no bag)"
-NO_MOMENT = "-"
+NO_BOOKMARK = "-"
 RECORDING_COLOR = (146, 64, 14)
 """Not the e-stop's."""
 
@@ -22,10 +22,11 @@ class RecordTab:
 
     def __init__(self, gui: Any, ask: Ask) -> None:
         self._ask = ask
+        self._seconds_by_option: dict[str, float] = {}
         with gui.add_folder("Record"):
             self._record = gui.add_button("Start recording", icon=viser.Icon.PLAYER_RECORD)
-            self._label = gui.add_text("Name", "", hint="What to call the moment")
-            mark = gui.add_button("Mark this moment (M)", hint="Key: M")
+            self._label = gui.add_text("Name", "", hint="Label of the next bookmark")
+            bookmark = gui.add_button("Add a bookmark (M)", hint="Key: M")
             self._words = Html(gui)
         with gui.add_folder("Replay"):
             self._bag = gui.add_dropdown("Bag", (NO_BAG,), hint="The newest first")
@@ -35,25 +36,25 @@ class RecordTab:
             self._rate = gui.add_dropdown(
                 "Speed, times", PLAY_RATES, initial_value="1", visible=False
             )
-            self._moments = gui.add_dropdown("Go to", (NO_MOMENT,), visible=False)
+            self._bookmarks = gui.add_dropdown("Go to", (NO_BOOKMARK,), visible=False)
             self._live = gui.add_button("Back to the running graph", visible=False)
         self._record.on_click(handing(ask, "record"))
-        mark.on_click(lambda _: ask("mark", self._label.value))
+        bookmark.on_click(lambda _: ask("bookmark", self._label.value))
         opened.on_click(lambda _: ask("open_bag", self._bag.value))
         self._play.on_click(handing(ask, "play"))
         self._live.on_click(handing(ask, "leave"))
         on_value(self._time, lambda seconds: ask("seek", seconds))
         on_value(self._rate, lambda rate: ask("replay_rate", float(rate)))
-        on_value(self._moments, self._go_to_moment)
-        command = gui.add_command("Mark this moment", hotkey="M")
-        command.on_trigger(lambda _: ask("mark", self._label.value))
+        on_value(self._bookmarks, self._go_to_bookmark)
+        command = gui.add_command("Add a bookmark", hotkey="M")
+        command.on_trigger(lambda _: ask("bookmark", self._label.value))
 
-    def _go_to_moment(self, told: str) -> None:
-        seconds, _, rest = told.partition(" s")
-        if rest:
-            self._ask("seek", float(seconds))
+    def _go_to_bookmark(self, option: str) -> None:
+        seconds = self._seconds_by_option.get(option)
+        if seconds is not None:
+            self._ask("seek", seconds)
             # So that the same can be chosen again.
-            self._moments.value = NO_MOMENT
+            self._bookmarks.value = NO_BOOKMARK
 
     def show_state(self, html: str, *, recording: bool) -> None:
         """What the recorder does."""
@@ -73,13 +74,15 @@ class RecordTab:
         """The timeline's place; `opened`: it is another bag's, or none any more."""
         timeline = replay.timeline
         if opened:
-            for handle in (self._play, self._time, self._rate, self._moments, self._live):
+            for handle in (self._play, self._time, self._rate, self._bookmarks, self._live):
                 handle.visible = timeline is not None
             if timeline is not None:
                 self._time.max = max(round(timeline.duration_s, 1), 0.1)
-                marked = [f"{seconds:.2f} s {label}" for seconds, label in timeline.moments]
-                self._moments.options = (NO_MOMENT, *marked)
-                self._moments.visible = bool(marked)
+                self._seconds_by_option = {
+                    f"{seconds:.2f} s {label}": seconds for seconds, label in timeline.bookmarks
+                }
+                self._bookmarks.options = (NO_BOOKMARK, *self._seconds_by_option)
+                self._bookmarks.visible = bool(self._seconds_by_option)
         if timeline is not None:
             self._time.value = round(timeline.seconds, 2)
             self._play.label = "Pause" if replay.playing else "Play"

@@ -1,4 +1,4 @@
-"""A bag as the page shows it: at any moment, the newest message of each topic until then."""
+"""Read a bag as the page shows it: the newest message of each topic up to a position."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import TypeVar
 
 from mcap.records import Message as Record
 
-from flexsheet.messages.bag import BagError, BagReader, Chunk, split_frames
+from flexsheet.messages.bag import BagError, BagReader, Chunk
 from flexsheet.messages.base import Header, Message
-from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import Moment
-from flexsheet.messages.wire import WireError, decode
+from flexsheet.messages.types import Bookmark
 from flexsheet.nodes.console.newest import checked
 
 M = TypeVar("M", bound=Message)
@@ -39,7 +37,7 @@ class Timeline:
         self._places = {name: self._times(name) for name in self._readable}
         self._chunks: OrderedDict[int, dict[tuple[int, int], Record]] = OrderedDict()
         self._opened: dict[str, tuple[int, tuple[Message, Header]]] = {}
-        self.moments = self._find_moments()
+        self.bookmarks = self._find_bookmarks()
         self.seconds = 0.0
 
     def newest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
@@ -69,10 +67,7 @@ class Timeline:
         record = self._records(chunks[i]).get((self._channels[name], times[i]))
         if record is None:
             raise BagError(f'{self.path}: topic "{name}": no message where its index says')
-        try:
-            return decode(split_frames(record.data), TOPICS[name])
-        except WireError as error:
-            raise BagError(f'{self.path}: topic "{name}" at {times[i]} ns: {error}') from error
+        return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
         """Messages of a chunk by channel and log time; the last few chunks are kept."""
@@ -91,12 +86,12 @@ class Timeline:
         self._chunks.move_to_end(chunk.offset)
         return held
 
-    def _find_moments(self) -> list[tuple[float, str]]:
-        """(seconds, label) of the moments that were marked."""
+    def _find_bookmarks(self) -> list[tuple[float, str]]:
+        """Return (seconds, label) of the bookmarks."""
         found = []
-        for i, time_ns in enumerate(self._places.get("moment", ([], []))[0]):
-            message, _ = self._open("moment", i)
-            if isinstance(message, Moment):
+        for i, time_ns in enumerate(self._places.get("bookmark", ([], []))[0]):
+            message, _ = self._open("bookmark", i)
+            if isinstance(message, Bookmark):
                 found.append(((time_ns - self._start_ns) * 1e-9, message.label))
         return found
 

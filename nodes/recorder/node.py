@@ -10,11 +10,11 @@ from typing import Any, ClassVar
 
 from flexsheet.messages.bag import BagError, BagWriter
 from flexsheet.messages.base import Header
-from flexsheet.messages.topics import Delivery, Topic, topic_named
+from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Recording
 from flexsheet.messages.wire import decode
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.node import Input, Node, periodic
+from flexsheet.nodes.node import Node, periodic
 from flexsheet.nodes.recorder.files import free_bytes, open_bag
 from flexsheet.nodes.recorder.parameters import RecorderParameters
 
@@ -45,15 +45,10 @@ class Recorder(Node):
     ) -> Sequence[str]:
         wanted = parameters.topics or [topic.name for topic in written if topic.logged]
         told = ("recording",) if parameters.start_paused else ()
-        return list(dict.fromkeys((*wanted, *parameters.also, *told)))
+        return list(dict.fromkeys((*wanted, *parameters.include, *told)))
 
-    def __init__(
-        self, parameters: RecorderParameters, *, topics: dict[str, str] | None = None, **rest: Any
-    ) -> None:
+    def __init__(self, parameters: RecorderParameters, **rest: Any) -> None:
         super().__init__(parameters, **rest)
-        for port, topic in (topics or {}).items():
-            if port.startswith("in/"):
-                self.inputs[port] = Input(topic_named(topic), self.clock)
         self._bag: BagWriter | None = None
         self._path, self._wanted = Path(), False
         self._latched: dict[tuple[str, str], tuple[Any, Header]] = {}

@@ -20,7 +20,9 @@ class RecorderParameters(NodeParameters):
     topics: tuple[str, ...] = Field(
         default=(), description="empty: all that the table of topics says are logged"
     )
-    also: tuple[str, ...] = Field(default=(), description="topics beside those, as stereo")
+    include: tuple[str, ...] = Field(
+        default=(), description="topics to record besides those, for example stereo"
+    )
     compress: bool | None = Field(
         default=None,
         description="null: unless pictures come, which take longer to compress than to write",

@@ -49,6 +49,7 @@ class TwinFingerNode(Node):
     motion: FingerMotion
     motion_from_ns = 0
     path_label = ""
+    path_stroke_s: float | None = None
     missed_frames = 0
 
     @cached_property
@@ -102,6 +103,7 @@ class TwinFingerNode(Node):
             joined_by=path.joined_by,
         )
         self.motion_from_ns, self.path_label = now_ns, path.label
+        self.path_stroke_s = path.stroke_s
 
     def truth(self, at_ns: int) -> FingerState:
         """Return the fingertip at a time of this node's clock."""
@@ -119,6 +121,7 @@ class TwinFingerNode(Node):
                 path_label=self.path_label,
                 path_done=state.path_done,
                 path_time_s=state.path_time_s,
+                path_stroke_s=self.path_stroke_s,
                 position_world_m=state.position,
                 velocity_world_m_per_s=state.velocity,
             ),

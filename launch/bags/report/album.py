@@ -35,7 +35,7 @@ class Album:
     """
 
     limit: int
-    moments: Sequence[tuple[float, str]] = ()
+    bookmarks: Sequence[tuple[float, str]] = ()
     seen: int = 0
     left_out: int = 0
     _every: int = 1
@@ -46,8 +46,8 @@ class Album:
         self, seconds: float, title: str, pictures: Sequence[tuple[str, NDArray[np.uint8]]]
     ) -> None:
         """Look at a shot; it is made small only if it is kept."""
-        passed = [label for at_s, label in self.moments if at_s <= seconds]
-        self.moments = self.moments[len(passed) :]
+        passed = [label for at_s, label in self.bookmarks if at_s <= seconds]
+        self.bookmarks = self.bookmarks[len(passed) :]
         if passed and len(self._marked) >= MARKED_MOST:
             self.left_out += 1
         elif passed:

@@ -34,7 +34,7 @@ HATCHES = {"hold": "//", "coasting": "//", "relax": "//", "fault": "xx", "estop"
            "engaged": "xx", "lost": "xx", "disconnected": "..", "stopping": ".."}  # fmt: skip
 """So that states which call for attention are told apart without colours."""
 
-MARKS = {"moment": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
+MARKS = {"bookmark": ("v", GOOD), "gap": ("|", DOUBTFUL), "restart": ("s", BAD),
          "error": ("x", BAD), "fault": ("X", BAD), "estop": ("D", BAD)}  # fmt: skip
 EVENTS = ("fingertip", "sheet target", "left arm command", "right arm command", "soft body",
           "frame drawn")  # fmt: skip

@@ -226,7 +226,7 @@ def _timeline(numbers: Mapping[str, Any], charts: Mapping[str, Chart]) -> Iterat
         yield table("How long in which state", ("what", "state and time"), rows)
     events, counts = numbers["events"]["first"], numbers["events"]["counts"]
     if not events:
-        yield "<p>No scene, moment, gap, fault, restart or e-stop was recorded.</p>"
+        yield "<p>No scene, bookmark, gap, fault, restart or e-stop was recorded.</p>"
         return
     told = ", ".join(f"{count} × {kind}" for kind, count in counts.items())
     title = f"What happened ({told})"
@@ -414,7 +414,7 @@ def _nodes(numbers: Mapping[str, Any]) -> Iterator[str]:
 def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
     albums = (
         ("What the camera saw", session.stereo, "stereo",
-         "Stereo pictures are recorded where asked for: flexsheet bag record BAG --also stereo."),
+         "Record stereo images with: flexsheet bag record BAG --include stereo."),
         ("Through the user's eye", session.eye, "eye", "The twin's eye took no picture."),
         ("What the projector was given", session.drawn, "frame",
          "No frame was recorded with its pixels."),
@@ -426,7 +426,7 @@ def _pictures(session: Session, numbers: Mapping[str, Any]) -> Iterator[str]:
             yield _missing(missing)
             continue
         if numbers["pictures"][key] > len(shots):
-            rest = f", {album.left_out} of marked moments left out" if album.left_out else ""
+            rest = f", {album.left_out} of bookmarks left out" if album.left_out else ""
             yield f"<p>{len(shots)} of {numbers['pictures'][key]}{rest}.</p>"
         yield from _album(title, album)
 
@@ -436,7 +436,7 @@ def _album(title: str, album: Album) -> Iterator[str]:
     for shot in album.shots():
         images = "".join(_image(title, shot, *one) for one in shot.pictures)
         yield f'<figure><div class="pair">{images}</div>'
-        marked = f" <strong>Moment: {escape(shot.marked)}.</strong>" if shot.marked else ""
+        marked = f" <strong>Bookmark: {escape(shot.marked)}.</strong>" if shot.marked else ""
         said = " | ".join(name for name, _ in shot.pictures)
         yield (
             f"<figcaption>{shot.seconds:.2f} s. {escape(shot.title)}{marked}<br>"

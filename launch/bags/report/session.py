@@ -26,12 +26,12 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import (
     ArmState,
+    Bookmark,
     Clocks,
     EStop,
     Fingertip,
     Frame,
     HostStatus,
-    Moment,
     PortStatus,
     SheetTarget,
     SoftBody,
@@ -204,7 +204,9 @@ class Arm:
 class Session:
     """All that is kept of a bag.  `scene`: the last that it holds."""
 
-    def __init__(self, reader: BagReader, info: BagInfo, moments: list[tuple[float, str]]) -> None:
+    def __init__(
+        self, reader: BagReader, info: BagInfo, bookmarks: list[tuple[float, str]]
+    ) -> None:
         self.info, self.metadata = info, reader.metadata
         self.plan, self.git = _plan_of(reader), _json_of(reader, "git.json")
         length_s = max(info.duration_s, 1e-3)
@@ -234,9 +236,9 @@ class Session:
         self.draw = Spread(Grid(0, 1.0, 1))
         self.frames = self.late_frames = 0
         self.errors = SheetErrors(self.grid)
-        self.moments = moments
-        self.stereo = Album(STEREO_SHOTS, moments)
-        self.eye, self.drawn = Album(EYE_SHOTS, moments), Album(FRAME_SHOTS, moments)
+        self.bookmarks = bookmarks
+        self.stereo = Album(STEREO_SHOTS, bookmarks)
+        self.eye, self.drawn = Album(EYE_SHOTS, bookmarks), Album(FRAME_SHOTS, bookmarks)
         self._table = ClockTable(self.clock_id)
         self._exposures: dict[str, int] = {}
         self._restarts: dict[str, int] = {}
@@ -384,8 +386,8 @@ class Session:
                 ):
                     text = f"e-stop {state} by {header.writer}: {message.reason}"
                     self.events.add(seconds, "estop", text)
-            case Moment():
-                self.events.add(seconds, "moment", message.label)
+            case Bookmark():
+                self.events.add(seconds, "bookmark", message.label)
             case HostStatus():
                 self.hosts[message.host] = message
                 self.loads.setdefault(message.host, HostLoad()).update(message)
@@ -420,12 +422,12 @@ def read_session(bag: Path, progress: Progress = lambda done_s, whole_s: None) -
     reader = BagReader(bag)
     info = reader.info()
     readable = {one.name for one in info.topics if one.readable}
-    moments = [
+    bookmarks = [
         ((log_ns - info.start_ns) * 1e-9, message.label)
-        for _, message, _, log_ns in BagReader(bag, {"moment"} & readable)
-        if isinstance(message, Moment)
+        for _, message, _, log_ns in BagReader(bag, {"bookmark"} & readable)
+        if isinstance(message, Bookmark)
     ]
-    session = Session(reader, info, moments)
+    session = Session(reader, info, bookmarks)
     selected = BagReader(bag, readable)
     for number, (topic, message, header, log_ns) in enumerate(selected):
         session.take(topic, message, header, log_ns)

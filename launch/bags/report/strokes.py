@@ -22,7 +22,6 @@ from flexsheet.launch.experiments.stroke import (
     edge_row,
     object_pose,
     sheet_errors,
-    stroke_label,
     stroke_window_s,
     track,
 )
@@ -51,20 +50,17 @@ class FingerRun:
     """One run of the simulator's finger along a path.
 
     zero_ns: when the path began.  done_ns: the last exposure on the path.  end_ns: the last
-    exposure that names the path.  sums: errors of a stroke of the experiment, measured and true.
+    exposure that names the path.  stroke_s: moving time of a stroke of the experiment; None for
+    another path.  sums: errors of such a stroke, measured and true.
     """
 
     label: str
     zero_ns: int
     done_ns: int
     end_ns: int
+    stroke_s: float | None
     sums: dict[str, Moments] = field(default_factory=dict)
     followed: FollowedFinger = field(default_factory=FollowedFinger)
-
-    @property
-    def stroke_s(self) -> float | None:
-        """The moving time of a stroke of the experiment; None for another path."""
-        return seconds_of(self.label)
 
     @property
     def stroke_window_ns(self) -> tuple[int, int]:
@@ -171,7 +167,7 @@ class SheetErrors:
             or last.label != finger.path_label
             or (abs(last.zero_ns - zero_ns) > SAME_RUN_NS)
         ):
-            last = FingerRun(finger.path_label, zero_ns, zero_ns, source_ns)
+            last = FingerRun(finger.path_label, zero_ns, zero_ns, source_ns, finger.path_stroke_s)
             self.runs.append(last)
         last.zero_ns, last.end_ns = zero_ns, source_ns
         if not finger.path_done:
@@ -254,16 +250,6 @@ def read_followed(bag: Path) -> list[dict[str, Any]]:
         errors.take(message, header.source_ns)
     errors.finish()
     return [run.figures() for run in errors.runs if run.followed.exposures]
-
-
-def seconds_of(label: str) -> float | None:
-    """How long the stroke of that label takes; None for a path that is none."""
-    _, _, rest = label.partition("stroke ")
-    try:
-        seconds = float(rest.removesuffix(" s"))
-    except ValueError:
-        return None
-    return seconds if stroke_label(seconds) == label else None
 
 
 def _edge(arm: ArmSpec) -> Floats:
