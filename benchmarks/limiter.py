@@ -621,6 +621,7 @@ class Bridge:
             self.control.all_faults,
             age_s,
             self.control.ready,
+            self.control.estop_reason is not None,
         )
 
     def hear(self, history: History, arm: int) -> None:

@@ -144,6 +144,10 @@ class ArmState(Message):
     ready: bool = Field(
         default=False, description="it may move: it was told so, and nothing has gone wrong since"
     )
+    estop_engaged: bool = Field(
+        default=False,
+        description="the bridge holds an e-stop; nothing moves, not even to slacken the sheet",
+    )
     reason: str = Field(default="", description="why it does not follow; empty otherwise")
     path_blocked: bool = Field(
         default=False,

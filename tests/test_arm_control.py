@@ -22,6 +22,7 @@ from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm, Pa
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal, goal_ahead, pace
 from flexsheet.nodes.arm_bridge.kinematics import KINEMATICS, STEPS, forward, next_joints
+from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, ArmFault
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.standstill import STANDSTILL_COUNT
 from flexsheet.nodes.methods import measure
@@ -83,6 +84,7 @@ class Arm:
             self.control.all_faults,
             age_s,
             self.control.ready,
+            self.control.estop_reason is not None,
         )
 
     @property
@@ -361,14 +363,31 @@ def test_an_arm_that_does_not_follow_is_a_fault() -> None:
     assert np.abs(command.joints_rad - stuck).max() < 0.14
 
 
+def test_an_estop_of_the_other_arm_is_read_from_its_typed_field_not_from_text() -> None:
+    arms = pair()
+    other = replace(arms[1].as_other(), mode="stopping", faults=("Not-Aus: Taster",))
+    assert not other.estopped
+    assert not replace(other, faults=("e-stop: button",)).estopped
+    assert replace(other, estop_engaged=True).estopped
+
+
+def test_only_the_typed_watchdog_fault_restarts_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    for fault in ArmFault:
+        monkeypatch.setitem(FAULT_TEXTS, fault, "watchdog: no command")
+        arms = pair()
+        run(arms, on_time(HOME), 10)
+        arms[0].control.take_measurement(arms[0].joints, (fault,))
+        assert (arms[0].control.faults == ()) == (fault is ArmFault.WATCHDOG)
+
+
 def test_faults_of_the_arm_are_latched_but_its_watchdog_starts_anew() -> None:
     arms = pair()
     run(arms, on_time(HOME), 10)
-    arms[0].control.take_measurement(arms[0].joints, ("watchdog: no command",))
+    arms[0].control.take_measurement(arms[0].joints, (ArmFault.WATCHDOG,))
     assert not arms[0].control.faults
     arms[0].cycle(on_time(HOME), arms[1].as_other())
     assert arms[0].command.mode == "idle"
-    arms[0].control.take_measurement(arms[0].joints, ("servo",))
+    arms[0].control.take_measurement(arms[0].joints, (ArmFault.SERVO,))
     assert list(arms[0].control.faults) == ["arm: servo"]
 
 

@@ -109,6 +109,7 @@ class ServoArm:
             self.control.all_faults,
             0.005,
             self.control.ready,
+            self.control.estop_reason is not None,
         )
 
 

@@ -17,7 +17,7 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.types import Arming, EStop
 from flexsheet.nodes.arm_bridge.control import LET_GO_AFTER_S, OLDEST_ARMING_S, READY_TOGETHER_S
 from flexsheet.nodes.arm_bridge.goal import Goal
-from flexsheet.nodes.arm_bridge.link import ArmStatus, Floats
+from flexsheet.nodes.arm_bridge.link import ArmFault, ArmStatus, Floats
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from tests.arm_states import arm_state
 from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
@@ -106,7 +106,7 @@ def lose_arm(arm: Arm) -> None:
 
 
 def trip_watchdog(arm: Arm) -> None:
-    arm.control.take_measurement(arm.joints, ("watchdog: no command",))
+    arm.control.take_measurement(arm.joints, (ArmFault.WATCHDOG,))
 
 
 @pytest.mark.parametrize("trouble", [lose_arm, trip_watchdog])

@@ -18,7 +18,13 @@ import pytest
 from flexsheet.launch.plans.plan import load_plan
 from flexsheet.launch.plans.planned import RUN_DIRECTORY, Plan
 from flexsheet.launch.running.estop_file import STATE_VARIABLE, EStopFile
-from flexsheet.launch.running.host import REASON_LENGTH, HostVoice, arms_of, waits_for_a_person
+from flexsheet.launch.running.host import (
+    REASON_LENGTH,
+    HostVoice,
+    arms_of,
+    shows_estop,
+    waits_for_a_person,
+)
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
@@ -254,3 +260,9 @@ def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
     file.remove()
     assert file.read() is None
     assert files(folder) == []
+
+
+def test_an_arm_shows_an_estop_by_its_typed_field_whatever_its_faults_say() -> None:
+    assert shows_estop(arm_state("left", mode="stopping", estop_engaged=True, faults=("Halt",)))
+    assert shows_estop(arm_state("left", mode="estop"))
+    assert not shows_estop(arm_state("left", mode="fault", faults=("e-stop: button",)))

@@ -9,6 +9,7 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
+from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS
 from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
@@ -40,7 +41,7 @@ def page(text: str) -> str:
 def registers() -> str:
     """Both blocks and the fault bits."""
     bits = ["Fault bits:", "", "| bit | meaning |", "|---|---|"]
-    bits += [f"| {bit} | {words} |" for bit, words in FAULT_BITS.items()]
+    bits += [f"| {bit} | {FAULT_TEXTS[fault]} |" for bit, fault in FAULT_BITS.items()]
     blocks = [
         _block("Command", COMMAND_ADDRESS, COMMAND),
         _block("Status", STATUS_ADDRESS, STATUS),

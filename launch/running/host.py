@@ -334,7 +334,7 @@ class HostVoice:
 
 def shows_estop(state: ArmState) -> bool:
     """Whether an arm's bridge still holds an e-stop."""
-    return state.mode == "estop" or any(fault.startswith("e-stop: ") for fault in state.faults)
+    return state.mode == "estop" or state.estop_engaged
 
 
 def arms_of(plan: Plan) -> list[str]:

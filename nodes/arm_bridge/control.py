@@ -29,7 +29,7 @@ from flexsheet.nodes.arm_bridge.limiter import (
     with_tool_speed,
     within_range,
 )
-from flexsheet.nodes.arm_bridge.link import Freshness
+from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, ArmFault, Freshness
 from flexsheet.nodes.arm_bridge.standstill import (
     MAX_RESTART_SHIFT_M,
     StandstillMonitor,
@@ -76,9 +76,6 @@ NO_MOTION = np.zeros(6)
 
 FAR_BEYOND = 1.1
 """A sheet that seems longer than so many times its limit is no sheet: nothing relaxes."""
-
-ESTOP = "e-stop: "
-"""How the fault of an arm that somebody has stopped begins."""
 
 JUMP_RAD = 0.35
 """Joints that would have to go further than this at once are on another branch of solutions."""
@@ -131,6 +128,7 @@ class OtherArm:
     faults: tuple[str, ...]
     age_s: float
     ready: bool
+    estop_engaged: bool
 
     @classmethod
     def from_state(cls, state: ArmState, age_s: float) -> OtherArm:
@@ -143,6 +141,7 @@ class OtherArm:
             state.faults,
             age_s,
             state.ready,
+            state.estop_engaged,
         )
 
     @property
@@ -159,7 +158,7 @@ class OtherArm:
     @property
     def estopped(self) -> bool:
         """Whether somebody has stopped it: then nothing moves, not even to let go."""
-        return self.mode == "estop" or any(text.startswith(ESTOP) for text in self.faults)
+        return self.mode == "estop" or self.estop_engaged
 
     @property
     def trouble(self) -> str | None:
@@ -234,7 +233,7 @@ class ArmControl:
     @property
     def all_faults(self) -> tuple[str, ...]:
         """What the other arm must stop for: own faults, e-stop, a lost connection."""
-        estop = () if self.estop_reason is None else (f"{ESTOP}{self.estop_reason}",)
+        estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
         lost = (self.reason,) if self.mode == "disconnected" else ()
         return (*self.faults, *estop, *lost)
 
@@ -294,7 +293,7 @@ class ArmControl:
     def take_measurement(
         self,
         joints_rad: Floats,
-        arm_faults: tuple[str, ...],
+        arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
         """Take over what the arm answered: joints (6,) where they are believed, and its faults."""
@@ -307,14 +306,14 @@ class ArmControl:
         self.measured_rad = self.last_measured_rad
         if not self._has_commanded and not self._standstill.has_jumped:
             self.commanded_rad = self.measured_rad
-        if arm_faults == ("watchdog: no command",):
+        if arm_faults == (ArmFault.WATCHDOG,):
             # The cycle came late, the arm has stopped by itself: begin again from where it stands.
             self._stop_short()
             self.mode, self.reason = "stopping", "the arm's watchdog stopped it"
             self._hinder(self.reason)
             self._has_pulled = False
         elif arm_faults and not self.faults:
-            self.faults = tuple(f"arm: {text}" for text in arm_faults)
+            self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
 
     def _stop_short(self) -> None:
         """The arm stands without a command of this bridge: tell it to be idle."""
@@ -396,7 +395,7 @@ class ArmControl:
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
         why = self._stood_down
         if self.estop_reason is not None:
-            why = f"{ESTOP}{self.estop_reason}"
+            why = f"e-stop: {self.estop_reason}"
         elif self.faults:
             why = self.faults[0]
         elif other is None or silent:
@@ -439,7 +438,7 @@ class ArmControl:
             self._hinder(clock_trouble)
             self._has_pulled = False
         if self.estop_reason is not None:
-            return self._stop("estop", f"{ESTOP}{self.estop_reason}", geometry, step_s)
+            return self._stop("estop", f"e-stop: {self.estop_reason}", geometry, step_s)
         if other is not None and other.estopped:
             rest_mode: ArmMode = "fault" if self.faults else "idle"
             return self._stop(rest_mode, "other arm: e-stop", geometry, step_s)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from dataclasses import dataclass, field
-from enum import StrEnum
+from enum import Enum, StrEnum, auto
 from typing import Protocol
 
 import numpy as np
@@ -36,6 +36,26 @@ class ArmRefusedError(ArmLinkError):
 
 class ArmAnswerError(ArmLinkError):
     """The answer is not of this protocol, is damaged, or belongs to another command."""
+
+
+class ArmFault(Enum):
+    """Faults that an arm's controller reports."""
+
+    JOINT_RANGE = auto()
+    STEP_SIZE = auto()
+    NOT_FINITE = auto()
+    WATCHDOG = auto()
+    SERVO = auto()
+
+
+FAULT_TEXTS = {
+    ArmFault.JOINT_RANGE: "joint out of range",
+    ArmFault.STEP_SIZE: "step too large",
+    ArmFault.NOT_FINITE: "command not finite",
+    ArmFault.WATCHDOG: "watchdog: no command",
+    ArmFault.SERVO: "servo",
+}
+"""The text of each fault, for logs and for `ArmState.faults`."""
 
 
 class Freshness(StrEnum):
@@ -96,7 +116,7 @@ class ArmStatus:
     """What an arm answers: joints (6,) rad as measured, what is wrong with it, and how fresh."""
 
     joints_rad: Floats
-    faults: tuple[str, ...]
+    faults: tuple[ArmFault, ...]
     freshness: Freshness = field(default=Freshness.FIRST, kw_only=True)
 
 

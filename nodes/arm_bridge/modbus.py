@@ -24,6 +24,7 @@ from pymodbus.pdu import DecodePDU, ModbusPDU
 
 from flexsheet.nodes.arm_bridge.link import (
     ArmAnswerError,
+    ArmFault,
     ArmLinkError,
     ArmRefusedError,
     ArmSilentError,
@@ -83,11 +84,11 @@ STATUS = (
 COMMAND_MODES = {"idle": 0, "move": 1, "hold": 2, "stop": 3}
 STATES = ("idle", "moving", "holding", "stopped", "fault")
 FAULT_BITS = {
-    1: "joint out of range",
-    2: "step too large",
-    4: "command not finite",
-    8: "watchdog: no command",
-    16: "servo",
+    1: ArmFault.JOINT_RANGE,
+    2: ArmFault.STEP_SIZE,
+    4: ArmFault.NOT_FINITE,
+    8: ArmFault.WATCHDOG,
+    16: ArmFault.SERVO,
 }
 
 
@@ -158,7 +159,7 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
         cycle=cycle,
         time_us=time_us,
         state=STATES[state],
-        faults=tuple(text for bit, text in FAULT_BITS.items() if faults & bit),
+        faults=tuple(fault for bit, fault in FAULT_BITS.items() if faults & bit),
         joints_rad=np.array(joints),
         refused=refused,
     )

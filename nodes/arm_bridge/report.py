@@ -49,6 +49,7 @@ def arm_state(
         mode=control.mode,
         faults=control.all_faults,
         ready=control.ready,
+        estop_engaged=control.estop_reason is not None,
         reason=control.reason,
         path_blocked=control.path_blocked,
         auto_arming=control.auto_arming,
