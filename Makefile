@@ -118,6 +118,7 @@ pages: setup
 	$(BIN)/python -m flexsheet.launch.reference.parameters > docs/parameters.md
 	$(BIN)/python -m flexsheet.launch.reference.errors > docs/errors.md
 	$(BIN)/python -m flexsheet.launch.reference.registers
+	$(BIN)/python -m flexsheet.launch.reference.arm_states
 
 # docs/charts: every method of every family, on this machine; half an hour.
 charts: setup

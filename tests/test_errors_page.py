@@ -31,7 +31,7 @@ PATH = r"\S*/"
          "renderer-and-projector"),
         ("e-stop of tools_left, kept until it is reset", "Warning", "graph-and-processes"),
         ("e-stop kept: ...", "Warning", "graph-and-processes"),
-        ("no way: the edges do not say where the sheet is", "Reason", "arms"),
+        ("no path: the sheet's pose is not rigid at the start or at the target", "Reason", "arms"),
         ("watchdog: no command", "Reason", "arms"),
         ("left: no picture for 2 s: it hangs, or its cable or hub is overloaded", "Reason",
          "camera-and-calibration"),
@@ -69,6 +69,6 @@ def test_what_pages_quote_is_explained(page: str) -> None:
 def test_quotes_are_found() -> None:
     found = {page: list(quoted((DOCS / f"{page}.md").read_text())) for page in QUOTING}
     assert "clock ... is known to ... only" in found["troubleshooting"]
-    assert any(message.startswith("no way: left arm") for message in found["troubleshooting"])
+    assert any(message.startswith("no path: left arm") for message in found["troubleshooting"])
     assert "takes connections and says nothing" in found["deploy"]
     assert any("is known to 7.1 ms only" in message for message in found["clocks"])

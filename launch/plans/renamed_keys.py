@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
+    "arm_bridge": {
+        "furthest_extrapolation_s": "max_extrapolation_s",
+        "largest_lag_rad": "max_tracking_error_rad",
+    },
     "fem_solver": {
         "largest_depth_m": "max_depth_m",
         "lead_s": "prediction_horizon_s",
@@ -36,10 +40,14 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """Old to new keys of scene files."""
 
+REMOVED_KEYS = frozenset({"kinematics"})
+"""Keys of scenes and of node parameters that had one possible value and were removed."""
+
 LAUNCH_KEYS: Mapping[str, str] = {"waits": "start_paused"}
 """Old to new keys of launch files, those of `record` among them."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
+    "arming": {"by_command": "manual", "by_itself": "auto"},
     "sheet_shape": {"dents": "reduced_order", "flat": "four_triangles"},
     "sheet_force": {"cubic": "scaled"},
     "tracking": {"exponential": "one_euro", "hand": "singer_tremor"},

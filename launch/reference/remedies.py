@@ -149,7 +149,7 @@ REMEDIES = {
     "NoEquilibriumError": "the push or tilt is beyond the sheet's range; lessen it.",
     "UnreachableError": "`flexsheet doctor scene SCENE` says what is out of reach and what would "
     "help.",
-    "PathError": "bring the arms nearer to the sheet by hand, then `flexsheet arms ready` again.",
+    "PathError": "bring the arms nearer to the sheet by hand, then `flexsheet arms enable` again.",
     "ArmSilentError": "first see whether the computer is busy: `flexsheet doctor`, row `load`; "
     "that is the usual cause where arms are simulated.  Otherwise check the arm's address, power "
     "and cable, and that its program runs.",
@@ -208,7 +208,7 @@ PARTICULAR = {
     "is not measured": "for some seconds after a start that is so; else its clock node or the "
     "network is down (docs/clocks.md).",
     "ms are allowed": "quieten the network, set up chrony, or allow more (docs/clocks.md).",
-    "no way: <first>": "bring the arms nearer to the sheet by hand, or the sheet to another place "
+    "no path: <first>": "bring the arms nearer to the sheet by hand, or the sheet to another place "
     "(docs/arms.md).",
     ": keeping the last valid sheet plane": "the arms are silent, or the sheet faces "
     "away; it recovers by itself.",

@@ -333,19 +333,19 @@ class HostVoice:
 
 
 def shows_estop(state: ArmState) -> bool:
-    """Whether an arm's bridge still holds an e-stop."""
+    """Return whether an arm's bridge holds an e-stop."""
     return state.mode == "estop" or state.estop_engaged
 
 
 def arms_of(plan: Plan) -> list[str]:
-    """List the plan's arms by the address of each; a bridge without one counts by its name."""
+    """List the addresses of the plan's arms; a bridge without one counts by its name."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
 
 def waits_for_a_person(plan: Plan) -> bool:
-    """Whether arms move at a person's word only; those that go by themselves are simulated."""
-    return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
+    """Return whether a person has to arm the arms; simulated ones may arm themselves."""
+    return any(node.parameters.get("arming") == "manual" for node in plan.nodes.values())
 
 
 def python_version() -> str:
