@@ -560,7 +560,7 @@ nodes:
   arm_left_bridge:
     type: arm_bridge
     host: left
-    parameters: {side: left, host: 127.0.0.1, port: 5020, arming: by_itself}
+    parameters: {side: left, host: 127.0.0.1, port: 5020, arming: auto}
     topics: {arm: arm_left, other_arm: null}
     restart: {policy: always, delay_s: 0.1}
 record: {bag: x.mcap, topics: [fingertip]}

@@ -89,9 +89,9 @@ class Case:
 
 
 CASES = {
-    "waiting": Case(no_pictures, "by_command"),
-    "standing": Case(no_pictures, "by_itself"),
-    "watching": Case(empty_pictures, "by_itself"),
+    "waiting": Case(no_pictures, "manual"),
+    "standing": Case(no_pictures, "auto"),
+    "watching": Case(empty_pictures, "auto"),
 }
 
 

@@ -38,11 +38,18 @@ from numpy.typing import NDArray
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import EStop, Side
-from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
+from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal
-from flexsheet.nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, limited, within_range
+from flexsheet.nodes.arm_bridge.limiter import (
+    MAX_TRAVEL_STEP_S,
+    JointLimits,
+    clamp_to_range,
+    limit_velocity,
+)
 from flexsheet.nodes.arm_bridge.link import Freshness
+from flexsheet.nodes.arm_bridge.other_arm import OtherArm
+from flexsheet.nodes.arm_bridge.state_machine import Event
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform, transform_from_rpy
 from flexsheet.nodes.twin.arms import (
@@ -230,8 +237,8 @@ STILL = np.zeros(6)
 
 
 def _anywhere(random: Random, limits: JointLimits, beyond: float = 0.0) -> Floats:
-    width = limits.highest_rad - limits.lowest_rad
-    return limits.lowest_rad + random.uniform(-beyond, 1.0 + beyond, 6) * width
+    width = limits.max_rad - limits.min_rad
+    return limits.min_rad + random.uniform(-beyond, 1.0 + beyond, 6) * width
 
 
 def leaps(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
@@ -257,8 +264,8 @@ def extremes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[
     """From one end of each joint's range to the other, at periods from two cycles to many."""
     while True:
         up, each = random.random(6) < 0.5, int(random.integers(1, 40))
-        goal = np.where(up, limits.highest_rad, limits.lowest_rad)
-        other = np.where(up, limits.lowest_rad, limits.highest_rad)
+        goal = np.where(up, limits.max_rad, limits.min_rad)
+        other = np.where(up, limits.min_rad, limits.max_rad)
         for number in range(8 * each):
             yield (goal, other)[number // each % 2], STILL
 
@@ -266,7 +273,7 @@ def extremes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[
 def edges(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
     """On the ends of the range, and a hair inside and outside of them."""
     while True:
-        end = np.where(random.random(6) < 0.5, limits.highest_rad, limits.lowest_rad)
+        end = np.where(random.random(6) < 0.5, limits.max_rad, limits.min_rad)
         for _ in range(random.integers(5, 80)):
             yield end + random.choice([0.0, 1e-12, -1e-12, 1e-3, -1e-3, 1.0, -1.0], 6), STILL
 
@@ -360,7 +367,7 @@ def joint_goals(
             for lane in lanes:
                 goal, along = next(lane.goals)
                 began_ns = time.thread_time_ns()
-                lane.velocity = limited(
+                lane.velocity = limit_velocity(
                     lane.joints_rad,
                     lane.velocity,
                     goal,
@@ -399,7 +406,7 @@ def judge_commands(
     """Commands (n, 6) after those held, with the velocities (n, 6) of the step before and this."""
     limits, fastest = geometry.joint_limits, geometry.max_tool_speed
     old, new = velocities
-    beyond = np.maximum(limits.lowest_rad - now, now - limits.highest_rad).max(axis=1)
+    beyond = np.maximum(limits.min_rad - now, now - limits.max_rad).max(axis=1)
     tally.judge("commanded position", 1.0 + beyond)
     tally.judge("commanded speed", np.abs(new) / limits.speed_rad_per_s)
     here = points_on_tool(held, tool)
@@ -407,18 +414,18 @@ def judge_commands(
     def tool_share(velocity: Floats) -> Floats:
         gone = points_on_tool(held + velocity * step_s, tool) - here
         furthest: Floats = np.linalg.norm(gone, axis=2).max(axis=1)
-        return furthest / (min(step_s, EVEN_STEP_S) * fastest)
+        return furthest / (min(step_s, MAX_TRAVEL_STEP_S) * fastest)
 
     tally.judge("commanded tool speed", tool_share(new))
     # Excused where to slow all that may be was not enough for tool speed or range.
     most = limits.acceleration_rad_per_s2 * step_s
     slowest = np.sign(old) * np.maximum(np.abs(old) - most, 0.0)
     stopping_s = (np.abs(old) / limits.acceleration_rad_per_s2).max(axis=1, keepdims=True)
-    braked = old * np.maximum(0.0, 1.0 - step_s / np.maximum(stopping_s, 1e-12))
+    decelerate = old * np.maximum(0.0, 1.0 - step_s / np.maximum(stopping_s, 1e-12))
     there = held + slowest * step_s
-    braked = within_range(held, old, braked, limits=limits, step_s=step_s)
-    forced = (tool_share(braked) > 1.0) | (
-        (there < limits.lowest_rad) | (there > limits.highest_rad)
+    decelerate = clamp_to_range(held, old, decelerate, limits=limits, step_s=step_s)
+    forced = (tool_share(decelerate) > 1.0) | (
+        (there < limits.min_rad) | (there > limits.max_rad)
     ).any(axis=1)
     share = (np.abs(new - old) / most).max(axis=1)
     tally.judge("commanded acceleration", share, allowed=forced)
@@ -428,7 +435,7 @@ def hunt(scene: Scene) -> list[list[Floats]]:
     """Sequences of goals that hypothesis drove towards the limits: the worst by each of them."""
     geometry = ArmGeometry(scene, "left")
     limits = geometry.joint_limits
-    width = limits.highest_rad - limits.lowest_rad
+    width = limits.max_rad - limits.min_rad
     found: list[tuple[float, float, list[Floats]]] = []
     share = st.one_of(st.floats(-0.2, 1.2), st.sampled_from([0.0, 1.0]))
     legs = st.lists(st.tuples(st.tuples(*[share] * 6), st.integers(1, 20)), min_size=1, max_size=5)
@@ -444,13 +451,13 @@ def hunt(scene: Scene) -> list[list[Floats]]:
     @given(start=st.tuples(*[st.floats(0.0, 1.0)] * 6), legs=legs)
     def search(start: tuple[float, ...], legs: list[tuple[tuple[float, ...], int]]) -> None:
         tally = Tally()
-        joints, velocity = limits.lowest_rad + np.array(start) * width, np.zeros(6)
+        joints, velocity = limits.min_rad + np.array(start) * width, np.zeros(6)
         arm = Judged(joints[None, :], scene, tally)
         goals = [
-            limits.lowest_rad + np.array(leg) * width for leg, count in legs for _ in range(count)
+            limits.min_rad + np.array(leg) * width for leg, count in legs for _ in range(count)
         ]
         for goal in goals:
-            velocity = limited(
+            velocity = limit_velocity(
                 joints, velocity, goal, STILL,
                 tool_points=geometry.tool_points, max_tool_speed=geometry.max_tool_speed,
                 limits=limits, step_s=2.0 * BEAT_S,
@@ -574,7 +581,7 @@ class SecondMaster:
 
     def command(self, geometry: ArmGeometry, step_s: float) -> Floats:
         goal, along = next(self.goals)
-        self.velocity = limited(
+        self.velocity = limit_velocity(
             self.joints_rad,
             self.velocity,
             goal,
@@ -621,21 +628,22 @@ class Bridge:
             self.control.all_faults,
             age_s,
             self.control.ready,
+            self.control.estop_reason is not None,
         )
 
     def hear(self, history: History, arm: int) -> None:
         """The arm's answer to the last command, or none."""
         if self.second is not None and self.second.refuses:
-            self.control.fail_exchange("the arm refused the command", silent=False)
+            self.control.on_exchange_failed("the arm refused the command", silent=False)
         elif self.unanswered == 0:
             joints, freshness = history[-1][arm], Freshness.FRESH
             if self.lie is not None:
                 joints, freshness = self.lie.report(history, arm)
                 self.lie = self.lie if self.lie.cycles > 0 else None
-            self.control.take_measurement(joints, (), freshness)
+            self.control.on_measurement(joints, (), freshness)
         else:
             self.unanswered -= 1
-            self.control.fail_exchange("no answer", silent=True)
+            self.control.on_exchange_failed("no answer", silent=True)
 
     def other_command(self, random: Random, joints_rad: Floats, step_s: float) -> Floats | None:
         """Joints (6,) that a second master sends in this cycle after the bridge, or None."""
@@ -658,9 +666,9 @@ class Bridge:
         elif chance < 0.001:
             self.unanswered = int(random.integers(1, 5))
         elif chance < 0.0015:
-            self.control.take_estop(EStop(engaged=True, reason="drill"), stamp_ns, stamp_ns)
+            self.control.on_estop(EStop(engaged=True, reason="drill"), stamp_ns, stamp_ns)
         elif chance > 0.98 and (self.control.faults or self.control.estop_reason):
-            self.control.take_estop(EStop(engaged=False, reason=""), stamp_ns, stamp_ns)
+            self.control.on_estop(EStop(engaged=False, reason=""), stamp_ns, stamp_ns)
 
 
 def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
@@ -697,20 +705,21 @@ def sheet_targets(commands: int, random: Random, scene: Scene, tally: Tally) -> 
 
 def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> None:
     """Pairs of arms that hold a sheet, from a start in the scene's middle."""
-    patience = Patience(hold_after_s=0.02, stop_after_s=0.1)
+    timeouts = Timeouts(hold_after_s=0.02, stop_after_s=0.1)
     home = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
     geometries = [ArmGeometry(scene, side) for side in SIDES]
     starts = [geometry.joints_for_sheet(home, START_GUESS_RAD) for geometry in geometries]
     bridges = [
-        Bridge(geometry, ArmControl(patience, largest_lag_rad=0.12, by_itself=True))
+        Bridge(geometry, ArmControl(timeouts, max_tracking_error_rad=0.12, auto_arming=True))
         for _ in range(PAIRS)
         for geometry in geometries
     ]
     arms = Judged(np.array(starts * PAIRS), scene, tally)
     history: History = deque([arms.servo.joints_rad], maxlen=HISTORY)
     for bridge, joints in zip(bridges, starts * PAIRS, strict=True):
-        bridge.control.take_measurement(joints, ())
-        bridge.control.mode = "idle"
+        bridge.control.on_measurement(joints, ())
+        bridge.control.handle(Event.CONNECTED)
+        bridge.control.handle(Event.ARM)
     wanted, moving = arms.servo.joints_rad.copy(), np.zeros(2 * PAIRS)
     thaw_s = np.zeros(2 * PAIRS)
     sent: list[Floats | None] = [None] * len(bridges)
@@ -732,8 +741,8 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
             command = control.step(bridge.geometry, pair_goals[number // 2], seen, step_s)
             if command.mode == "move":
                 tally.pass_ns.append(time.thread_time_ns() - began_ns)
-            if control.question is not None:
-                control.take_way(control.question, None)
+            if control.pending_check is not None:
+                control.on_path_result(control.pending_check, None)
             judge_bridge(
                 tally,
                 bridge.geometry,
@@ -790,7 +799,7 @@ def judge_bridge(
         return
     joints, limits = command.joints_rad, geometry.joint_limits
     tally.judge("finite", 0.0 if np.isfinite(joints).all() else 2.0)
-    beyond = np.maximum(limits.lowest_rad - joints, joints - limits.highest_rad).max()
+    beyond = np.maximum(limits.min_rad - joints, joints - limits.max_rad).max()
     tally.judge("commanded position", 1.0 + float(beyond))
     if before is not None:
         furthest = step_s * limits.speed_rad_per_s
@@ -808,7 +817,7 @@ def stroke_passes(scene: Scene) -> list[int]:
         turned = transform_from_rpy(np.zeros(3), [tilt_rad, 0.0, 0.0])
         began_ns = time.thread_time_ns()
         goal = geometry.joints_for_sheet(replace(home, world_from_sheet=turned), joints)
-        velocity = limited(
+        velocity = limit_velocity(
             joints,
             velocity,
             goal,

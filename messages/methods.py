@@ -18,8 +18,6 @@ TriangulationMethod = Literal["dlt"]
 TrackingMethod = Literal[
     "none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"
 ]
-KinematicsMethod = Literal["closed_form_continuous"]
-"""The one by which an arm's way is checked beforehand: its steps have to stay on that branch."""
 SheetForceMethod = Literal["linear", "scaled", "table"]
 SheetShapeMethod = Literal["four_triangles", "reduced_order"]
 Correction = Literal["none", "one_plane", "four_triangles", "two_pass"]
@@ -43,7 +41,6 @@ class Methods(BaseModel):
     marker: MarkerMethod | None = None
     triangulation: TriangulationMethod | None = None
     tracking: TrackingMethod | None = None
-    kinematics: KinematicsMethod | None = None
     sheet_force: SheetForceMethod | None = None
     sheet_shape: SheetShapeMethod | None = None
     correction: Correction | None = None

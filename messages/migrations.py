@@ -4,10 +4,10 @@ Every bag holds the JSON Schema of its messages.  Where a type has since only ga
 defaults, further values of a literal, further members of a union), the recorded fields are valid
 as they are, and `fits` finds that out by comparing the two schemas.
 
-A renamed field or literal value needs a line in `RENAMED_FIELDS` or `RENAMED_VALUES`.  These hold
-for every recorded version of the type.  Any other change needs a line in `MIGRATIONS`: the type,
-the fingerprint it had (`flexsheet bag info --json` names it), and a function from the recorded
-fields to those of the type that came after.
+A renamed field or literal value needs a line in `RENAMED_FIELDS` or `RENAMED_VALUES`, a removed
+field one in `REMOVED_FIELDS`.  These hold for every recorded version of the type.  Any other change
+needs a line in `MIGRATIONS`: the type, the fingerprint it had (`flexsheet bag info --json` names
+it), and a function from the recorded fields to those of the type that came after.
 """
 
 from __future__ import annotations
@@ -56,9 +56,11 @@ RENAMED_VALUES: dict[tuple[str, str], dict[str, str]] = {
     ("Methods", "triangulation"): {"midpoint": "dlt", "optimal": "dlt"},
     ("Methods", "tracking"): {"hand": "singer_tremor", "exponential": "one_euro"},
     ("Methods", "sheet_force"): {"cubic": "scaled"},
-    ("Methods", "kinematics"): {"closed_form": "closed_form_continuous"},
 }
 """By model and today's field name: recorded literal values and those of today."""
+
+REMOVED_FIELDS: dict[str, frozenset[str]] = {"Methods": frozenset({"kinematics"})}
+"""By model: recorded fields that are dropped, since nothing reads them any more."""
 
 _STROKE_LABEL = re.compile(r"stroke (\d+(?:\.\d+)?) s")
 
@@ -109,14 +111,15 @@ def _rename_part(model: str, schema: Any) -> Any:
     """Return one model's schema with its renamed properties and literal values."""
     if not isinstance(schema, Mapping) or not isinstance(schema.get("properties"), Mapping):
         return schema
-    names = RENAMED_FIELDS.get(model, {})
+    names, removed = RENAMED_FIELDS.get(model, {}), REMOVED_FIELDS.get(model, frozenset())
     properties = {
         names.get(name, name): _rename_values(
             field, RENAMED_VALUES.get((model, names.get(name, name)), {})
         )
         for name, field in schema["properties"].items()
+        if name not in removed
     }
-    required = [names.get(name, name) for name in schema.get("required", ())]
+    required = [names.get(name, name) for name in schema.get("required", ()) if name not in removed]
     return {**schema, "properties": properties, "required": required}
 
 
@@ -139,6 +142,8 @@ def _rename_in_fields(model: type[BaseModel], fields: Fields) -> Fields:
     names = RENAMED_FIELDS.get(model.__name__, {})
     renamed: Fields = {}
     for name, value in fields.items():
+        if name in REMOVED_FIELDS.get(model.__name__, frozenset()):
+            continue
         key = names.get(name, name)
         values = RENAMED_VALUES.get((model.__name__, key), {})
         if isinstance(value, str):

@@ -142,16 +142,21 @@ class ArmState(Message):
     mode: ArmMode
     faults: tuple[str, ...]
     ready: bool = Field(
-        default=False, description="it may move: it was told so, and nothing has gone wrong since"
+        default=False,
+        description="it may move: it has been armed, and no interlock has disarmed it since",
+    )
+    estop_engaged: bool = Field(
+        default=False,
+        description="the bridge holds an e-stop; nothing moves, not even to slacken the sheet",
     )
     reason: str = Field(default="", description="why it does not follow; empty otherwise")
     path_blocked: bool = Field(
         default=False,
-        description="it stands because no path to the sheet's target is clear and within its "
+        description="it rests because no path to the sheet's target is clear and within its "
         "limits; reason says what blocks it",
     )
     auto_arming: bool = Field(
-        default=False, description="it becomes ready by itself, without anybody's word"
+        default=False, description="it arms itself, without a person's command"
     )
     joints_rad: Vector6
     joints_commanded_rad: Vector6

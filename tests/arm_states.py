@@ -1,4 +1,4 @@
-"""States of arms for tests: an arm that follows, at rest, without a fault."""
+"""Make states of arms for tests."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 
 from flexsheet.messages.types import ArmState
+from flexsheet.nodes.arm_bridge.control import ArmControl
+from flexsheet.nodes.arm_bridge.state_machine import Event
 
 
 def arm_state(side: str, **changes: Any) -> ArmState:
@@ -27,3 +29,10 @@ def arm_state(side: str, **changes: Any) -> ArmState:
         "cycle_s": 0.001,
     }
     return ArmState(**values | changes)
+
+
+def connect_control(control: ArmControl) -> None:
+    """Bring a new control to rest as after its first cycles, armed with `auto_arming`."""
+    control.handle(Event.CONNECTED)
+    if control.auto_arming:
+        control.handle(Event.ARM)

@@ -141,7 +141,7 @@ class Lab:
         self,
         *,
         without: Collection[str] = LIGHT,
-        arming: str = "by_itself",
+        arming: str = "auto",
         watchdog_s: float = 0.1,
         **bridge: Any,
     ) -> None:

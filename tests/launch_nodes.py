@@ -138,4 +138,6 @@ class StandInBridge(Node):
         side, stopped = self.parameters.side, self.stopped
         faults = () if stopped is None else (f"e-stop: {stopped.reason}",)
         mode = "follow" if stopped is None else "estop"
-        self.arm.publish(arm_state(side, mode=mode, faults=faults))
+        self.arm.publish(
+            arm_state(side, mode=mode, faults=faults, estop_engaged=stopped is not None)
+        )

@@ -4,30 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from pydantic import ValidationError
 from ruamel.yaml import YAML
 
 from flexsheet.messages.clock import VirtualClock
-from flexsheet.messages.methods import KinematicsMethod
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, EStop, Side
-from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
+from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import Goal, goal_ahead, pace
-from flexsheet.nodes.arm_bridge.kinematics import KINEMATICS, STEPS, forward, next_joints
+from flexsheet.nodes.arm_bridge.goal import Goal, extrapolate_goal, sync_factor
+from flexsheet.nodes.arm_bridge.kinematics import forward
+from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, ArmFault
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
+from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.standstill import STANDSTILL_COUNT
-from flexsheet.nodes.methods import measure
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation
 from flexsheet.nodes.models.sheet import edge_poses
+from tests.arm_states import connect_control
 from tests.twists import twist_between
 
 Floats = NDArray[np.float64]
@@ -36,7 +35,7 @@ SCENE = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE))
 STEP_S = 1.0 / 140.0
 GUESS = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 HOME = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
-PATIENCE = Patience(hold_after_s=0.02, stop_after_s=0.1)
+TIMEOUTS = Timeouts(hold_after_s=0.02, stop_after_s=0.1)
 
 
 def sheet_at(
@@ -57,22 +56,22 @@ class Arm:
     command: Command
 
     @classmethod
-    def holding(cls, side: Side, motion: SheetMotion = HOME, *, by_itself: bool = True) -> Arm:
+    def holding(cls, side: Side, motion: SheetMotion = HOME, *, auto_arming: bool = True) -> Arm:
         geometry = ArmGeometry(SCENE, side)
-        control = ArmControl(PATIENCE, largest_lag_rad=0.12, by_itself=by_itself)
+        control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.12, auto_arming=auto_arming)
         joints = geometry.joints_for_sheet(motion, GUESS)
         arm = cls(geometry, control, joints, Command("idle", joints))
         for _ in range(STANDSTILL_COUNT):
-            control.take_measurement(joints, ())
+            control.on_measurement(joints, ())
         return arm
 
     def cycle(self, goal: Goal | None, other: OtherArm | None, step_s: float = STEP_S) -> None:
         self.command = self.control.step(self.geometry, goal, other, step_s)
-        if self.control.question is not None:
-            self.control.take_way(self.control.question, None)
+        if self.control.pending_check is not None:
+            self.control.on_path_result(self.control.pending_check, None)
         if self.command.mode == "move":
             self.joints = self.command.joints_rad
-        self.control.take_measurement(self.joints, ())
+        self.control.on_measurement(self.joints, ())
 
     def as_other(self, age_s: float = 0.005) -> OtherArm:
         return OtherArm(
@@ -83,6 +82,7 @@ class Arm:
             self.control.all_faults,
             age_s,
             self.control.ready,
+            self.control.estop_reason is not None,
         )
 
     @property
@@ -90,13 +90,13 @@ class Arm:
         return self.geometry.world_from_edge(self.joints)
 
 
-def pair(motion: SheetMotion = HOME, *, by_itself: bool = True) -> tuple[Arm, Arm]:
+def pair(motion: SheetMotion = HOME, *, auto_arming: bool = True) -> tuple[Arm, Arm]:
     arms = (
-        Arm.holding("left", motion, by_itself=by_itself),
-        Arm.holding("right", motion, by_itself=by_itself),
+        Arm.holding("left", motion, auto_arming=auto_arming),
+        Arm.holding("right", motion, auto_arming=auto_arming),
     )
     for arm in arms:
-        arm.control.mode = "idle"
+        connect_control(arm.control)
     return arms
 
 
@@ -125,7 +125,7 @@ def test_the_first_command_is_the_measured_pose() -> None:
 
 
 def test_before_the_arm_answers_it_is_told_to_be_idle() -> None:
-    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+    control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
     geometry = ArmGeometry(SCENE, "left")
     command = control.step(geometry, on_time(HOME), None, STEP_S)
     assert command.mode == "idle"
@@ -176,7 +176,7 @@ poses = st.builds(
 @given(one=poses, other=poses, target=poses)
 @settings(max_examples=200, deadline=None)
 def test_never_do_both_arms_wait(one: Floats, other: Floats, target: Floats) -> None:
-    shares = pace(one, other, target, left=True), pace(other, one, target, left=False)
+    shares = sync_factor(one, other, target, left=True), sync_factor(other, one, target, left=False)
     assert max(shares) == 1.0
 
 
@@ -186,7 +186,11 @@ def test_arms_that_are_together_do_not_wait_wherever_they_go(
     sheet: Floats, target: Floats, stretch: float
 ) -> None:
     left, right = edge_poses(sheet, 0.24 * stretch)
-    assert pace(left, right, target, left=True) == pace(right, left, target, left=False) == 1.0
+    assert (
+        sync_factor(left, right, target, left=True)
+        == sync_factor(right, left, target, left=False)
+        == 1.0
+    )
 
 
 @pytest.mark.parametrize(("lead", "share"), [(0.03, 1.0), (0.085, 0.5), (0.2, 0.0)])
@@ -194,8 +198,8 @@ def test_the_leading_arm_slows_by_its_lead_and_the_other_not(lead: float, share:
     target = transform_from_rpy([0.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     ahead = transform_from_rpy([-0.12, 0.0, 0.0], [0.3 + lead, 0.0, 0.0])
     behind = transform_from_rpy([0.12, 0.0, 0.0], [0.3, 0.0, 0.0])
-    assert pace(ahead, behind, target, left=True) == pytest.approx(share)
-    assert pace(behind, ahead, target, left=False) == 1.0
+    assert sync_factor(ahead, behind, target, left=True) == pytest.approx(share)
+    assert sync_factor(behind, ahead, target, left=False) == 1.0
 
 
 def test_a_moving_target_is_followed_without_lag() -> None:
@@ -269,7 +273,7 @@ def test_the_other_arms_fault_stops_this_one_in_the_same_cycle_and_slackens_the_
 def test_the_arm_that_can_still_move_slackens_the_sheet_alone() -> None:
     arms = pair(sheet_at(stretch=1.06))
     run(arms, on_time(sheet_at(stretch=1.06)), 30)
-    arms[0].control.lose_connection("cable")
+    arms[0].control.on_connection_lost("cable")
     for _ in range(600):
         arms[1].cycle(on_time(HOME), arms[0].as_other())
     assert distance(arms) == pytest.approx(0.24, abs=0.0005)
@@ -278,14 +282,14 @@ def test_the_arm_that_can_still_move_slackens_the_sheet_alone() -> None:
 
 def test_one_missed_answer_is_forgiven_and_a_second_is_not() -> None:
     arms = pair()
-    assert not ArmControl(PATIENCE, largest_lag_rad=0.1).miss_answer("late")
+    assert not ArmControl(TIMEOUTS, max_tracking_error_rad=0.1).on_answer_missed("late")
     run(arms, on_time(HOME), 10)
-    assert arms[0].control.miss_answer("late")
+    assert arms[0].control.on_answer_missed("late")
     assert (arms[0].control.mode, arms[0].control.all_faults) == ("hold", ())
-    assert not arms[0].control.miss_answer("late")
+    assert not arms[0].control.on_answer_missed("late")
     run(arms, on_time(HOME), 1)
     assert arms[0].control.mode == "follow"
-    assert arms[0].control.miss_answer("late")
+    assert arms[0].control.on_answer_missed("late")
 
 
 def test_the_estop_latches_until_reset_at_rest() -> None:
@@ -354,21 +358,38 @@ def test_an_arm_that_does_not_follow_is_a_fault() -> None:
         command = arms[0].control.step(
             arms[0].geometry, on_time(sheet_at(0.08)), arms[1].as_other(), STEP_S
         )
-        arms[0].control.take_measurement(stuck, ())
+        arms[0].control.on_measurement(stuck, ())
         if arms[0].control.faults:
             break
     assert "trails its command" in arms[0].control.faults[0]
     assert np.abs(command.joints_rad - stuck).max() < 0.14
 
 
+def test_an_estop_of_the_other_arm_is_read_from_its_typed_field_not_from_text() -> None:
+    arms = pair()
+    other = replace(arms[1].as_other(), mode="stopping", faults=("Not-Aus: Taster",))
+    assert not other.estopped
+    assert not replace(other, faults=("e-stop: button",)).estopped
+    assert replace(other, estop_engaged=True).estopped
+
+
+def test_only_the_typed_watchdog_fault_restarts_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
+    for fault in ArmFault:
+        monkeypatch.setitem(FAULT_TEXTS, fault, "watchdog: no command")
+        arms = pair()
+        run(arms, on_time(HOME), 10)
+        arms[0].control.on_measurement(arms[0].joints, (fault,))
+        assert (arms[0].control.faults == ()) == (fault is ArmFault.WATCHDOG)
+
+
 def test_faults_of_the_arm_are_latched_but_its_watchdog_starts_anew() -> None:
     arms = pair()
     run(arms, on_time(HOME), 10)
-    arms[0].control.take_measurement(arms[0].joints, ("watchdog: no command",))
+    arms[0].control.on_measurement(arms[0].joints, (ArmFault.WATCHDOG,))
     assert not arms[0].control.faults
     arms[0].cycle(on_time(HOME), arms[1].as_other())
     assert arms[0].command.mode == "idle"
-    arms[0].control.take_measurement(arms[0].joints, ("servo",))
+    arms[0].control.on_measurement(arms[0].joints, (ArmFault.SERVO,))
     assert list(arms[0].control.faults) == ["arm: servo"]
 
 
@@ -402,8 +423,8 @@ def test_no_target_leads_to_a_command_out_of_bounds(
                 arm.cycle(goal, other.as_other(), step_s)
                 limits = arm.geometry.joint_limits
                 assert np.isfinite(arm.joints).all()
-                assert (arm.joints >= limits.lowest_rad - 1e-9).all()
-                assert (arm.joints <= limits.highest_rad + 1e-9).all()
+                assert (arm.joints >= limits.min_rad - 1e-9).all()
+                assert (arm.joints <= limits.max_rad + 1e-9).all()
                 speed = np.abs(arm.joints - before) / step_s
                 assert (speed <= limits.speed_rad_per_s * (1 + 1e-6)).all()
                 moved = np.linalg.norm(arm.geometry.tool_points(arm.joints) - tool, axis=1)
@@ -428,8 +449,8 @@ def test_the_scene_is_reachable_over_its_strokes() -> None:
                     motion = replace(HOME, world_from_sheet=pose, stretch_ratio=stretch)
                     joints = geometry.joints_for_sheet(motion, joints)
                     assert abs(joints[4]) > np.radians(30.0)
-                    assert (joints > geometry.joint_limits.lowest_rad).all()
-                    assert (joints < geometry.joint_limits.highest_rad).all()
+                    assert (joints > geometry.joint_limits.min_rad).all()
+                    assert (joints < geometry.joint_limits.max_rad).all()
 
 
 async def test_without_a_scene_the_node_waits() -> None:
@@ -448,57 +469,43 @@ async def test_without_a_scene_the_node_waits() -> None:
     await node.close()
 
 
-def test_every_method_of_the_family_is_within_tolerance_in_its_range() -> None:
-    points = [measure(trial, repeats=1) for trial in KINEMATICS.trials(SCENE)]
-    assert {point.method for point in points} == set(KINEMATICS.methods)
-    for point in points:
-        assert not point.in_range or point.error <= KINEMATICS.tolerance(SCENE)
-
-
-def test_a_bridge_steps_by_what_its_way_is_checked_with_and_by_nothing_else() -> None:
-    assert set(STEPS.values()) == {next_joints}
-    assert set(get_args(KinematicsMethod)) == set(STEPS)
-    with pytest.raises(ValidationError):
-        ArmBridgeParameters.model_validate({"side": "left", "kinematics": "closed_form"})
-
-
 def test_without_a_connection_the_last_measured_pose_is_kept_and_none_is_made_up() -> None:
-    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
-    control.lose_connection("cable")
+    control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
+    control.on_connection_lost("cable")
     assert control.last_measured_rad is None
-    control.take_measurement(GUESS, ())
-    control.lose_connection("cable")
+    control.on_measurement(GUESS, ())
+    control.on_connection_lost("cable")
     assert control.last_measured_rad is not None
     assert (control.last_measured_rad == GUESS).all()
 
 
 def test_a_reset_from_before_the_stop_does_not_clear_it() -> None:
-    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+    control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
     stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
-    assert control.take_estop(stop, 200, 200) is None
-    assert control.take_estop(reset, 100, 210) == "it is older than the stop"
+    assert control.on_estop(stop, 200, 200) is None
+    assert control.on_estop(reset, 100, 210) == "it is older than the stop"
     assert control.estop_reason == "hand"
-    assert control.take_estop(reset, 300, 310) is None
+    assert control.on_estop(reset, 300, 310) is None
     assert control.estop_reason is None
 
 
 def test_last_words_of_several_writers_may_come_in_any_order() -> None:
     """To a bridge that is started anew: the newest stop counts, not the one that came last."""
-    control = ArmControl(PATIENCE, largest_lag_rad=0.1)
+    control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
     stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
-    assert control.take_estop(stop, 30, 100) is None
-    assert control.take_estop(stop, 5, 100) is None
-    assert control.take_estop(reset, 20, 100) == "it is older than the stop"
+    assert control.on_estop(stop, 30, 100) is None
+    assert control.on_estop(stop, 5, 100) is None
+    assert control.on_estop(reset, 20, 100) == "it is older than the stop"
     assert control.estop_reason == "hand"
 
 
 def test_a_stop_whose_stamp_is_doubtful_or_of_the_future_can_be_reset_afterwards() -> None:
     stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
     for stamp_ns, doubt in ((10_000, ""), (5, "clock main is not measured")):
-        control = ArmControl(PATIENCE, largest_lag_rad=0.1)
-        assert control.take_estop(stop, stamp_ns, 100, doubt) is None
-        assert control.take_estop(reset, 99, 101) == "it is older than the stop"
-        assert control.take_estop(reset, 102, 103) is None
+        control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
+        assert control.on_estop(stop, stamp_ns, 100, doubt) is None
+        assert control.on_estop(reset, 99, 101) == "it is older than the stop"
+        assert control.on_estop(reset, 102, 103) is None
 
 
 def test_a_sheet_that_seems_impossibly_long_is_not_relaxed() -> None:
@@ -512,12 +519,12 @@ def test_a_sheet_that_seems_impossibly_long_is_not_relaxed() -> None:
     for _ in range(200):
         arms[1].cycle(on_time(sheet_at(stretch=1.05)), phantom)
     assert arms[1].edge == pytest.approx(before, abs=1e-4)
-    assert "no sheet" in arms[1].control.reason
+    assert "measured length is not possible" in arms[1].control.reason
 
 
 def test_a_target_that_arrived_just_now_but_is_old_is_overdue() -> None:
-    fresh = goal_ahead(HOME, 0.02, -0.01, furthest_s=0.06)
-    old = goal_ahead(HOME, 5.0, -0.01, furthest_s=0.06)
+    fresh = extrapolate_goal(HOME, 0.02, -0.01, max_extrapolation_s=0.06)
+    old = extrapolate_goal(HOME, 5.0, -0.01, max_extrapolation_s=0.06)
     assert fresh.overdue_s == -0.01
     assert old.overdue_s == pytest.approx(4.94)
     arms = pair()
@@ -531,7 +538,7 @@ def test_a_new_scene_under_a_motion_brings_both_arms_to_rest_first() -> None:
     run(arms, on_time(HOME), 60)
     run(arms, on_time(sheet_at(0.03)), 10)
     for arm in arms:
-        arm.control.interrupt()
+        arm.control.on_scene_changed()
     run(arms, on_time(sheet_at(0.03)), 1)
     assert {arm.control.mode for arm in arms} <= {"stopping", "idle"}
     assert not any(arm.control.faults for arm in arms)
@@ -552,7 +559,7 @@ def test_joints_on_another_branch_are_refused(monkeypatch: pytest.MonkeyPatch) -
         lambda self, motion, present: present + np.array([0.0, 0.0, 0.0, 3.0, 0.0, -3.0]),
     )
     arms[0].cycle(on_time(HOME), arms[1].as_other())
-    assert "leap" in arms[0].control.faults[0]
+    assert "jump" in arms[0].control.faults[0]
 
 
 def test_when_somebody_has_stopped_the_other_arm_this_one_stands_and_lets_nothing_go() -> None:
@@ -604,7 +611,7 @@ def test_measured_flanges_outside_the_workspace_or_too_near_are_faults() -> None
         moved = geometry.world_from_flange(arms[0].joints)
         moved[:3, 3] += shift
         geometry.world_from_flange = lambda joints, moved=moved: moved
-        control._watch(geometry, arms[1].as_other(), arms[0].joints)
+        control._check_measurement(geometry, arms[1].as_other(), arms[0].joints)
         assert control.faults
         assert control.faults[0].startswith("measured: ")
         assert words in control.faults[0]
@@ -615,11 +622,11 @@ def test_an_arm_that_does_not_let_go_is_not_led_on() -> None:
     arms = pair(sheet_at(stretch=1.08))
     run(arms, on_time(sheet_at(stretch=1.08)), 30)
     arms[0].control.faults = ("drill",)
-    arms[0].control._largest_lag_rad = 0.01
+    arms[0].control._max_tracking_error_rad = 0.01
     stuck = arms[0].joints
     for _ in range(600):
         arms[0].control.step(arms[0].geometry, on_time(HOME), arms[1].as_other(), STEP_S)
-        arms[0].control.take_measurement(stuck, ())
+        arms[0].control.on_measurement(stuck, ())
         assert np.abs(arms[0].control.commanded_rad - stuck).max() < 0.015
     assert arms[0].control.mode == "fault"
 
@@ -630,9 +637,9 @@ def test_only_a_reset_clears_a_fault() -> None:
     arms[0].control.faults = ("drill",)
     run(arms, on_time(HOME), 200)
     for event in (
-        lambda: arms[0].control.lose_connection("cable"),
-        lambda: arms[0].control.take_measurement(arms[0].joints, ()),
-        arms[0].control.interrupt,
+        lambda: arms[0].control.on_connection_lost("cable"),
+        lambda: arms[0].control.on_measurement(arms[0].joints, ()),
+        arms[0].control.on_scene_changed,
         lambda: run(arms, None, 60),
         lambda: run(arms, on_time(HOME), 60),
     ):
@@ -670,7 +677,7 @@ def test_a_slack_sheet_is_held_as_told_until_the_flanges_come_too_near() -> None
 @pytest.mark.parametrize(
     ("shift", "turn", "words"),
     [
-        ((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), "edges turned by 14.3 degrees"),
+        ((0.0, 0.0, 0.0), (0.25, 0.0, 0.0), "edges rotated by 14.3 degrees"),
         ((0.0, 0.06, 0.0), (0.0, 0.0, 0.0), "edge skewed by"),
         ((0.03, 0.0, 0.0), (0.0, 0.0, 0.0), "sheet of"),
         ((0.0154, 0.0, 0.0), (0.0, 0.0, 0.0), "edge force 20"),
@@ -704,7 +711,7 @@ def lifted(y: float, aside_rad: float) -> SheetMotion:
 
 @pytest.mark.parametrize(
     ("aside_rad", "through", "ends"),
-    [(0.0, True, ""), (0.005, True, ""), (0.02, False, "leap"), (0.05, False, "")],
+    [(0.0, True, ""), (0.005, True, ""), (0.02, False, "jump"), (0.05, False, "")],
 )
 def test_past_the_wrists_singularity_both_go_on_together_or_both_stop(
     aside_rad: float, *, through: bool, ends: str

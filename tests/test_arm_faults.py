@@ -18,7 +18,7 @@ import pytest
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.types import ArmState, EStop
-from flexsheet.nodes.arm_bridge.link_drivers import link_for
+from flexsheet.nodes.arm_bridge.link_drivers import make_link
 from flexsheet.nodes.arm_bridge.modbus import MAGIC
 from flexsheet.nodes.twin import arms as twin_arms
 from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, STATE_FAULT, Fault, Servo, forward
@@ -75,7 +75,7 @@ class Stroke:
         )
         return [state for name in counts for state, _ in self.rig.states[name][counts[name] :]]
 
-    def longest_m(self) -> float:
+    def max_length_m(self) -> float:
         """The longest that the sheet ever was, as measured."""
         return max(
             state.edge_distance_m or 0.0
@@ -133,7 +133,7 @@ async def mid_stroke(
     ):
         left = nodes["left"]
         left._link.close()
-        left._link = link_for("modbus", "127.0.0.1", cut.port, TIMEOUT_S)
+        left._link = make_link("modbus", "127.0.0.1", cut.port, TIMEOUT_S)
         await both_follow(rig, nodes["planner"], AT_FRONT)
         path = to_and_fro(rig.scene.object.geometry.radius_m, seconds)
         task = asyncio.create_task(play_finger(rig, nodes["planner"], path, 60.0))
@@ -141,7 +141,7 @@ async def mid_stroke(
         try:
             await stroke.lasts(40)
             yield stroke
-            assert stroke.longest_m() <= LONGEST_M
+            assert stroke.max_length_m() <= LONGEST_M
         finally:
             task.cancel()
             with suppress(asyncio.CancelledError):
@@ -214,7 +214,7 @@ async def test_an_arm_without_a_sound_answer_is_lost_and_the_other_stops(
 
 
 async def test_a_frozen_arm_is_a_fault_of_it_until_somebody_resets_it() -> None:
-    async with mid_stroke(largest_lag_rad=0.06) as stroke:
+    async with mid_stroke(max_tracking_error_rad=0.06) as stroke:
         stroke.suffer("frozen")
         await until(lambda: bool(stroke.reasons()))
         await until(lambda: stroke.modes() <= {"idle", "fault"})
@@ -240,7 +240,7 @@ async def test_an_arm_that_moves_fifty_milliseconds_late_is_lived_with_in_a_slow
 
 
 async def test_an_arm_that_moves_fifty_milliseconds_late_stops_both_in_a_fast_stroke() -> None:
-    async with mid_stroke(1.2, largest_lag_rad=0.1) as stroke:
+    async with mid_stroke(1.2, max_tracking_error_rad=0.1) as stroke:
         stroke.suffer("lagging")
         await until(lambda: "trails its command" in stroke.reasons())
         await until(lambda: stroke.modes() <= {"idle", "fault"})

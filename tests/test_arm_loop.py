@@ -120,7 +120,7 @@ async def running_rig(
             ArmBridgeParameters(
                 side=side,
                 port=twin.servers[side].port,
-                **{"arming": "by_itself", **bridge_parameters},
+                **{"arming": "auto", **bridge_parameters},
             ),
             name=f"bridge_{side}",
             clock=rig.clock,
@@ -304,7 +304,7 @@ async def test_a_bad_answer_disconnects_with_its_reason(fault: str, words: str) 
 
 
 async def test_a_frozen_arm_is_noticed_and_both_stop() -> None:
-    async with running_rig(largest_lag_rad=0.05) as (rig, nodes):
+    async with running_rig(max_tracking_error_rad=0.05) as (rig, nodes):
         planner = nodes["planner"]
         await both_follow(rig, planner, AT_FRONT)
         nodes["twin"].servers["right"].controller.fault = "frozen"

@@ -15,12 +15,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flexsheet.messages.types import Side
-from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm
+from flexsheet.nodes.arm_bridge.control import ArmControl, Command
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
-from flexsheet.nodes.arm_bridge.limiter import EVEN_STEP_S, JointLimits, bounded_step
+from flexsheet.nodes.arm_bridge.limiter import MAX_TRAVEL_STEP_S, JointLimits, bound_step
 from flexsheet.nodes.arm_bridge.link import MAX_UNCHANGED_S, CounterMonitor, Freshness
+from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.standstill import (
     JOINT_LEVER_M,
     MAX_RESTART_SHIFT_M,
@@ -30,7 +31,8 @@ from flexsheet.nodes.arm_bridge.standstill import (
 )
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.twin.arms import SPEED_RAD_PER_S, Servo, forward
-from tests.test_arm_control import GUESS, HOME, PATIENCE, SCENE, STEP_S, on_time, sheet_at
+from tests.arm_states import connect_control
+from tests.test_arm_control import GUESS, HOME, SCENE, STEP_S, TIMEOUTS, on_time, sheet_at
 
 Floats = NDArray[np.float64]
 NOISE_RAD = 5e-6
@@ -59,17 +61,17 @@ class ServoArm:
     def holding(cls, side: Side) -> ServoArm:
         geometry = ArmGeometry(SCENE, side)
         joints = geometry.joints_for_sheet(HOME, GUESS)
-        control = ArmControl(PATIENCE, largest_lag_rad=0.12, by_itself=True)
+        control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.12, auto_arming=True)
         arm = cls(geometry, control, Servo(joints, 0.025), np.random.default_rng(len(side)))
         for _ in range(STANDSTILL_COUNT):
             arm.measure()
-        control.mode = "idle"
+        connect_control(control)
         return arm
 
     def measure(self) -> None:
         noisy = self.servo.joints_rad + NOISE_RAD * self.random.standard_normal(6)
         self.reported = self.reading(noisy)
-        self.control.take_measurement(self.reported, (), self.freshness)
+        self.control.on_measurement(self.reported, (), self.freshness)
 
     def tool_points(self) -> Floats:
         """Both ends of the edge and the flange (3, 3), by the twin's kinematics."""
@@ -83,8 +85,8 @@ class ServoArm:
     def cycle(self, goal: Goal | None, other: OtherArm | None) -> None:
         held, was_moving = self.command.joints_rad, self.command.mode == "move"
         self.command = self.control.step(self.geometry, goal, other, STEP_S)
-        if self.control.question is not None:
-            self.control.take_way(self.control.question, None)
+        if self.control.pending_check is not None:
+            self.control.on_path_result(self.control.pending_check, None)
         if was_moving and self.command.mode == "move":
             step = np.abs(self.command.joints_rad - held)
             ratio = float((step / (SPEED_RAD_PER_S * STEP_S)).max())
@@ -109,6 +111,7 @@ class ServoArm:
             self.control.all_faults,
             0.005,
             self.control.ready,
+            self.control.estop_reason is not None,
         )
 
 
@@ -252,8 +255,8 @@ def test_a_measurement_that_is_not_fresh_is_not_believed(freshness: Freshness, w
 def test_nothing_starts_before_fresh_measurements_confirm_a_standstill() -> None:
     for freshness in (Freshness.FIRST, Freshness.REPEATED):
         arms = servo_pair()
-        arms[0].control.lose_connection("cable")
-        arms[0].control.take_measurement(arms[0].reported, (), Freshness.FIRST)
+        arms[0].control.on_connection_lost("cable")
+        arms[0].control.on_measurement(arms[0].reported, (), Freshness.FIRST)
         arms[0].freshness = freshness
         stroke(arms, 0.5)
         assert arms[0].control.reason == "waits until the arm stands still"
@@ -268,19 +271,21 @@ def test_nothing_starts_before_fresh_measurements_confirm_a_standstill() -> None
 MS = 10**6
 
 
-def judge(
+def classify(
     monitor: CounterMonitor, counters: tuple[int, ...], at_ns: int, *, may_restart: bool
 ) -> Freshness:
     """An answer that comes at once."""
-    return monitor.judge(counters, sent_ns=at_ns, received_ns=at_ns, may_restart=may_restart)
+    return monitor.classify(counters, sent_ns=at_ns, received_ns=at_ns, may_restart=may_restart)
 
 
 def test_counters_of_answers_that_came_late_are_not_stalled() -> None:
     """Two answers of the same cycle: the one came 0.1 s late, the other at once or late too."""
     for received_ns in (101 * MS, 300 * MS):
         monitor = CounterMonitor()
-        monitor.judge((5, 6), sent_ns=0, received_ns=100 * MS, may_restart=False)
-        found = monitor.judge((6, 6), sent_ns=100 * MS, received_ns=received_ns, may_restart=False)
+        monitor.classify((5, 6), sent_ns=0, received_ns=100 * MS, may_restart=False)
+        found = monitor.classify(
+            (6, 6), sent_ns=100 * MS, received_ns=received_ns, may_restart=False
+        )
         assert found == Freshness.FRESH
 
 
@@ -288,24 +293,24 @@ def test_counters_that_go_on_are_fresh_also_over_their_end() -> None:
     monitor, found = CounterMonitor(), []
     for number in range(6):
         counters = ((2**32 - 30_000 + 10_000 * number) % 2**32, number)
-        found.append(judge(monitor, counters, number * 10 * MS, may_restart=False))
+        found.append(classify(monitor, counters, number * 10 * MS, may_restart=False))
     assert found == [Freshness.FIRST, *[Freshness.FRESH] * 5]
 
 
 def test_counters_that_stand_still_are_repeated_then_stalled() -> None:
     for counters in ((5, 6), (5, 7)):
         monitor = CounterMonitor()
-        assert judge(monitor, (5, 6), 0, may_restart=True) == Freshness.FIRST
-        assert judge(monitor, counters, 40 * MS, may_restart=True) == Freshness.REPEATED
+        assert classify(monitor, (5, 6), 0, may_restart=True) == Freshness.FIRST
+        assert classify(monitor, counters, 40 * MS, may_restart=True) == Freshness.REPEATED
         late_ns = round(MAX_UNCHANGED_S * 1e9) + MS
-        assert judge(monitor, counters, late_ns, may_restart=True) == Freshness.STALLED
-        assert judge(monitor, (9, 9), late_ns + MS, may_restart=True) == Freshness.FRESH
+        assert classify(monitor, counters, late_ns, may_restart=True) == Freshness.STALLED
+        assert classify(monitor, (9, 9), late_ns + MS, may_restart=True) == Freshness.FRESH
 
 
 def test_a_measurement_time_that_goes_on_without_cycles_is_stalled_too() -> None:
     monitor = CounterMonitor()
     found = [
-        judge(monitor, (number, 3), number * 10 * MS, may_restart=False) for number in range(8)
+        classify(monitor, (number, 3), number * 10 * MS, may_restart=False) for number in range(8)
     ]
     assert found[:6] == [Freshness.FIRST, *[Freshness.FRESH] * 5]
     assert found[6:] == [Freshness.STALLED] * 2
@@ -314,9 +319,9 @@ def test_a_measurement_time_that_goes_on_without_cycles_is_stalled_too() -> None
 def test_counters_that_run_backwards_are_a_restart_only_where_one_is_possible() -> None:
     for counters in ((4, 7), (6, 5)):
         monitor = CounterMonitor()
-        judge(monitor, (5, 6), 0, may_restart=True)
-        assert judge(monitor, counters, MS, may_restart=False) == Freshness.REVERSED
-        assert judge(monitor, counters, MS, may_restart=True) == Freshness.FIRST
+        classify(monitor, (5, 6), 0, may_restart=True)
+        assert classify(monitor, counters, MS, may_restart=False) == Freshness.REVERSED
+        assert classify(monitor, counters, MS, may_restart=True) == Freshness.FIRST
 
 
 # Standstill.
@@ -325,22 +330,22 @@ def test_counters_that_run_backwards_are_a_restart_only_where_one_is_possible() 
 def test_a_standstill_takes_fresh_unchanged_measurements_after_the_last_motion() -> None:
     monitor = StandstillMonitor()
     for number in range(STANDSTILL_COUNT):
-        assert not monitor.is_standing(where_sent=True)
+        assert not monitor.is_standing(at_command=True)
         monitor.on_measurement(GUESS + number * 1e-6, Freshness.FRESH)
-    assert monitor.is_standing(where_sent=True)
+    assert monitor.is_standing(at_command=True)
     assert monitor.is_alive
     monitor.on_command(GUESS, np.full(6, 0.1), STEP_S)
-    assert not monitor.is_standing(where_sent=True)
+    assert not monitor.is_standing(at_command=True)
     for number in range(3 * STANDSTILL_COUNT):
         monitor.on_measurement(GUESS + number * 0.6e-3, Freshness.FRESH)
-        assert not monitor.is_standing(where_sent=True)
+        assert not monitor.is_standing(at_command=True)
     for freshness in (Freshness.REPEATED, Freshness.STALLED, Freshness.REVERSED, Freshness.FIRST):
         for _ in range(3 * STANDSTILL_COUNT):
             monitor.on_measurement(GUESS, freshness)
-        assert not monitor.is_standing(where_sent=True)
+        assert not monitor.is_standing(at_command=True)
     for _ in range(STANDSTILL_COUNT):
         monitor.on_measurement(GUESS, Freshness.FRESH)
-    assert monitor.is_standing(where_sent=True)
+    assert monitor.is_standing(at_command=True)
     assert not monitor.is_alive, "exactly the same each time"
 
 
@@ -366,7 +371,7 @@ def test_a_jump_is_a_change_off_the_commanded_path_that_is_too_fast() -> None:
 
 
 joints_in_range = st.tuples(*[st.floats(0.02, 0.98)] * 6).map(
-    lambda part: LIMITS.lowest_rad + np.array(part) * (LIMITS.highest_rad - LIMITS.lowest_rad)
+    lambda part: LIMITS.min_rad + np.array(part) * (LIMITS.max_rad - LIMITS.min_rad)
 )
 GEOMETRY = ArmGeometry(SCENE, "left")
 LIMITS: JointLimits = GEOMETRY.joint_limits
@@ -402,7 +407,7 @@ any_number = st.one_of(st.floats(-4.0, 4.0), st.sampled_from([np.nan, np.inf, -n
 def test_a_bounded_step_keeps_joint_speeds_and_tool_speed(
     joints: Floats, wanted: tuple[float, ...], step_s: float
 ) -> None:
-    found = bounded_step(
+    found = bound_step(
         joints,
         np.array(wanted),
         tool_points=GEOMETRY.tool_points,
@@ -412,7 +417,7 @@ def test_a_bounded_step_keeps_joint_speeds_and_tool_speed(
     )
     assert (np.abs(found - joints) <= JOINT_SPEED_RAD_PER_S * step_s).all()
     shift = np.linalg.norm(GEOMETRY.tool_points(found) - GEOMETRY.tool_points(joints), axis=1)
-    furthest = GEOMETRY.max_tool_speed * min(step_s, EVEN_STEP_S)
+    furthest = GEOMETRY.max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
     assert shift.max() <= furthest * (1.0 + 1e-6) + 1e-12
 
 
@@ -422,10 +427,10 @@ def test_no_decision_commands_a_leap(leap: float, monkeypatch: pytest.MonkeyPatc
     arms = servo_pair()
     time_s = stroke(arms, 1.2)
     control, geometry = arms[0].control, arms[0].geometry
-    monkeypatch.setattr(control, "_limited", lambda *_: np.full(6, leap / STEP_S))
+    monkeypatch.setattr(control, "_limit_velocity", lambda *_: np.full(6, leap / STEP_S))
     monkeypatch.setattr(geometry, "sheet_limits", replace(geometry.sheet_limits))
-    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.place_trouble", lambda *_, **__: None)
-    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.sheet_trouble", lambda *_, **__: None)
+    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.check_flange", lambda *_, **__: None)
+    monkeypatch.setattr("flexsheet.nodes.arm_bridge.control.check_sheet", lambda *_, **__: None)
     before = arms[0].command.joints_rad
     arms[0].cycle(stroke_goal(time_s), arms[1].as_other())
     assert control.faults == ("commanded: a step beyond the joint or tool speed",)

@@ -27,7 +27,7 @@ from tests.waiting import until
 
 pytestmark = pytest.mark.alone
 
-PATIENT = {"arming": "by_itself", "timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
+PATIENT = {"arming": "auto", "timeout_s": 0.25, "hold_after_s": 0.1, "stop_after_s": 0.6}
 PATIENT_TWIN = {"watchdog_s": 0.8}
 SIDES = ("left", "right")
 LONGEST_M = 0.24 * 1.09

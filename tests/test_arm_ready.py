@@ -15,9 +15,9 @@ from flexsheet.launch.plans.plan import load_graph, load_scene
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.types import Arming, EStop
-from flexsheet.nodes.arm_bridge.control import LET_GO_AFTER_S, OLDEST_ARMING_S, READY_TOGETHER_S
+from flexsheet.nodes.arm_bridge.control import MAX_ARMING_AGE_S, MAX_WAIT_FOR_OTHER_S, RELAX_DELAY_S
 from flexsheet.nodes.arm_bridge.goal import Goal
-from flexsheet.nodes.arm_bridge.link import ArmStatus, Floats
+from flexsheet.nodes.arm_bridge.link import ArmFault, ArmStatus, Floats
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from tests.arm_states import arm_state
 from tests.test_arm_control import HOME, STEP_S, Arm, distance, on_time, pair, run, sheet_at
@@ -31,11 +31,11 @@ Arms = tuple[Arm, Arm]
 
 
 def unready() -> Arms:
-    return pair(sheet_at(stretch=1.06), by_itself=False)
+    return pair(sheet_at(stretch=1.06), auto_arming=False)
 
 
 def say_go(arms: Arms) -> list[str | None]:
-    return [arm.control.take_arming(GO, 0.01) for arm in arms]
+    return [arm.control.on_arming(GO, 0.01) for arm in arms]
 
 
 def following() -> Arms:
@@ -81,7 +81,7 @@ def test_without_targets_both_stop_let_go_and_stay_when_they_come_again() -> Non
 
 def test_a_target_that_is_missing_for_a_moment_costs_no_tension_but_the_word() -> None:
     arms = following()
-    run(arms, NO_TARGET, round(0.5 * LET_GO_AFTER_S / STEP_S))
+    run(arms, NO_TARGET, round(0.5 * RELAX_DELAY_S / STEP_S))
     run(arms, GOAL, 2)
     assert distance(arms) == pytest.approx(SLACK_M * 1.06, abs=1e-6)
     assert {arm.control.mode for arm in arms} == {"idle"}
@@ -102,11 +102,11 @@ def test_when_the_other_arm_falls_silent_the_sheet_stays_as_it_is_for_good() -> 
 
 
 def lose_arm(arm: Arm) -> None:
-    arm.control.lose_connection("no answer")
+    arm.control.on_connection_lost("no answer")
 
 
 def trip_watchdog(arm: Arm) -> None:
-    arm.control.take_measurement(arm.joints, ("watchdog: no command",))
+    arm.control.on_measurement(arm.joints, (ArmFault.WATCHDOG,))
 
 
 @pytest.mark.parametrize("trouble", [lose_arm, trip_watchdog])
@@ -127,7 +127,7 @@ def test_clocks_in_doubt_take_the_word_back_too() -> None:
     arms = following()
     for arm, other in (arms, arms[::-1]):
         arm.control.step(arm.geometry, GOAL, other.as_other(), STEP_S, "clocks: 9 ms apart")
-    assert arms[0].control.take_arming(GO, 0.0) == "clocks: 9 ms apart"
+    assert arms[0].control.on_arming(GO, 0.0) == "clocks: 9 ms apart"
     assert_stands(arms)
     assert arms[1].control.reason == "not ready since: clocks: 9 ms apart"
 
@@ -155,8 +155,10 @@ def test_the_word_is_refused_where_it_cannot_be_meant() -> None:
     run(arms, None, 3)
     assert say_go(arms) == ["waiting for a sheet target", "waiting for a sheet target"]
     run(arms, GOAL, 3)
-    assert arms[0].control.take_arming(GO, OLDEST_ARMING_S + 0.5) == "the word is 1.5 s old"
-    assert "nan" in str(arms[0].control.take_arming(GO, float("nan")))
+    assert (
+        arms[0].control.on_arming(GO, MAX_ARMING_AGE_S + 0.5) == "the arming command is 1.5 s old"
+    )
+    assert "nan" in str(arms[0].control.on_arming(GO, float("nan")))
     assert_stands(arms)
     arms, up = following(), np.array([0.0, 0.15, 0.0, 0.0, 0.0, 0.0])
     for number in range(60):
@@ -164,19 +166,19 @@ def test_the_word_is_refused_where_it_cannot_be_meant() -> None:
         run(arms, on_time(replace(shifted, twist_world=up)), 1)
     run(arms, NO_TARGET, 1)
     run(arms, GOAL, 1)
-    assert arms[0].control.take_arming(GO, 0.0) == "the arm still moves"
+    assert arms[0].control.on_arming(GO, 0.0) == "the arm still moves"
 
 
 def test_one_arm_alone_is_not_ready_for_long() -> None:
     arms = unready()
     run(arms, GOAL, 3)
-    assert arms[0].control.take_arming(GO, 0.0) is None
-    run(arms, GOAL, round(0.5 * READY_TOGETHER_S / STEP_S))
+    assert arms[0].control.on_arming(GO, 0.0) is None
+    run(arms, GOAL, round(0.5 * MAX_WAIT_FOR_OTHER_S / STEP_S))
     assert arms[0].control.ready
-    run(arms, GOAL, round(0.6 * READY_TOGETHER_S / STEP_S))
+    run(arms, GOAL, round(0.6 * MAX_WAIT_FOR_OTHER_S / STEP_S))
     assert not arms[0].control.ready
     # Told so now, the second must not find the first still waiting.
-    assert arms[1].control.take_arming(GO, 0.0) is None
+    assert arms[1].control.on_arming(GO, 0.0) is None
     run(arms, GOAL, 3)
     assert {arm.control.mode for arm in arms} == {"idle"}
 
@@ -185,11 +187,11 @@ def test_told_to_stand_down_both_stop_and_let_go() -> None:
     for arms in (following(), pair(sheet_at(stretch=1.06))):
         run(arms, GOAL, 60)
         for arm in arms:
-            assert arm.control.take_arming(STAND_DOWN, 99.0) is None
+            assert arm.control.on_arming(STAND_DOWN, 99.0) is None
         run(arms, GOAL, 600)
         assert distance(arms) == pytest.approx(SLACK_M, abs=5e-4)
         assert_stands(arms)
-        assert arms[0].control.reason == "stood down: lunch"
+        assert arms[0].control.reason == "disabled: lunch"
         assert say_go(arms) == [None, None]
         run(arms, GOAL, 600)
         assert {arm.control.mode for arm in arms} == {"follow"}
@@ -225,7 +227,6 @@ def test_whatever_happens_an_arm_that_is_not_ready_begins_no_motion(events: list
                 begins = resting and not (arm.joints == before).all()
                 if begins and not was_ready:
                     assert arm.control.mode == "relax", (event, arm.control.mode)
-                    assert arm.control._has_pulled
 
 
 class CountingLink:
@@ -295,7 +296,7 @@ async def test_the_node_hears_the_word_and_says_what_it_is() -> None:
 
 def test_real_arms_need_the_word_and_the_demos_do_not() -> None:
     folder = SCENE_FILE.parent.parent
-    for name, expected in (("lab.yaml", "by_command"), ("demo.yaml", "by_itself")):
+    for name, expected in (("lab.yaml", "manual"), ("demo.yaml", "auto")):
         nodes = load_graph(folder / name).nodes.values()
         found = {node.parameters["arming"] for node in nodes if node.type == "arm_bridge"}
         assert found == {expected}

@@ -16,7 +16,7 @@ from flexsheet.messages.types import (
     Recording,
 )
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.limiter import sheet_trouble
+from flexsheet.nodes.arm_bridge.limiter import check_sheet
 from flexsheet.nodes.console import scenes
 from flexsheet.nodes.console.aim import Aim
 from flexsheet.nodes.console.desk import SETTLE_S, Desk, Files, SceneDesk
@@ -87,7 +87,7 @@ def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
     left, right = np.eye(4), np.eye(4)
     left[0, 3], right[0, 3] = np.array([-0.5, 0.5]) * limit * tight.width_m
     limits = ArmGeometry(scene, "left").sheet_limits
-    assert sheet_trouble(left, right, left=True, limits=limits) is None
+    assert check_sheet(left, right, left=True, limits=limits) is None
 
 
 async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path) -> None:

@@ -159,7 +159,7 @@ def test_only_arms_that_wait_for_a_word_are_said_to(auto: bool) -> None:
     for html in (stopped, faulty):
         assert ("the arms then move at once" in html) == auto
     for html in (stopped, faulty, idle):
-        assert ("flexsheet arms ready" in html) != auto
+        assert ("flexsheet arms enable" in html) != auto
 
 
 def test_under_the_banner_stands_why_nothing_happens() -> None:

@@ -18,11 +18,11 @@ LAB = ROOT / "launch" / "lab.yaml"
 def test_the_page_says_where_each_command_is_typed_and_how_it_ends() -> None:
     found = list(steps(PAGE.read_text()))
     typed = [one.command for one in found]
-    for part in ("keys new", "keys install", "launch", "doctor hosts", "arms ready", "^C"):
+    for part in ("keys new", "keys install", "launch", "doctor hosts", "arms enable", "^C"):
         assert any(part in command for command in typed), part
     assert {one.hosts for one in found} == {HOSTS, ("main",), ("left",)}
     assert [one.command.split("#")[0].strip() for one in found if one.code] == [
-        "flexsheet arms ready"
+        "flexsheet arms enable"
     ]
 
 

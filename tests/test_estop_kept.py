@@ -18,14 +18,20 @@ import pytest
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import RUN_DIRECTORY, ResolvedGraph
 from flexsheet.launch.running.estop_file import STATE_VARIABLE, EStopFile
-from flexsheet.launch.running.host import REASON_LENGTH, HostAgent, has_manual_arming, list_arms
+from flexsheet.launch.running.host import (
+    REASON_LENGTH,
+    HostAgent,
+    has_manual_arming,
+    list_arms,
+    shows_estop,
+)
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.clock import SystemClock
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
 from flexsheet.messages.topics import topic_named
 from flexsheet.messages.types import EStop
-from flexsheet.nodes.arm_bridge.control import ArmControl, Patience
+from flexsheet.nodes.arm_bridge.control import ArmControl, Timeouts
 from flexsheet.nodes.node import PortCounts
 from tests.arm_states import arm_state
 from tests.waiting import DEADLINE_S, NOTHING_COMES_S, until
@@ -47,7 +53,7 @@ def folder(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     shutil.rmtree(made)
 
 
-def plan_of(folder: Path, *, arming: str = "by_command") -> ResolvedGraph:
+def plan_of(folder: Path, *, arming: str = "manual") -> ResolvedGraph:
     """A graph in which an arm waits for a person's word; only its launchers are started."""
     path = folder / "graph.yaml"
     bridge = BRIDGE | {"parameters": {"side": "left", "arming": arming}}
@@ -191,13 +197,13 @@ async def test_a_reset_from_the_future_is_refused(folder: Path) -> None:
 
 def test_a_bridge_refuses_a_reset_from_the_future() -> None:
     """It would clear, sent again to a late reader, all stops until then."""
-    control = ArmControl(Patience(0.02, 0.1), largest_lag_rad=0.12)
-    assert control.take_estop(STOP, 200, 200) is None
+    control = ArmControl(Timeouts(0.02, 0.1), max_tracking_error_rad=0.12)
+    assert control.on_estop(STOP, 200, 200) is None
     now_ns = 10**9
     far_ns = now_ns + MAX_STAMP_AHEAD_NS + 1
-    assert control.take_estop(RESET, far_ns, now_ns) == "it is stamped in the future"
+    assert control.on_estop(RESET, far_ns, now_ns) == "it is stamped in the future"
     assert control.estop_reason == STOP.reason
-    assert control.take_estop(RESET, far_ns, now_ns + 1) is None
+    assert control.on_estop(RESET, far_ns, now_ns + 1) is None
     assert control.estop_reason is None
 
 
@@ -240,7 +246,7 @@ def test_graphs_of_other_arms_keep_stops_of_their_own(folder: Path) -> None:
 
 def test_simulated_arms_that_go_by_themselves_forget(folder: Path) -> None:
     assert has_manual_arming(plan_of(folder))
-    assert not has_manual_arming(plan_of(folder, arming="by_itself"))
+    assert not has_manual_arming(plan_of(folder, arming="auto"))
 
 
 def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
@@ -254,3 +260,9 @@ def test_a_file_of_a_stop_is_whole_or_not_there(folder: Path) -> None:
     file.remove()
     assert file.read() is None
     assert files(folder) == []
+
+
+def test_an_arm_shows_an_estop_by_its_typed_field_whatever_its_faults_say() -> None:
+    assert shows_estop(arm_state("left", mode="stopping", estop_engaged=True, faults=("Halt",)))
+    assert shows_estop(arm_state("left", mode="estop"))
+    assert not shows_estop(arm_state("left", mode="fault", faults=("e-stop: button",)))

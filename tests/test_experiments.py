@@ -29,7 +29,6 @@ from flexsheet.launch.methods.charts import (
 from flexsheet.launch.methods.svg import INK
 from flexsheet.messages.methods import (
     Correction,
-    KinematicsMethod,
     MarkerMethod,
     SheetForceMethod,
     SheetShapeMethod,
@@ -228,7 +227,6 @@ CHOICES = {
     "marker": MarkerMethod,
     "triangulation": TriangulationMethod,
     "tracking": TrackingMethod,
-    "kinematics": KinematicsMethod,
     "sheet-force": SheetForceMethod,
     "sheet-shape": SheetShapeMethod,
     "correction": Correction,

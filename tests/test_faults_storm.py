@@ -73,7 +73,7 @@ class Bench:
         self.monkeypatch.setattr(bridge_node.asyncio, "sleep", self.sleep)
         for side, other in (SIDES, SIDES[::-1]):
             self.bridges[side] = bridge = ArmBridge(
-                ArmBridgeParameters(side=side, port=1, arming="by_itself"),
+                ArmBridgeParameters(side=side, port=1, arming="auto"),
                 name=f"arm_{side}_bridge", clock=self.clock, send=self.take,
                 topics={"arm": f"arm_{side}", "other_arm": f"arm_{other}"},
             )  # fmt: skip

@@ -21,7 +21,12 @@ from flexsheet.messages.base import Header, Message
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import ArmState, EStop, Fingertip, SheetTarget
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.way import Alignment, Lookout, Way, check_way
+from flexsheet.nodes.arm_bridge.path_check import (
+    Alignment,
+    PathChecker,
+    PathCheckRequest,
+    check_path,
+)
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from flexsheet.nodes.planner.node import Planner
 from flexsheet.nodes.planner.parameters import PlannerParameters
@@ -49,13 +54,15 @@ def tool_points(side: str, joints_rad: Floats) -> Floats:
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
-class Immediate(Lookout):
+class Immediate(PathChecker):
     """Answers at once: a thread would take real time, and here time is virtual."""
 
-    def answer(self, question: Way | None) -> tuple[Way, Alignment | str] | None:
+    def poll(
+        self, question: PathCheckRequest | None
+    ) -> tuple[PathCheckRequest, Alignment | str] | None:
         if question is None:
             return None
-        return question, check_way(self._arm, self._other, question)
+        return question, check_path(self._arm, self._other, question)
 
 
 def edge_distance_m(joints_rad: Mapping[str, Floats]) -> float:
@@ -79,7 +86,7 @@ class ForgedBench(Bench):
     _points: dict[str, Floats] = field(default_factory=dict)
     max_tool_speed: float = 0.0
     max_joint_ratio: float = 0.0
-    longest_m: float = 0.0
+    max_length_m: float = 0.0
     fingertips: int = 0
 
     async def set_up(self) -> None:
@@ -90,7 +97,7 @@ class ForgedBench(Bench):
         )
         await self.planner.setup()
         for side, other in (SIDES, SIDES[::-1]):
-            self.bridges[side]._lookout = Immediate(
+            self.bridges[side]._path_checker = Immediate(
                 ArmGeometry(SCENE, side), ArmGeometry(SCENE, other)
             )
         await self.planner.step("scene", SCENE, self.header("scene", 1))
@@ -122,7 +129,7 @@ class ForgedBench(Bench):
             self._points[side] = points
         servos: Any = {side: self.twin.servers[side].controller.servo for side in SIDES}
         length_m = edge_distance_m({side: servo.joints_rad for side, servo in servos.items()})
-        self.longest_m = max(self.longest_m, length_m)
+        self.max_length_m = max(self.max_length_m, length_m)
 
     async def point(self, seconds: float, tip: Callable[[], tuple[Fingertip, Header]]) -> None:
         """Let time pass while the planner gets these fingertips."""
@@ -145,7 +152,7 @@ class ForgedBench(Bench):
     def assert_within_limits(self) -> None:
         assert self.max_tool_speed <= MAX_TOOL_SPEED
         assert self.max_joint_ratio <= 1.0
-        assert self.longest_m <= LONGEST_M
+        assert self.max_length_m <= LONGEST_M
         for states in self.states.values():
             for state in states:
                 # Whoever does not follow says why.

@@ -17,16 +17,16 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     forward,
 )
 from flexsheet.nodes.arm_bridge.limiter import (
-    EVEN_STEP_S,
+    MAX_TRAVEL_STEP_S,
     JointLimits,
     SheetLimits,
-    braked,
-    limited,
-    place_trouble,
-    sheet_trouble,
-    step_trouble,
-    towards,
-    within_range,
+    check_flange,
+    check_sheet,
+    check_tracking_error,
+    clamp_to_range,
+    decelerate,
+    find_desired_velocity,
+    limit_velocity,
 )
 from flexsheet.nodes.models.rigid import transform, transform_from_rpy
 
@@ -45,7 +45,7 @@ def tool_points(joints_rad: Floats) -> Floats:
 
 
 def step(joints: Floats, velocity: Floats, goal: Floats, along: Floats, step_s: float) -> Floats:
-    return limited(
+    return limit_velocity(
         joints,
         velocity,
         goal,
@@ -62,7 +62,7 @@ any_number = st.one_of(
 )
 any_joints = arrays(np.float64, 6, elements=any_number)
 start_joints = arrays(np.float64, 6, elements=st.floats(0.02, 0.98)).map(
-    lambda share: LIMITS.lowest_rad + share * (LIMITS.highest_rad - LIMITS.lowest_rad)
+    lambda share: LIMITS.min_rad + share * (LIMITS.max_rad - LIMITS.min_rad)
 )
 
 
@@ -82,8 +82,8 @@ def test_nothing_out_of_bounds_ever_goes_out(
         velocity = step(joints, velocity, goal, along, step_s)
         joints = joints + velocity * step_s
         assert np.isfinite(joints).all()
-        assert (joints >= LIMITS.lowest_rad - 1e-9).all()
-        assert (joints <= LIMITS.highest_rad + 1e-9).all()
+        assert (joints >= LIMITS.min_rad - 1e-9).all()
+        assert (joints <= LIMITS.max_rad + 1e-9).all()
         assert (np.abs(velocity) <= LIMITS.speed_rad_per_s * (1 + 1e-9)).all()
         speed = np.linalg.norm(tool_points(joints) - before, axis=1).max() / step_s
         assert speed <= TOOL_SPEED * (1 + 1e-6)
@@ -101,13 +101,13 @@ def test_acceleration_is_bounded_and_joints_stop_in_range(
     joints, velocity = start, np.zeros(6)
     for goal in [goal for goal in goals for _ in range(each)]:
         before = velocity
-        wanted = towards(joints, goal, np.zeros(6), limits=LIMITS, step_s=STEP_S)
-        velocity = within_range(joints, velocity, wanted, limits=LIMITS, step_s=STEP_S)
+        wanted = find_desired_velocity(joints, goal, np.zeros(6), limits=LIMITS, step_s=STEP_S)
+        velocity = clamp_to_range(joints, velocity, wanted, limits=LIMITS, step_s=STEP_S)
         change = np.abs(velocity - before)
         assert (change <= LIMITS.acceleration_rad_per_s2 * STEP_S * (1 + 1e-6) + 1e-12).all()
         joints = joints + velocity * STEP_S
-        assert (joints >= LIMITS.lowest_rad - 1e-12).all()
-        assert (joints <= LIMITS.highest_rad + 1e-12).all()
+        assert (joints >= LIMITS.min_rad - 1e-12).all()
+        assert (joints <= LIMITS.max_rad + 1e-12).all()
 
 
 @settings(max_examples=50, deadline=None)
@@ -116,8 +116,8 @@ def test_a_still_goal_is_reached_without_overshoot(start: Floats, goal: Floats) 
     joints, velocity = start, np.zeros(6)
     side = np.sign(goal - start)
     for _ in range(4000):
-        wanted = towards(joints, goal, np.zeros(6), limits=LIMITS, step_s=STEP_S)
-        velocity = within_range(joints, velocity, wanted, limits=LIMITS, step_s=STEP_S)
+        wanted = find_desired_velocity(joints, goal, np.zeros(6), limits=LIMITS, step_s=STEP_S)
+        velocity = clamp_to_range(joints, velocity, wanted, limits=LIMITS, step_s=STEP_S)
         joints = joints + velocity * STEP_S
         assert (side * (joints - goal) <= 1e-9).all()
         if np.abs(joints - goal).max() < 1e-9:
@@ -140,7 +140,7 @@ def test_braking_keeps_to_the_path_and_ends_at_rest() -> None:
     velocity = np.array([1.0, -0.5, 0.2, 0.0, 2.0, -3.0])
     direction = velocity / np.linalg.norm(velocity)
     for _ in range(200):
-        slower = braked(velocity, limits=LIMITS, step_s=STEP_S)
+        slower = decelerate(velocity, limits=LIMITS, step_s=STEP_S)
         assert slower == pytest.approx(direction * np.linalg.norm(slower), abs=1e-12)
         velocity = slower
     assert (velocity == 0.0).all()
@@ -151,7 +151,7 @@ SHEET = SheetLimits(
     height_m=0.24,
     thickness_m=0.001,
     young_modulus_pa=1e6,
-    longest_m=0.2604,
+    max_length_m=0.2604,
     max_edge_force_n=20.0,
     max_twist_rad=0.2,
     min_flange_distance_m=0.15,
@@ -171,7 +171,7 @@ def edge(x: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
         (edge(-0.11), edge(0.11), None),
         (edge(-0.135), edge(0.135), "sheet of 270.0 mm, at most 260.4 mm"),
         (edge(-0.13015), edge(0.13015), "edge force 20"),
-        (edge(-0.125, (0.3, 0.0, 0.0)), edge(0.125), "edges turned by 17.2 degrees"),
+        (edge(-0.125, (0.3, 0.0, 0.0)), edge(0.125), "edges rotated by 17.2 degrees"),
         (
             edge(-0.125, (0.0, 0.0, 0.25)),
             edge(0.125, (0.0, 0.0, 0.25)),
@@ -182,23 +182,23 @@ def edge(x: float, rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Floats:
 def test_a_sheet_in_trouble_is_named(own: Floats, other: Floats, words: str | None) -> None:
     for left in (True, False):
         pair = (own, other) if left else (other, own)
-        found = sheet_trouble(*pair, left=left, limits=SHEET)
+        found = check_sheet(*pair, left=left, limits=SHEET)
         assert (found is None) if words is None else (found is not None and words in found)
 
 
 def test_edges_that_have_changed_places_are_in_trouble() -> None:
-    found = sheet_trouble(edge(0.12), edge(-0.12), left=True, limits=SHEET)
+    found = check_sheet(edge(0.12), edge(-0.12), left=True, limits=SHEET)
     assert found is not None
     assert "skewed by 180" in found
 
 
 def test_flanges_outside_the_workspace_or_too_near_are_in_trouble() -> None:
     far = transform(np.eye(3), [0.3, 0.0, 0.0])
-    assert place_trouble(transform(np.eye(3), [-0.15, 0.0, 0.0]), far, SHEET) is None
-    outside = place_trouble(transform(np.eye(3), [0.0, 0.0, 0.31]), far, SHEET)
+    assert check_flange(transform(np.eye(3), [-0.15, 0.0, 0.0]), far, SHEET) is None
+    outside = check_flange(transform(np.eye(3), [0.0, 0.0, 0.31]), far, SHEET)
     assert outside is not None
     assert "outside the workspace" in outside
-    near = place_trouble(transform(np.eye(3), [0.2, 0.0, 0.0]), far, SHEET)
+    near = check_flange(transform(np.eye(3), [0.2, 0.0, 0.0]), far, SHEET)
     assert near is not None
     assert "flanges 100 mm apart" in near
 
@@ -234,10 +234,10 @@ def test_from_any_state_no_goal_and_no_step_leads_out_of_bounds(
     after = joints + velocity * step_s
     assert np.isfinite(velocity).all()
     assert (np.abs(velocity) <= LIMITS.speed_rad_per_s * (1 + 1e-9)).all()
-    assert (after >= np.minimum(LIMITS.lowest_rad, joints) - 1e-9).all()
-    assert (after <= np.maximum(LIMITS.highest_rad, joints) + 1e-9).all()
+    assert (after >= np.minimum(LIMITS.min_rad, joints) - 1e-9).all()
+    assert (after <= np.maximum(LIMITS.max_rad, joints) + 1e-9).all()
     way = np.linalg.norm(tool_points(after) - tool_points(joints), axis=1).max()
-    assert way <= TOOL_SPEED * min(step_s, EVEN_STEP_S) * (1 + 1e-6) + 1e-15
+    assert way <= TOOL_SPEED * min(step_s, MAX_TRAVEL_STEP_S) * (1 + 1e-6) + 1e-15
 
 
 def test_after_a_long_gap_a_command_leads_no_further_than_after_an_even_one() -> None:
@@ -249,8 +249,8 @@ def test_after_a_long_gap_a_command_leads_no_further_than_after_an_even_one() ->
     for gap_s in (0.5 * STEP_S, STEP_S, 2.0 * STEP_S):
         moved = step(joints, velocity, far, np.zeros(6), gap_s) * gap_s
         way = np.linalg.norm(tool_points(joints + moved) - tool_points(joints), axis=1).max()
-        assert way <= TOOL_SPEED * min(gap_s, EVEN_STEP_S) * (1 + 1e-9)
-        assert way >= 0.9 * TOOL_SPEED * min(gap_s, EVEN_STEP_S)
+        assert way <= TOOL_SPEED * min(gap_s, MAX_TRAVEL_STEP_S) * (1 + 1e-9)
+        assert way >= 0.9 * TOOL_SPEED * min(gap_s, MAX_TRAVEL_STEP_S)
 
 
 def test_what_is_not_finite_is_trouble() -> None:
@@ -258,28 +258,31 @@ def test_what_is_not_finite_is_trouble() -> None:
     for row, column in ((0, 0), (1, 2), (0, 3), (2, 3)):
         broken = odd.copy()
         broken[row, column] = np.nan
-        assert sheet_trouble(sound, broken, left=True, limits=SHEET) is not None
-        assert sheet_trouble(broken, sound, left=False, limits=SHEET) is not None
+        assert check_sheet(sound, broken, left=True, limits=SHEET) is not None
+        assert check_sheet(broken, sound, left=False, limits=SHEET) is not None
         if column == 3:
-            assert place_trouble(sound, broken, SHEET) is not None
-            assert place_trouble(broken, sound, SHEET) is not None
-    assert step_trouble(np.full(6, np.nan), np.zeros(6), 0.1) is not None
+            assert check_flange(sound, broken, SHEET) is not None
+            assert check_flange(broken, sound, SHEET) is not None
+    assert check_tracking_error(np.full(6, np.nan), np.zeros(6), 0.1) is not None
 
 
 def test_a_command_far_from_the_measured_joints_is_trouble() -> None:
     joints = np.zeros(6)
-    assert step_trouble(joints + 0.1, joints, 0.12) is None
-    assert step_trouble(joints + 0.13, joints, 0.12) == "the arm trails its command by 7.4 degrees"
+    assert check_tracking_error(joints + 0.1, joints, 0.12) is None
+    assert (
+        check_tracking_error(joints + 0.13, joints, 0.12)
+        == "the arm trails its command by 7.4 degrees"
+    )
 
 
 def test_measured_places_have_some_slack_and_commanded_ones_none() -> None:
     far = transform(np.eye(3), [0.3, 0.0, 0.0])
     outside = transform(np.eye(3), [0.0, 0.0, 0.301])
-    assert place_trouble(outside, far, SHEET) is not None
-    assert place_trouble(outside, far, SHEET, slack_m=0.002) is None
+    assert check_flange(outside, far, SHEET) is not None
+    assert check_flange(outside, far, SHEET, slack_m=0.002) is None
     near = transform(np.eye(3), [0.1515, 0.0, 0.0])
-    assert place_trouble(near, far, SHEET) is not None
-    assert place_trouble(near, far, SHEET, slack_m=0.002) is None
+    assert check_flange(near, far, SHEET) is not None
+    assert check_flange(near, far, SHEET, slack_m=0.002) is None
 
 
 @settings(max_examples=100, deadline=None)
@@ -289,7 +292,7 @@ def test_the_turn_between_edges_is_the_angle_of_their_rotation(
 ) -> None:
     turned = transform_from_rpy(shift, tilt)
     angle = np.arccos(np.clip(0.5 * (np.trace(turned[:3, :3]) - 1.0), -1.0, 1.0))
-    found = sheet_trouble(transform(np.eye(3), [-0.1, 0.0, 0.0]), turned, left=True, limits=SHEET)
+    found = check_sheet(transform(np.eye(3), [-0.1, 0.0, 0.0]), turned, left=True, limits=SHEET)
     if angle > 0.201 and np.linalg.norm(turned[:3, 3] - [-0.1, 0.0, 0.0]) < 0.2401:
         assert found is not None
         assert f"turned by {np.degrees(angle):.1f}" in found or "force" in found

@@ -48,14 +48,16 @@ def recorded_schema(name: str) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kinematics", ["closed_form", "closed_form_continuous", None])
-def test_a_recorded_scene_is_read_with_the_method_names_of_today(kinematics: str | None) -> None:
+def test_a_recorded_scene_is_read_with_todays_methods_and_without_removed_ones(
+    kinematics: str | None,
+) -> None:
     recorded = next(message for name, message, *_ in BagReader(OLD_BAG) if name == "scene")
     fields = recorded.model_dump()
     fields["methods"] = {"kinematics": kinematics, "mark": "moments", "tracking": "hand"}
     migration = migration_for(Scene, "d7307561a5180666", recorded_schema("Scene"))
     assert migration is not None
     methods = Scene.model_validate(migration(fields)).methods
-    assert methods.kinematics == (None if kinematics is None else "closed_form_continuous")
+    assert not hasattr(methods, "kinematics")
     assert (methods.marker, methods.tracking) == ("moments", "singer_tremor")
 
 

@@ -15,7 +15,12 @@ from hypothesis import strategies as st
 from pymodbus.client import AsyncModbusTcpClient
 from pymodbus.exceptions import ModbusIOException
 
-from flexsheet.nodes.arm_bridge.link import ArmAnswerError, ArmRefusedError, ArmSilentError
+from flexsheet.nodes.arm_bridge.link import (
+    ArmAnswerError,
+    ArmFault,
+    ArmRefusedError,
+    ArmSilentError,
+)
 from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
@@ -61,7 +66,7 @@ def test_a_sound_status_is_decoded() -> None:
     status = decode_status(status_registers(faults=3))
     assert (status.accepted, status.cycle, status.time_us, status.refused) == (7, 9, 11, 2)
     assert status.state == "moving"
-    assert status.faults == ("joint out of range", "step too large")
+    assert status.faults == (ArmFault.JOINT_RANGE, ArmFault.STEP_SIZE)
     assert status.joints_rad == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6], abs=1e-7)
 
 
@@ -251,7 +256,7 @@ def test_the_map_is_frozen() -> None:
     status = decode_status(list(struct.unpack(">26H", block)))
     assert (status.accepted, status.cycle, status.time_us) == (0x01020304, 7, 0x0A0B0C0D)
     assert (status.state, status.refused) == ("fault", 5)
-    assert status.faults == ("joint out of range", "watchdog: no command")
+    assert status.faults == (ArmFault.JOINT_RANGE, ArmFault.WATCHDOG)
     assert status.joints_rad.tolist() == [0.5, -0.25, 1.5, 2.0, -1.0, 0.0]
 
 

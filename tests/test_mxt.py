@@ -37,9 +37,9 @@ from flexsheet.nodes.arm_bridge.mxt import (
     MxtLink,
     decode_answer,
     encode,
-    has_gone_on,
-    joints_packet,
-    pose_packet,
+    encode_joints,
+    encode_pose,
+    has_advanced,
 )
 from flexsheet.nodes.twin.arms import CONTROLLER_CYCLE_S, RANGE_RAD, SPEED_RAD_PER_S, Fault, forward
 from flexsheet.nodes.twin.mxt_controller import MxtController, MxtServer, numbers_of, pose_from
@@ -69,7 +69,7 @@ def test_the_document_has_the_layout_of_the_code() -> None:
 
 def test_the_bytes_of_a_command_are_the_makers() -> None:
     """Offsets from the maker's struct: command 0, types 2 and 4, data 8, counters 58 and 60."""
-    packet = joints_packet(np.array([0.5, -0.25, 1.5, 2.0, -1.0, 0.0]))
+    packet = encode_joints(np.array([0.5, -0.25, 1.5, 2.0, -1.0, 0.0]))
     assert len(packet) == 196
     assert packet[:8].hex() == "0100020008000000"
     assert packet[8:32].hex() == "0000003f000080be0000c03f00000040000080bf00000000"
@@ -146,15 +146,15 @@ def test_any_bytes_are_a_status_or_an_error(packet: bytes) -> None:
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 2**31 - 1))
 def test_a_counter_goes_on_over_its_end_and_not_back(count: int, steps: int) -> None:
-    assert has_gone_on((count + steps) % 2**32, count, 1)
-    assert has_gone_on((count + steps) % 2**32, count, steps)
-    assert not has_gone_on((count + steps) % 2**32, count, steps + 1)
-    assert not has_gone_on(count, (count + steps) % 2**32, 1)
-    assert not has_gone_on(count, count, 1)
+    assert has_advanced((count + steps) % 2**32, count, 1)
+    assert has_advanced((count + steps) % 2**32, count, steps)
+    assert not has_advanced((count + steps) % 2**32, count, steps + 1)
+    assert not has_advanced(count, (count + steps) % 2**32, 1)
+    assert not has_advanced(count, count, 1)
 
 
 @pytest.mark.parametrize("bad", [[0.0] * 5, [0.0] * 5 + [float("nan")], [0.0] * 5 + [np.inf]])
-@pytest.mark.parametrize("packet_of", [joints_packet, pose_packet])
+@pytest.mark.parametrize("packet_of", [encode_joints, encode_pose])
 def test_what_is_not_six_angles_is_never_sent(
     bad: list[float], packet_of: Callable[[Floats], bytes]
 ) -> None:
@@ -169,8 +169,8 @@ inside = arrays(np.float64, 6, elements=st.floats(0.02, 0.98)).map(
 
 @settings(max_examples=100, deadline=None)
 @given(inside)
-def test_a_pose_packet_says_where_the_flange_shall_be(joints: Floats) -> None:
-    numbers = np.array(struct.unpack_from("<8f", pose_packet(joints), 8), dtype=np.float64)
+def test_a_encode_pose_says_where_the_flange_shall_be(joints: Floats) -> None:
+    numbers = np.array(struct.unpack_from("<8f", encode_pose(joints), 8), dtype=np.float64)
     assert pose_from(numbers) == pytest.approx(kinematics.forward(joints), abs=2e-6)
 
 
@@ -216,7 +216,7 @@ def test_it_answers_each_packet_at_the_end_of_its_cycle_and_counts() -> None:
     arm.advance(0.0002)
     assert len(arm.answers) == 1
     arm.answers.clear()
-    counts = [decode_answer(ask(arm, joints_packet(JOINTS)) or b"").count for _ in range(3)]
+    counts = [decode_answer(ask(arm, encode_joints(JOINTS)) or b"").count for _ in range(3)]
     assert counts[1:] == [counts[0] + 1, counts[0] + 2]
 
 
@@ -226,7 +226,7 @@ def test_it_follows_set_points_through_filter_and_servo() -> None:
     rate = np.full(6, 0.3)
     for number in range(200):
         wanted = JOINTS + rate * number * CONTROLLER_CYCLE_S
-        ask(arm, joints_packet(wanted))
+        ask(arm, encode_joints(wanted))
     trailing_s = (wanted - arm.servo.joints_rad) / rate
     assert trailing_s == pytest.approx(np.full(6, 0.025), abs=0.002)
 
@@ -237,8 +237,8 @@ def test_it_takes_poses_as_it_takes_joints() -> None:
         ask(arm, encode(COMMAND_NONE))
     for number in range(30):
         wanted = JOINTS + 0.002 * number
-        ask(one, joints_packet(wanted))
-        ask(other, pose_packet(wanted))
+        ask(one, encode_joints(wanted))
+        ask(other, encode_pose(wanted))
     assert (one.error, other.error) == ("", "")
     assert other.wanted_rad == pytest.approx(one.wanted_rad, abs=1e-5)
 
@@ -250,10 +250,10 @@ def near(change: Floats | float) -> Floats:
 @pytest.mark.parametrize(
     ("packets", "words"),
     [
-        ([joints_packet(JOINTS)], "ahead of the first packet"),
-        ([encode(COMMAND_NONE), joints_packet(near(0.02))], "first set-point away"),
+        ([encode_joints(JOINTS)], "ahead of the first packet"),
+        ([encode(COMMAND_NONE), encode_joints(near(0.02))], "first set-point away"),
         (
-            [encode(COMMAND_NONE), joints_packet(JOINTS), joints_packet(near(0.06))],
+            [encode(COMMAND_NONE), encode_joints(JOINTS), encode_joints(near(0.06))],
             "set-point too far",
         ),
         ([encode(COMMAND_NONE), encode(COMMAND_MOVE)], "type 0"),
@@ -296,7 +296,7 @@ def test_what_it_must_not_do_ends_its_program(packets: list[bytes], words: str) 
 
 def test_its_operator_starts_the_program_again_after_a_while() -> None:
     arm = controller(restart_after_s=0.5)
-    ask(arm, joints_packet(JOINTS))
+    ask(arm, encode_joints(JOINTS))
     assert arm.error
     arm.advance(0.4)
     assert arm.error
@@ -307,9 +307,9 @@ def test_its_operator_starts_the_program_again_after_a_while() -> None:
 def test_a_gap_of_fifty_milliseconds_is_counted_and_lived_through() -> None:
     arm = controller()
     ask(arm, encode(COMMAND_NONE))
-    ask(arm, joints_packet(JOINTS))
+    ask(arm, encode_joints(JOINTS))
     arm.advance(0.05)
-    late = ask(arm, joints_packet(JOINTS))
+    late = ask(arm, encode_joints(JOINTS))
     assert late is not None
     assert decode_answer(late).timeouts == 7
     assert arm.error == ""
@@ -318,7 +318,7 @@ def test_a_gap_of_fifty_milliseconds_is_counted_and_lived_through() -> None:
 def test_another_master_is_ignored_until_the_first_has_ended() -> None:
     arm, other = controller(), ("127.0.0.1", 4712)
     ask(arm, encode(COMMAND_NONE))
-    assert ask(arm, joints_packet(JOINTS), other) is None
+    assert ask(arm, encode_joints(JOINTS), other) is None
     assert (arm.refused, arm.error) == (1, "")
     ask(arm, encode(COMMAND_END))
     assert ask(arm, encode(COMMAND_NONE), other) is not None
@@ -332,7 +332,7 @@ def test_no_bytes_crash_the_controller_or_move_the_arm_out_of_bounds(
     arm = controller(restart_after_s=0.02)
     if opened:
         ask(arm, encode(COMMAND_NONE))
-        ask(arm, joints_packet(JOINTS))
+        ask(arm, encode_joints(JOINTS))
     for packet in packets:
         before = arm.servo.joints_rad
         ask(arm, packet)

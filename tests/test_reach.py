@@ -29,24 +29,24 @@ from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import (
     CENTRE_RAD,
     WRIST_NEAR_RAD,
-    branch_of,
-    jacobian,
+    find_branch,
     next_joints,
 )
 from flexsheet.nodes.arm_bridge.reach import (
-    LARGEST_STEP_RAD,
     LIMITS,
+    MAX_STEP_RAD,
     SPEED_LIMITS,
     PathError,
-    Places,
-    arm_reach,
-    best_reach,
-    coordinated_path,
+    SheetPoses,
+    compute_reach,
+    find_best_reach,
     flange_poses,
+    plan_path,
 )
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy
 from flexsheet.nodes.twin.arms import forward as twin_forward
+from tests.arm_jacobian import jacobian
 
 Floats = NDArray[np.float64]
 
@@ -54,15 +54,15 @@ ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 SCENE = load_scene(SCENE_FILE)
 LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
-FRONT = branch_of(CENTRE_RAD)
+FRONT = find_branch(CENTRE_RAD)
 
 
 def sheet(position_m: Any, rpy_rad: Any = (0.0, 0.0, 0.0), stretch: float = 1.04) -> SheetMotion:
     return SheetMotion(transform_from_rpy(position_m, rpy_rad), np.zeros(6), stretch, 0.0)
 
 
-def places(*motions: SheetMotion, twists: Floats | None = None) -> Places:
-    return Places(
+def places(*motions: SheetMotion, twists: Floats | None = None) -> SheetPoses:
+    return SheetPoses(
         np.array([motion.world_from_sheet for motion in motions]),
         np.array([motion.stretch_ratio for motion in motions]),
         np.empty((len(motions), 0, 6)) if twists is None else twists,
@@ -95,7 +95,9 @@ def test_the_joints_hold_the_sheet_by_the_twins_arms(
     position: tuple[float, ...], rpy: tuple[float, ...], stretch: float
 ) -> None:
     wanted = sheet(position, rpy, stretch)
-    both = [best_reach(arm, other, places(wanted)) for arm, other in ((LEFT, RIGHT), (RIGHT, LEFT))]
+    both = [
+        find_best_reach(arm, other, places(wanted)) for arm, other in ((LEFT, RIGHT), (RIGHT, LEFT))
+    ]
     assume(all(np.isfinite(one.joints_rad).all() for one in both))
     left, right = edges_by_the_twin(both[0].joints_rad[0], both[1].joints_rad[0])
     assert right[:3, 3] - left[:3, 3] == pytest.approx(
@@ -110,7 +112,7 @@ def test_the_joints_hold_the_sheet_by_the_twins_arms(
 @given(near, near, lean, st.lists(st.floats(-0.3, 0.3), min_size=6, max_size=6))
 def test_speeds_are_those_of_the_jacobian(y: float, z: float, roll: float, twist: Any) -> None:
     where = places(sheet((0.0, y, z), (roll, 0.0, 0.0)), twists=np.array(twist).reshape(1, 1, 6))
-    reach = arm_reach(LEFT, RIGHT, where, FRONT)
+    reach = compute_reach(LEFT, RIGHT, where, FRONT)
     assume(reach.margins["wrist singularity"][0] > 0.0)
     flange = flange_poses(LEFT, where)[0]
     linear, angular = np.split(np.array(twist), 2)
@@ -134,8 +136,8 @@ def test_speeds_are_those_of_the_jacobian(y: float, z: float, roll: float, twist
     ],
 )
 def test_each_limit_binds_where_it_should(wanted: SheetMotion, limit: str) -> None:
-    reach = arm_reach(LEFT, RIGHT, places(sheet((0.0, 0.0, 0.0)), wanted), FRONT)
-    assert reach.reached.tolist() == [True, False]
+    reach = compute_reach(LEFT, RIGHT, places(sheet((0.0, 0.0, 0.0)), wanted), FRONT)
+    assert reach.reachable.tolist() == [True, False]
     assert LIMITS[reach.binding[1]] == limit
     assert reach.margins[limit][1] < 0.0 < reach.margins[limit][0]
 
@@ -144,26 +146,26 @@ def test_the_workspace_binds_where_the_arm_could_go_on() -> None:
     arms = SCENE.arms.model_copy(update={"workspace_max_m": np.array([0.4, 0.3, 0.1])})
     smaller = ArmGeometry(SCENE.model_copy(update={"arms": arms}), "left")
     where = places(sheet((0.0, 0.0, 0.09)), sheet((0.0, 0.0, 0.11)))
-    reach = arm_reach(smaller, RIGHT, where, FRONT)
+    reach = compute_reach(smaller, RIGHT, where, FRONT)
     assert [LIMITS[one] if one >= 0 else "" for one in reach.binding] == ["", "workspace"]
     assert reach.margins["workspace"] == pytest.approx([0.01, -0.01])
-    assert arm_reach(LEFT, RIGHT, where, FRONT).reached.all()
+    assert compute_reach(LEFT, RIGHT, where, FRONT).reachable.all()
 
 
 def test_a_place_too_fast_to_follow_is_reached_all_the_same() -> None:
     fast = np.array([[[0.0, 0.0, 0.3, 0.0, 0.0, 0.0]], [[0.0, 0.0, 0.2, 0.0, 0.0, 0.0]]])
     where = places(sheet((0.0, 0.0, 0.0)), sheet((0.0, 0.0, 0.0)), twists=fast)
-    reach = arm_reach(LEFT, RIGHT, where, FRONT)
-    assert reach.reached.tolist() == [True, True]
-    assert reach.followed.tolist() == [False, True]
+    reach = compute_reach(LEFT, RIGHT, where, FRONT)
+    assert reach.reachable.tolist() == [True, True]
+    assert reach.trackable.tolist() == [False, True]
     assert LIMITS[reach.binding[0]] in SPEED_LIMITS
     most = LEFT.max_tool_speed
     assert reach.margins["tool speed"] == pytest.approx([1.0 - 0.3 / most, 1.0 - 0.2 / most])
 
 
 def test_no_places_are_all_reached() -> None:
-    none = Places(np.empty((0, 4, 4)), np.empty(0), np.empty((0, 2, 6)))
-    assert arm_reach(LEFT, RIGHT, none, FRONT).reached.all()
+    none = SheetPoses(np.empty((0, 4, 4)), np.empty(0), np.empty((0, 2, 6)))
+    assert compute_reach(LEFT, RIGHT, none, FRONT).reachable.all()
 
 
 def assert_sound(path: Any, start: SheetMotion, goal: SheetMotion) -> None:
@@ -185,9 +187,9 @@ def assert_sound(path: Any, start: SheetMotion, goal: SheetMotion) -> None:
         assert left[:3, :3] == pytest.approx(right[:3, :3], abs=1e-9)
     for arm, joints in ((LEFT, path.left_rad), (RIGHT, path.right_rad)):
         steps = np.abs(np.diff(joints, axis=0))
-        assert steps.max(initial=0.0) <= LARGEST_STEP_RAD
-        assert (joints >= arm.joint_limits.lowest_rad).all()
-        assert (joints <= arm.joint_limits.highest_rad).all()
+        assert steps.max(initial=0.0) <= MAX_STEP_RAD
+        assert (joints >= arm.joint_limits.min_rad).all()
+        assert (joints <= arm.joint_limits.max_rad).all()
         assert (np.abs(joints[:, 4]) >= WRIST_NEAR_RAD).all()
         times = np.diff(path.times_s)[:, None]
         assert (steps <= times * arm.joint_limits.speed_rad_per_s * (1.0 + 1e-9)).all()
@@ -200,20 +202,20 @@ def test_a_way_between_two_places_keeps_the_edges_together(
 ) -> None:
     start = sheet((0.0, here[0], here[1]), (here[2], 0.0, 0.0), 1.02)
     goal = sheet((0.0, there[0], there[1]), (there[2], 0.0, 0.0), 1.07)
-    assert_sound(coordinated_path(LEFT, RIGHT, start, goal), start, goal)
+    assert_sound(plan_path(LEFT, RIGHT, start, goal), start, goal)
 
 
 def test_a_way_to_where_one_is_takes_no_time() -> None:
     start = sheet((0.0, 0.0, 0.0))
-    path = coordinated_path(LEFT, RIGHT, start, start)
+    path = plan_path(LEFT, RIGHT, start, start)
     assert_sound(path, start, start)
     assert path.times_s[-1] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_way_begins_with_the_joints_given() -> None:
     start, goal = sheet((0.0, 0.0, 0.0)), sheet((0.0, 0.03, 0.05), (0.4, 0.0, 0.0))
-    joints = best_reach(LEFT, RIGHT, places(start)).joints_rad[0]
-    path = coordinated_path(LEFT, RIGHT, start, goal, left_rad=joints)
+    joints = find_best_reach(LEFT, RIGHT, places(start)).joints_rad[0]
+    path = plan_path(LEFT, RIGHT, start, goal, left_rad=joints)
     assert path.left_rad[0] == pytest.approx(joints, abs=1e-9)
     assert path.via_m is None
 
@@ -229,10 +231,10 @@ def test_where_the_straight_way_is_barred_it_goes_round() -> None:
             for _ in range(2)
         )
     with pytest.raises(PathError) as barred:
-        coordinated_path(LEFT, RIGHT, start, goal, detours_m=())
+        plan_path(LEFT, RIGHT, start, goal, detours_m=())
     assert barred.value.limit == "J5 range"
-    assert 0.4 < barred.value.share < 0.6
-    found = coordinated_path(LEFT, RIGHT, start, goal)
+    assert 0.4 < barred.value.fraction < 0.6
+    found = plan_path(LEFT, RIGHT, start, goal)
     assert found.via_m is not None
     assert_sound(found, start, goal)
 
@@ -247,14 +249,14 @@ def test_where_the_straight_way_is_barred_it_goes_round() -> None:
 )
 def test_a_way_that_no_arm_can_go_says_why(goal: SheetMotion, side: str, limit: str) -> None:
     with pytest.raises(PathError, match=f"{side} arm") as caught:
-        coordinated_path(LEFT, RIGHT, sheet((0.0, 0.0, 0.0)), goal)
+        plan_path(LEFT, RIGHT, sheet((0.0, 0.0, 0.0)), goal)
     assert (caught.value.side, caught.value.limit) == (side, limit)
-    assert 0.0 < caught.value.share <= 1.0
+    assert 0.0 < caught.value.fraction <= 1.0
 
 
 def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_no() -> None:
     # The bridge follows with a bounded error; a layout must keep clear of it all the same.
-    present = best_reach(LEFT, RIGHT, places(turned_about_the_left_edge(0.0))).joints_rad[0]
+    present = find_best_reach(LEFT, RIGHT, places(turned_about_the_left_edge(0.0))).joints_rad[0]
     signs = []
     for yaw in np.linspace(0.0, -0.9, 200):
         pose = flange_poses(LEFT, places(turned_about_the_left_edge(yaw)))[0]
@@ -263,7 +265,7 @@ def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_
         signs.append(np.sign(present[4]))
     assert signs[0] == -signs[-1]
     asked = places(*(turned_about_the_left_edge(yaw) for yaw in (-0.4, -0.6)))
-    assert arm_reach(LEFT, RIGHT, asked, FRONT).reached.tolist() == [True, False]
+    assert compute_reach(LEFT, RIGHT, asked, FRONT).reachable.tolist() == [True, False]
 
 
 def barred_scene() -> Scene:
@@ -309,16 +311,18 @@ def test_the_samples_cover_the_working_range(demo: Layout) -> None:
 
 def test_a_base_too_far_off_is_found_out_and_a_remedy_works(barred: Layout) -> None:
     assert not barred.reachable
-    assert barred.right.reached.all()
-    assert not barred.left.reached.all()
+    assert barred.right.reachable.all()
+    assert not barred.left.reachable.all()
     binding = {one["limit"] for one in layout_result(barred)["arms"]["left"]["binding"]}
     assert {"reach", "J3 range"} <= binding
     moved = [one for one in barred.remedies if "left_base_offset_m" in one.values]
     assert len(moved) == 1
     offset = np.array(moved[0].values["left_base_offset_m"])
     again = with_base_moved(barred_scene(), "left", offset)
-    reach = best_reach(ArmGeometry(again, "left"), RIGHT, samples_of(again, touches(again)).places)
-    assert reach.reached.all()
+    reach = find_best_reach(
+        ArmGeometry(again, "left"), RIGHT, samples_of(again, touches(again)).places
+    )
+    assert reach.reachable.all()
 
 
 def test_the_first_place_that_binds_is_the_nearest_to_the_front(barred: Layout) -> None:
@@ -341,7 +345,7 @@ def test_less_tilt_helps_where_a_base_cannot() -> None:
     for remedy in found.remedies:
         if "tilt_rad" in remedy.values:
             kept = np.abs(found.samples.tilt_rad) <= remedy.values["tilt_rad"]
-            assert found.reached[kept].all()
+            assert found.reachable[kept].all()
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -9,8 +10,10 @@ import numpy as np
 import pytest
 from pydantic import create_model
 from ruamel.yaml import YAML
+from typer.main import get_command
 
 from flexsheet.launch.bags.replay import lives_in
+from flexsheet.launch.commands import arms
 from flexsheet.launch.plans import renamed_keys
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph, load_scene
@@ -190,3 +193,30 @@ def test_an_old_topic_gets_an_error_that_names_the_new_one(old: str, new: str) -
     assert new in TOPICS
     with pytest.raises(UnknownTopicError, match=f'unknown topic "{old}"; it is now "{new}"'):
         topic_named(old)
+
+
+def test_a_removed_method_in_a_scene_gets_an_error_that_says_to_remove_it(tmp_path: Path) -> None:
+    content = YAML(typ="safe").load(SCENE_FILE.read_text())
+    content["methods"] = {"kinematics": "closed_form_continuous"}
+    file = tmp_path / "scene.yaml"
+    YAML().dump(content, file)
+    with pytest.raises(BadInputError, match='unknown key "kinematics"; remove it'):
+        load_scene(file)
+
+
+@pytest.mark.parametrize("old", renamed_keys.VALUES["arming"])
+def test_an_old_arming_gets_an_error_that_names_the_new_one(tmp_path: Path, old: str) -> None:
+    file = tmp_path / "old.yaml"
+    nodes = {"one": {"type": "arm_bridge", "parameters": {"side": "left", "arming": old}}}
+    YAML().dump({"nodes": nodes}, file)
+    with pytest.raises(BadInputError, match=f'it is now "{renamed_keys.VALUES["arming"][old]}"'):
+        load_graph(file)
+
+
+@pytest.mark.parametrize(("old", "new"), [("ready", "enable"), ("stand-down", "disable")])
+def test_an_old_command_of_the_arms_is_a_hidden_alias(old: str, new: str) -> None:
+    commands: dict[str, Any] = getattr(get_command(arms.app), "commands")  # noqa: B009
+    assert commands[old].hidden
+    assert not commands[new].hidden
+    callbacks = [inspect.unwrap(commands[name].callback) for name in (old, new)]
+    assert callbacks[0] is callbacks[1]

@@ -108,7 +108,7 @@ async def next_states(lab: Lab, side: str, count: int) -> list[ArmState]:
 
 async def test_arms_that_stroke_stop_with_what_fails_and_move_when_told_so() -> None:
     troubles = Troubles()
-    async with Lab(arming="by_command", watchdog_s=0.8, **PATIENT) as lab:
+    async with Lab(arming="manual", watchdog_s=0.8, **PATIENT) as lab:
         await last_weeks_plan_is_refused(lab)
         lab.stroke()
         await lab.until(lambda: lab.modes() == {"idle"}, "both arms to stand")

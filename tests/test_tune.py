@@ -31,7 +31,6 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.arm_bridge.kinematics import KINEMATICS
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from flexsheet.nodes.methods import Case, Family, Point, Trial
 from flexsheet.nodes.planner.force_table import law_by
@@ -374,14 +373,14 @@ def run(*arguments: object) -> Any:
 
 def test_a_real_family_is_tuned_by_the_command(tmp_path: Path) -> None:
     out = tmp_path / "tuned.yaml"
-    command = [SCENES / "light-touch.yaml", "--family", "kinematics", "--output", out, "--json"]
+    command = [SCENES / "light-touch.yaml", "--family", "triangulation", "--output", out, "--json"]
     outcome = run(*command)
     assert outcome.exit_code == 0, outcome.output
     result = json.loads(outcome.stdout)
     assert result["met"]
     (only,) = result["families"]
-    assert only["chosen"].startswith("closed_form")
-    assert load_scene(out).methods.kinematics == only["setting"]
+    assert only["chosen"] == "dlt"
+    assert load_scene(out).methods.triangulation == only["setting"]
 
 
 def test_a_miss_has_an_exit_code_of_its_own(
@@ -423,8 +422,6 @@ def test_families_ask_for_the_scenes_own_cases_only() -> None:
     asked_for = [trial for trial in TRIANGULATION.trials(wider) if trial.in_scene]
     assert {trial.case["baseline_mm"] for trial in asked_for} == {130.0}
     assert all(trial.in_range for trial in asked_for)
-    tilts = [trial.case for trial in KINEMATICS.trials(SCENE) if trial.in_scene]
-    assert all("tilt_deg" in case for case in tilts)
 
 
 @pytest.mark.parametrize(("name", "missed"), [("light-touch", False), ("demanding", True)])

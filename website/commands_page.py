@@ -25,10 +25,12 @@ files.  What a message means: [errors.md](errors.md).
 
 
 def commands(group: Any = None, words: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """All commands that do something, by what is typed."""
+    """Yield all commands but hidden aliases, with the words that call them."""
     group = group or get_command(app)
     for name, command in group.commands.items():
         path = (*words, name)
+        if command.hidden:
+            continue
         if not hasattr(command, "commands"):
             yield " ".join(path), command
             continue

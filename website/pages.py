@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 from flexsheet.messages import reference as messages_page
-from website import commands_page, errors_page, parameters_page, registers_page
+from website import arm_states_page, commands_page, errors_page, parameters_page, registers_page
 from website.graph import PICTURES, svg
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
@@ -18,13 +18,14 @@ DOCS = Path(__file__).resolve().parent.parent / "docs"
 def generate(docs: Path) -> dict[Path, str]:
     """Return the contents of all generated files by their path relative to the folder of pages.
 
-    docs: folder with modbus.md, of which only a part is generated.
+    docs: folder with arms.md and modbus.md, of which only a part is generated.
     """
     return {
         Path("messages.md"): messages_page.reference(),
         Path("cli.md"): commands_page.reference(),
         Path("parameters.md"): parameters_page.reference(),
         Path("errors.md"): errors_page.reference(),
+        Path("arms.md"): arm_states_page.page((docs / "arms.md").read_text(encoding="utf-8")),
         Path("modbus.md"): registers_page.page((docs / "modbus.md").read_text(encoding="utf-8")),
         **{Path("images") / name: svg(picture) for name, picture in PICTURES.items()},
     }

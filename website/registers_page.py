@@ -5,13 +5,14 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
+from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS
 from flexsheet.nodes.arm_bridge.modbus import (
     COMMAND,
     COMMAND_ADDRESS,
     FAULT_BITS,
     STATUS,
     STATUS_ADDRESS,
-    Field,
+    RegisterField,
     register_count,
 )
 
@@ -21,18 +22,23 @@ KINDS = {"H": "u16", "I": "u32", "f": "float32"}
 
 
 def page(text: str) -> str:
-    """The page with its register map as the code has it; ValueError where it lacks the marks."""
-    before, begin, rest = text.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        raise ValueError(f"the page needs the marks {BEGIN.strip()} and {END.strip()}")
-    return f"{before}{begin}\n{registers()}\n{end}{after}"
+    """Return the page with the register map of the code; ValueError if a mark is missing."""
+    return replace_block(text, BEGIN, END, registers())
+
+
+def replace_block(text: str, begin: str, end: str, content: str) -> str:
+    """Return the text with `content` between two marks; ValueError if a mark is missing."""
+    before, first, rest = text.partition(begin)
+    _, last, after = rest.partition(end)
+    if not (first and last):
+        raise ValueError(f"the page needs the marks {begin.strip()} and {end.strip()}")
+    return f"{before}{first}\n{content}\n{last}{after}"
 
 
 def registers() -> str:
     """Both blocks and the fault bits."""
     bits = ["Fault bits:", "", "| bit | meaning |", "|---|---|"]
-    bits += [f"| {bit} | {words} |" for bit, words in FAULT_BITS.items()]
+    bits += [f"| {bit} | {FAULT_TEXTS[fault]} |" for bit, fault in FAULT_BITS.items()]
     blocks = [
         _block("Command", COMMAND_ADDRESS, COMMAND),
         _block("Status", STATUS_ADDRESS, STATUS),
@@ -41,7 +47,7 @@ def registers() -> str:
     return "\n".join(blocks)
 
 
-def _block(title: str, address: int, block: Sequence[Field]) -> str:
+def _block(title: str, address: int, block: Sequence[RegisterField]) -> str:
     """A block's heading and table; address: of its first register."""
     lines = [f"## {title}: {register_count(block)} registers from {address}", ""]
     lines += ["| register | field | type | meaning |", "|---|---|---|---|"]

@@ -1,4 +1,4 @@
-"""`flexsheet arms`: whether the arms may move, how they are, and a stop."""
+"""`flexsheet arms`: show, enable, disable, stop and reset the arms of a running graph."""
 
 from __future__ import annotations
 
@@ -34,45 +34,44 @@ if TYPE_CHECKING:
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="The arms of the graph that runs: ready, stop, reset.",
+    help="Show, enable, disable, stop and reset the arms of a running graph.",
 )
 
 SIDES = ("left", "right")
 TOPICS = ("arm_left", "arm_right")
-ANSWER_S = 3.0
-FRESH_S, TURN_S = 0.5, 0.02
+CONFIRMATION_TIMEOUT_S = 3.0
+MAX_STATE_AGE_S, POLL_PERIOD_S = 0.5, 0.02
 
-ReasonOption = Annotated[str, typer.Option("--reason", help="Why, for whoever reads it.")]
+ReasonOption = Annotated[str, typer.Option("--reason", help="Reason to show and to log.")]
 
 
 @app.command(epilog=examples("flexsheet arms status", "flexsheet arms status --json"))
 def status(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """How the arms are; exit code 1 when one says nothing."""
-    raise typer.Exit(run_interruptible(_say(run, None, lambda arms: len(arms) == 2, as_json)))
+    """Show the state of both arms; exit code 1 if one does not report."""
+    raise typer.Exit(run_interruptible(_command(run, None, lambda arms: len(arms) == 2, as_json)))
 
 
-@app.command(epilog=examples("flexsheet arms ready"))
-def ready(run: RunOption = None, as_json: JsonOption = False) -> None:
-    """Let the arms move.  Look first that nobody is near them.
+@app.command("ready", hidden=True, epilog=examples("flexsheet arms ready"))
+@app.command(epilog=examples("flexsheet arms enable"))
+def enable(run: RunOption = None, as_json: JsonOption = False) -> None:
+    """Let the arms move.  Make sure first that nobody is near them.
 
-    Exit code 1 when an arm refuses; its reason is shown.
+    Exit code 1 if an arm refuses; its reason is shown.
     """
     from flexsheet.messages.types import Arming
 
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and all(arm.ready for arm in arms.values())
 
-    raise typer.Exit(run_interruptible(_say(run, ("arming", Arming(ready=True)), done, as_json)))
+    raise typer.Exit(
+        run_interruptible(_command(run, ("arming", Arming(ready=True)), done, as_json))
+    )
 
 
-@app.command(
-    "stand-down",
-    epilog=examples("flexsheet arms stand-down --reason 'end of the session'"),
-)
-def stand_down(
-    reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False
-) -> None:
-    """Bring both arms to rest in order, and let the sheet go slack; `ready` ends it."""
+@app.command("stand-down", hidden=True, epilog=examples("flexsheet arms stand-down"))
+@app.command(epilog=examples("flexsheet arms disable --reason 'end of the session'"))
+def disable(reason: ReasonOption = "", run: RunOption = None, as_json: JsonOption = False) -> None:
+    """Bring both arms to rest and slacken the sheet, until `flexsheet arms enable`."""
     from flexsheet.messages.types import Arming
 
     message = Arming(ready=False, reason=reason)
@@ -80,18 +79,18 @@ def stand_down(
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and not any(arm.ready for arm in arms.values())
 
-    raise typer.Exit(run_interruptible(_say(run, ("arming", message), done, as_json)))
+    raise typer.Exit(run_interruptible(_command(run, ("arming", message), done, as_json)))
 
 
 @app.command(epilog=examples("flexsheet arms stop"))
 def stop(
     reason: ReasonOption = "flexsheet arms stop", run: RunOption = None, as_json: JsonOption = False
 ) -> None:
-    """E-stop by software: both arms stop and stay; it latches.  Never instead of the red button.
+    """Engage the software e-stop, which latches; it never replaces the hard-wired stop.
 
-    Without --run every graph of yours on this computer is stopped.
+    Without --run, all graphs of this user on this computer stop.
 
-    Exit code 0 when a launcher or a bridge has confirmed it, or both arms show it.
+    Exit code 0 if a launcher or a bridge has confirmed the stop, or both arms report it.
     """
     from flexsheet.launch.running.runs import live_runs
     from flexsheet.launch.running.stopping import sent_early, stop_arms
@@ -106,7 +105,7 @@ def stop(
 async def _confirm_stop(
     run_directory: Path | None, reason: str, attempts: list[StopAttempt], as_json: bool
 ) -> int:
-    """Publish the stop too where no launcher has confirmed it; show how the arms are then."""
+    """Publish the stop unless a launcher has confirmed it; show the state of the arms."""
     from flexsheet.launch.running.stopping import StopOutcome, StopPath
     from flexsheet.messages.types import EStop
 
@@ -120,29 +119,29 @@ async def _confirm_stop(
             return len(states) == 2 and all(arm.mode == "estop" for arm in states.values())
 
         shown = await arms.wait_for(stopped)
-    good = shown or any(one.worked for one in attempts)
-    _show_stop(arms.states, attempts, good, as_json)
+    confirmed = shown or any(one.worked for one in attempts)
+    _show_stop(arms.states, attempts, confirmed, as_json)
     for text in arms.problems:
         words.print(text, markup=False)
     if not shown:
         silent = [side for side, state in arms.states.items() if state.mode != "estop"]
         silent += [side for side in SIDES if side not in arms.states]
-        words.print(f"[red]not confirmed by the arms themselves[/]: {', '.join(silent)}")
+        words.print(f"[red]not confirmed by the arms[/]: {', '.join(silent)}")
     if any(one.outcome is StopOutcome.REFUSED for one in attempts):
         words.print("another tool holds the endpoint of the topic estop")
-    return 0 if good else FAILED
+    return 0 if confirmed else FAILED
 
 
-@app.command(epilog=examples("flexsheet arms reset --reason 'looked at, all clear'"))
+@app.command(epilog=examples("flexsheet arms reset --reason 'inspected, all clear'"))
 def reset(
     reason: ReasonOption = "flexsheet arms reset",
     run: RunOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Clear an e-stop and latched faults, once the arms are at rest.
+    """Clear an e-stop and latched faults of arms at rest.
 
-    Arms that wait for `arms ready` stay where they are.  Arms with `arming: by_itself`, which are
-    simulated, follow at once when there is a target.
+    Arms with `arming: manual` stay where they are until `flexsheet arms enable`.  Simulated arms
+    with `arming: auto` move as soon as there is a target.
     """
     from flexsheet.messages.types import EStop
 
@@ -151,39 +150,36 @@ def reset(
     def done(arms: dict[str, ArmState]) -> bool:
         return len(arms) == 2 and not any(arm.faults for arm in arms.values())
 
-    code = run_interruptible(_say(run, ("estop", message), done, as_json))
+    code = run_interruptible(_command(run, ("estop", message), done, as_json))
     if code == 0:
-        words.print(_what_moves(running_graph(run)[0]))
+        words.print(_describe_reset(running_graph(run)[0]))
     raise typer.Exit(code)
 
 
-def _what_moves(plan: ResolvedGraph) -> str:
-    """What the arms of a plan do after a reset, by their bridges' `arming`."""
+def _describe_reset(plan: ResolvedGraph) -> str:
+    """Return what the arms of a plan do after a reset, by their bridges' `arming`."""
     arming = {
         str(node.arm_side): node.parameters.get("arming")
         for node in plan.nodes.values()
         if node.role is NodeRole.ARM_BRIDGE
     }
-    waiting = [side for side, how in arming.items() if how != "by_itself"]
+    waiting = [side for side, kind in arming.items() if kind != "auto"]
     free = [side for side in arming if side not in waiting]
     sentences = ["reset"]
     if waiting:
-        sentences.append(f"{' and '.join(waiting)}: moves again only after flexsheet arms ready")
+        sentences.append(f"{' and '.join(waiting)}: moves again only after flexsheet arms enable")
     if free:
-        sentences.append(
-            f"{' and '.join(free)}: moves by itself as soon as there is a target "
-            "(arming: by_itself)"
-        )
+        sentences.append(f"{' and '.join(free)}: moves as soon as there is a target (arming: auto)")
     return "; ".join(sentences)
 
 
 class _Arms:
-    """The arms of a running graph, as their bridges publish them; use as an async context."""
+    """Read the arms' states of a running graph, and publish to them; an async context."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
         self._loop = asyncio.get_running_loop()
-        self._came_s: dict[str, float] = {}
+        self._received_s: dict[str, float] = {}
         self._subscribers: list[Subscriber] = []
         self._writer: GraphWriter | None = None
         self.states: dict[str, ArmState] = {}
@@ -195,7 +191,7 @@ class _Arms:
         for topic in TOPICS:
             self._subscribers.append(
                 make_subscriber(
-                    topic, self._plan, self._run, self._take, on_problem=self.problems.append
+                    topic, self._plan, self._run, self._on_state, on_problem=self.problems.append
                 )
             )
             self._subscribers[-1].start()
@@ -207,11 +203,11 @@ class _Arms:
         for subscriber in self._subscribers:
             subscriber.close()
 
-    def _take(self, state: Any, _: Any) -> None:
-        self.states[state.side], self._came_s[state.side] = state, self._loop.time()
+    def _on_state(self, state: Any, _: Any) -> None:
+        self.states[state.side], self._received_s[state.side] = state, self._loop.time()
 
     async def publish(self, topic: str, message: Message) -> None:
-        """Send it once readers have connected, and once only: a person means now."""
+        """Send a message once, after its readers have connected."""
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
 
         self._writer = GraphWriter(self._plan, self._run, [topic])
@@ -219,7 +215,7 @@ class _Arms:
         self._writer.publish(topic, message)
 
     async def publish_stop(self, estop: EStop) -> StopAttempt:
-        """Send it at once: it is latched, and readers get it as they connect."""
+        """Send a stop at once; it is latched, so later readers receive it too."""
         from flexsheet.launch.running.stopping import StopAttempt, StopOutcome, StopPath
         from flexsheet.launch.running.tools import READER_RECONNECT_S, GraphWriter
         from flexsheet.messages.bus import BusError
@@ -228,59 +224,62 @@ class _Arms:
         try:
             self._writer = GraphWriter(self._plan, self._run, ["estop"])
             self._writer.publish("estop", estop)
-            # The last reader may be a launcher, which is to keep it.
+            # The last reader may be a launcher, which stores it.
             await asyncio.sleep(READER_RECONNECT_S)
         except BusError:
             outcome = StopOutcome.REFUSED
         return StopAttempt(StopPath.TOPIC, "estop", outcome, 1e3 * (self._loop.time() - begun_s))
 
     async def wait_for(self, done: Callable[[dict[str, ArmState]], bool]) -> bool:
-        """Whether `done` holds of fresh states within `ANSWER_S`."""
-        for _ in range(round(ANSWER_S / TURN_S)):
+        """Return whether fresh states satisfy `done` within CONFIRMATION_TIMEOUT_S."""
+        for _ in range(round(CONFIRMATION_TIMEOUT_S / POLL_PERIOD_S)):
             now_s = self._loop.time()
             if done(
-                {s: arm for s, arm in self.states.items() if now_s - self._came_s[s] < FRESH_S}
+                {
+                    s: arm
+                    for s, arm in self.states.items()
+                    if now_s - self._received_s[s] < MAX_STATE_AGE_S
+                }
             ):
                 return True
-            await asyncio.sleep(TURN_S)
+            await asyncio.sleep(POLL_PERIOD_S)
         return False
 
 
-async def _say(
+async def _command(
     run_directory: Path | None,
-    word: tuple[str, Message] | None,
+    command: tuple[str, Message] | None,
     done: Callable[[dict[str, ArmState]], bool],
     as_json: bool,
 ) -> int:
-    """Say a word to both arms and wait until it holds; show how they are then."""
+    """Publish a command to both arms, wait until it has acted, and show their state."""
     from flexsheet.launch.running.tools import tools_host
 
     plan, run = running_graph(run_directory)
-    _refuse_reset_from_elsewhere(plan, tools_host(run), word)
+    _check_may_reset(plan, tools_host(run), command)
     async with _Arms(plan, run) as arms:
-        if word is not None:
-            await arms.publish(*word)
-        good = await arms.wait_for(done)
+        if command is not None:
+            await arms.publish(*command)
+        confirmed = await arms.wait_for(done)
     _show(arms.states, as_json)
     for text in arms.problems:
         words.print(text, markup=False)
-    if not good:
-        words.print("[red]not so[/]: see the reasons; each bridge's log says what it refused")
-    return 0 if good else FAILED
+    if not confirmed:
+        words.print("[red]not confirmed[/]: see the reasons above and the bridges' logs")
+    return 0 if confirmed else FAILED
 
 
-def _refuse_reset_from_elsewhere(
-    plan: ResolvedGraph, host: str, word: tuple[str, Message] | None
-) -> None:
+def _check_may_reset(plan: ResolvedGraph, host: str, command: tuple[str, Message] | None) -> None:
     from flexsheet.launch.plans.plan_model import tools_on
     from flexsheet.messages.types import EStop
 
-    if word is None or not isinstance(word[1], EStop) or word[1].engaged:
+    if command is None or not isinstance(command[1], EStop) or command[1].engaged:
         return
     if tools_on(host) not in plan.may_reset_estop():
         raise CommandError(
-            f'host "{host}" may not reset an e-stop; do it on {", ".join(plan.estop_resetters)}, '
-            f"or let it: hosts.{host}.may_reset_estop in {plan.launch_file}",
+            f'host "{host}" may not reset an e-stop; reset it on '
+            f"{', '.join(plan.estop_resetters)}, "
+            f"or set hosts.{host}.may_reset_estop in {plan.launch_file}",
             BAD_INPUT,
         )
 
@@ -291,7 +290,7 @@ def _rows(arms: dict[str, ArmState]) -> list[dict[str, Any]]:
             "side": side,
             "mode": arms[side].mode if side in arms else "silent",
             "ready": side in arms and arms[side].ready,
-            "reason": arms[side].reason if side in arms else "nothing came from its bridge",
+            "reason": arms[side].reason if side in arms else "no message from its bridge",
             "faults": list(arms[side].faults) if side in arms else [],
         }
         for side in SIDES

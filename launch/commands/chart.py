@@ -32,7 +32,7 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
     epilog=examples(
         "flexsheet chart tracking",
         "flexsheet chart triangulation --cases",
-        "flexsheet chart kinematics --scene lab.yaml --json",
+        "flexsheet chart marker --scene lab.yaml --json",
         "flexsheet chart --output docs/charts --redraw",
     )
 )

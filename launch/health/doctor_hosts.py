@@ -418,9 +418,9 @@ def _check_arm(node: ResolvedNode, probe: HostProbe) -> HostFinding:
     if arm.faults:
         remedy = "when the cause is fixed: flexsheet arms reset"
         return HostFinding(probe.host, check, "warning", what, remedy)
-    by_itself = node.parameters.get("arming") == "by_itself"
-    moves = "moves as soon as no interlock inhibits it"
-    waits = moves if by_itself else "flexsheet arms ready lets it move"
+    auto_arming = node.parameters.get("arming") == "auto"
+    moves = "moves as soon as no interlock holds"
+    waits = moves if auto_arming else "flexsheet arms enable lets it move"
     ready = "ready" if arm.ready else waits
     return HostFinding(probe.host, check, "ok", f"{what}; {ready}")
 

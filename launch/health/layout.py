@@ -27,9 +27,9 @@ from flexsheet.nodes.arm_bridge.reach import (
     SPEEDS,
     ArmReach,
     PathError,
-    Places,
-    best_reach,
-    coordinated_path,
+    SheetPoses,
+    find_best_reach,
+    plan_path,
 )
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
@@ -85,7 +85,7 @@ Touches = Callable[[Scene], Sequence[Touch]]
 class Samples:
     """All that the arms are asked: places, with the tilt (n,), depth (n,) and contact (n, 3)."""
 
-    places: Places
+    places: SheetPoses
     tilt_rad: Floats
     depth_m: Floats
     contact_world_m: Floats
@@ -112,11 +112,11 @@ class Layout:
 
     @property
     def reached(self) -> NDArray[np.bool_]:
-        return self.left.reached & self.right.reached
+        return self.left.reachable & self.right.reachable
 
     @property
     def followed(self) -> NDArray[np.bool_]:
-        return self.left.followed & self.right.followed
+        return self.left.trackable & self.right.trackable
 
     @property
     def reachable(self) -> bool:
@@ -264,7 +264,7 @@ def samples_of(scene: Scene, touch_places: Sequence[Touch]) -> Samples:
                 depths.append(depth)
                 contacts.append(touch.contact_world_m)
     return Samples(
-        Places(np.array(poses), np.array(stretches), np.array(twists)),
+        SheetPoses(np.array(poses), np.array(stretches), np.array(twists)),
         np.array(tilts),
         np.array(depths),
         np.array(contacts),
@@ -279,9 +279,9 @@ def check_layout(
     samples = samples_of(scene, touches_of(scene))
     left, right = ArmGeometry(scene, "left"), ArmGeometry(scene, "right")
     progress(f"{len(samples.places)} places of the sheet, left arm")
-    left_reach = best_reach(left, right, samples.places)
+    left_reach = find_best_reach(left, right, samples.places)
     progress(f"{len(samples.places)} places of the sheet, right arm")
-    right_reach = best_reach(right, left, samples.places)
+    right_reach = find_best_reach(right, left, samples.places)
     found = Layout(scene, samples, left_reach, right_reach, (), ())
     progress("ways from the front to the farthest places")
     found = replace(found, broken_ways=tuple(_broken_ways(found, left, right)))
@@ -309,7 +309,7 @@ def _broken_ways(layout: Layout, left: ArmGeometry, right: ArmGeometry) -> Itera
     }
     for goal in sorted(rim):
         try:
-            coordinated_path(
+            plan_path(
                 left,
                 right,
                 motion(start),
@@ -327,7 +327,7 @@ def _remedies(layout: Layout, progress: Progress) -> Iterator[Remedy]:
     """What would make all reachable: bases moved, less tilt, less depth, less speed."""
     moved: dict[Side, Floats] = {}
     for side, reach in layout.arms():
-        if not reach.reached.all():
+        if not reach.reachable.all():
             progress(f"other places for the {side} base")
             offset = _base_offset(layout, side)
             if offset is None:
@@ -374,8 +374,8 @@ def _base_offset(layout: Layout, side: Side) -> Floats | None:
     """The least of the tried shifts of a base with which that arm reaches all, or None."""
     other: Side = "right" if side == "left" else "left"
     reach = layout.left if side == "left" else layout.right
-    bad = np.flatnonzero(~reach.reached)
-    fair = np.flatnonzero(reach.reached)
+    bad = np.flatnonzero(~reach.reachable)
+    fair = np.flatnonzero(reach.reachable)
     # Where the flange may be does not depend on where the base is.
     elsewhere = {"workspace", "flange distance", "edge force"}
     if any(LIMITS[number] in elsewhere for number in set(reach.binding[bad].tolist())):
@@ -391,9 +391,9 @@ def _base_offset(layout: Layout, side: Side) -> Floats | None:
     )
     for offset in offsets[1:]:
         arm = ArmGeometry(with_base_moved(layout.scene, side, offset), side)
-        if not best_reach(arm, other_arm, thin.without_motion()).reached.all():
+        if not find_best_reach(arm, other_arm, thin.without_twists()).reachable.all():
             continue
-        if best_reach(arm, other_arm, layout.samples.places.without_motion()).reached.all():
+        if find_best_reach(arm, other_arm, layout.samples.places.without_twists()).reachable.all():
             return offset
     return None
 
@@ -418,8 +418,8 @@ def _arm_result(layout: Layout, reach: ArmReach) -> dict[str, Any]:
     binding = reach.binding
     present = sorted(set(binding[binding >= 0].tolist()))
     return {
-        "share": float(reach.reached.mean()),
-        "share_at_working_speed": float(reach.followed.mean()),
+        "share": float(reach.reachable.mean()),
+        "share_at_working_speed": float(reach.trackable.mean()),
         "branch": reach.branch._asdict(),
         "binding": [_first(layout, number, binding) for number in present],
         "least_margins": least_margins(layout, reach),
@@ -484,10 +484,10 @@ def draw_layout(layout: Layout, path: Path) -> None:
     for column, (side, reach) in enumerate(layout.arms()):
         upper, lower = panels[0, column], panels[1, column]
         upper.imshow(grid.colored(_place_binding(reach), colors), **grid.frame)
-        upper.set_title(f"{side} arm: reaches {100 * reach.reached.mean():.1f} %")
-        speeds = np.where(reach.reached, 1e3 * layout.speeds_m_per_s(reach), np.nan)
+        upper.set_title(f"{side} arm: reaches {100 * reach.reachable.mean():.1f} %")
+        speeds = np.where(reach.reachable, 1e3 * layout.speeds_m_per_s(reach), np.nan)
         shown = lower.imshow(grid.least(speeds), vmin=0.0, vmax=2.0 * asked, **grid.frame)
-        followed = 100 * reach.followed.mean()
+        followed = 100 * reach.trackable.mean()
         lower.set_title(f"{side} arm: follows {asked:.0f} mm/s at {followed:.1f} %")
         lower.set_xlabel("tilt of the contact, degrees (positive: facing up)")
         panels[column, 0].set_ylabel("push depth, mm")
@@ -504,7 +504,7 @@ def draw_layout(layout: Layout, path: Path) -> None:
 
 def _place_binding(reach: ArmReach) -> NDArray[np.intp]:
     """Number of the limit that keeps the arm from a place, (n,); -1 where it reaches it."""
-    return np.where(reach.reached, -1, reach.binding)
+    return np.where(reach.reachable, -1, reach.binding)
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,6 @@ FAMILIES: dict[str, str] = {
     "marker": "flexsheet.nodes.triangulator.families:MARKER",
     "triangulation": "flexsheet.nodes.triangulator.families:TRIANGULATION",
     "tracking": "flexsheet.launch.methods.families:TRACKING",
-    "kinematics": "flexsheet.nodes.arm_bridge.kinematics:KINEMATICS",
     "soft-body": "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY",
     "correction": "flexsheet.launch.methods.families:CORRECTION",
     "sheet-force": "flexsheet.launch.methods.families:SHEET_FORCE",

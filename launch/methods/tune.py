@@ -94,12 +94,6 @@ TUNABLES = (
         _by_name("none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"),
     ),
     Tunable(
-        "kinematics",
-        "kinematics",
-        ("flexsheet.nodes.arm_bridge.kinematics:KINEMATICS",),
-        _by_name("closed_form_continuous"),
-    ),
-    Tunable(
         "sheet-force",
         "sheet_force",
         (

@@ -35,7 +35,13 @@ from ruamel.yaml.tokens import (
     ScalarToken,
 )
 
-from flexsheet.launch.plans.renamed_keys import LAUNCH_KEYS, NODE_PARAMETERS, SCENE_KEYS, VALUES
+from flexsheet.launch.plans.renamed_keys import (
+    LAUNCH_KEYS,
+    NODE_PARAMETERS,
+    REMOVED_KEYS,
+    SCENE_KEYS,
+    VALUES,
+)
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NODES
@@ -336,6 +342,8 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
         key = (*at, *inside, name)
         renamed = _renamed_keys(model, document, key).get(str(name))
         remedy = f'it is now "{renamed}"' if renamed else did_you_mean(name, known)
+        if name in REMOVED_KEYS:
+            remedy = "remove it: only one method is left"
         return document.problem(key, f'unknown key "{name}"', remedy)
     key = _existing_part(document, (*at, *_walk(model, location)[0]))
     if error["type"] in MAPPING_WANTED:

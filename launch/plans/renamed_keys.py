@@ -5,6 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
+    "arm_bridge": {
+        "furthest_extrapolation_s": "max_extrapolation_s",
+        "largest_lag_rad": "max_tracking_error_rad",
+    },
     "console": {"drives_finger": "control_finger", "kept": "state_file"},
     "fem_solver": {
         "largest_depth_m": "max_depth_m",
@@ -37,6 +41,9 @@ NODE_PARAMETERS: Mapping[str, Mapping[str, str]] = {
 SCENE_KEYS: Mapping[str, str] = {"mark": "marker"}
 """Old to new keys of scene files."""
 
+REMOVED_KEYS = frozenset({"kinematics"})
+"""Keys of scenes and of node parameters that had one possible value and were removed."""
+
 LAUNCH_KEYS: Mapping[str, str] = {
     "from_tools": "external_topics",
     "also": "include",
@@ -45,6 +52,7 @@ LAUNCH_KEYS: Mapping[str, str] = {
 """Old to new keys of launch files, those of `record` among them."""
 
 VALUES: Mapping[str, Mapping[str, str]] = {
+    "arming": {"by_command": "manual", "by_itself": "auto"},
     "sheet_shape": {"dents": "reduced_order", "flat": "four_triangles"},
     "sheet_force": {"cubic": "scaled"},
     "tracking": {"exponential": "one_euro", "hand": "singer_tremor"},

@@ -1,7 +1,7 @@
-"""An e-stop as a file: what a launcher that is started anew must know though all who knew are gone.
+"""Persist an engaged e-stop across restarts of a host's launcher.
 
-Only a reset removes it.  What cannot be read counts as a stop.  A file belongs to the arms that it
-stops, so that graphs of the same arms share it, whatever their launch files, and others do not.
+Only a reset removes the file.  A file that cannot be read counts as a stop.  The file's name
+depends on the arms that it stops.  Graphs with the same arms therefore share it, and others do not.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from pathlib import Path
 from flexsheet.messages.types import EStop
 
 STATE_VARIABLE = "FLEXSHEET_STATE"
-"""Environment variable that moves the directory of what outlives a computer's start."""
+"""Environment variable with the directory of state that survives a reboot."""
 
 
 def directory() -> Path:
-    """Where this user's launchers write what they must not forget."""
+    """Return the directory of persistent state of this user's launchers."""
     given = os.environ.get(STATE_VARIABLE)
     if given:
         return Path(given)
@@ -27,27 +27,27 @@ def directory() -> Path:
 
 
 class EStopFile:
-    """The e-stop that a host's launcher keeps.
+    """Read and write the e-stop of one host.
 
-    arms: where the arms are reached.
+    arms: addresses of the arms.
     """
 
     def __init__(self, host: str, arms: Sequence[str]) -> None:
-        which = hashlib.sha256("\n".join(sorted(arms)).encode()).hexdigest()[:8]
-        self.path = directory() / f"estop-{host}-{which}.json"
+        digest = hashlib.sha256("\n".join(sorted(arms)).encode()).hexdigest()[:8]
+        self.path = directory() / f"estop-{host}-{digest}.json"
 
     def read(self) -> EStop | None:
-        """The e-stop that was engaged; None where none is."""
+        """Return the stored e-stop, or None.  A file that cannot be read counts as a stop."""
         try:
             reason = json.loads(self.path.read_text())["reason"]
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-            reason = f"{self.path} cannot be read ({error}), which may have held one"
+            reason = f"{self.path} cannot be read ({error}) and may hold an e-stop"
         return EStop(engaged=True, reason=str(reason))
 
     def write(self, estop: EStop) -> None:
-        """Write it down for good, also should the power fail next; OSError."""
+        """Store the e-stop so that it survives a power failure; raises OSError."""
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         part = self.path.with_suffix(".part")
         with part.open("w") as file:
@@ -58,7 +58,7 @@ class EStopFile:
         self._sync_folder()
 
     def remove(self) -> None:
-        """It was reset; OSError."""
+        """Remove the file after a reset; raises OSError."""
         self.path.unlink(missing_ok=True)
         if self.path.parent.is_dir():
             self._sync_folder()

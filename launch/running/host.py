@@ -331,8 +331,8 @@ class HostAgent:
 
 
 def shows_estop(state: ArmState) -> bool:
-    """Whether an arm's bridge still holds an e-stop."""
-    return state.mode == "estop" or any(fault.startswith("e-stop: ") for fault in state.faults)
+    """Return whether an arm's bridge holds an e-stop."""
+    return state.mode == "estop" or state.estop_engaged
 
 
 def list_arms(plan: ResolvedGraph) -> list[str]:
@@ -342,8 +342,8 @@ def list_arms(plan: ResolvedGraph) -> list[str]:
 
 
 def has_manual_arming(plan: ResolvedGraph) -> bool:
-    """Whether arms move at a person's word only; those that go by themselves are simulated."""
-    return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
+    """Return whether a person has to arm the arms; simulated ones may arm themselves."""
+    return any(node.parameters.get("arming") == "manual" for node in plan.nodes.values())
 
 
 def python_version() -> str:

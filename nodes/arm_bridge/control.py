@@ -1,8 +1,9 @@
-"""What an arm does in each cycle: follow the sheet's target, hold, stop, relax; decided here.
+"""Decide one arm's command in each cycle: follow the sheet's target, hold, stop or relax.
 
-No sockets and no clock: the node hands in what it knows and how long the cycle is, and sends what
-comes back.  The sheet's motion is bounded in the sheet's own frame first, in both bridges alike, so
-that the two arms stay together on long ways; then each arm's joints go through the limiter.
+This module uses no sockets and no clock.  The node passes in the inputs and the duration of the
+cycle, and sends the command that comes back.  `state_machine` defines the states and their
+transitions.  Both bridges bound the sheet's motion alike in the sheet's frame, so that the two
+arms stay together on long paths.  Each arm's joints then pass the limiter.
 """
 
 from __future__ import annotations
@@ -13,29 +14,47 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.clock_table import MAX_STAMP_AHEAD_NS
-from flexsheet.messages.types import Arming, ArmMode, ArmState, EStop
+from flexsheet.messages.types import Arming, ArmMode, EStop
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
-from flexsheet.nodes.arm_bridge.goal import Goal, pace, slowed
+from flexsheet.nodes.arm_bridge.goal import Goal, scale_speeds, sync_factor
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_MAX_RAD, JOINT_MIN_RAD, UnreachableError
 from flexsheet.nodes.arm_bridge.limiter import (
     SheetLimits,
-    bounded_step,
-    braked,
-    limited,
-    place_trouble,
-    relaxed_limits,
-    sheet_trouble,
-    step_trouble,
-    with_tool_speed,
-    within_range,
+    bound_step,
+    check_flange,
+    check_sheet,
+    check_tracking_error,
+    clamp_to_range,
+    decelerate,
+    limit_tool_speed,
+    limit_velocity,
+    relax_limits,
 )
-from flexsheet.nodes.arm_bridge.link import Freshness
+from flexsheet.nodes.arm_bridge.link import FAULT_TEXTS, ArmFault, Freshness
+from flexsheet.nodes.arm_bridge.other_arm import OtherArm
+from flexsheet.nodes.arm_bridge.path_check import (
+    START_BOUNDS,
+    Alignment,
+    PathCheckRequest,
+    measure_distance,
+)
 from flexsheet.nodes.arm_bridge.standstill import (
     MAX_RESTART_SHIFT_M,
     StandstillMonitor,
     edge_shift_m,
 )
-from flexsheet.nodes.arm_bridge.way import START_BOUNDS, Alignment, Way, lag
+from flexsheet.nodes.arm_bridge.state_machine import (
+    CHECKING_STATES,
+    MODES,
+    MOTION_STATES,
+    PAUSING_STATES,
+    READY_STATES,
+    RELAXING,
+    TRACKING,
+    TRANSITIONS,
+    Event,
+    State,
+)
 from flexsheet.nodes.models.motion import (
     EdgeBound,
     SheetBounds,
@@ -47,11 +66,11 @@ from flexsheet.nodes.models.rigid import is_rigid
 
 Floats = NDArray[np.float64]
 
-REST_RAD_PER_S = 1e-6
-"""Slower than this an arm is at rest: a ten-thousandth of a degree a second."""
+MAX_REST_RAD_PER_S = 1e-6
+"""Joint speed below which an arm is at rest."""
 
-# Accelerations that the joints can follow (J6 by 22 rad/s^2, J2 by 9.4): beyond, the joints would
-# run on past a target that turns back, each arm by as much as its cycles happen to lie.
+# Accelerations that the joints can follow (J6 22 rad/s^2, J2 9.4 rad/s^2).  With larger ones the
+# joints would overshoot a target that reverses, and each arm by a different amount.
 FOLLOW_BOUNDS = SheetBounds(
     speed_m_per_s=0.22,
     acceleration_m_per_s2=2.6,
@@ -60,295 +79,256 @@ FOLLOW_BOUNDS = SheetBounds(
     stretch_rate_per_s=0.1,
     stretch_acceleration_per_s2=1.0,
 )
-# Letting go is no haste either, but a taut sheet is what hurts: slack in about a second.
+# The sheet becomes slack in about a second.
 RELAX_BOUNDS = replace(START_BOUNDS, stretch_rate_per_s=0.05)
 
-# On its target, for good: from then until it next stops, the sheet goes with the target.
 SETTLED_M, SETTLED_RAD, SETTLED_STRETCH = 0.001, 0.01, 0.003
+"""Distance to the target at which the sheet changes to FOLLOW_BOUNDS, until the next stop."""
 
 MEASURED_SLACK_M = 0.002
-"""How far a measured flange may be past a place where it may still be sent: servos ripple."""
+"""How far a measured flange may exceed a limit of commands; servos ripple."""
 
 SLACK_STRETCH = 1.0005
-"""A sheet this long pulls with a tenth of a newton: let go."""
+"""Stretch ratio at which the sheet counts as slack; it then pulls with 0.1 N."""
 
 NO_MOTION = np.zeros(6)
 
-FAR_BEYOND = 1.1
-"""A sheet that seems longer than so many times its limit is no sheet: nothing relaxes."""
+IMPLAUSIBLE_LENGTH_RATIO = 1.1
+"""A measured sheet longer than this multiple of its limit is a measurement error."""
 
-ESTOP = "e-stop: "
-"""How the fault of an arm that somebody has stopped begins."""
+MAX_JOINT_JUMP_RAD = 0.35
+"""A goal further away than this in one cycle lies on another branch of solutions."""
 
-JUMP_RAD = 0.35
-"""Joints that would have to go further than this at once are on another branch of solutions."""
+RELAX_DELAY_S = 0.5
+"""An arm without a target slackens the sheet after this time; a short gap changes nothing."""
 
-LET_GO_AFTER_S = 0.5
-"""An arm without a target lets the sheet go after so long: a moment's gap is not worth it."""
-
-NOT_BELIEVED = {
-    Freshness.STALLED: "the counters of its status stand still, its joints are not believed",
-    Freshness.REVERSED: "the counters of its status run backwards, its joints are not believed",
+STALE_REASONS = {
+    Freshness.STALLED: "the counters of its status stand still, its joints are not used",
+    Freshness.REVERSED: "the counters of its status run backwards, its joints are not used",
 }
 
-READY_TOGETHER_S = 1.0
-"""An arm that was told to be ready is no longer, if the other has not become so by then."""
+MAX_WAIT_FOR_OTHER_S = 1.0
+"""An armed arm is disarmed if the other one is not armed within this time."""
 
-OLDEST_ARMING_S = 1.0
-"""An older word was held up on the way; who gave it may no longer mean it."""
-
+MAX_ARMING_AGE_S = 1.0
+"""An older arming command was delayed; the person may no longer mean it."""
 
 ALIGNED_RAD = 1e-4
-"""Joints this near to the end of an alignment are there."""
-
-MAX_FUTURE_S = 0.02
-"""A state of the other arm from further in the future cannot be right.  Measured clocks are off by
-less, and a state that was believed would stay fresh for as long as it lies ahead."""
+"""Joints this near to the end of an alignment have reached it."""
 
 MAX_BEYOND_RANGE_RAD = 0.02
-"""Measured joints further beyond the maker's ranges are not those of an arm."""
+"""Measured joints further outside the joint ranges are a measurement error."""
 
-LOOK_AGAIN_S = 0.5
-"""How long a barred way stays barred before it is looked at again, the target having moved on."""
+RECHECK_PERIOD_S = 0.5
+"""Time after which a blocked path is checked again, since the target may have moved."""
 
 
 @dataclass(frozen=True, slots=True)
-class Patience:
-    """How late things may be before the arm holds, and before it stops (seconds)."""
+class Timeouts:
+    """Hold the lateness (s) of an input after which the arm holds, and after which it stops."""
 
     hold_after_s: float
     stop_after_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class OtherArm:
-    """The other arm as its bridge tells: joints (6,), flange in the world, whether it is well."""
-
-    joints_rad: Floats
-    world_from_flange: Floats
-    world_from_flange_commanded: Floats
-    mode: ArmMode
-    faults: tuple[str, ...]
-    age_s: float
-    ready: bool
-
-    @classmethod
-    def from_state(cls, state: ArmState, age_s: float) -> OtherArm:
-        """What the other bridge's message says, `age_s` after it came."""
-        return cls(
-            state.joints_rad,
-            state.world_from_flange,
-            state.world_from_flange_commanded,
-            state.mode,
-            state.faults,
-            age_s,
-            state.ready,
-        )
-
-    @property
-    def invalid_reason(self) -> str | None:
-        """Why nothing can be done with this state, or None; it is then as good as none."""
-        if not np.isfinite(self.joints_rad).all():
-            return "its joints are not finite"
-        if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
-            return "its flange is not a rigid pose"
-        if self.age_s < -MAX_FUTURE_S:
-            return f"it is of {-self.age_s:.3g} s in the future"
-        return None
-
-    @property
-    def estopped(self) -> bool:
-        """Whether somebody has stopped it: then nothing moves, not even to let go."""
-        return self.mode == "estop" or any(text.startswith(ESTOP) for text in self.faults)
-
-    @property
-    def trouble(self) -> str | None:
-        """Why this arm must not move with it, or None."""
-        if self.faults:
-            return f"other arm: {self.faults[0]}"
-        if self.mode in ("disconnected", "fault", "estop"):
-            return f"other arm: {self.mode}"
-        if self.mode == "starting":
-            return "waiting for the other arm"
-        return None
-
-
-@dataclass(frozen=True, slots=True)
 class Command:
-    """What to tell the arm's controller: mode of the register map, joints (6,) rad."""
+    """Hold a command for the arm's controller: a mode of `ArmLink`, and joints (6,) rad."""
 
     mode: str
     joints_rad: Floats
 
 
 class ArmControl:
-    """One arm's state from cycle to cycle.
+    """Control one arm from cycle to cycle.
 
-    mode, faults and reason are for people and for the other arm: faults hold what is wrong with
-    this arm (latched until `reset`, but for a lost connection), reason why it does not follow.
-    ready: whether it may move.  A person makes it so, and whatever hinders the motion (a target or
-    the other arm silent for long, a lost connection, a fault, a stop) ends it: when all is well
-    again the arm stays where it is.  With `by_itself` it is ready whenever nothing hinders it.
-    question: the way of which it wants to know, by `take_way`, whether it is clear; None: of none.
+    state: changes only by `handle`, through the table of `state_machine`.
+    mode, faults, reason: for people and for the other arm.  faults are latched until `reset`.
+        reason says why the arm does not follow.
+    ready: whether the arm may move.  A person arms it; every interlock disarms it.  When the
+        interlock has gone, the arm stays where it is.  With `auto_arming` it is armed whenever no
+        interlock holds.
+    pending_check: the path whose check is awaited by `on_path_result`, or None.
     """
 
     def __init__(
-        self, patience: Patience, *, largest_lag_rad: float, by_itself: bool = False
+        self, timeouts: Timeouts, *, max_tracking_error_rad: float, auto_arming: bool = False
     ) -> None:
-        self.mode: ArmMode = "starting"
+        self.auto_arming = auto_arming
         self.faults: tuple[str, ...] = ()
         self.reason = "waiting for the arm to answer"
         self.estop_reason: str | None = None
         self.measured_rad: Floats | None = None
         self.last_measured_rad: Floats | None = None
         self.commanded_rad = np.zeros(6)
-        self.question: Way | None = None
-        self.ready = by_itself
-        self._by_itself = by_itself
-        self._hindrance: str | None = self.reason
-        self._unready_since = ""
-        self._stood_down: str | None = None
+        self.pending_check: PathCheckRequest | None = None
+        self._state = State.STARTING
+        self._timeouts = timeouts
+        self._max_tracking_error_rad = max_tracking_error_rad
+        self._interlock_reason: str | None = self.reason
+        self._disarm_reason: str | None = None
+        self._last_interlock = ""
         self._waited_s = 0.0
         self._silence = ""
-        self._clear_way: tuple[Way, Alignment | None] | None = None
+        self._clear_path: tuple[PathCheckRequest, Alignment | None] | None = None
         self._alignment: Alignment | None = None
         self._aligned_s = 0.0
         self._relaxed_limits: SheetLimits
-        self._barred: tuple[str, float] | None = None
+        self._blocked: tuple[str, float] | None = None
         self._together = False
-        self._patience = patience
-        self._largest_lag_rad = largest_lag_rad
         self._velocity = np.zeros(6)
         self._standstill = StandstillMonitor()
         self._has_commanded = False
         self._sheet: SheetMotion | None = None
         self._settled = False
-        self._clear_arm = False
-        self._has_pulled = False
-        self._interrupted = False
+        self._must_idle = False
         self._engaged_ns = 0
         self._missed = False
         self._goal_rad: Floats | None = None
         self._relax_from: float | None = None
 
     @property
+    def state(self) -> State:
+        """The present state."""
+        return self._state
+
+    @property
+    def mode(self) -> ArmMode:
+        """The mode that the bridge publishes."""
+        return "fault" if self._state is State.TAUT and self.faults else MODES[self._state]
+
+    @property
+    def ready(self) -> bool:
+        """Whether the arm may move."""
+        return self._state in READY_STATES
+
+    @property
     def all_faults(self) -> tuple[str, ...]:
-        """What the other arm must stop for: own faults, e-stop, a lost connection."""
-        estop = () if self.estop_reason is None else (f"{ESTOP}{self.estop_reason}",)
-        lost = (self.reason,) if self.mode == "disconnected" else ()
+        """Faults for which the other arm must stop: own faults, an e-stop, a lost connection."""
+        estop = () if self.estop_reason is None else (f"e-stop: {self.estop_reason}",)
+        lost = (self.reason,) if self._state is State.DISCONNECTED else ()
         return (*self.faults, *estop, *lost)
 
     @property
     def path_blocked(self) -> bool:
-        """Whether it stands because no path to the target is clear."""
-        return self._barred is not None and self.mode == "hold"
-
-    @property
-    def auto_arming(self) -> bool:
-        """Whether it becomes ready without a person's word."""
-        return self._by_itself
+        """Whether the arm rests because no path to the target is clear."""
+        return self._blocked is not None and self._state in CHECKING_STATES
 
     @property
     def at_rest(self) -> bool:
-        return float(np.abs(self._velocity).max()) <= REST_RAD_PER_S
+        """Whether the commanded joints are at rest."""
+        return float(np.abs(self._velocity).max()) <= MAX_REST_RAD_PER_S
 
     @property
-    def resting(self) -> bool:
-        """Whether nothing will move before somebody says so; then the arm needs to hear less."""
-        return self.mode == "idle" and not self.ready and not self._has_pulled and self.at_rest
+    def is_idle(self) -> bool:
+        """Whether nothing moves before a person acts; fewer exchanges suffice meanwhile."""
+        return self._state is State.IDLE and self.at_rest
 
-    def miss_answer(self, text: str) -> bool:
-        """One exchange without an answer is forgiven while moving; False for a second in a row.
+    def handle(self, event: Event) -> None:
+        """Change the state by the table; an ignored event changes nothing."""
+        target = TRANSITIONS[self._state, event]
+        if target is None:
+            return
+        keeps_path = target in TRACKING | RELAXING
+        if self._state in TRACKING | RELAXING and not keeps_path:
+            self._drop_path()
+        self._state = target
 
-        The arm's own watchdog guards the meantime, and the next command goes on from this one.
+    def on_answer_missed(self, text: str) -> bool:
+        """Tolerate one exchange without an answer; return False for a second one in a row.
+
+        The arm's own watchdog covers the gap, and the next command continues from this one.
         """
         if self._missed or self.measured_rad is None:
             return False
         self._missed = True
         self._standstill.forget()
-        if self.mode == "follow":
-            self.mode, self.reason = "hold", text
+        before = self._state
+        self.handle(Event.ANSWER_MISSED)
+        if self._state is not before:
+            self.reason = text
         return True
 
-    def fail_exchange(self, text: str, *, silent: bool) -> bool:
-        """An exchange has failed; True when with it the arm counts as lost, for the first time."""
+    def on_exchange_failed(self, text: str, *, silent: bool) -> bool:
+        """Handle a failed exchange; return True when the arm counts as lost from now on.
+
+        silent: no answer came at all.
+        """
         if silent and self.last_measured_rad is None:
-            # It has never answered: it may still be starting, which is no fault.
+            # It has never answered, so it may still be starting, which is no fault.
             self.reason = f"waiting for the arm: {text}"
             return False
-        if silent and self.miss_answer(text):
+        if silent and self.on_answer_missed(text):
             return False
-        newly = self.mode != "disconnected"
-        self.lose_connection(text)
+        newly = self._state is not State.DISCONNECTED
+        self.on_connection_lost(text)
         return newly
 
-    def lose_connection(self, text: str) -> None:
-        """The arm cannot be reached: forget all but a latched fault or e-stop."""
+    def on_connection_lost(self, text: str) -> None:
+        """Drop everything but a latched fault or e-stop."""
         self.measured_rad = None
         self._standstill.forget()
-        self.mode, self.reason = "disconnected", text
-        self._hinder(text)
-        self._has_pulled = False
+        self._inhibit(text, Event.CONNECTION_LOST)
+        self.reason = text
         self._forget_motion()
 
-    def take_measurement(
+    def on_measurement(
         self,
         joints_rad: Floats,
-        arm_faults: tuple[str, ...],
+        arm_faults: tuple[ArmFault, ...],
         freshness: Freshness = Freshness.FRESH,
     ) -> None:
-        """Take over what the arm answered: joints (6,) where they are believed, and its faults."""
+        """Store the arm's answer: joints (6,) rad if they are fresh, and the arm's faults."""
         self._missed = False
         self._standstill.on_measurement(joints_rad, freshness)
         if self.last_measured_rad is None or freshness in (Freshness.FIRST, Freshness.FRESH):
             self.last_measured_rad = joints_rad
-        if not freshness.is_believed and not self.faults:
-            self.faults = (f"arm: {NOT_BELIEVED[freshness]}",)
+        if not freshness.is_usable and not self.faults:
+            self.faults = (f"arm: {STALE_REASONS[freshness]}",)
         self.measured_rad = self.last_measured_rad
         if not self._has_commanded and not self._standstill.has_jumped:
             self.commanded_rad = self.measured_rad
-        if arm_faults == ("watchdog: no command",):
-            # The cycle came late, the arm has stopped by itself: begin again from where it stands.
-            self._stop_short()
-            self.mode, self.reason = "stopping", "the arm's watchdog stopped it"
-            self._hinder(self.reason)
-            self._has_pulled = False
+        if arm_faults == (ArmFault.WATCHDOG,):
+            # A cycle came late, and the arm has stopped by itself: restart from where it stands.
+            self._restart_idle()
+            self.reason = "the arm's watchdog stopped it"
+            self._inhibit(self.reason, Event.WATCHDOG_TRIPPED)
         elif arm_faults and not self.faults:
-            self.faults = tuple(f"arm: {text}" for text in arm_faults)
+            self.faults = tuple(f"arm: {FAULT_TEXTS[fault]}" for fault in arm_faults)
 
-    def _stop_short(self) -> None:
-        """The arm stands without a command of this bridge: tell it to be idle."""
+    def _restart_idle(self) -> None:
+        """Forget the motion and command `idle` next; the arm rests without a command."""
         self._forget_motion()
         self._standstill.restart()
-        self._clear_arm = True
+        self._must_idle = True
 
-    def interrupt(self) -> None:
-        """Come to rest and begin anew: the scene has changed under the motion."""
-        self._interrupted = True
-        self.question = self._clear_way = self._barred = None
-        if self.mode in ("follow", "hold"):
-            self.mode = "stopping"
+    def on_scene_changed(self) -> None:
+        """Stop, and check the path again before the next motion."""
+        self.pending_check = self._clear_path = self._blocked = None
+        self.handle(Event.SCENE_CHANGED)
 
     def engage_estop(self, reason: str) -> None:
+        """Latch an e-stop; the next `step` stops the arm."""
         self.estop_reason = reason
 
-    def take_estop(
-        self, estop: EStop, stamp_ns: int, now_ns: int, clock_trouble: str = ""
+    def on_estop(
+        self, estop: EStop, stamp_ns: int, now_ns: int, clock_problem: str = ""
     ) -> str | None:
-        """Engage or reset; returns why a reset is refused.
+        """Engage or reset the e-stop; return why a reset is refused, or None.
 
-        stamp_ns: when the message was made, which clock_trouble says not to be sure of.  Several
-        nodes may write e-stops, and the last word of each comes anew to a late reader, in any
-        order: a reset from before the last stop does not clear it.  One that is stamped in the
-        future would clear the stops that come until then.
+        stamp_ns: time of the message.  clock_problem: why that time is uncertain.
+
+        Several nodes write e-stops, and a late reader receives the last message of each in any
+        order.  A reset from before the last stop therefore clears nothing, and neither does one
+        that is stamped in the future.
         """
         if estop.engaged:
-            # A stamp from the future would bar every reset to come.
-            engaged_ns = now_ns if clock_trouble else min(stamp_ns, now_ns)
+            # A stamp from the future would block every reset until then.
+            engaged_ns = now_ns if clock_problem else min(stamp_ns, now_ns)
             self._engaged_ns = max(self._engaged_ns, engaged_ns)
             self.engage_estop(estop.reason)
-        elif clock_trouble:
-            return clock_trouble
+        elif clock_problem:
+            return clock_problem
         elif stamp_ns > now_ns + MAX_STAMP_AHEAD_NS:
             return "it is stamped in the future"
         elif stamp_ns < self._engaged_ns:
@@ -358,61 +338,93 @@ class ArmControl:
         return None
 
     def reset(self) -> bool:
-        """Clear e-stop and faults; refused (False) while the arm still moves."""
+        """Clear e-stop and faults; return False while the arm still moves."""
         if not self.at_rest:
             return False
         self.estop_reason, self.faults = None, ()
         if self.measured_rad is not None:
-            self._stop_short()
+            self._restart_idle()
+        self.handle(Event.RESET)
         return True
 
-    def take_arming(self, arming: Arming, age_s: float) -> str | None:
-        """A person's word that the arm may move, or shall no longer; returns why it is refused."""
+    def on_arming(self, arming: Arming, age_s: float) -> str | None:
+        """Arm or disarm at a person's command; return why arming is refused, or None."""
         if not arming.ready:
-            self._stood_down = f"stood down: {arming.reason}" if arming.reason else "stood down"
+            self._disarm_reason = f"disabled: {arming.reason}" if arming.reason else "disabled"
             return None
-        if not age_s <= OLDEST_ARMING_S:
-            return f"the word is {age_s:.1f} s old"
-        if self._hindrance not in (None, self._stood_down):
-            return self._hindrance
+        if not age_s <= MAX_ARMING_AGE_S:
+            return f"the arming command is {age_s:.1f} s old"
+        if self._interlock_reason is not None:
+            return self._interlock_reason
         if not self.at_rest:
             return "the arm still moves"
-        self._stood_down = self._hindrance = None
-        self._make_ready()
+        self._disarm_reason = None
+        self._arm()
         return None
 
-    def _make_ready(self) -> None:
-        self.ready, self._waited_s = True, 0.0
+    def _arm(self) -> None:
+        self._waited_s = 0.0
+        self.handle(Event.ARM)
 
-    def _hinder(self, why: str) -> None:
-        """Something keeps the arm from moving: it is ready no longer."""
-        self._hindrance = why
-        if self.ready:
-            self.ready, self._unready_since, self._waited_s = False, why, 0.0
+    def _inhibit(self, reason: str, event: Event = Event.INTERLOCK) -> None:
+        """Disarm the arm by an event, and keep the reason."""
+        self._interlock_reason = reason
+        self._disarm(reason, event)
 
-    def _look_for_hindrance(self, goal: Goal | None, other: OtherArm | None) -> None:
-        """Whether the arm is, and stays, ready."""
-        silent = other is None or not other.age_s <= self._patience.stop_after_s
+    def _disarm(self, reason: str, event: Event) -> None:
+        was_ready = self.ready
+        self.handle(event)
+        if was_ready and not self.ready:
+            self._last_interlock, self._waited_s = reason, 0.0
+
+    def _check_interlocks(
+        self, goal: Goal | None, other: OtherArm | None, clock_problem: str
+    ) -> None:
+        """Disarm the arm while anything forbids motion; arm it otherwise if `auto_arming`."""
+        silent = other is None or not other.age_s <= self._timeouts.stop_after_s
         stopped = self.estop_reason is not None or (other is not None and other.estopped)
-        why = self._stood_down
-        if self.estop_reason is not None:
-            why = f"{ESTOP}{self.estop_reason}"
-        elif self.faults:
-            why = self.faults[0]
-        elif other is None or silent:
-            why = self._silence
-        elif other.trouble is not None:
-            why = other.trouble
-        elif goal is None or not goal.overdue_s <= self._patience.stop_after_s:
-            why = why or ("waiting for a sheet target" if goal is None else "no sheet target")
-        if why is not None:
-            self._hinder(why)
+        reason = self._find_interlock(goal, None if silent else other)
+        if reason is not None:
+            self._inhibit(reason)
+        elif self._disarm_reason is not None:
+            self._interlock_reason = None
+            self._disarm(self._disarm_reason, Event.INTERLOCK)
         else:
-            self._hindrance = None
-            if self._by_itself:
-                self._make_ready()
-        # To let go is a motion too: it belongs to the stop, and never comes after a silence.
-        self._has_pulled = self._has_pulled and not (silent or stopped)
+            self._interlock_reason = None
+            if self.auto_arming:
+                self._arm()
+        if clock_problem:
+            self._inhibit(clock_problem)
+        if silent or stopped or clock_problem:
+            # Relaxing belongs to a stop; it must not begin after the other arm was away.
+            self.handle(Event.ISOLATED)
+        self._settle()
+
+    def _find_interlock(self, goal: Goal | None, other: OtherArm | None) -> str | None:
+        """Return why the arm must not move, apart from a person's command; other None: silent."""
+        if self.estop_reason is not None:
+            return f"e-stop: {self.estop_reason}"
+        if self.faults:
+            return self.faults[0]
+        if other is None:
+            return self._silence
+        if other.interlock_reason is not None:
+            return other.interlock_reason
+        if self._disarm_reason is None and (
+            goal is None or not goal.overdue_s <= self._timeouts.stop_after_s
+        ):
+            return "waiting for a sheet target" if goal is None else "no sheet target"
+        return None
+
+    def _settle(self) -> None:
+        """Apply latched stops, and the end of a deceleration, to the state."""
+        for _ in range(2):
+            if self.estop_reason is not None:
+                self.handle(Event.ESTOP)
+            elif self.faults:
+                self._disarm(self.faults[0], Event.FAULT)
+            if self.at_rest:
+                self.handle(Event.AT_REST)
 
     def step(
         self,
@@ -420,83 +432,85 @@ class ArmControl:
         goal: Goal | None,
         other: OtherArm | None,
         step_s: float,
-        clock_trouble: str = "",
+        clock_problem: str = "",
     ) -> Command:
-        """Decide and compute this cycle's command; `step_s` is the time that it covers.
+        """Compute this cycle's command, which covers `step_s` seconds.
 
-        clock_trouble: why it cannot be known how old goal and other arm are; empty: it is.
+        clock_problem: why the ages of `goal` and `other` are unknown; empty: they are known.
         """
         measured = self.measured_rad
-        if measured is None or self._clear_arm:
-            self._clear_arm = self._clear_arm and measured is None
+        if measured is None or self._must_idle:
+            self._must_idle = self._must_idle and measured is None
             return self._send("idle", self.commanded_rad, geometry, step_s)
+        self.handle(Event.CONNECTED)
         self._silence = "the other arm is silent" if other else "waiting for the other arm"
         if other is not None and (invalid := other.invalid_reason) is not None:
             self._silence, other = f"state of the other arm: {invalid}", None
-        self._watch(geometry, other, measured)
-        self._look_for_hindrance(goal, other)
-        if clock_trouble:
-            self._hinder(clock_trouble)
-            self._has_pulled = False
-        if self.estop_reason is not None:
-            return self._stop("estop", f"{ESTOP}{self.estop_reason}", geometry, step_s)
-        if other is not None and other.estopped:
-            rest_mode: ArmMode = "fault" if self.faults else "idle"
-            return self._stop(rest_mode, "other arm: e-stop", geometry, step_s)
+        self._check_measurement(geometry, other, measured)
+        self._check_interlocks(goal, other, clock_problem)
+        if (stop := self._find_stop(other, clock_problem)) is not None:
+            return self._decelerate(stop, geometry, step_s)
         if self.faults:
-            return self._stop_and_relax("fault", self.faults[0], geometry, other, step_s)
-        if clock_trouble:
-            return self._stop("idle", clock_trouble, geometry, step_s)
-        return self._serve(geometry, goal, other, measured, step_s)
-
-    def _serve(
-        self,
-        geometry: ArmGeometry,
-        goal: Goal | None,
-        other: OtherArm | None,
-        measured: Floats,
-        step_s: float,
-    ) -> Command:
-        """Nothing is wrong with this arm: go with the target, if there are target and other arm."""
-        if other is None or not other.age_s <= self._patience.stop_after_s:
-            return self._stop("idle", self._silence, geometry, step_s)
-        if other.trouble is not None:
-            return self._stop_and_relax("idle", other.trouble, geometry, other, step_s)
+            return self._slacken(self.faults[0], geometry, other, step_s)
+        if other is None or not other.age_s <= self._timeouts.stop_after_s:
+            return self._decelerate(self._silence, geometry, step_s)
+        if other.interlock_reason is not None:
+            return self._slacken(other.interlock_reason, geometry, other, step_s)
         if goal is None or not self.ready or not other.ready:
-            return self._stand(geometry, other, step_s)
-        self._waited_s = 0.0
-        if self._relax_from is not None:
-            return self._stop("idle", "after relaxing", geometry, step_s)
-        if not _is_sound(goal.motion):
-            return self._fail("sheet target is not a rigid pose", geometry, step_s)
-        if self._interrupted or (self._sheet is None and not self.at_rest):
-            self._has_pulled = self._has_pulled and not self._interrupted
-            self._interrupted = self._interrupted and not self.at_rest
-            return self._stop("idle", "comes to rest", geometry, step_s)
-        if self._sheet is None:
-            return self._set_out(geometry, goal, other, measured, step_s)
-        return self._follow(goal, self._sheet, geometry, other, step_s)
+            return self._wait_for_arming(geometry, other, step_s)
+        return self._move_to_target(geometry, goal, other, measured, step_s)
 
-    def _stand(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
-        """Not ready: stop, let the sheet go if that is still to be done, and stay."""
+    def _find_stop(self, other: OtherArm | None, clock_problem: str) -> str | None:
+        """Return why the arm must rest and must not slacken the sheet, or None."""
+        if self.estop_reason is not None:
+            return f"e-stop: {self.estop_reason}"
+        if other is not None and other.estopped:
+            return "other arm: e-stop"
+        return clock_problem if clock_problem and not self.faults else None
+
+    def _wait_for_arming(self, geometry: ArmGeometry, other: OtherArm, step_s: float) -> Command:
+        """Stop, slacken the sheet if it may be taut, and rest until both arms are ready."""
         self._waited_s += step_s
         if self.ready:
             return self._wait_for_other(geometry, step_s)
-        why = self._hindrance
-        if why is None:
-            why = f"not ready since: {self._unready_since}" if self._unready_since else "not ready"
-        if self._waited_s > LET_GO_AFTER_S:
-            return self._stop_and_relax("idle", why, geometry, other, step_s)
-        return self._stop("idle", why, geometry, step_s)
+        reason = self._interlock_reason or self._disarm_reason
+        if reason is None:
+            since = self._last_interlock
+            reason = f"not ready since: {since}" if since else "not ready"
+        if self._waited_s > RELAX_DELAY_S:
+            return self._slacken(reason, geometry, other, step_s)
+        return self._decelerate(reason, geometry, step_s)
 
     def _wait_for_other(self, geometry: ArmGeometry, step_s: float) -> Command:
-        """The other arm may not move: this one stops too; not yet begun, it waits a moment."""
-        began = self._sheet is not None or not self.at_rest
-        if not self._by_itself and (began or self._waited_s > READY_TOGETHER_S):
-            self._hinder("the other arm is not ready")
-        return self._stop("idle", "the other arm is not ready", geometry, step_s)
+        """Stop because the other arm is not ready; before a motion, wait for it for a while."""
+        reason = "the other arm is not ready"
+        has_begun = self._sheet is not None or not self.at_rest
+        if not self.auto_arming and (has_begun or self._waited_s > MAX_WAIT_FOR_OTHER_S):
+            self._inhibit(reason)
+        else:
+            self.handle(Event.WAIT_FOR_OTHER)
+        return self._decelerate(reason, geometry, step_s)
 
-    def _follow(
+    def _move_to_target(
+        self,
+        geometry: ArmGeometry,
+        goal: Goal,
+        other: OtherArm,
+        measured: Floats,
+        step_s: float,
+    ) -> Command:
+        """Follow the target; from rest, check the path to it first."""
+        self._waited_s = 0.0
+        if not _is_valid(goal.motion):
+            return self._latch_fault("sheet target is not a rigid pose", geometry, step_s)
+        if self._state in PAUSING_STATES:
+            return self._decelerate("decelerates before the next motion", geometry, step_s)
+        self.handle(Event.TARGET)
+        if self._sheet is None:
+            return self._check_path(geometry, goal, other, measured, step_s)
+        return self._track_target(goal, self._sheet, geometry, other, step_s)
+
+    def _track_target(
         self,
         goal: Goal,
         sheet: SheetMotion,
@@ -504,49 +518,55 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """Go with the target; come to rest gently while it, or the other arm, is late."""
-        late = max(goal.overdue_s, other.age_s - self._patience.hold_after_s)
-        if late > self._patience.hold_after_s:
-            self.mode, self.reason = "hold", "sheet target or other arm late"
-            if self._alignment is not None:
-                return self._align(self._alignment, geometry, other, step_s)
-            sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
+        """Move with the target; decelerate while it, or the other arm's state, is late."""
+        late_s = max(goal.overdue_s, other.age_s - self._timeouts.hold_after_s)
+        is_late = late_s > self._timeouts.hold_after_s
+        self.handle(Event.LATE if is_late else Event.IN_TIME)
+        if is_late:
+            self.reason = "sheet target or other arm late"
         else:
             self._together = self._together or other.mode == "follow"
-            self.mode, self.reason = "follow", "" if self._together else "waits for the other arm"
-            if self._alignment is not None:
-                return self._align(self._alignment, geometry, other, step_s)
-            share = pace(
+            self.reason = "" if self._together else "waits for the other arm"
+        if self._alignment is not None:
+            return self._align(self._alignment, geometry, other, step_s)
+        if is_late:
+            sheet = coast_sheet(sheet, bounds=FOLLOW_BOUNDS, step_s=step_s)
+        else:
+            speed_factor = sync_factor(
                 geometry.world_from_edge(self.commanded_rad),
                 other.world_from_flange_commanded @ geometry.other_flange_from_edge,
                 goal.motion.world_from_sheet,
                 left=geometry.left,
             )
-            share = share if self._together else 0.0
-            sheet = self._towards(goal.motion, sheet, geometry.edge_bound, share, step_s)
-        return self._carry(sheet, geometry, other, step_s)
+            speed_factor = speed_factor if self._together else 0.0
+            sheet = self._advance_sheet(
+                goal.motion, sheet, geometry.edge_bound, speed_factor, step_s
+            )
+        return self._command_sheet(sheet, geometry, other, step_s)
 
-    def _watch(self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats) -> None:
-        """Latch a fault when the measured poses are not as they must be while moving."""
-        if self.faults or self._sheet is None or self.mode not in ("follow", "hold"):
+    def _check_measurement(
+        self, geometry: ArmGeometry, other: OtherArm | None, measured: Floats
+    ) -> None:
+        """Latch a fault when the measured poses violate a limit of the motion."""
+        if self.faults or self._state not in TRACKING:
             return
-        trouble = step_trouble(self.commanded_rad, measured, self._largest_lag_rad)
-        if trouble is not None:
-            self.faults = (trouble,)
+        violation = check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
+        if violation is not None:
+            self.faults = (violation,)
         elif other is not None:
             flange = geometry.world_from_flange(measured)
-            trouble = place_trouble(
+            violation = check_flange(
                 flange, other.world_from_flange, self._limits(geometry), slack_m=MEASURED_SLACK_M
-            ) or sheet_trouble(
+            ) or check_sheet(
                 flange @ geometry.flange_from_edge,
                 other.world_from_flange @ geometry.other_flange_from_edge,
                 left=geometry.left,
                 limits=self._limits(geometry),
             )
-            if trouble is not None:
-                self.faults = (f"measured: {trouble}",)
+            if violation is not None:
+                self.faults = (f"measured: {violation}",)
 
-    def _set_out(
+    def _check_path(
         self,
         geometry: ArmGeometry,
         goal: Goal,
@@ -554,45 +574,47 @@ class ArmControl:
         measured: Floats,
         step_s: float,
     ) -> Command:
-        """Begin if the way to the target is known to be clear; else stand, and ask whether it is.
+        """Start the motion if its path is known to be clear; else rest and request a check.
 
-        The other bridge asks the same of the same two arms.  Neither moves before both follow.
+        The other bridge checks the same path of the same arms.  Neither moves before both follow.
         """
         if not self._stands_still(measured):
-            return self._stop("hold", "waits until the arm stands still", geometry, step_s)
-        if (doubt := self._restart_doubt(measured)) is not None:
-            return self._stop("hold", doubt, geometry, step_s)
+            return self._decelerate("waits for the arm to stand still", geometry, step_s)
+        if (refusal := self._restart_refusal(measured)) is not None:
+            return self._decelerate(refusal, geometry, step_s)
         sheet = geometry.sheet_between(
             geometry.world_from_edge(measured),
             other.world_from_flange @ geometry.other_flange_from_edge,
         )
-        if self._clear_way is not None:
-            way, alignment = self._clear_way
-            if way.leads_to(goal.motion) and way.begins_at(measured, other.joints_rad):
+        if self._clear_path is not None:
+            request, alignment = self._clear_path
+            if request.leads_to(goal.motion) and request.begins_at(measured, other.joints_rad):
                 self._restart_at(measured)
-                return self._begin(sheet, alignment, geometry, other, step_s)
-        reason = "looks whether the way is clear"
-        if self._barred is not None:
-            reason, since_s = self._barred
-            self._barred = reason, since_s + step_s
-        if self.question is None and (self._barred is None or self._barred[1] > LOOK_AGAIN_S):
-            self.question = Way(sheet, goal.motion, measured, other.joints_rad)
-        return self._stop("hold", reason, geometry, step_s)
+                return self._start_motion(sheet, alignment, geometry, other, step_s)
+        reason = "checks the path to the target"
+        if self._blocked is not None:
+            reason, since_s = self._blocked
+            self._blocked = reason, since_s + step_s
+        if self.pending_check is None and (
+            self._blocked is None or self._blocked[1] > RECHECK_PERIOD_S
+        ):
+            self.pending_check = PathCheckRequest(sheet, goal.motion, measured, other.joints_rad)
+        return self._decelerate(reason, geometry, step_s)
 
-    def take_way(self, way: Way, found: Alignment | str | None) -> None:
-        """Take the answer to the question: how to begin, or why not; None: to begin as it stands.
+    def on_path_result(self, request: PathCheckRequest, result: Alignment | str | None) -> None:
+        """Store the result of a check: the alignment, or why the path is blocked.
 
-        The answer to a question that is no longer asked is thrown away.
+        None starts the motion as the arms stand.  The result of an older request is dropped.
         """
-        if way is not self.question:
+        if request is not self.pending_check:
             return
-        self.question = None
-        if isinstance(found, str):
-            self._clear_way, self._barred = None, (found, 0.0)
+        self.pending_check = None
+        if isinstance(result, str):
+            self._clear_path, self._blocked = None, (result, 0.0)
         else:
-            self._clear_way, self._barred = (way, found), None
+            self._clear_path, self._blocked = (request, result), None
 
-    def _begin(
+    def _start_motion(
         self,
         sheet: SheetMotion,
         alignment: Alignment | None,
@@ -600,11 +622,12 @@ class ArmControl:
         other: OtherArm,
         step_s: float,
     ) -> Command:
-        """The first command of a motion is the measured pose."""
+        """Start the motion; its first command is the measured pose."""
+        self.handle(Event.PATH_CLEAR)
         self._sheet = sheet if alignment is None else alignment.sheet
         self._alignment, self._aligned_s = alignment, 0.0
         flange = geometry.world_from_flange(self.commanded_rad)
-        self._relaxed_limits = relaxed_limits(
+        self._relaxed_limits = relax_limits(
             geometry.sheet_limits,
             flange,
             flange @ geometry.flange_from_edge,
@@ -612,125 +635,120 @@ class ArmControl:
             other.world_from_flange @ geometry.other_flange_from_edge,
             left=geometry.left,
         )
-        self._has_pulled = True
-        self.mode, self.reason = "follow", "waits for the other arm"
+        self.reason = "waits for the other arm"
         return self._send("move", self.commanded_rad, geometry, step_s)
 
     def _align(
         self, alignment: Alignment, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Go on with the alignment, if this arm does not wait; then with the sheet."""
-        if self.mode == "follow" and self._together:
+        """Continue the alignment unless this arm holds or waits; end it when it is complete."""
+        if self._state is State.FOLLOW and self._together:
             self._aligned_s += step_s
         goal_rad = alignment.joints_at(self._aligned_s)
-        command = self._lead(goal_rad, geometry, other, step_s)
+        command = self._command_joints(goal_rad, geometry, other, step_s)
         left_rad = float(np.abs(self.commanded_rad - alignment.to_rad).max())
         if self._aligned_s >= alignment.duration_s and left_rad <= ALIGNED_RAD and self._together:
             self._alignment = None
         return command
 
-    def _towards(
+    def _advance_sheet(
         self,
         target: SheetMotion,
         sheet: SheetMotion,
         edges: EdgeBound,
-        share: float,
+        speed_factor: float,
         step_s: float,
     ) -> SheetMotion:
-        """The sheet's next motion: gently until it is on its target, from then on with it.
+        """Return the sheet's next motion: slow until it has reached its target, then with it.
 
-        share: of the speeds, less than 1 for the arm that is ahead of the other.
+        speed_factor: of the speed bounds, below 1 for the arm that leads the other.
         """
         if not self._settled:
-            distance, angle = lag(sheet, target)
-            longer = abs(target.stretch_ratio - sheet.stretch_ratio)
-            near = distance < SETTLED_M and angle < SETTLED_RAD
-            self._settled = near and longer < SETTLED_STRETCH
+            distance_m, angle_rad = measure_distance(sheet, target)
+            stretch = abs(target.stretch_ratio - sheet.stretch_ratio)
+            is_near = distance_m < SETTLED_M and angle_rad < SETTLED_RAD
+            self._settled = is_near and stretch < SETTLED_STRETCH
         bounds = FOLLOW_BOUNDS if self._settled else START_BOUNDS
-        return follow_sheet(sheet, target, bounds=slowed(bounds, share), edges=edges, step_s=step_s)
+        bounds = scale_speeds(bounds, speed_factor)
+        return follow_sheet(sheet, target, bounds=bounds, edges=edges, step_s=step_s)
 
-    def _carry(
+    def _command_sheet(
         self, sheet: SheetMotion, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Bring this arm's edge to the sheet's motion, through the limiter."""
+        """Command the joints that bring this arm's edge to the sheet's pose."""
         try:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError as error:
-            return self._fail(str(error), geometry, step_s)
-        jump = float(np.abs(goal_rad - self.commanded_rad).max())
-        if jump > JUMP_RAD:
-            return self._fail(
-                f"joints would leap by {np.degrees(jump):.0f} degrees", geometry, step_s
-            )
+            return self._latch_fault(str(error), geometry, step_s)
+        jump_rad = float(np.abs(goal_rad - self.commanded_rad).max())
+        if jump_rad > MAX_JOINT_JUMP_RAD:
+            text = f"joints would jump by {np.degrees(jump_rad):.0f} degrees"
+            return self._latch_fault(text, geometry, step_s)
         self._sheet = sheet
-        return self._lead(goal_rad, geometry, other, step_s)
+        return self._command_joints(goal_rad, geometry, other, step_s)
 
     def _limits(self, geometry: ArmGeometry) -> SheetLimits:
-        """The limits of the sheet that hold now: while the arms align, wide enough to begin."""
+        """Return the present limits of the sheet; during an alignment they include its start."""
         return geometry.sheet_limits if self._alignment is None else self._relaxed_limits
 
-    def _lead(
+    def _command_joints(
         self, goal_rad: Floats, geometry: ArmGeometry, other: OtherArm, step_s: float
     ) -> Command:
-        """Go towards joints (6,), through the limiter; a sheet that would suffer is a fault."""
-        velocity = self._limited(goal_rad, geometry, step_s)
+        """Move towards joints (6,) through the limiter; latch a fault for an unsafe sheet."""
+        velocity = self._limit_velocity(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
         limits = self._limits(geometry)
-        trouble = place_trouble(flange, other.world_from_flange_commanded, limits) or sheet_trouble(
+        violation = check_flange(flange, other.world_from_flange_commanded, limits) or check_sheet(
             flange @ geometry.flange_from_edge,
             other.world_from_flange_commanded @ geometry.other_flange_from_edge,
             left=geometry.left,
             limits=limits,
         )
-        if trouble is not None:
-            return self._fail(f"commanded: {trouble}", geometry, step_s)
+        if violation is not None:
+            return self._latch_fault(f"commanded: {violation}", geometry, step_s)
         self._goal_rad = goal_rad
         return self._move(velocity, geometry, step_s)
 
-    def _fail(self, text: str, geometry: ArmGeometry, step_s: float) -> Command:
+    def _latch_fault(self, text: str, geometry: ArmGeometry, step_s: float) -> Command:
         self.faults = (text,)
-        return self._stop("fault", text, geometry, step_s)
+        self._inhibit(text, Event.FAULT)
+        return self._decelerate(text, geometry, step_s)
 
-    def _stop_and_relax(
-        self,
-        rest_mode: ArmMode,
-        reason: str,
-        geometry: ArmGeometry,
-        other: OtherArm | None,
-        step_s: float,
+    def _slacken(
+        self, reason: str, geometry: ArmGeometry, other: OtherArm | None, step_s: float
     ) -> Command:
-        """Stop; once at rest let the sheet go slack, moving this edge towards the other one."""
+        """Stop; at rest, slacken the sheet by moving this edge towards the other one."""
+        self._settle()
         measured = self.measured_rad
-        braking = not self.at_rest and self._relax_from is None
-        alone = other is None or not other.age_s <= self._patience.stop_after_s
-        if braking or alone or not self._has_pulled or other is None or measured is None:
-            return self._stop(rest_mode, reason, geometry, step_s)
+        begins = self._state is State.TAUT
+        if not (begins or self._state is State.RELAX) or other is None or measured is None:
+            return self._decelerate(reason, geometry, step_s)
         between = geometry.sheet_between(
             geometry.world_from_edge(measured),
             other.world_from_flange @ geometry.other_flange_from_edge,
         )
         limits = geometry.sheet_limits
         if between.stretch_ratio <= SLACK_STRETCH:
-            self._has_pulled = False
-            return self._stop(rest_mode, reason, geometry, step_s)
-        if between.stretch_ratio > FAR_BEYOND * limits.longest_m / limits.width_m:
-            return self._stop(rest_mode, f"{reason}; no sheet can be so long", geometry, step_s)
-        starts = self._relax_from is None or self._sheet is None
-        if starts and not self._stands_still(measured):
-            return self._stop(rest_mode, reason, geometry, step_s)
-        doubt = (
-            self._restart_doubt(measured)
-            if starts
-            else step_trouble(self.commanded_rad, measured, self._largest_lag_rad)
+            self.handle(Event.RELAX_ENDED)
+            return self._decelerate(reason, geometry, step_s)
+        if between.stretch_ratio > IMPLAUSIBLE_LENGTH_RATIO * limits.max_length_m / limits.width_m:
+            text = f"{reason}; the measured length is not possible"
+            return self._decelerate(text, geometry, step_s)
+        if begins and not self._stands_still(measured):
+            return self._decelerate(reason, geometry, step_s)
+        refusal = (
+            self._restart_refusal(measured)
+            if begins
+            else check_tracking_error(self.commanded_rad, measured, self._max_tracking_error_rad)
         )
-        if doubt is not None:
-            # It does not obey: to go on would be a leap once it does.
-            self._has_pulled = False
-            return self._stop(rest_mode, f"{reason}; {doubt}", geometry, step_s)
-        if self._relax_from is None or self._sheet is None:
+        if refusal is not None:
+            # The arm does not obey; further commands would make it jump once it does.
+            self.handle(Event.RELAX_ENDED)
+            return self._decelerate(f"{reason}; {refusal}", geometry, step_s)
+        if begins or self._sheet is None or self._relax_from is None:
             self._restart_at(measured)
             self._sheet, self._relax_from = between, between.stretch_ratio
-        # Alone, this arm has to give way by the whole of the stretch, twice its share.
+        # The other arm rests, so this arm covers the whole stretch: twice its half.
         target = replace(
             self._sheet,
             twist_world=np.zeros(6),
@@ -743,31 +761,30 @@ class ArmControl:
         try:
             goal_rad = geometry.joints_for_sheet(sheet, self.commanded_rad)
         except UnreachableError:
-            return self._stop(rest_mode, reason, geometry, step_s)
-        velocity = self._limited(goal_rad, geometry, step_s)
+            return self._decelerate(reason, geometry, step_s)
+        velocity = self._limit_velocity(goal_rad, geometry, step_s)
         flange = geometry.world_from_flange(self.commanded_rad + velocity * step_s)
-        if place_trouble(flange, other.world_from_flange, limits) is not None:
-            return self._stop(rest_mode, reason, geometry, step_s)
+        if check_flange(flange, other.world_from_flange, limits) is not None:
+            return self._decelerate(reason, geometry, step_s)
         self._sheet, self._goal_rad = sheet, goal_rad
-        self.mode, self.reason = "relax", reason
+        self.handle(Event.RELAX)
+        self.reason = reason
         return self._move(velocity, geometry, step_s)
 
-    def _stop(
-        self, rest_mode: ArmMode, reason: str, geometry: ArmGeometry, step_s: float
-    ) -> Command:
-        """Brake along the path; at rest stay in `rest_mode`."""
-        self._leave_way()
+    def _decelerate(self, reason: str, geometry: ArmGeometry, step_s: float) -> Command:
+        """Decelerate along the path; at rest, stay."""
+        self.handle(Event.RELAX_BLOCKED)
+        self._drop_path()
+        self._settle()
         self.reason = reason
         if self.at_rest:
-            self.mode = rest_mode
-            mode = "idle" if rest_mode == "idle" else "stop"
+            mode = "idle" if self.mode == "idle" else "stop"
             return self._send(mode, self.commanded_rad, geometry, step_s)
-        self.mode = "stopping"
-        slower = braked(self._velocity, limits=geometry.joint_limits, step_s=step_s)
-        velocity = with_tool_speed(
+        slower = decelerate(self._velocity, limits=geometry.joint_limits, step_s=step_s)
+        velocity = limit_tool_speed(
             self.commanded_rad,
             self._velocity,
-            within_range(
+            clamp_to_range(
                 self.commanded_rad,
                 self._velocity,
                 slower,
@@ -781,10 +798,10 @@ class ArmControl:
         )
         return self._move(velocity, geometry, step_s)
 
-    def _limited(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
-        """Joint velocities towards a goal that moves as it did since the last cycle."""
+    def _limit_velocity(self, goal_rad: Floats, geometry: ArmGeometry, step_s: float) -> Floats:
+        """Return joint velocities towards a goal that moves as it did since the last cycle."""
         before = self.commanded_rad if self._goal_rad is None else self._goal_rad
-        return limited(
+        return limit_velocity(
             self.commanded_rad,
             self._velocity,
             goal_rad,
@@ -802,11 +819,14 @@ class ArmControl:
     def _send(self, mode: str, joints_rad: Floats, geometry: ArmGeometry, step_s: float) -> Command:
         """Return the command for these joints; every command is made here.
 
-        Whatever has been decided, it leads no further from the last commanded joints than joint
-        speeds and tool speed allow.  A decision that would lead further is a fault.
+        Two last checks hold whatever has been decided.  A state without motion sends no motion.
+        No command exceeds the joint speeds or the tool speed.  A violation of either is a fault.
         """
         before = self.commanded_rad
-        bounded = bounded_step(
+        if mode == "move" and self._state not in MOTION_STATES:
+            self.faults = self.faults or (f"commanded: a motion in the state {self._state.name}",)
+            mode, joints_rad = "stop", before
+        bounded = bound_step(
             before,
             joints_rad,
             tool_points=geometry.tool_points,
@@ -817,6 +837,8 @@ class ArmControl:
         if bounded is not joints_rad:
             self._velocity = (bounded - before) / step_s
             self.faults = self.faults or ("commanded: a step beyond the joint or tool speed",)
+        if self.faults:
+            self._disarm(self.faults[0], Event.FAULT)
         self.commanded_rad = bounded
         self._has_commanded = self._has_commanded or mode == "move"
         if mode != "move":
@@ -825,44 +847,44 @@ class ArmControl:
         self._standstill.on_command(bounded, velocity, step_s)
         return Command(mode, bounded)
 
-    def _is_where_sent(self, measured: Floats) -> bool:
-        """Whether the arm stands at its last command, near enough to start from the measurement."""
+    def _is_at_command(self, measured: Floats) -> bool:
+        """Whether the arm is near enough to its last command to restart from the measurement."""
         return edge_shift_m(self.commanded_rad, measured) <= MAX_RESTART_SHIFT_M
 
     def _stands_still(self, measured: Floats) -> bool:
-        return self._standstill.is_standing(where_sent=self._is_where_sent(measured))
+        return self._standstill.is_standing(at_command=self._is_at_command(measured))
 
-    def _restart_doubt(self, measured: Floats) -> str | None:
-        """Why the last commanded joints may not be forgotten for the measured ones, or None.
+    def _restart_refusal(self, measured: Floats) -> str | None:
+        """Return why a motion must not restart from the measured joints, or None.
 
-        For an arm that stands still.  One that stands where it was sent to may start from there.
-        Elsewhere, either the arm has not obeyed or the measurement is wrong, which is a leap if it
-        is believed.
+        For an arm that stands still.  One at its last command may restart.  Elsewhere, either the
+        arm has not obeyed, or the measurement is wrong and would make the arm jump.
         """
         beyond = max(
             float((JOINT_MIN_RAD - measured).max()), float((measured - JOINT_MAX_RAD).max())
         )
         if beyond > MAX_BEYOND_RANGE_RAD:
             return f"measured joints are {np.degrees(beyond):.1f} degrees beyond their range"
-        if self._is_where_sent(measured):
+        if self._is_at_command(measured):
             return None
         monitor = self._standstill
         if monitor.is_alive and not monitor.has_jumped:
             return None
-        angle = float(np.degrees(np.abs(self.commanded_rad - measured).max()))
-        why = "leapt before" if monitor.has_jumped else "are frozen"
+        angle_deg = float(np.degrees(np.abs(self.commanded_rad - measured).max()))
+        defect = "jumped before" if monitor.has_jumped else "are frozen"
         return (
-            f"the arm stands {angle:.1f} degrees off its command by measured joints that {why}: "
-            "check the arm, then restart its bridge"
+            f"the arm stands {angle_deg:.1f} degrees off its command by measured joints that "
+            f"{defect}: check the arm, then restart its bridge"
         )
 
     def _restart_at(self, measured: Floats) -> None:
-        """Forget the last commanded joints: the next command goes on from the measured ones.
+        """Replace the last commanded joints by the measured ones.
 
-        A decision to do so for an arm that does not stand still is a fault, and they are kept.
+        Latch a fault instead if the arm does not stand still.
         """
-        if not self._stands_still(measured) or self._restart_doubt(measured) is not None:
+        if not self._stands_still(measured) or self._restart_refusal(measured) is not None:
             self.faults = self.faults or ("commanded: a start before the arm stands still",)
+            self._inhibit(self.faults[0], Event.FAULT)
             return
         self._forget_motion()
         self.commanded_rad = measured.copy()
@@ -870,13 +892,14 @@ class ArmControl:
 
     def _forget_motion(self) -> None:
         self._velocity = np.zeros(6)
-        self._leave_way()
+        self._drop_path()
 
-    def _leave_way(self) -> None:
-        self._sheet = self._goal_rad = self._relax_from = self._clear_way = self._alignment = None
+    def _drop_path(self) -> None:
+        self._sheet = self._goal_rad = self._relax_from = self._clear_path = self._alignment = None
         self._settled = self._together = False
 
 
-def _is_sound(motion: SheetMotion) -> bool:
+def _is_valid(motion: SheetMotion) -> bool:
+    """Return whether a target has a rigid pose and finite rates."""
     rates = (*motion.twist_world, motion.stretch_ratio, motion.stretch_rate_per_s)
     return is_rigid(motion.world_from_sheet) and bool(np.isfinite(rates).all())

@@ -1,4 +1,4 @@
-"""One arm's place in the scene: where it stands, how it holds its edge, what limits it."""
+"""Describe one arm of the scene: its base, its edge of the sheet, and its limits."""
 
 from __future__ import annotations
 
@@ -14,11 +14,10 @@ from flexsheet.nodes.arm_bridge.kinematics import (
     JOINT_MAX_RAD,
     JOINT_MIN_RAD,
     JOINT_SPEED_RAD_PER_S,
-    JointsFor,
     forward,
     next_joints,
 )
-from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_SHARE, JointLimits, SheetLimits
+from flexsheet.nodes.arm_bridge.limiter import TOOL_SPEED_FRACTION, JointLimits, SheetLimits
 from flexsheet.nodes.models.motion import EdgeBound, SheetMotion
 from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
 from flexsheet.nodes.models.sheet import edge_force_n, edge_poses, flange_pose, sheet_from_edges
@@ -27,13 +26,13 @@ Floats = NDArray[np.float64]
 
 RANGE_MARGIN_RAD = np.radians(2.0)
 
-EDGE_SPEED_SHARE = 0.95
-"""Share of the tool speed that the sheet's motion may use; beyond it the joints are cut."""
+EDGE_SPEED_FRACTION = 0.95
+"""Fraction of the tool speed that the sheet's motion may use; the limiter clamps the rest."""
 
 
 @lru_cache(maxsize=16)
 def _base_from_flange(joints_rad: tuple[float, ...]) -> Floats:
-    """`forward`, once for all who ask for the same joints in a cycle; not to be written to."""
+    """Compute `forward` once per cycle for the same joints; the result is read-only."""
     pose = forward(joints_rad)
     pose.flags.writeable = False
     return pose
@@ -44,13 +43,11 @@ def _transform(pose: Pose) -> Floats:
 
 
 class ArmGeometry:
-    """Where an arm of the scene stands, how it holds its edge, and what limits it."""
+    """Hold the pose of an arm's base, its edge of the sheet, and its limits."""
 
-    def __init__(self, scene: Scene, side: Side, *, joints_for: JointsFor = next_joints) -> None:
-        """joints_for: from a flange pose and the present joints to the next joints."""
+    def __init__(self, scene: Scene, side: Side) -> None:
         self.side: Side = side
         self.left = side == "left"
-        self._joints_for = joints_for
         arm, other = scene.arms.left, scene.arms.right
         if not self.left:
             arm, other = other, arm
@@ -58,10 +55,10 @@ class ArmGeometry:
         self.base_from_world = inverse(self.world_from_base)
         self.flange_from_edge = _transform(arm.flange_from_edge)
         self.other_flange_from_edge = _transform(other.flange_from_edge)
-        self.max_tool_speed = TOOL_SPEED_SHARE * scene.arms.max_tool_speed_m_per_s
+        self.max_tool_speed = TOOL_SPEED_FRACTION * scene.arms.max_tool_speed_m_per_s
         sheet = scene.sheet
         half = 0.5 * sheet.height_m
-        self.edge_bound = EdgeBound(EDGE_SPEED_SHARE * self.max_tool_speed, half)
+        self.edge_bound = EdgeBound(EDGE_SPEED_FRACTION * self.max_tool_speed, half)
         self.edge_points_flange = apply(
             self.flange_from_edge,
             np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]]),
@@ -78,7 +75,7 @@ class ArmGeometry:
             height_m=sheet.height_m,
             thickness_m=sheet.thickness_m,
             young_modulus_pa=sheet.young_modulus_pa,
-            longest_m=sheet.width_m * (sheet.max_stretch_ratio + 0.005),
+            max_length_m=sheet.width_m * (sheet.max_stretch_ratio + 0.005),
             max_edge_force_n=sheet.max_edge_force_n,
             max_twist_rad=0.2,
             min_flange_distance_m=scene.arms.min_distance_m,
@@ -93,22 +90,22 @@ class ArmGeometry:
         return self.world_from_flange(joints_rad) @ self.flange_from_edge
 
     def tool_points(self, joints_rad: Floats) -> Floats:
-        """Middle and both ends of the clamped edge, and the flange (4, 3), in the base frame."""
+        """Return centre and both ends of the clamped edge, and the flange (4, 3) m, base frame."""
         return apply(_base_from_flange(tuple(joints_rad.tolist())), self._tool_points)
 
     def joints_for_sheet(self, motion: SheetMotion, present_rad: Floats) -> Floats:
-        """Joints that bring this arm's edge to the sheet's, a step from the present joints.
+        """Return joints (6,) rad that hold this arm's edge of the sheet, near the present ones.
 
-        UnreachableError says why there are none.
+        Raises UnreachableError if there are none.
         """
         edges = edge_poses(
             motion.world_from_sheet, motion.stretch_ratio * self.sheet_limits.width_m
         )
         flange = flange_pose(edges[0 if self.left else 1], self.flange_from_edge)
-        return self._joints_for(self.base_from_world @ flange, present_rad)
+        return next_joints(self.base_from_world @ flange, present_rad)
 
     def sheet_between(self, own_edge: Floats, other_edge: Floats) -> SheetMotion:
-        """The sheet at rest between this arm's edge and the other's."""
+        """Return the resting sheet between this arm's edge and the other's (world poses)."""
         left, right = (own_edge, other_edge) if self.left else (other_edge, own_edge)
         distance = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
         stretch = distance / self.sheet_limits.width_m
@@ -117,7 +114,7 @@ class ArmGeometry:
     def sheet_state(
         self, joints_rad: Floats, world_from_other_flange: Floats | None
     ) -> tuple[float | None, float | None]:
-        """Distance of the edges (m) and force on each (N), as measured; None without the other."""
+        """Return measured distance of the edges (m) and force (N); None without the other arm."""
         if world_from_other_flange is None:
             return None, None
         other_edge = world_from_other_flange @ self.other_flange_from_edge

@@ -1,6 +1,6 @@
-"""Where a sheet target leads an arm, and how the two arms keep together on the way.
+"""Convert a sheet target to a goal for one arm, and synchronize the two arms.
 
-Plain functions: poses 4x4 in the world, turns in rad, lengths in m, times in s or ns as named.
+Plain functions: poses are 4x4 in the world, rotations in rad, lengths in m, times in s or ns.
 """
 
 from __future__ import annotations
@@ -17,109 +17,121 @@ from flexsheet.nodes.models.rigid import transform, vector_from_rotation
 
 Floats = NDArray[np.float64]
 
-WAIT_FROM_RAD = 0.05
-"""How far apart the edges may get before the arm that is ahead slows."""
+SLOW_FROM_RAD = 0.05
+"""Difference of the edges from which the leading arm slows."""
 
-WAIT_FULL_RAD = 0.12
-"""How far apart they may get before it stands still; the limiter stops both at 0.2."""
+WAIT_FROM_RAD = 0.12
+"""Difference of the edges at which the leading arm waits; the limiter stops both at 0.2 rad."""
 
-FURTHEST_FUTURE_S = 0.15
-"""No sheet is planned further ahead than fingertips say where they will be, and a little."""
+MAX_PREDICTION_S = 0.15
+"""Largest time of a target ahead of now: the horizon of fingertip predictions and a margin."""
 
 SKEW_LENGTH_M = 0.25
-"""An edge that far out of line with the other counts as one radian apart."""
+"""Skew of an edge to the other one that counts as 1 rad of difference."""
 
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """The sheet's target at the moment when this command takes effect; age since it arrived."""
+    """Hold the sheet's target at the time when a command acts.
+
+    overdue_s: time since the next target was due; below 0 while it is not.
+    """
 
     motion: SheetMotion
     overdue_s: float
 
 
-def goal_ahead(motion: SheetMotion, ahead_s: float, overdue_s: float, *, furthest_s: float) -> Goal:
-    """The target carried on by `ahead_s` (of either sign), but no further than `furthest_s`.
+def extrapolate_goal(
+    motion: SheetMotion, ahead_s: float, overdue_s: float, *, max_extrapolation_s: float
+) -> Goal:
+    """Extrapolate the target by `ahead_s` (of either sign), at most by `max_extrapolation_s`.
 
-    overdue_s: since its arrival, beyond when the next was due.  A target that would have to be
-    carried on further is overdue by that much, however lately it has arrived; so is one for a
-    moment too far ahead, whose clock cannot be right.
+    overdue_s: time since the next target was due.  A target that needs a longer extrapolation is
+    overdue by the rest, whenever it has arrived.  So is one too far in the future, whose clock
+    must be wrong.
     """
-    carried_s = min(max(ahead_s, -furthest_s), furthest_s)
-    late_s = max(overdue_s, ahead_s - furthest_s, -ahead_s - FURTHEST_FUTURE_S)
+    carried_s = min(max(ahead_s, -max_extrapolation_s), max_extrapolation_s)
+    late_s = max(overdue_s, ahead_s - max_extrapolation_s, -ahead_s - MAX_PREDICTION_S)
     return Goal(extrapolate(motion, carried_s), late_s)
 
 
 @dataclass(frozen=True, slots=True)
-class Timing:
-    """servo_lag_s: how long after it is sent a command acts.  target_period_s: after its arrival
-    the next target is due.  furthest_s: how far a target may be carried on."""
+class GoalTiming:
+    """Hold the times (s) that convert a target to a goal.
+
+    servo_lag_s: from sending a command until it acts.
+    target_period_s: from a target's arrival until the next is due.
+    max_extrapolation_s: longest extrapolation of a target.
+    """
 
     servo_lag_s: float
     target_period_s: float
-    furthest_s: float
+    max_extrapolation_s: float
 
 
-def goal_of(
+def make_goal(
     target: SheetTarget,
     *,
     received_ns: int,
     now_ns: int,
-    timing: Timing,
+    timing: GoalTiming,
 ) -> Goal:
-    """A target's goal for a command that is sent now.
+    """Return a target's goal for a command that is sent now.
 
-    A target states no rate of stretch, which the arms therefore trail.
+    A target has no rate of stretch, so the arms follow a changing stretch with a lag.
     """
     motion = SheetMotion(target.world_from_sheet, target.twist_world, target.stretch_ratio, 0.0)
     ahead_s = (now_ns - target.valid_at_ns) * 1e-9 + timing.servo_lag_s
     overdue_s = (now_ns - received_ns) * 1e-9 - timing.target_period_s
-    return goal_ahead(motion, ahead_s, overdue_s, furthest_s=timing.furthest_s)
-
-
-def pace(own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool) -> float:
-    """Share (0..1) of its speed with which an arm goes on, so that it waits for one behind it.
-
-    own_edge, other_edge: world poses of the commanded edges, the own one on the sheet's left or
-    right; target: world_from_sheet.  Each bridge moves the sheet by its own cycle, and a cycle late
-    on one side is a turn of the sheet's edges to one another.  The arm that leads on the way to the
-    target slows in proportion to its lead.  What one arm leads the other trails, so they never wait
-    for each other.
-    """
-    across = other_edge[:3, 3] - own_edge[:3, 3]
-    half = (0.5 if left else -0.5) * sqrt(float(across @ across))
-    own, other = _middle(own_edge, half), _middle(other_edge, -half)
-    lead = _between(other, own)
-    apart = sqrt(float(lead @ lead))
-    if apart <= WAIT_FROM_RAD:
-        return 1.0
-    way = _between(own, target) + _between(other, target)
-    if float(lead @ way) <= 0.0:
-        return 1.0
-    return max(0.0, (WAIT_FULL_RAD - apart) / (WAIT_FULL_RAD - WAIT_FROM_RAD))
-
-
-def slowed(bounds: SheetBounds, share: float) -> SheetBounds:
-    """The bounds with that share of their speeds; accelerations stay."""
-    if share == 1.0:
-        return bounds
-    return replace(
-        bounds,
-        speed_m_per_s=share * bounds.speed_m_per_s,
-        turn_rad_per_s=share * bounds.turn_rad_per_s,
-        stretch_rate_per_s=share * bounds.stretch_rate_per_s,
+    return extrapolate_goal(
+        motion, ahead_s, overdue_s, max_extrapolation_s=timing.max_extrapolation_s
     )
 
 
-def _middle(edge: Floats, along_m: float) -> Floats:
-    """The sheet's pose as one edge has it: its middle lies so far along the edge's x axis."""
+def sync_factor(own_edge: Floats, other_edge: Floats, target: Floats, *, left: bool) -> float:
+    """Return the factor (0..1) on an arm's speed that lets the other arm catch up.
+
+    own_edge, other_edge: world poses of the commanded edges; left: whether the own edge is the
+    sheet's left one.  target: world_from_sheet.
+
+    Each bridge moves the sheet in its own cycles, and a late cycle on one side rotates the edges
+    against each other.  The arm that leads on the path to the target slows in proportion to its
+    lead.  One arm's lead is the other's lag, so the arms never wait for each other.
+    """
+    across = other_edge[:3, 3] - own_edge[:3, 3]
+    half = (0.5 if left else -0.5) * sqrt(float(across @ across))
+    own, other = _sheet_centre(own_edge, half), _sheet_centre(other_edge, -half)
+    lead = _difference(other, own)
+    lead_rad = sqrt(float(lead @ lead))
+    if lead_rad <= SLOW_FROM_RAD:
+        return 1.0
+    remaining = _difference(own, target) + _difference(other, target)
+    if float(lead @ remaining) <= 0.0:
+        return 1.0
+    return max(0.0, (WAIT_FROM_RAD - lead_rad) / (WAIT_FROM_RAD - SLOW_FROM_RAD))
+
+
+def scale_speeds(bounds: SheetBounds, factor: float) -> SheetBounds:
+    """Return the bounds with scaled speeds and the same accelerations."""
+    if factor == 1.0:
+        return bounds
+    return replace(
+        bounds,
+        speed_m_per_s=factor * bounds.speed_m_per_s,
+        turn_rad_per_s=factor * bounds.turn_rad_per_s,
+        stretch_rate_per_s=factor * bounds.stretch_rate_per_s,
+    )
+
+
+def _sheet_centre(edge: Floats, along_m: float) -> Floats:
+    """Return the sheet's pose seen from one edge; its centre lies `along_m` along the edge's x."""
     return transform(edge[:3, :3], edge[:3, 3] + along_m * edge[:3, 0])
 
 
-def _between(pose: Floats, other: Floats) -> Floats:
-    """The way (6,) from one pose to another: turn (rad), then shift over SKEW_LENGTH_M.
+def _difference(pose: Floats, other: Floats) -> Floats:
+    """Return the difference (6,) of two poses: rotation (rad), then offset over SKEW_LENGTH_M.
 
-    The way back is the negative, exactly.
+    Exchanging the poses negates it exactly.
     """
-    turn = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
-    return np.concatenate([turn, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])
+    rotation = vector_from_rotation(other[:3, :3] @ pose[:3, :3].T)
+    return np.concatenate([rotation, (other[:3, 3] - pose[:3, 3]) / SKEW_LENGTH_M])

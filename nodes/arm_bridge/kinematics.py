@@ -1,17 +1,16 @@
-"""Kinematics of the Mitsubishi RV-1A.
+"""Compute the kinematics of the Mitsubishi RV-1A.
 
-Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.  The chain, from the axis and
-offset lists of two independent public models (Adolphus `mitsubishirv1a.yaml`, ICube `mrv1a.urdf`):
-at zero both arms stand upright and every frame is parallel to the base; J1, J4, J6 turn about z,
-J2, J3, J5 about y; shoulder 300 mm up, upper arm 250 mm, elbow shift 90 mm backwards, forearm
-160 mm, flange 72 mm beyond the wrist centre.
+Joints are (6,) in radians, poses 4x4 `base_from_flange` in metres.
+
+The chain follows two independent public models (Adolphus `mitsubishirv1a.yaml`, ICube
+`mrv1a.urdf`).  At zero the arm stands upright, and every frame is parallel to the base.  J1, J4, J6
+rotate about z; J2, J3, J5 about y.  Shoulder height 300 mm, upper arm 250 mm, elbow shift 90 mm
+backwards, forearm 160 mm, flange 72 mm beyond the wrist centre.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder, sin
 from typing import Literal, NamedTuple, get_args
 
@@ -19,22 +18,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from flexsheet.messages.errors import FlexsheetError
-from flexsheet.messages.methods import KinematicsMethod
-from flexsheet.messages.scene import Scene
-from flexsheet.nodes.methods import Family, Trial
-from flexsheet.nodes.models.rigid import (
-    apply,
-    inverse,
-    rotation_from_vector,
-    transform,
-    transform_from_rpy,
-    vector_from_rotation,
-)
-from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 
 Floats = NDArray[np.float64]
-JointsFor = Callable[[Floats, Floats], Floats]
-"""A flange pose (4, 4) in the base frame and the present joints (6,) to the next joints (6,)."""
 
 SHOULDER_HEIGHT_M = 0.3
 UPPER_ARM_M = 0.25
@@ -47,38 +32,38 @@ JOINT_MAX_RAD = np.radians([150.0, 120.0, 155.0, 160.0, 90.0, 200.0])
 JOINT_SPEED_RAD_PER_S = np.radians([180.0, 90.0, 135.0, 180.0, 180.0, 210.0])
 
 WRIST_SINGULAR = 1e-7
-"""Below this |sin J5| the axes of J4 and J6 are one; J4 then stays where it is."""
+"""|sin J5| below which the axes of J4 and J6 coincide; J4 then keeps its angle."""
 
 SHOULDER_SINGULAR_M = 1e-7
-"""A wrist centre nearer than this to the axis of J1 leaves J1 free; it stays where it is."""
+"""Distance of the wrist centre from the axis of J1 below which J1 keeps its angle."""
 
 WRIST_HELD_RAD, WRIST_NEAR_RAD = float(np.radians(0.75)), float(np.radians(6.0))
-"""J5 this near to zero leaves J4 where it is; from the second angle on it is exact again."""
+"""|J5| up to which J4 keeps its angle, and from which J4 is exact."""
 
 SHOULDER_HELD_M, SHOULDER_NEAR_M = 0.0007, 0.02
-"""The same for J1 and a wrist centre near its axis."""
+"""Distance of the wrist centre from the axis of J1, likewise."""
 
 HELD_ERROR = 1.4
-"""What is left undone between both, at most, over the first of them: 1.05 degrees, 1 mm."""
+"""Largest error between both, as a multiple of the first of them: 1.05 degrees, 1 mm."""
 
-LARGEST_TURN_RAD = 0.01
-"""What J4 or J1 turns in one step because of a singularity, at most: half their speed at 140 Hz."""
+MAX_FREE_ROTATION_RAD = 0.01
+"""Largest rotation of J4 or J1 in one step near a singularity: half their speed at 140 Hz."""
 
 _ELBOW_TO_WRIST_M = hypot(ELBOW_SHIFT_M, FOREARM_M)
 ELBOW_ANGLE_RAD = atan2(ELBOW_SHIFT_M, FOREARM_M)
-"""J3 (29.4 degrees) with shoulder, elbow and wrist centre in line: 30 degrees out of its range."""
+"""J3 (29.4 degrees) with shoulder, elbow and wrist centre in line, 30 degrees out of its range."""
 
 _LOWEST = tuple(float(angle) for angle in JOINT_MIN_RAD)
 _HIGHEST = tuple(float(angle) for angle in JOINT_MAX_RAD)
 
-FARTHEST_WRIST_M = float(
+MAX_WRIST_M = float(
     np.sqrt(
         UPPER_ARM_M**2
         + _ELBOW_TO_WRIST_M**2
         + 2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.cos(_LOWEST[2] - ELBOW_ANGLE_RAD)
     )
 )
-"""Of the wrist centre from the shoulder (0.4185 m), where J3 ends."""
+"""Largest distance of the wrist centre from the shoulder (0.4185 m), at the end of J3."""
 
 
 Shoulder = Literal["front", "back"]
@@ -87,10 +72,11 @@ Wrist = Literal["plain", "flipped"]
 
 
 class Branch(NamedTuple):
-    """One of the eight ways in which the arm can hold a flange pose.
+    """Name one of the eight solutions for a flange pose.
 
     shoulder: whether the wrist centre lies before or behind the plane through the axes of J1 and
-        J2.  elbow: "up" with J3 beyond `ELBOW_ANGLE_RAD`, as its whole range is, else "down".
+        J2.
+    elbow: "up" with J3 beyond `ELBOW_ANGLE_RAD`, as in its whole range, else "down".
     wrist: "flipped" with J5 below zero.
     """
 
@@ -105,13 +91,13 @@ BRANCHES = tuple(
     for elbow in get_args(Elbow)
     for wrist in get_args(Wrist)
 )
-"""In the order of what `branches` returns."""
+"""All branches, in the order of the result of `branches`."""
 
 
 class UnreachableError(FlexsheetError, ValueError):
-    """No joint angles within the ranges give the wanted flange pose.
+    """No joint angles within the ranges give the flange pose.
 
-    limit: what keeps the arm from there: "reach", or the joint of the branch that comes nearest.
+    limit: "reach", or the joint that the nearest branch has out of range.
     """
 
     code = "unreachable"
@@ -123,13 +109,13 @@ class UnreachableError(FlexsheetError, ValueError):
 
 
 def _arm_rotation(joint_1: float, joints_23: float) -> Floats:
-    """Rotation of the forearm: about z by J1, then about y by J2 + J3."""
+    """Return the rotation (3, 3) of the forearm: about z by J1, then about y by J2 + J3."""
     c1, s1, c23, s23 = cos(joint_1), sin(joint_1), cos(joints_23), sin(joints_23)
     return np.array([[c1 * c23, -s1, c1 * s23], [s1 * c23, c1, s1 * s23], [-s23, 0.0, c23]])
 
 
 def forward(joints_rad: ArrayLike) -> Floats:
-    """base_from_flange (4, 4) of joints (6,)."""
+    """Return base_from_flange (4, 4) of joints (6,) rad."""
     q1, q2, q3, q4, q5, q6 = np.asarray(joints_rad, dtype=np.float64).tolist()
     s2, c2, s23, c23 = sin(q2), cos(q2), sin(q2 + q3), cos(q2 + q3)
     out = UPPER_ARM_M * s2 - ELBOW_SHIFT_M * c23 + FOREARM_M * s23
@@ -137,7 +123,7 @@ def forward(joints_rad: ArrayLike) -> Floats:
     s1, c1, s4, c4 = sin(q1), cos(q1), sin(q4), cos(q4)
     s5, c5, s6, c6 = sin(q5), cos(q5), sin(q6), cos(q6)
     rows = []
-    # The flange's axes as the forearm sees them, turned about y by J2 + J3, then about z by J1.
+    # The flange's axes in the forearm's frame, rotated about y by J2 + J3, then about z by J1.
     for x, y, z in (
         (c4 * c5 * c6 - s4 * s6, s4 * c5 * c6 + c4 * s6, -s5 * c6),
         (-c4 * c5 * s6 - s4 * c6, -s4 * c5 * s6 + c4 * c6, s5 * s6),
@@ -151,11 +137,11 @@ def forward(joints_rad: ArrayLike) -> Floats:
 
 
 def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[float, ...]]:
-    """Every joint solution of a flange pose, up to 8, whatever the joint ranges say.
+    """Return every joint solution of a flange pose, up to 8, in or out of the joint ranges.
 
-    In the order of `BRANCHES`.  Where a singularity leaves
-    a joint free it is taken from `present_rad` (6,).  Angles are within a turn of zero.  Empty when
-    the wrist centre is too far or too near.
+    The order is that of `BRANCHES`.  A joint that a singularity leaves free is taken from
+    `present_rad` (6,).  Angles are within a revolution of zero.  The list is empty when the wrist
+    centre is too far or too near.
     """
     present = np.asarray(present_rad, dtype=np.float64).tolist()
     rotation = base_from_flange[:3, :3]
@@ -168,7 +154,7 @@ def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[flo
     found: list[tuple[float, ...]] = []
     for q1, out in ((azimuth, radius), (azimuth - pi if azimuth > 0 else azimuth + pi, -radius)):
         for q3 in (ELBOW_ANGLE_RAD + bend, ELBOW_ANGLE_RAD - bend):
-            q2 = _shoulder_angle(out, height, q3)
+            q2 = _solve_shoulder(out, height, q3)
             wrist = (_arm_rotation(q1, q2 + q3).T @ rotation).tolist()
             sine = hypot(wrist[0][2], wrist[1][2])
             q5 = atan2(sine, wrist[2][2])
@@ -187,17 +173,17 @@ def branches(base_from_flange: Floats, present_rad: ArrayLike) -> list[tuple[flo
 
 
 def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-    """Joints (6,) within the ranges that give the flange pose, nearest to the present joints.
+    """Return joints (6,) within the ranges for a flange pose, nearest to the present joints.
 
-    Nearest is by the largest change of any joint; J6 may lie up to 200 degrees either way, so that
-    a whole turn more or less is tried too.  UnreachableError when no branch is in range.
+    The distance is the largest change of any joint.  J6 has a range of 400 degrees, so one
+    revolution more or less is tried too.  Raises UnreachableError when no branch is in range.
     """
     present = np.asarray(present_rad, dtype=np.float64).tolist()
     nearest, least = None, inf
     solutions = branches(base_from_flange, present)
     for solution in solutions:
         joints = [
-            _nearest_turn(angle, near, low, high)
+            _nearest_revolution(angle, near, low, high)
             for angle, near, low, high in zip(solution, present, _LOWEST, _HIGHEST, strict=True)
         ]
         change = max(abs(angle - near) for angle, near in zip(joints, present, strict=True))
@@ -209,24 +195,24 @@ def inverse_kinematics(base_from_flange: Floats, present_rad: ArrayLike) -> Floa
 
 
 def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
-    """Joints (6,) for the next step of a motion: of the present branch, and without leaps.
+    """Return joints (6,) rad for the next step of a motion, on the present branch without jumps.
 
-    Exact, but for the neighbourhood of two singularities.  With J5 near zero the direction of J4 is
-    that of a vector with length sin(J5), which turns as fast as one likes when it passes zero at a
-    small distance.  There J4 may stay back: J5 takes the part of the vector along J4, be it
-    negative, and the rest (HELD_ERROR * WRIST_HELD_RAD at most) is left as an error of the flange's
-    orientation.  J1 does the same for a wrist centre near its axis.  So a path that passes a
-    singularity no further than the first length is followed straight through, with little motion of
-    J4 or J1.  One that passes further away turns them as the exact solution does, and it is for the
-    caller to bound their speeds.
+    The result is exact except near two singularities.  Near J5 = 0 the direction of J4 is that of a
+    vector of length sin(J5), which rotates arbitrarily fast when it passes zero closely.  There J4
+    may lag.  J5 takes the component of the vector along J4, which may be negative.  The rest is an
+    error of the flange's orientation of at most HELD_ERROR * WRIST_HELD_RAD.
 
-    Where the branch ends at a joint's range, another is taken if there is one, as by
-    `inverse_kinematics`, which raises UnreachableError.
+    J1 does the same for a wrist centre near its axis.  A path that passes a singularity within the
+    first length is therefore followed straight, with little motion of J4 or J1.  A path further
+    away rotates them like the exact solution, and the caller bounds their speeds.
+
+    At a joint's range the nearest other branch is used, by `inverse_kinematics`, which raises
+    UnreachableError if there is none.
     """
     present = np.asarray(present_rad, dtype=np.float64).tolist()
     rotation = base_from_flange[:3, :3]
     x, y, z = (base_from_flange[:3, 3] - FLANGE_M * rotation[:, 2]).tolist()
-    q1 = present[0] + _held_turn(
+    q1 = present[0] + _held_rotation(
         x * cos(present[0]) + y * sin(present[0]),
         y * cos(present[0]) - x * sin(present[0]),
         held=SHOULDER_HELD_M,
@@ -237,10 +223,10 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     if bend is None:
         raise _unreachable(base_from_flange, [])
     q3 = ELBOW_ANGLE_RAD + copysign(bend, present[2] - ELBOW_ANGLE_RAD)
-    q2 = _shoulder_angle(out, height, q3)
+    q2 = _solve_shoulder(out, height, q3)
     wrist = (_arm_rotation(q1, q2 + q3).T @ rotation).tolist()
     c4, s4 = cos(present[3]), sin(present[3])
-    q4 = present[3] + _held_turn(
+    q4 = present[3] + _held_rotation(
         c4 * wrist[0][2] + s4 * wrist[1][2],
         c4 * wrist[1][2] - s4 * wrist[0][2],
         held=WRIST_HELD_RAD,
@@ -248,7 +234,7 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     )
     c4, s4 = cos(q4), sin(q4)
     q5 = atan2(c4 * wrist[0][2] + s4 * wrist[1][2], wrist[2][2])
-    q6 = _last_turn(wrist, q4, q5)
+    q6 = _solve_last_joint(wrist, q4, q5)
     joints = [
         near + remainder(angle - near, 2.0 * pi)
         for angle, near in zip((q1, q2, q3, q4, q5, q6), present, strict=True)
@@ -258,13 +244,14 @@ def next_joints(base_from_flange: Floats, present_rad: ArrayLike) -> Floats:
     return inverse_kinematics(base_from_flange, present)
 
 
-def _held_turn(along: float, across: float, *, held: float, near: float) -> float:
-    """By how much (rad) an axis turns towards a vector, or its opposite, whichever is nearer.
+def _held_rotation(along: float, across: float, *, held: float, near: float) -> float:
+    """Return the rotation (rad) of an axis towards a vector, or towards its opposite if nearer.
 
-    along, across: the vector's parts along the axis' present direction, and 90 degrees further.
-    held, near: a vector no longer than the first needs no turn, from the second length on all of
-    it.  In between the direction may be off by an angle that falls from 90 degrees to zero; it is
-    made up for, as far as LARGEST_TURN_RAD allows.
+    along, across: the vector's components along the axis, and 90 degrees further.
+    held, near: lengths up to which the vector needs no rotation, and from which it needs all of it.
+
+    In between, the direction may be off by an angle that falls from 90 degrees to zero.  The rest
+    is corrected by at most MAX_FREE_ROTATION_RAD.
     """
     length = hypot(along, across)
     if length == 0.0:
@@ -274,12 +261,12 @@ def _held_turn(along: float, across: float, *, held: float, near: float) -> floa
         return turn
     slack = 0.5 * pi * min(1.0, held / length) * min(1.0, (near - length) / (near - held))
     wanted = abs(turn)
-    free = min(LARGEST_TURN_RAD * min(1.0, length / held), wanted, slack)
+    free = min(MAX_FREE_ROTATION_RAD * min(1.0, length / held), wanted, slack)
     return copysign(max(wanted - slack, 0.0) + free, turn)
 
 
-def _last_turn(wrist: list[list[float]], q4: float, q5: float) -> float:
-    """J6 that leaves the least rotation between R4 R5 R6 and the wrist's rotation (3, 3)."""
+def _solve_last_joint(wrist: list[list[float]], q4: float, q5: float) -> float:
+    """Return the J6 (rad) that brings R4 R5 R6 nearest to the wrist's rotation (3, 3)."""
     s4, c4, s5, c5 = sin(q4), cos(q4), sin(q5), cos(q5)
     first = (c4 * c5, s4 * c5, -s5)
     second = (-s4, c4, 0.0)
@@ -289,7 +276,7 @@ def _last_turn(wrist: list[list[float]], q4: float, q5: float) -> float:
 
 
 def _bend(out: float, height: float) -> float | None:
-    """Angle (0..pi) between upper arm and the line from elbow to wrist; None: out of reach."""
+    """Return the angle (0..pi) between upper arm and elbow-wrist line; None: out of reach."""
     cosine = (out * out + height * height - UPPER_ARM_M**2 - _ELBOW_TO_WRIST_M**2) / (
         2.0 * UPPER_ARM_M * _ELBOW_TO_WRIST_M
     )
@@ -298,16 +285,16 @@ def _bend(out: float, height: float) -> float | None:
     return acos(min(1.0, max(-1.0, cosine)))
 
 
-def _shoulder_angle(out: float, height: float, q3: float) -> float:
-    """J2 that brings the wrist centre, with the elbow at J3, to that place in the arm's plane."""
+def _solve_shoulder(out: float, height: float, q3: float) -> float:
+    """Return the J2 (rad) that brings the wrist centre to a point in the arm's plane."""
     along = FOREARM_M * sin(q3) - ELBOW_SHIFT_M * cos(q3)
     up = UPPER_ARM_M + ELBOW_SHIFT_M * sin(q3) + FOREARM_M * cos(q3)
     return _wrapped(atan2(out, height) - atan2(along, up))
 
 
 def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -> UnreachableError:
-    """What to say of a pose of which no solution is within the joint ranges."""
-    # Adding zero takes the sign from what is rounded to minus zero.
+    """Return the error for a pose without a solution within the joint ranges."""
+    # Adding zero removes the sign of a negative zero.
     x, y, z = np.round(base_from_flange[:3, 3] * 1e3) + 0.0
     where = f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm from the base"
     if not solutions:
@@ -315,7 +302,7 @@ def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -
         away = float(np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M]))
         return UnreachableError(
             f"{where}: out of the arm's reach, the wrist would be {1e3 * away:.0f} mm from the "
-            f"shoulder, at most {1e3 * FARTHEST_WRIST_M:.1f} mm",
+            f"shoulder, at most {1e3 * MAX_WRIST_M:.1f} mm",
             "reach",
         )
     _, joint, angle = min(max(_beyond(solution)) for solution in solutions)
@@ -328,31 +315,31 @@ def _unreachable(base_from_flange: Floats, solutions: list[tuple[float, ...]]) -
 
 
 def _beyond(solution: tuple[float, ...]) -> list[tuple[float, int, float]]:
-    """How far (rad) each joint is out of its range, with its number and its angle."""
+    """Return how far (rad) each joint is out of range, with its number and its angle."""
     found = []
     for joint, (angle, low, high) in enumerate(zip(solution, _LOWEST, _HIGHEST, strict=True)):
         middle = 0.5 * (low + high)
-        turned = middle + remainder(angle - middle, 2.0 * pi)
-        found.append((max(low - turned, turned - high), joint, turned))
+        rotated = middle + remainder(angle - middle, 2.0 * pi)
+        found.append((max(low - rotated, rotated - high), joint, rotated))
     return found
 
 
 def _wrapped(angle: float) -> float:
-    """The same direction within -pi..pi."""
+    """Return the angle within -pi..pi."""
     return atan2(sin(angle), cos(angle))
 
 
-def _nearest_turn(angle: float, near: float, low: float, high: float) -> float:
-    """`angle` plus whole turns, in [low, high], nearest to `near`; infinite when none is."""
+def _nearest_revolution(angle: float, near: float, low: float, high: float) -> float:
+    """Return `angle` plus revolutions, in [low, high], nearest to `near`; infinite for none."""
     best = inf
-    for turned in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
-        if low <= turned <= high and abs(turned - near) < abs(best - near):
-            best = turned
+    for rotated in (angle, angle - 2.0 * pi, angle + 2.0 * pi):
+        if low <= rotated <= high and abs(rotated - near) < abs(best - near):
+            best = rotated
     return best
 
 
-def branch_of(joints_rad: ArrayLike) -> Branch:
-    """The branch that joints (6,) are on; where two meet (at a singularity), the first of them."""
+def find_branch(joints_rad: ArrayLike) -> Branch:
+    """Return the branch of joints (6,) rad; at a singularity, the first of those that meet."""
     joints = np.asarray(joints_rad, dtype=np.float64)
     return Branch(
         "front" if _out(joints) >= 0.0 else "back",
@@ -362,11 +349,10 @@ def branch_of(joints_rad: ArrayLike) -> Branch:
 
 
 def joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLike) -> Floats:
-    """Joints (n, 6) of flange poses (n, 4, 4) on one branch, whatever the joint ranges say.
+    """Return joints (n, 6) rad of flange poses (n, 4, 4) on one branch, in or out of range.
 
-    NaN where the wrist centre is out of reach.  J4 and J6 may be given with whole turns more or
-    less: of those within the range, or else of all, the one nearest to `near_rad` (6,).  At a
-    singularity itself the free joint is 0.
+    NaN where the wrist centre is out of reach.  J4 and J6 are the nearest to `near_rad` (6,) of
+    all angles in range, or else of all.  At a singularity the free joint is 0.
     """
     poses = np.asarray(base_from_flange, dtype=np.float64)
     wrist = poses[:, :3, 3] - FLANGE_M * poses[:, :3, 2]
@@ -398,19 +384,19 @@ def joints_on_branch(base_from_flange: Floats, branch: Branch, near_rad: ArrayLi
     joints = near + np.remainder(joints - near + pi, 2.0 * pi) - pi
     for joint in (3, 5):
         angle = joints[:, joint]
-        for turned in (angle - 2.0 * pi, angle + 2.0 * pi):
-            better = (turned >= _LOWEST[joint]) & (turned <= _HIGHEST[joint])
+        for rotated in (angle - 2.0 * pi, angle + 2.0 * pi):
+            better = (rotated >= _LOWEST[joint]) & (rotated <= _HIGHEST[joint])
             better &= (angle < _LOWEST[joint]) | (angle > _HIGHEST[joint])
-            joints[:, joint] = np.where(better, turned, joints[:, joint])
+            joints[:, joint] = np.where(better, rotated, joints[:, joint])
     return joints
 
 
 @dataclass(frozen=True, slots=True)
 class Singularities:
-    """How far joints (..., 6) are from the three places where the arm loses a direction of motion.
+    """Hold the distances of joints (..., 6) to the arm's three singularities.
 
     shoulder_m: of the wrist centre from the axis of J1.
-    elbow_rad: of J3 from where shoulder, elbow and wrist centre are in line (either way).
+    elbow_rad: of J3 from an angle with shoulder, elbow and wrist centre in line.
     wrist_rad: of J5 from zero.
     """
 
@@ -420,181 +406,20 @@ class Singularities:
 
 
 def singularities(joints_rad: ArrayLike) -> Singularities:
-    """The distances of joints (..., 6) to the arm's singularities, arrays (...)."""
+    """Return the distances of joints (..., 6) to the arm's singularities, arrays (...)."""
     joints = np.asarray(joints_rad, dtype=np.float64)
     elbow = np.remainder(joints[..., 2] - ELBOW_ANGLE_RAD + 0.5 * pi, pi) - 0.5 * pi
     wrist = np.remainder(joints[..., 4] + 0.5 * pi, pi) - 0.5 * pi
     return Singularities(np.abs(_out(joints)), np.abs(elbow), np.abs(wrist))
 
 
-def manipulability(joints_rad: ArrayLike) -> Floats:
-    """|det J| (m^3) of joints (..., 6): 0 at a singularity (Yoshikawa, IJRR 4(2), 1985).
-
-    With a spherical wrist the determinant is that of the arm times that of the wrist; here it is
-    upper arm x (elbow to wrist) x |sin(J3 - straight)| x |wrist centre to J1's axis| x |sin J5|.
-    """
-    joints = np.asarray(joints_rad, dtype=np.float64)
-    elbow = np.sin(joints[..., 2] - ELBOW_ANGLE_RAD)
-    return np.asarray(
-        UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.abs(elbow * _out(joints) * np.sin(joints[..., 4]))
-    )
-
-
 def _out(joints: Floats) -> Floats:
-    """How far (m) the wrist centre lies before the axes of J1; negative behind it."""
+    """Return the distance (m) of the wrist centre before the axis of J1; negative behind it."""
     q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
     return np.asarray(
         UPPER_ARM_M * np.sin(q2) - ELBOW_SHIFT_M * np.cos(q23) + FOREARM_M * np.sin(q23)
     )
 
 
-def jacobian(joints_rad: ArrayLike) -> Floats:
-    """(6, 6): joint speeds to the flange's velocity, then its angular velocity, in the base."""
-    q1, q2, q3, q4 = (float(angle) for angle in np.asarray(joints_rad)[:4])
-    arm = _arm_rotation(q1, q2 + q3)
-    flange = forward(joints_rad)
-    shoulder = np.array([0.0, 0.0, SHOULDER_HEIGHT_M])
-    elbow = shoulder + UPPER_ARM_M * np.array([cos(q1) * sin(q2), sin(q1) * sin(q2), cos(q2)])
-    wrist = flange[:3, 3] - FLANGE_M * flange[:3, 2]
-    axes = np.column_stack(
-        [
-            [0.0, 0.0, 1.0],
-            arm[:, 1],
-            arm[:, 1],
-            arm[:, 2],
-            arm @ np.array([-sin(q4), cos(q4), 0.0]),
-            flange[:3, 2],
-        ]
-    )
-    centres = np.column_stack([shoulder, shoulder, elbow, wrist, wrist, wrist])
-    return np.vstack([np.cross(axes, flange[:3, 3:] - centres, axis=0), axes])
-
-
-def damped_least_squares(
-    base_from_flange: Floats,
-    present_rad: ArrayLike,
-    *,
-    iterations: int = 20,
-    damping: float = 1e-3,
-    tolerance: float = 1e-9,
-) -> Floats:
-    """Joints (6,) near `present_rad` for a flange pose, by Levenberg's damped steps.
-
-    Needs a start from which the pose can be reached without a change of branch; knows no joint
-    ranges; stops at `tolerance` (m and rad) or after `iterations`, whatever is left then
-    (Wampler 1986).
-    """
-    joints = np.array(present_rad, dtype=np.float64)
-    for _ in range(iterations):
-        pose = forward(joints)
-        error = np.concatenate(
-            [
-                base_from_flange[:3, 3] - pose[:3, 3],
-                vector_from_rotation(base_from_flange[:3, :3] @ pose[:3, :3].T),
-            ]
-        )
-        if float(np.abs(error).max()) < tolerance:
-            break
-        slope = jacobian(joints)
-        joints += slope.T @ np.linalg.solve(slope @ slope.T + damping**2 * np.eye(6), error)
-    return joints
-
-
-CHART_LEAP_RAD = 0.35
-"""Joints that would go further than this in one step stop the bridge: out of a method's range."""
-
 CENTRE_RAD = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
-"""The arm reaching forward, far from all singularities and ranges."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Edge:
-    """A clamped edge's middle and ends (3, 3) m, seen from the flange: what errors are taken of."""
-
-    points: Floats
-
-    def error_mm(self, wanted: Floats, joints_rad: Floats) -> float:
-        """How far a point of the edge is off, at most."""
-        off = apply(forward(joints_rad), self.points) - apply(wanted, self.points)
-        return 1e3 * float(np.linalg.norm(off, axis=1).max())
-
-
-def _trials(scene: Scene) -> Iterable[Trial]:
-    """Steps of the left arm: tilts over the working range, and past the wrist's singularity.
-
-    tilt: the sheet turns by 0.03 rad.  past: the flange's axis passes that of the forearm at a
-    distance, in a step of 0.02 rad that begins 0.01 rad before the nearest point.
-    """
-    arm = scene.arms.left
-    base_from_world = inverse(
-        transform_from_rpy(arm.world_from_base.position_m, arm.world_from_base.rpy_rad)
-    )
-    flange_from_edge = transform_from_rpy(
-        arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad
-    )
-    half = 0.5 * scene.sheet.height_m
-    edge = _Edge(apply(flange_from_edge, np.array([[0.0, -half, 0.0], [0, 0, 0], [0, half, 0]])))
-
-    def flange(tilt_rad: float) -> Floats:
-        world_from_sheet = transform_from_rpy(np.zeros(3), [tilt_rad, 0.0, 0.0])
-        left, _ = edge_poses(world_from_sheet, scene.sheet.width_m)
-        return base_from_world @ flange_pose(left, flange_from_edge)
-
-    start = CENTRE_RAD
-    for share in (0.0, 0.5, 1.0):
-        tilt_rad = share * scene.working_range.tilt_rad
-        start = inverse_kinematics(flange(tilt_rad - 0.03), start)
-        tilt_deg = round(degrees(tilt_rad), 1)
-        yield from _step_trials({"tilt_deg": tilt_deg}, start, flange(tilt_rad), edge)
-    for past_deg in (0.1, 1.0, 8.0):
-        distance = float(np.radians(past_deg))
-        start = CENTRE_RAD.copy()
-        start[3:] = atan2(-distance, 0.01), -hypot(distance, 0.01), 0.0
-        pose = forward(start)
-        axis = _arm_rotation(start[0], start[1] + start[2])[:, 1]
-        wrist = pose[:3, 3] - FLANGE_M * pose[:3, 2]
-        turned = rotation_from_vector(0.02 * axis) @ pose[:3, :3]
-        wanted = transform(turned, wrist + FLANGE_M * turned[:, 2])
-        for trial in _step_trials({"past_singularity_deg": past_deg}, start, wanted, edge):
-            yield replace(trial, in_scene=False)
-
-
-def _step_trials(
-    case: dict[str, float | int | str], start: Floats, wanted: Floats, edge: _Edge
-) -> Iterable[Trial]:
-    near = float(singularities(start).wrist_rad) < WRIST_NEAR_RAD
-    for method, solve in _METHODS.items():
-        leap = float(np.abs(solve(wanted, start) - start).max())
-        gives_way = near and solve is next_joints
-        yield Trial(
-            method=method,
-            case=case,
-            run=partial(solve, wanted, start),
-            error=partial(edge.error_mm, wanted),
-            in_range=leap <= CHART_LEAP_RAD and not gives_way,
-            size={"leap_deg": round(degrees(leap), 2)},
-        )
-
-
-STEPS: Mapping[KinematicsMethod, JointsFor] = {
-    "closed_form_continuous": next_joints,
-}
-"""What a bridge may step by: the branch that its way was checked on.  Of the others of the family,
-which are there to compare, one leaves that branch past a singularity and the rest know no ranges.
-"""
-
-_METHODS: dict[str, JointsFor] = {
-    "closed_form": inverse_kinematics,
-    "closed_form_continuous": next_joints,
-    "damped_least_squares_2": partial(damped_least_squares, iterations=2),
-    "damped_least_squares_20": partial(damped_least_squares, iterations=20),
-}
-
-KINEMATICS = Family(
-    name="kinematics",
-    unit="mm",
-    reference="forward kinematics",
-    methods=tuple(_METHODS),
-    trials=_trials,
-    tolerance=lambda scene: 1e3 * scene.tolerances.sheet_position_m,
-)
+"""Joints of an arm that reaches forward, far from all singularities and ranges."""

@@ -1,8 +1,10 @@
-"""What stands between any command and an arm.
+"""Limit every command to an arm.
 
-Speed, acceleration and tool speed are clamped, so that the arm merely gets there later; what no
-clamp makes safe (a sheet overstretched or twisted, flanges too near, a place outside the workspace)
-is named, and the caller stops the arm.  Plain functions: joints (6,) rad, poses 4x4, metres.
+Speed, acceleration and tool speed are clamped, which delays the arm.  No clamp makes an
+overstretched or twisted sheet, flanges too near, or a position outside the workspace safe.  The
+checks return these as text, and the caller stops the arm.
+
+Plain functions: joints (6,) rad, poses 4x4, metres.
 """
 
 from __future__ import annotations
@@ -20,51 +22,51 @@ from flexsheet.nodes.models.sheet import edge_force_n
 
 Floats = NDArray[np.float64]
 
-TOOL_SPEED_SHARE = 0.82
-"""Share of the tool speed that commands may use: an arm that is sent to a place at a time, and not
-a velocity, ripples about its mean speed.  Most where wrist joints turn fast against one another:
-each ripples by its own speed, of which little is left at the tool (benchmarks/limiter.py)."""
+TOOL_SPEED_FRACTION = 0.82
+"""Fraction of the tool speed that commands may use.  An arm that receives positions ripples about
+its mean speed.  The ripple is largest where wrist joints rotate fast against each other, because
+each ripples with its own speed (benchmarks/limiter.py)."""
 
-EVEN_STEP_S = 0.01
-"""After a longer gap than that a command leads no further than in this time: what a late one makes
-up at once, the arm would do faster than it may."""
+MAX_TRAVEL_STEP_S = 0.01
+"""Largest duration whose travel one command may cover.  After a longer gap the arm would catch up
+faster than the tool speed allows."""
 
-SHORTEST_STEP_S, LONGEST_STEP_S = 1e-6, 10.0
-"""What a command may cover; speeds over less are rounding errors, and over more no control."""
+MIN_STEP_S, MAX_STEP_S = 1e-6, 10.0
+"""Shortest and longest duration of a command; speeds over less are rounding errors."""
 
-LEAST_SHARE = 0.02
-"""Below this share of the way from braking to the wanted velocity it is not worth looking."""
+MIN_BLEND = 0.02
+"""Smallest blend from decelerating to the desired velocity that is tried."""
 
-WITHIN = 1.0 + 1e-6
-"""A step that is longer than its limit by rounding errors is within it."""
+ROUNDING_FACTOR = 1.0 + 1e-6
+"""Factor by which rounding errors may exceed a limit."""
 
 RELAXED_M, RELAXED_RAD = 0.002, 0.01
-"""By how much a limit that is exceeded at the start of a motion may be exceeded further: servos
-ripple, and measurements are noisy."""
+"""Margin on a limit that is exceeded at the start of a motion; servos ripple, and measurements are
+noisy."""
 
-RANGE_BRAKE_SHARE = 2.0 / 3.0
-"""Share of a joint's acceleration kept for stopping short of the end of its range."""
+RANGE_BRAKE_FRACTION = 2.0 / 3.0
+"""Fraction of a joint's acceleration that is reserved for stopping within its range."""
 
 
 @dataclass(frozen=True, slots=True)
 class JointLimits:
-    """Range, speed and acceleration of each joint, (6,)."""
+    """Hold range, speed and acceleration of each joint, (6,)."""
 
-    lowest_rad: Floats
-    highest_rad: Floats
+    min_rad: Floats
+    max_rad: Floats
     speed_rad_per_s: Floats
     acceleration_rad_per_s2: Floats
 
 
 @dataclass(frozen=True, slots=True)
 class SheetLimits:
-    """What the sheet and the two arms that share it may suffer."""
+    """Hold the limits of the sheet and of the two arms that hold it."""
 
     width_m: float
     height_m: float
     thickness_m: float
     young_modulus_pa: float
-    longest_m: float
+    max_length_m: float
     max_edge_force_n: float
     max_twist_rad: float
     min_flange_distance_m: float
@@ -72,7 +74,7 @@ class SheetLimits:
     workspace_max_m: Floats
 
     def force_n(self, length_m: float) -> float:
-        """Force on each edge of a sheet of that length."""
+        """Return the force (N) on each edge of a sheet of this length."""
         return edge_force_n(
             length_m / self.width_m,
             young_modulus_pa=self.young_modulus_pa,
@@ -81,7 +83,7 @@ class SheetLimits:
         )
 
 
-def limited(
+def limit_velocity(
     joints_rad: Floats,
     velocity: Floats,
     goal_rad: Floats,
@@ -92,26 +94,28 @@ def limited(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Joint velocities (6,) for the next step towards a goal that moves: the whole limiter.
+    """Return joint velocities (6,) rad/s for the next step towards a moving goal.
 
-    goal_rad is where the joints should be at the end of the step; a goal that is not finite brakes.
-    velocity is what the last call returned.  tool_points: joints to points (n, 3) in metres, none
-    of which may exceed `max_tool_speed`.  Whatever the goal, joints_rad + result * step_s is in
-    range, and speed and tool speed are kept.  So is the acceleration, unless range or tool speed
-    could not be kept otherwise.  ValueError when step_s is no duration of a step.
+    goal_rad: joints at the end of the step; a goal that is not finite decelerates.
+    velocity: result of the last call.
+    tool_points: from joints to points (n, 3) m, none of which may exceed `max_tool_speed`.
+
+    For any goal, joints_rad + result * step_s is in range, and joint and tool speeds are within
+    their limits.  So is the acceleration, unless range or tool speed need more.  Raises ValueError
+    for a `step_s` outside MIN_STEP_S to MAX_STEP_S.
     """
-    if not SHORTEST_STEP_S <= step_s <= LONGEST_STEP_S:
-        raise ValueError(
-            f"a step of {step_s} s: a command covers {SHORTEST_STEP_S} to {LONGEST_STEP_S} s"
-        )
+    if not MIN_STEP_S <= step_s <= MAX_STEP_S:
+        raise ValueError(f"step_s is {step_s} s; a command covers {MIN_STEP_S} to {MAX_STEP_S} s")
     if np.isfinite(goal_rad).all() and np.isfinite(goal_velocity).all():
-        wanted = towards(joints_rad, goal_rad, goal_velocity, limits=limits, step_s=step_s)
+        wanted = find_desired_velocity(
+            joints_rad, goal_rad, goal_velocity, limits=limits, step_s=step_s
+        )
     else:
-        wanted = braked(velocity, limits=limits, step_s=step_s)
-    return with_tool_speed(
+        wanted = decelerate(velocity, limits=limits, step_s=step_s)
+    return limit_tool_speed(
         joints_rad,
         velocity,
-        within_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s),
+        clamp_to_range(joints_rad, velocity, wanted, limits=limits, step_s=step_s),
         tool_points=tool_points,
         max_tool_speed=max_tool_speed,
         limits=limits,
@@ -119,7 +123,7 @@ def limited(
     )
 
 
-def towards(
+def find_desired_velocity(
     joints_rad: Floats,
     goal_rad: Floats,
     goal_velocity: Floats,
@@ -127,47 +131,48 @@ def towards(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """The velocities (6,) one would like: onto the goal at once, or closing in to stop there."""
-    fastest = limits.speed_rad_per_s
-    goal = _between(goal_rad, limits.lowest_rad, limits.highest_rad)
-    along = _between(goal_velocity, -fastest, fastest)
+    """Return the velocities (6,) that reach the goal at once, or approach it to stop there."""
+    max_speed = limits.speed_rad_per_s
+    goal = _clamp(goal_rad, limits.min_rad, limits.max_rad)
+    along = _clamp(goal_velocity, -max_speed, max_speed)
     offset = goal - along * step_s - joints_rad
     brake = BRAKE_FRACTION * limits.acceleration_rad_per_s2
     closing = np.sign(offset) * closing_speed(np.abs(offset), brake, step_s)
-    return _between(along + closing, -fastest, fastest)
+    return _clamp(along + closing, -max_speed, max_speed)
 
 
-def within_range(
+def clamp_to_range(
     joints_rad: Floats, velocity: Floats, wanted: Floats, *, limits: JointLimits, step_s: float
 ) -> Floats:
-    """The wanted velocities, clamped to acceleration and so that every joint can stop in range."""
-    sharpest = limits.acceleration_rad_per_s2
-    up = _room(limits.highest_rad - joints_rad, sharpest, step_s)
-    down = _room(joints_rad - limits.lowest_rad, sharpest, step_s)
-    reach = sharpest * step_s
-    result = _between(_between(wanted, -down, up), velocity - reach, velocity + reach)
-    lowest = (limits.lowest_rad - joints_rad) / step_s
-    highest = (limits.highest_rad - joints_rad) / step_s
-    # Outside the range (as after a start there) the way back is open, the way on is not.
-    return _between(result, np.minimum(lowest, 0.0), np.maximum(highest, 0.0))
+    """Clamp desired velocities to the acceleration, and so that every joint can stop in range."""
+    max_acceleration = limits.acceleration_rad_per_s2
+    up = _find_max_speed(limits.max_rad - joints_rad, max_acceleration, step_s)
+    down = _find_max_speed(joints_rad - limits.min_rad, max_acceleration, step_s)
+    reach = max_acceleration * step_s
+    result = _clamp(_clamp(wanted, -down, up), velocity - reach, velocity + reach)
+    lower = (limits.min_rad - joints_rad) / step_s
+    upper = (limits.max_rad - joints_rad) / step_s
+    # Outside the range, as after a start there, only motion back into it is allowed.
+    return _clamp(result, np.minimum(lower, 0.0), np.maximum(upper, 0.0))
 
 
-def _between(values: Floats, lowest: Floats, highest: Floats) -> Floats:
-    """As numpy.clip, at a fifth of its cost for six numbers."""
+def _clamp(values: Floats, lowest: Floats, highest: Floats) -> Floats:
+    """Clip like numpy.clip, at a fifth of its cost for six numbers."""
     return np.minimum(np.maximum(values, lowest), highest)
 
 
-def _room(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
-    return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_SHARE * acceleration, step_s)
+def _find_max_speed(distance: Floats, acceleration: Floats, step_s: float) -> Floats:
+    """Return the largest speeds from which the joints can stop within these distances."""
+    return closing_speed(np.maximum(distance, 0.0), RANGE_BRAKE_FRACTION * acceleration, step_s)
 
 
-def braked(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
-    """Velocities (6,) one step nearer to rest: all joints slow in proportion, along their path."""
+def decelerate(velocity: Floats, *, limits: JointLimits, step_s: float) -> Floats:
+    """Return velocities (6,) one step nearer to rest; all joints slow in proportion."""
     stopping_s = float(np.max(np.abs(velocity) / limits.acceleration_rad_per_s2))
     return velocity * max(0.0, 1.0 - step_s / stopping_s) if stopping_s > 0.0 else velocity
 
 
-def with_tool_speed(
+def limit_tool_speed(
     joints_rad: Floats,
     velocity: Floats,
     wanted: Floats,
@@ -177,44 +182,43 @@ def with_tool_speed(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """The wanted velocities (6,), held back until no tool point moves faster than it may.
+    """Return the nearest velocities (6,) to the desired ones that keep the tool speed.
 
-    What lies between the wanted velocities and those of braking is within acceleration and range
-    like both; the nearest to the wanted ones is taken.  If even braking is too fast, it is cut: the
-    speed limit comes before the smooth ride.
+    Velocities between the desired ones and those of decelerating keep acceleration and range like
+    both.  If even decelerating is too fast, it is scaled down and exceeds the acceleration.
     """
     here = tool_points(joints_rad)
-    furthest = max_tool_speed * min(step_s, EVEN_STEP_S)
+    max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
 
     def shifts(candidate: Floats) -> Floats:
         return tool_points(joints_rad + candidate * step_s) - here
 
     fast = shifts(wanted)
-    if _longest(fast) <= furthest:
+    if _longest(fast) <= max_shift_m:
         return wanted
-    slower = within_range(
+    slower = clamp_to_range(
         joints_rad,
         velocity,
-        braked(velocity, limits=limits, step_s=step_s),
+        decelerate(velocity, limits=limits, step_s=step_s),
         limits=limits,
         step_s=step_s,
     )
     slow = shifts(slower)
-    if (way := _longest(slow)) <= furthest:
-        share = _share_within(slow, fast, furthest)
-        while share > LEAST_SHARE:
-            between = slower + share * (wanted - slower)
-            if _longest(shifts(between)) <= furthest:
+    if (shift_m := _longest(slow)) <= max_shift_m:
+        blend = _find_blend(slow, fast, max_shift_m)
+        while blend > MIN_BLEND:
+            between = slower + blend * (wanted - slower)
+            if _longest(shifts(between)) <= max_shift_m:
                 return between
-            share *= 0.8
+            blend *= 0.8
         return slower
-    while way > furthest:
-        slower = slower * (0.99 * furthest / way)
-        way = _longest(shifts(slower))
+    while shift_m > max_shift_m:
+        slower = slower * (0.99 * max_shift_m / shift_m)
+        shift_m = _longest(shifts(slower))
     return slower
 
 
-def bounded_step(
+def bound_step(
     joints_rad: Floats,
     wanted_rad: Floats,
     *,
@@ -223,10 +227,10 @@ def bounded_step(
     limits: JointLimits,
     step_s: float,
 ) -> Floats:
-    """Joints (6,) no further from `joints_rad` than joint speeds and tool speed allow in a step.
+    """Return the joints (6,) towards `wanted_rad` that one step can reach.
 
-    Returns `wanted_rad` itself where it is near enough, else joints on the straight line to it; the
-    present joints where it is not finite.
+    Joint speeds and tool speed bound the step.  Returns `wanted_rad` itself where it is within
+    them, else joints on the straight line to it.  Returns `joints_rad` where it is not finite.
     """
     if wanted_rad is joints_rad:
         return wanted_rad
@@ -234,38 +238,40 @@ def bounded_step(
     ratio = float((np.abs(step) / (limits.speed_rad_per_s * step_s)).max())
     if not np.isfinite(ratio):
         return joints_rad
-    if ratio > WITHIN:
+    if ratio > ROUNDING_FACTOR:
         step = step / ratio
     here = tool_points(joints_rad)
-    furthest = max_tool_speed * min(step_s, EVEN_STEP_S)
-    shift = _longest(tool_points(joints_rad + step if ratio > WITHIN else wanted_rad) - here)
-    if ratio <= WITHIN and shift <= WITHIN * furthest:
+    max_shift_m = max_tool_speed * min(step_s, MAX_TRAVEL_STEP_S)
+    shift = _longest(
+        tool_points(joints_rad + step if ratio > ROUNDING_FACTOR else wanted_rad) - here
+    )
+    if ratio <= ROUNDING_FACTOR and shift <= ROUNDING_FACTOR * max_shift_m:
         return wanted_rad
-    while shift > furthest:
-        step = step * (0.99 * furthest / shift)
+    while shift > max_shift_m:
+        step = step * (0.99 * max_shift_m / shift)
         shift = _longest(tool_points(joints_rad + step) - here)
     result: Floats = joints_rad + step
     return result
 
 
 def _longest(shifts: Floats) -> float:
-    """The length of the longest of vectors (n, 3)."""
+    """Return the length of the longest of vectors (n, 3)."""
     return math.sqrt(float((shifts * shifts).sum(axis=1).max()))
 
 
-def _share_within(slow: Floats, fast: Floats, furthest: float) -> float:
-    """How far to go from shifts (n, 3) that are within a length to such that are not.
+def _find_blend(slow: Floats, fast: Floats, max_shift_m: float) -> float:
+    """Return the largest blend from slow to fast shifts (n, 3) within a length, linearly.
 
-    As if they went straight over; from |slow + share (fast - slow)| = furthest.
+    Solves |slow + blend (fast - slow)| = max_shift_m for each shift.
     """
     change = fast - slow
     square, mixed = (change * change).sum(axis=1), (slow * change).sum(axis=1)
-    left = (slow * slow).sum(axis=1) - furthest * furthest
+    left = (slow * slow).sum(axis=1) - max_shift_m * max_shift_m
     root = np.sqrt(mixed * mixed - square * np.minimum(left, 0.0))
     return float(((root - mixed) / np.maximum(square, 1e-30)).min()) * (1.0 - 1e-3)
 
 
-def relaxed_limits(
+def relax_limits(
     limits: SheetLimits,
     flange: Floats,
     edge: Floats,
@@ -274,20 +280,20 @@ def relaxed_limits(
     *,
     left: bool,
 ) -> SheetLimits:
-    """The limits, widened where the arms (world poses) stand beyond them or nearly so.
+    """Widen the limits where the arms (world poses) exceed them, or nearly do.
 
-    A motion that begins beyond a limit may lead back, and no further.  `left`: as `sheet_trouble`.
+    A motion that begins beyond a limit may lead back, and not further.  left: see `check_sheet`.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     apart = other_flange[:3, 3] - flange[:3, 3]
-    longest_m = math.sqrt(float(across @ across)) + RELAXED_M
-    skewed = angle_between(across if left else -across, edge[:3, 0])
+    max_length_m = math.sqrt(float(across @ across)) + RELAXED_M
+    skew_rad = angle_between(across if left else -across, edge[:3, 0])
     return replace(
         limits,
-        longest_m=max(limits.longest_m, longest_m),
-        max_edge_force_n=max(limits.max_edge_force_n, limits.force_n(longest_m)),
+        max_length_m=max(limits.max_length_m, max_length_m),
+        max_edge_force_n=max(limits.max_edge_force_n, limits.force_n(max_length_m)),
         max_twist_rad=max(
-            limits.max_twist_rad, max(skewed, _twist(edge, other_edge)) + RELAXED_RAD
+            limits.max_twist_rad, max(skew_rad, _twist(edge, other_edge)) + RELAXED_RAD
         ),
         min_flange_distance_m=min(
             limits.min_flange_distance_m, math.sqrt(float(apart @ apart)) - RELAXED_M
@@ -298,54 +304,53 @@ def relaxed_limits(
 
 
 def _twist(edge: Floats, other_edge: Floats) -> float:
-    """Angle between two edges' orientations, rad."""
-    # Of two rotations' difference the Frobenius norm is sqrt(8) sin(half the angle between them).
+    """Return the angle (rad) between two edges' orientations."""
+    # The Frobenius norm of the difference of two rotations is sqrt(8) sin(angle / 2).
     apart = (other_edge[:3, :3] - edge[:3, :3]).ravel()
     return 2.0 * math.asin(min(1.0, math.sqrt(float(apart @ apart) / 8.0)))
 
 
-def sheet_trouble(
-    edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits
-) -> str | None:
-    """What is wrong with the sheet between two edges (world poses), or None.
+def check_sheet(edge: Floats, other_edge: Floats, *, left: bool, limits: SheetLimits) -> str | None:
+    """Return which limit the sheet between two edges (world poses) violates, or None.
 
-    edge is this arm's, and `left` says which side that is.  What is not finite is wrong.
+    edge: of this arm; left: whether it is the sheet's left one.  Numbers that are not finite
+    violate every limit.
     """
     across = other_edge[:3, 3] - edge[:3, 3]
     distance = math.sqrt(float(across @ across))
-    if not distance <= limits.longest_m:
-        return f"sheet of {distance * 1e3:.1f} mm, at most {limits.longest_m * 1e3:.1f} mm"
+    if not distance <= limits.max_length_m:
+        return f"sheet of {distance * 1e3:.1f} mm, at most {limits.max_length_m * 1e3:.1f} mm"
     force = limits.force_n(distance)
     if not force <= limits.max_edge_force_n:
         return f"edge force {force:.1f} N, at most {limits.max_edge_force_n:.1f} N"
     twist = _twist(edge, other_edge)
     if not twist <= limits.max_twist_rad:
         return (
-            f"edges turned by {np.degrees(twist):.1f} degrees to one another, "
+            f"edges rotated by {np.degrees(twist):.1f} degrees to one another, "
             f"at most {np.degrees(limits.max_twist_rad):.1f}"
         )
-    skewed = angle_between(across if left else -across, edge[:3, 0])
-    if not skewed <= limits.max_twist_rad:
+    skew_rad = angle_between(across if left else -across, edge[:3, 0])
+    if not skew_rad <= limits.max_twist_rad:
         return (
-            f"edge skewed by {np.degrees(skewed):.1f} degrees to the line between both, "
+            f"edge skewed by {np.degrees(skew_rad):.1f} degrees to the line between both, "
             f"at most {np.degrees(limits.max_twist_rad):.1f}"
         )
     return None
 
 
-def place_trouble(
+def check_flange(
     flange_world: Floats, other_flange: Floats, limits: SheetLimits, *, slack_m: float = 0.0
 ) -> str | None:
-    """Whether a flange (world pose) leaves the workspace or comes too near to the other arm's.
+    """Return which limit a flange (world pose) violates, or None: workspace or flange distance.
 
-    slack_m: by how much both limits may be overstepped.  What is not finite is trouble.
+    slack_m: tolerance on both limits.  Numbers that are not finite violate both.
     """
-    place = flange_world[:3, 3]
+    position = flange_world[:3, 3]
     lowest, highest = limits.workspace_min_m - slack_m, limits.workspace_max_m + slack_m
-    if not ((place >= lowest) & (place <= highest)).all():
-        x, y, z = place * 1e3
+    if not ((position >= lowest) & (position <= highest)).all():
+        x, y, z = position * 1e3
         return f"flange at ({x:.0f}, {y:.0f}, {z:.0f}) mm is outside the workspace"
-    apart = other_flange[:3, 3] - place
+    apart = other_flange[:3, 3] - position
     distance = math.sqrt(float(apart @ apart))
     if not distance >= limits.min_flange_distance_m - slack_m:
         return (
@@ -355,9 +360,11 @@ def place_trouble(
     return None
 
 
-def step_trouble(joints_rad: Floats, measured_rad: Floats, largest_rad: float) -> str | None:
-    """Whether a command (6,) is further from the measured joints than an arm may trail."""
+def check_tracking_error(
+    joints_rad: Floats, measured_rad: Floats, max_error_rad: float
+) -> str | None:
+    """Return the violation if a command (6,) is too far from the measured joints, or None."""
     lag = float(np.abs(joints_rad - measured_rad).max())
-    if not lag <= largest_rad:
+    if not lag <= max_error_rad:
         return f"the arm trails its command by {np.degrees(lag):.1f} degrees"
     return None

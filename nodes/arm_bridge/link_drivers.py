@@ -1,4 +1,4 @@
-"""The drivers to choose from, by the name that a launch file gives."""
+"""Create the driver that a launch file names."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from flexsheet.nodes.arm_bridge.mxt import MxtLink
 Driver = Literal["modbus", "mxt", "mxt_pose"]
 
 
-def link_for(driver: Driver, host: str, port: int, timeout_s: float | None) -> ArmLink:
-    """An arm's link, not yet open; timeout_s None: the driver's own."""
-    given = {} if timeout_s is None else {"timeout_s": timeout_s}
+def make_link(driver: Driver, host: str, port: int, timeout_s: float | None) -> ArmLink:
+    """Create an arm's link, not yet open; timeout_s None: the driver's default."""
+    options = {} if timeout_s is None else {"timeout_s": timeout_s}
     if driver == "modbus":
-        return ModbusLink(host, port, **given)
-    return MxtLink(host, port, poses=driver == "mxt_pose", **given)
+        return ModbusLink(host, port, **options)
+    return MxtLink(host, port, poses=driver == "mxt_pose", **options)

@@ -1,7 +1,7 @@
-"""Modbus TCP to an arm: one FC23 exchange per cycle, guarded by magic, version, sequence and CRC.
+"""Exchange with an arm by Modbus TCP: one FC23 per cycle, with magic, version, sequence and CRC.
 
-The register map is `COMMAND` and `STATUS` below; the tables of `docs/modbus.md` are written from
-them (`launch.reference.registers`).  Numbers of 32 bits take two registers, high word first.  The
+`COMMAND` and `STATUS` define the register map; `website.registers_page` writes the tables of
+docs/modbus.md from them.  Numbers of 32 bits take two registers, high word first.  The
 CRC-32 (zlib's) covers every register before it in its block, high byte first.
 """
 
@@ -24,13 +24,14 @@ from pymodbus.pdu import DecodePDU, ModbusPDU
 
 from flexsheet.nodes.arm_bridge.link import (
     ArmAnswerError,
+    ArmFault,
     ArmLinkError,
     ArmRefusedError,
     ArmSilentError,
     ArmStatus,
     CounterMonitor,
-    be_cancelled,
-    checked_joints,
+    propagate_cancellation,
+    validate_joints,
 )
 
 Floats = NDArray[np.float64]
@@ -42,8 +43,8 @@ STATUS_ADDRESS = 100
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
-    """One entry of a block; `kind` is a struct code: H (u16), I (u32), f (float32)."""
+class RegisterField:
+    """Define one entry of a block; `kind` is a struct code: H (u16), I (u32), f (float32)."""
 
     name: str
     kind: str
@@ -52,55 +53,60 @@ class Field:
 
 
 COMMAND = (
-    Field("magic", "H", 1, "0x4653, the letters FS"),
-    Field("version", "H", 1, "of this map: 1"),
-    Field("sequence", "I", 1, "counts up with every command; an `idle` command may start anew"),
-    Field("time_us", "I", 1, "when the command was made, sender's clock, wraps after 71 minutes"),
-    Field("mode", "H", 1, "0 idle, 1 move, 2 hold, 3 stop"),
-    Field("reserved", "H", 1, "0"),
-    Field("joints_rad", "f", 6, "J1 to J6; read only in mode `move`"),
-    Field("crc", "I", 1, "CRC-32 of the block's registers before it"),
+    RegisterField("magic", "H", 1, "0x4653, the letters FS"),
+    RegisterField("version", "H", 1, "of this map: 1"),
+    RegisterField(
+        "sequence", "I", 1, "increases with every command; an `idle` command may restart it"
+    ),
+    RegisterField(
+        "time_us", "I", 1, "when the command was made, sender's clock, wraps after 71 minutes"
+    ),
+    RegisterField("mode", "H", 1, "0 idle, 1 move, 2 hold, 3 stop"),
+    RegisterField("reserved", "H", 1, "0"),
+    RegisterField("joints_rad", "f", 6, "J1 to J6; read only in mode `move`"),
+    RegisterField("crc", "I", 1, "CRC-32 of the block's registers before it"),
 )
 
 STATUS = (
-    Field("magic", "H", 1, "0x4653"),
-    Field("version", "H", 1, "of this map: 1"),
-    Field("accepted", "I", 1, "sequence of the last accepted command"),
-    Field("cycle", "I", 1, "the controller's cycles since its start"),
-    Field("time_us", "I", 1, "when the joints were measured, controller's clock"),
-    Field("state", "H", 1, "0 idle, 1 moving, 2 holding, 3 stopped, 4 fault"),
-    Field(
+    RegisterField("magic", "H", 1, "0x4653"),
+    RegisterField("version", "H", 1, "of this map: 1"),
+    RegisterField("accepted", "I", 1, "sequence of the last accepted command"),
+    RegisterField("cycle", "I", 1, "the controller's cycles since its start"),
+    RegisterField("time_us", "I", 1, "when the joints were measured, controller's clock"),
+    RegisterField("state", "H", 1, "0 idle, 1 moving, 2 holding, 3 stopped, 4 fault"),
+    RegisterField(
         "faults",
         "H",
         1,
         "bits: 1 joint out of range, 2 step too large, 4 not finite, 8 watchdog, 16 servo",
     ),
-    Field("joints_rad", "f", 6, "measured J1 to J6"),
-    Field("refused", "I", 1, "commands refused since the controller's start"),
-    Field("crc", "I", 1, "CRC-32 of the block's registers before it"),
+    RegisterField("joints_rad", "f", 6, "measured J1 to J6"),
+    RegisterField("refused", "I", 1, "commands refused since the controller's start"),
+    RegisterField("crc", "I", 1, "CRC-32 of the block's registers before it"),
 )
 
 COMMAND_MODES = {"idle": 0, "move": 1, "hold": 2, "stop": 3}
 STATES = ("idle", "moving", "holding", "stopped", "fault")
 FAULT_BITS = {
-    1: "joint out of range",
-    2: "step too large",
-    4: "command not finite",
-    8: "watchdog: no command",
-    16: "servo",
+    1: ArmFault.JOINT_RANGE,
+    2: ArmFault.STEP_SIZE,
+    4: ArmFault.NOT_FINITE,
+    8: ArmFault.WATCHDOG,
+    16: ArmFault.SERVO,
 }
 
 
-def struct_format(block: Sequence[Field]) -> str:
-    """The struct format of a block, big-endian."""
+def struct_format(block: Sequence[RegisterField]) -> str:
+    """Return the struct format of a block, big-endian."""
     return ">" + "".join(f"{field.count}{field.kind}" for field in block)
 
 
-def register_count(block: Sequence[Field]) -> int:
+def register_count(block: Sequence[RegisterField]) -> int:
+    """Return the number of 16-bit registers of a block."""
     return struct.calcsize(struct_format(block)) // 2
 
 
-# Every failure is raised as ArmLinkError; the library's own log would say it again, with hex dumps.
+# Every failure is raised as ArmLinkError; the library's log would repeat it with hex dumps.
 logging.getLogger("pymodbus").setLevel(logging.CRITICAL)
 
 _COMMAND_FORMAT, _STATUS_FORMAT = struct_format(COMMAND), struct_format(STATUS)
@@ -109,7 +115,7 @@ _STATUS_REGISTERS = register_count(STATUS)
 
 @dataclass(frozen=True, slots=True)
 class ModbusStatus(ArmStatus):
-    """What the status block says."""
+    """Hold the contents of a status block."""
 
     accepted: int
     cycle: int
@@ -119,7 +125,7 @@ class ModbusStatus(ArmStatus):
 
 
 def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats) -> list[int]:
-    """The command block's registers; sequence and time are taken modulo 2^32."""
+    """Encode a command block as registers; sequence and time are taken modulo 2^32."""
     body = struct.pack(
         _COMMAND_FORMAT[:-2],
         MAGIC,
@@ -128,14 +134,14 @@ def encode_command(*, sequence: int, time_us: int, mode: str, joints_rad: Floats
         time_us & 0xFFFFFFFF,
         COMMAND_MODES[mode],
         0,
-        *checked_joints(joints_rad),
+        *validate_joints(joints_rad),
     )
     whole = body + struct.pack(">I", zlib.crc32(body))
     return list(struct.unpack(f">{len(whole) // 2}H", whole))
 
 
 def decode_status(registers: Sequence[int]) -> ModbusStatus:
-    """The status block of its registers; ArmAnswerError says what is wrong with it."""
+    """Decode a status block; raises ArmAnswerError with what is wrong."""
     if len(registers) != _STATUS_REGISTERS:
         raise ArmAnswerError(f"status of {len(registers)} registers, wanted {_STATUS_REGISTERS}")
     whole = struct.pack(f">{len(registers)}H", *registers)
@@ -144,7 +150,9 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
     )
     *joints, refused, crc = rest
     if magic != MAGIC:
-        raise ArmAnswerError(f"status magic 0x{magic:04x}, wanted 0x{MAGIC:04x}: not our map")
+        raise ArmAnswerError(
+            f"status magic 0x{magic:04x}, wanted 0x{MAGIC:04x}: another register map"
+        )
     if version != VERSION:
         raise ArmAnswerError(f"register map version {version}, wanted {VERSION}")
     if crc != zlib.crc32(whole[:-4]):
@@ -158,17 +166,17 @@ def decode_status(registers: Sequence[int]) -> ModbusStatus:
         cycle=cycle,
         time_us=time_us,
         state=STATES[state],
-        faults=tuple(text for bit, text in FAULT_BITS.items() if faults & bit),
+        faults=tuple(fault for bit, fault in FAULT_BITS.items() if faults & bit),
         joints_rad=np.array(joints),
         refused=refused,
     )
 
 
 class _Framer(FramerSocket):
-    """The library's, whose error on an answer that is none fails the request that awaits one.
+    """Fail the pending request when an answer cannot be decoded.
 
-    Else it would be raised into the loop, which ends the connection, prints a trace each time, and
-    lets the request wait for its time-out.
+    The library raises the error into the event loop.  That ends the connection, prints a trace,
+    and lets the request wait for its time-out.
     """
 
     def __init__(self, client: AsyncModbusTcpClient) -> None:
@@ -176,7 +184,7 @@ class _Framer(FramerSocket):
         self._client = client
         self.undecodable = False
 
-    def handleFrame(  # pymodbus calls it so
+    def handleFrame(  # name given by pymodbus
         self, data: bytes, exp_devid: int, exp_tid: int
     ) -> tuple[int, ModbusPDU | None]:
         try:
@@ -186,17 +194,18 @@ class _Framer(FramerSocket):
             awaited = self._client.ctx.response_future
             if not awaited.done():
                 awaited.set_exception(error)
-                # Nobody may be waiting: then the next request tells, and not the future's end.
+                # If no task waits for it, asyncio must not report the exception as lost.
                 awaited.exception()
             return len(data), None
 
 
 class ModbusLink:
-    """An `ArmLink`: one connection to one arm.
+    """Implement `ArmLink` by one Modbus TCP connection to one arm.
 
     Any failure that leaves an answer outstanding closes the connection, because pymodbus 3.16.1 can
-    hand a late answer to the next request; the echoed sequence and the CRC catch what remains.  It
-    opens again at once after a first failure, then with a pause that doubles to `longest_pause_s`.
+    hand a late answer to the next request.  The echoed sequence and the CRC detect the rest.  The
+    connection reopens at once after a first failure, then after pauses that double up to
+    `max_pause_s`.
     """
 
     def __init__(
@@ -205,12 +214,12 @@ class ModbusLink:
         port: int,
         *,
         timeout_s: float = 0.03,
-        first_pause_s: float = 0.05,
-        longest_pause_s: float = 1.0,
+        min_pause_s: float = 0.05,
+        max_pause_s: float = 1.0,
     ) -> None:
         self.host, self.port = host, port
         self._timeout_s = timeout_s
-        self._first_pause_s, self._longest_pause_s = first_pause_s, longest_pause_s
+        self._min_pause_s, self._max_pause_s = min_pause_s, max_pause_s
         self._pause_s = 0.0
         self._try_again_ns = 0
         self._client: AsyncModbusTcpClient | None = None
@@ -224,36 +233,36 @@ class ModbusLink:
         return self._client is not None and self._client.connected
 
     def due(self, now_ns: int) -> bool:
-        """Whether there is a connection, or the pause before the next attempt is over."""
+        """Return whether a connection is open, or the pause before the next attempt is over."""
         return self.connected or now_ns >= self._try_again_ns
 
     async def exchange(self, *, mode: str, joints_rad: Floats, now_ns: int) -> ModbusStatus:
         """Send one command and return the status that answers it; raises ArmLinkError."""
         loop = asyncio.get_running_loop()
-        begun_s = loop.time()
+        start_s = loop.time()
         try:
             client = await self._open()
             self._sequence = (self._sequence + 1) & 0xFFFFFFFF
-            status = await self._ask(client, mode, joints_rad, now_ns)
+            status = await self._request(client, mode, joints_rad, now_ns)
         except ArmRefusedError:
             raise
         except ArmLinkError:
             self.close()
             self._try_again_ns = now_ns + int(self._pause_s * 1e9)
-            longer_s = max(2.0 * self._pause_s, self._first_pause_s)
-            self._pause_s = min(longer_s, self._longest_pause_s)
+            doubled_s = max(2.0 * self._pause_s, self._min_pause_s)
+            self._pause_s = min(doubled_s, self._max_pause_s)
             raise
         except asyncio.CancelledError:
-            # The answer is outstanding still, and would be taken for the next one's.
+            # The answer is still outstanding, and the next request would receive it.
             self.close()
             raise
         finally:
-            be_cancelled()
+            propagate_cancellation()
         self._pause_s = 0.0
-        freshness = self._counters.judge(
+        freshness = self._counters.classify(
             (status.time_us, status.cycle),
             sent_ns=now_ns,
-            received_ns=now_ns + round((loop.time() - begun_s) * 1e9),
+            received_ns=now_ns + round((loop.time() - start_s) * 1e9),
             may_restart=mode == "idle",
         )
         return replace(status, freshness=freshness)
@@ -274,7 +283,7 @@ class ModbusLink:
         self.connections += 1
         return client
 
-    async def _ask(
+    async def _request(
         self, client: AsyncModbusTcpClient, mode: str, joints_rad: Floats, now_ns: int
     ) -> ModbusStatus:
         values = encode_command(

@@ -1,4 +1,4 @@
-"""What an arm's bridge is told by the launch file."""
+"""Define the parameters of an arm's bridge."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import Literal
 
 from pydantic import Field
 
-from flexsheet.messages.methods import KinematicsMethod
 from flexsheet.messages.scene import NonNegative, Positive
 from flexsheet.messages.types import Side
 from flexsheet.nodes.arm_bridge.link_drivers import Driver
@@ -15,30 +14,39 @@ from flexsheet.nodes.parameter_marks import DeviceHost, DevicePort
 
 
 class ArmBridgeParameters(NodeParameters):
+    """Parameters of `arm_bridge`."""
+
     side: Side
-    host: DeviceHost = "127.0.0.1"
+    host: DeviceHost = Field(default="127.0.0.1", description="address of the arm's controller")
     port: DevicePort = 5020
-    rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0)
+    rate_hz: float = Field(default=140.0, ge=10.0, le=1000.0, description="rate of commands")
     resting_rate_hz: float = Field(
-        default=40.0, ge=20.0, le=1000.0, description="while idle, until it is made ready"
+        default=40.0, ge=20.0, le=1000.0, description="rate of commands to an idle arm"
     )
     driver: Driver = "modbus"
-    timeout_s: Positive | None = Field(default=None, description="null: the driver's own")
+    timeout_s: Positive | None = Field(
+        default=None, description="longest wait for an answer; null: the driver's default"
+    )
     servo_lag_s: NonNegative = Field(
-        default=0.03, description="how far the arm trails a command that moves evenly"
+        default=0.03, description="lag of the arm behind a command of constant velocity"
     )
     target_period_s: Positive | None = Field(
-        default=None, description="older than that is late; null: the period of the scene's camera"
+        default=None, description="period of the targets; null: the period of the scene's camera"
     )
-    hold_after_s: Positive = 0.02
-    stop_after_s: Positive = 0.1
-    furthest_extrapolation_s: Positive = 0.06
-    largest_lag_rad: Positive = 0.12
-    kinematics: KinematicsMethod | Literal["auto"] = Field(
-        default="auto", description="auto: as the scene's methods say, else closed_form_continuous"
+    hold_after_s: Positive = Field(
+        default=0.02, description="lateness of a target or of the other arm after which it holds"
     )
-    arming: Literal["by_command", "by_itself"] = Field(
-        default="by_command",
-        description="whether a person must say that it may move (flexsheet arms ready), at first "
-        "and after each stop; by_itself is for simulated arms",
+    stop_after_s: Positive = Field(
+        default=0.1, description="lateness of a target or of the other arm after which it stops"
+    )
+    max_extrapolation_s: Positive = Field(
+        default=0.06, description="longest extrapolation of a target"
+    )
+    max_tracking_error_rad: Positive = Field(
+        default=0.12, description="largest lag of a measured joint behind its command"
+    )
+    arming: Literal["manual", "auto"] = Field(
+        default="manual",
+        description="manual: a person arms it with `flexsheet arms enable`, at first and after "
+        "each stop; auto: it arms itself, only for simulated arms",
     )

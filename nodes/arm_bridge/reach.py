@@ -1,8 +1,8 @@
-"""Whether the arms can hold the sheet there: for many places at once, and along a path.
+"""Check whether the arms can hold the sheet: at many poses at once, and along a path.
 
-Places of the sheet are poses (n, 4, 4) in the world with stretches (n,), joints (n, 6) rad.  Each
-limit's margin is positive where it is kept; margins of speeds are shares of what is allowed.  The
-sheet is the constraint: both edges follow from its pose and stretch, so that they always agree.
+Poses of the sheet are (n, 4, 4) in the world with stretch ratios (n,); joints are (n, 6) rad.  A
+limit's margin is positive where the limit holds.  Margins of speeds are fractions of the limit.
+Both edges follow from the sheet's pose and stretch, so they always agree.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import (
     BRANCHES,
     CENTRE_RAD,
-    FARTHEST_WRIST_M,
     FLANGE_M,
+    MAX_WRIST_M,
     SHOULDER_HEIGHT_M,
     SHOULDER_NEAR_M,
     WRIST_NEAR_RAD,
     Branch,
     UnreachableError,
-    branch_of,
     branches,
+    find_branch,
     joints_on_branch,
     next_joints,
     singularities,
@@ -48,7 +48,7 @@ Bools = NDArray[np.bool_]
 
 RANGES = tuple(f"J{joint} range" for joint in range(1, 7))
 SPEEDS = tuple(f"J{joint} speed" for joint in range(1, 7))
-PLACE_LIMITS = (
+POSE_LIMITS = (
     "reach",
     *RANGES,
     "shoulder singularity",
@@ -59,26 +59,26 @@ PLACE_LIMITS = (
     "edge force",
 )
 COMMAND_LIMITS = ("reach", *RANGES, "workspace", "flange distance", "edge force")
-"""Those without which the limiter lets no command through."""
+"""Limits that the limiter enforces for every command."""
 SPEED_LIMITS = (*SPEEDS, "tool speed")
-LIMITS = (*PLACE_LIMITS, *SPEED_LIMITS)
-"""In the order in which the first that is not kept is said to bind."""
+LIMITS = (*POSE_LIMITS, *SPEED_LIMITS)
+"""The first violated limit in this order is the binding one."""
 
 ELBOW_NEAR_RAD = WRIST_NEAR_RAD
 
-CHOOSE = 500
-"""About so many of the places decide on the branch."""
+BRANCH_SAMPLES = 500
+"""Approximate number of poses that select the branch."""
 
 SPEED_STEP_S = 1e-4
-"""Over which joint speeds are taken as differences."""
+"""Step of the central differences for joint speeds."""
 
-LARGEST_STEP_RAD = 0.05
-"""Between two places of a path no joint goes further: a leap shows however close they are."""
+MAX_STEP_RAD = 0.05
+"""Largest joint step between two poses of a path; a jump exceeds it at any spacing."""
 
-FINEST_SHARE = 1e-6
+MIN_FRACTION = 1e-6
 
 ROUNDING = 1e-9
-"""What a margin may shrink by without the limit being broken further."""
+"""Rounding error by which a margin may shrink."""
 
 DETOURS_M = (
     (0.0, 0.0, 0.05),
@@ -88,15 +88,15 @@ DETOURS_M = (
     (0.0, 0.08, 0.0),
     (0.0, -0.08, 0.0),
 )
-"""Where a path may go instead of straight on, in the world: towards the user first."""
+"""Offsets of detours in the world, m; towards the user first."""
 
 
 @dataclass(frozen=True, slots=True)
-class Places:
-    """Where the sheet shall be held: poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6).
+class SheetPoses:
+    """Hold poses (n, 4, 4), stretch ratios (n,) and twists (n, k, 6) of the sheet in the world.
 
-    twists: k motions (m/s, rad/s) of the sheet's middle that the arms must be able to follow from
-    there, in the world; k may be 0.
+    twists: k motions (m/s, rad/s) of the sheet's centre that the arms must follow from each pose;
+    k may be 0.
     """
 
     world_from_sheet: Floats
@@ -106,23 +106,23 @@ class Places:
     def __len__(self) -> int:
         return len(self.stretch_ratio)
 
-    def some(self, chosen: NDArray[np.intp] | Bools) -> Places:
-        """Those of the places that an index array (or one of truth values) names."""
-        return Places(
+    def some(self, chosen: NDArray[np.intp] | Bools) -> SheetPoses:
+        """Return the poses that an index array, or a boolean one, selects."""
+        return SheetPoses(
             self.world_from_sheet[chosen], self.stretch_ratio[chosen], self.twists_world[chosen]
         )
 
-    def without_motion(self) -> Places:
-        """The same places, to be held only."""
-        return Places(self.world_from_sheet, self.stretch_ratio, np.empty((len(self), 0, 6)))
+    def without_twists(self) -> SheetPoses:
+        """Return the same poses without motions to follow."""
+        return SheetPoses(self.world_from_sheet, self.stretch_ratio, np.empty((len(self), 0, 6)))
 
 
 @dataclass(frozen=True, slots=True)
 class ArmReach:
-    """How one arm holds its edge at n places, on one branch.
+    """Hold how one arm reaches n poses of the sheet on one branch.
 
-    joints_rad: (n, 6), NaN out of reach.  margins: of each of `LIMITS`, (n,); where the arm does
-    not reach, those that follow from its joints are NaN.
+    joints_rad: (n, 6), NaN out of reach.
+    margins: (n,) for each of `LIMITS`; NaN where they need joints that do not exist.
     """
 
     branch: Branch
@@ -131,26 +131,26 @@ class ArmReach:
 
     @property
     def binding(self) -> NDArray[np.intp]:
-        """Number in `LIMITS` of the first limit that is not kept, (n,); -1 where all are."""
+        """Return the index in `LIMITS` of the first violated limit, (n,); -1 for none."""
         found = np.full(len(self.joints_rad), -1)
         for number in reversed(range(len(LIMITS))):
             found[self.margins[LIMITS[number]] < 0.0] = number
         return found
 
     @property
-    def reached(self) -> Bools:
-        """Whether the arm can hold its edge there, (n,); how fast it would have to move or not."""
+    def reachable(self) -> Bools:
+        """Return whether the arm can hold its edge there, (n,), at rest."""
         binding = self.binding
-        return np.asarray((binding < 0) | (binding >= len(PLACE_LIMITS)))
+        return np.asarray((binding < 0) | (binding >= len(POSE_LIMITS)))
 
     @property
-    def followed(self) -> Bools:
-        """Whether it can, and can go on from there as fast as the twists ask for, (n,)."""
+    def trackable(self) -> Bools:
+        """Return whether the arm can also follow the twists from there, (n,)."""
         return np.asarray(self.binding < 0)
 
 
-def flange_poses(geometry: ArmGeometry, places: Places) -> Floats:
-    """world_from_flange (n, 4, 4) of an arm that holds its edge of the sheet at the places."""
+def flange_poses(geometry: ArmGeometry, places: SheetPoses) -> Floats:
+    """Return world_from_flange (n, 4, 4) of an arm that holds its edge of the sheet."""
     width = geometry.sheet_limits.width_m
     outwards = -0.5 if geometry.left else 0.5
     edges = places.world_from_sheet.copy()
@@ -159,10 +159,10 @@ def flange_poses(geometry: ArmGeometry, places: Places) -> Floats:
     return np.asarray(edges @ inverse(geometry.flange_from_edge))
 
 
-def arm_reach(
-    geometry: ArmGeometry, other: ArmGeometry, places: Places, branch: Branch
+def compute_reach(
+    geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses, branch: Branch
 ) -> ArmReach:
-    """How an arm holds the sheet at the places, on that branch; other: the other arm."""
+    """Return how an arm reaches the poses on one branch; other: the other arm."""
     flanges = flange_poses(geometry, places)
     joints = joints_on_branch(geometry.base_from_world @ flanges, branch, CENTRE_RAD)
     others = flange_poses(other, places)
@@ -172,21 +172,22 @@ def arm_reach(
     return ArmReach(branch, joints, margins)
 
 
-def best_reach(geometry: ArmGeometry, other: ArmGeometry, places: Places) -> ArmReach:
-    """On the branch that reaches the most places; of equal ones that with the largest margins.
+def find_best_reach(geometry: ArmGeometry, other: ArmGeometry, places: SheetPoses) -> ArmReach:
+    """Return the reach on the branch with most reachable poses, then with the largest margins.
 
-    An arm cannot go from one branch to another without letting go of what it does, hence one branch
-    for all places.
+    An arm cannot change its branch while it holds the sheet, so one branch serves all poses.
     """
-    still = places.without_motion().some(np.arange(0, len(places), max(1, len(places) // CHOOSE)))
+    still = places.without_twists().some(
+        np.arange(0, len(places), max(1, len(places) // BRANCH_SAMPLES))
+    )
 
     def merit(branch: Branch) -> tuple[float, float]:
-        reach = arm_reach(geometry, other, still, branch)
+        reach = compute_reach(geometry, other, still, branch)
         ranges = np.stack([reach.margins[limit] for limit in RANGES])
         room = np.where(np.isfinite(ranges), ranges, -np.pi).min(axis=0)
-        return float(reach.reached.sum()), float(np.minimum(room, 0.2).sum())
+        return float(reach.reachable.sum()), float(np.minimum(room, 0.2).sum())
 
-    return arm_reach(geometry, other, places, max(BRANCHES, key=merit))
+    return compute_reach(geometry, other, places, max(BRANCHES, key=merit))
 
 
 def _margins(
@@ -196,11 +197,11 @@ def _margins(
     joints: Floats,
     flanges: Floats,
     others: Floats,
-    places: Places,
+    places: SheetPoses,
 ) -> dict[str, Floats]:
-    """Every limit's margin (n,) for joints (n, 6) that hold flanges (n, 4, 4) in the world.
+    """Return every limit's margin (n,) for joints (n, 6) and world flange poses (n, 4, 4).
 
-    branch: that the joints are on, for where the sheet moves on from there.
+    branch: of the joints; joint speeds are evaluated on it.
     """
     limits, joint_limits = geometry.sheet_limits, geometry.joint_limits
     away = singularities(joints)
@@ -218,16 +219,16 @@ def _margins(
             for stretch in places.stretch_ratio.tolist()
         ]
     )
-    room = np.minimum(joints - joint_limits.lowest_rad, joint_limits.highest_rad - joints)
+    room = np.minimum(joints - joint_limits.min_rad, joint_limits.max_rad - joints)
     base_from_flange = geometry.base_from_world @ flanges
     wrist = base_from_flange[:, :3, 3] - FLANGE_M * base_from_flange[:, :3, 2]
-    reach = FARTHEST_WRIST_M - np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M], axis=1)
-    # A little beyond the reach there still are joints, with J3 out of its range.
-    reached = np.isfinite(joints).all(axis=1)
+    reach = MAX_WRIST_M - np.linalg.norm(wrist - [0.0, 0.0, SHOULDER_HEIGHT_M], axis=1)
+    # Slightly beyond the reach joints exist still, with J3 out of its range.
+    reachable = np.isfinite(joints).all(axis=1)
     speeds, tool_speed = _speeds(geometry, branch, joints, flanges, places)
     spare = 1.0 - speeds / joint_limits.speed_rad_per_s
     return {
-        "reach": np.where(reached, np.maximum(reach, 0.0), np.minimum(-np.abs(reach), -1e-9)),
+        "reach": np.where(reachable, np.maximum(reach, 0.0), np.minimum(-np.abs(reach), -1e-9)),
         **{name: room[:, joint] for joint, name in enumerate(RANGES)},
         "shoulder singularity": away.shoulder_m - SHOULDER_NEAR_M,
         "elbow singularity": away.elbow_rad - ELBOW_NEAR_RAD,
@@ -241,14 +242,14 @@ def _margins(
 
 
 def _speeds(
-    geometry: ArmGeometry, branch: Branch, joints: Floats, flanges: Floats, places: Places
+    geometry: ArmGeometry, branch: Branch, joints: Floats, flanges: Floats, places: SheetPoses
 ) -> tuple[Floats, Floats]:
-    """Largest joint speeds (n, 6) and speeds of edge and flange (n,) over the places' twists."""
+    """Return the largest joint speeds (n, 6) and tool speeds (n,) over all twists."""
     fastest, tool = np.zeros_like(joints), np.zeros(len(joints))
     centre = places.world_from_sheet[:, :3, 3]
     points = _tool_points(geometry, flanges)
     fastest[~np.isfinite(joints)] = np.nan
-    reached = np.isfinite(joints).all(axis=1)
+    reachable = np.isfinite(joints).all(axis=1)
     for motion in range(places.twists_world.shape[1]):
         linear, angular = np.split(places.twists_world[:, motion], 2, axis=1)
         arms = points - centre[:, None]
@@ -257,12 +258,12 @@ def _speeds(
         rates = _joint_rates(
             geometry, branch, flanges=flanges, linear=linear, angular=angular, centre=centre
         )
-        fastest[reached] = np.fmax(fastest[reached], np.abs(rates[reached]))
+        fastest[reachable] = np.fmax(fastest[reachable], np.abs(rates[reachable]))
     return fastest, tool
 
 
 def _tool_points(geometry: ArmGeometry, flanges: Floats) -> Floats:
-    """Middle and ends of the clamped edge, and the flange, (n, 4, 3) in the world."""
+    """Return centre and ends of the clamped edge, and the flange, (n, 4, 3) m in the world."""
     half = 0.5 * geometry.sheet_limits.height_m
     edge = apply(
         geometry.flange_from_edge, np.array([[0.0, 0.0, 0.0], [0.0, -half, 0.0], [0.0, half, 0.0]])
@@ -280,10 +281,10 @@ def _joint_rates(
     angular: Floats,
     centre: Floats,
 ) -> Floats:
-    """Joint speeds (n, 6) when the sheet's middle moves so; by central differences of the IK."""
+    """Return joint speeds (n, 6) for a motion of the sheet, by central differences of the IK."""
     found = []
     for time_s in (-SPEED_STEP_S, SPEED_STEP_S):
-        turn = _small_turns(angular * time_s)
+        turn = _small_rotations(angular * time_s)
         moved = flanges.copy()
         moved[:, :3, :3] = turn @ flanges[:, :3, :3]
         arm = flanges[:, :3, 3] - centre
@@ -293,8 +294,8 @@ def _joint_rates(
     return np.asarray((change - 2.0 * np.pi * np.rint(change / (2.0 * np.pi))) / (2 * SPEED_STEP_S))
 
 
-def _small_turns(vectors: Floats) -> Floats:
-    """Rotations (n, 3, 3) by vectors (n, 3) of less than a milliradian, to second order."""
+def _small_rotations(vectors: Floats) -> Floats:
+    """Return rotations (n, 3, 3) by vectors (n, 3) below a milliradian, to second order."""
     x, y, z = vectors.T
     none = np.zeros_like(x)
     cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
@@ -303,14 +304,14 @@ def _small_turns(vectors: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class SheetPath:
-    """A way of the sheet that both arms can go: m places, from `start` to `goal`.
+    """Hold a path of the sheet that both arms can follow: m poses from start to goal.
 
     left_rad, right_rad: joints (m, 6) of both arms, on one branch each.
-    times_s: (m,) from 0, the least in which neither joints nor edges go too fast.
-    via: whether it goes straight or round by somewhere: the detour's offset in the world, m.
+    times_s: (m,) from 0, the shortest within the speed limits of joints and edges.
+    via_m: offset of the detour in the world, m; None: the path is straight.
     """
 
-    places: Places
+    places: SheetPoses
     left_rad: Floats
     right_rad: Floats
     times_s: Floats
@@ -318,8 +319,8 @@ class SheetPath:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """A place on the way, and the joints (6,) of both arms there."""
+class PathStep:
+    """Hold a pose on a path, and the joints (6,) of both arms there."""
 
     sheet: SheetMotion
     left_rad: Floats
@@ -327,28 +328,28 @@ class Step:
 
 
 class PathError(FlexsheetError, ValueError):
-    """The arms cannot carry the sheet that way; side, limit (of `LIMITS`, or "leap") and where.
+    """The arms cannot move the sheet along a path; names the arm, the limit and the position.
 
-    share: of the straight way, 0..1.
+    limit: of `LIMITS`, or "jump".  fraction: position on the straight path, 0..1.
     """
 
     code = "path"
     remedy = "Move the arms nearer to the sheet by hand, then enable them again."
 
     def __init__(
-        self, why: str, *, side: Side, limit: str, share: float, world_from_sheet: Floats
+        self, why: str, *, side: Side, limit: str, fraction: float, world_from_sheet: Floats
     ) -> None:
         x, y, z = np.round(1e3 * world_from_sheet[:3, 3]) + 0.0
         super().__init__(
-            f"{side} arm, at {100 * share:.0f} % of the way, "
+            f"{side} arm, at {100 * fraction:.0f} % of the path, "
             f"sheet at ({x:.0f}, {y:.0f}, {z:.0f}) mm: {why}"
         )
         self.side: Side = side
         self.limit = limit
-        self.share = share
+        self.fraction = fraction
 
 
-def coordinated_path(
+def plan_path(
     left: ArmGeometry,
     right: ArmGeometry,
     start: SheetMotion,
@@ -358,12 +359,13 @@ def coordinated_path(
     right_rad: Floats | None = None,
     detours_m: Sequence[tuple[float, float, float]] = DETOURS_M,
 ) -> SheetPath:
-    """A way for both arms from one pose and stretch of the sheet to another; else PathError.
+    """Plan a path for both arms between two poses and stretches of the sheet.
 
-    left_rad, right_rad: joints (6,) at the start; without them every branch is tried.  The sheet
-    goes straight and turns about one axis, its stretch changes evenly.  Where that does not work,
-    it leaves the start, and comes to the goal, by one of the detours: both shifted by that offset.
-    The error says what keeps it from the straight way.
+    left_rad, right_rad: joints (6,) at the start; without them every branch is tried.
+
+    The sheet moves straight and rotates about one axis, and its stretch changes linearly.  If that
+    is blocked, the path goes through start and goal shifted by one of the detours.  Raises
+    PathError with what blocks the straight path.
     """
     starts = list(product(_starts(left, start, left_rad), _starts(right, start, right_rad)))
     first: PathError | None = None
@@ -371,15 +373,15 @@ def coordinated_path(
         corners = [start, goal] if via is None else [start, *_shifted((start, goal), via), goal]
         for at_left, at_right in starts:
             try:
-                track = _track(left, right, corners, Step(start, at_left, at_right))
-                return _checked(left, right, track, via)
+                track = _sample_path(left, right, corners, PathStep(start, at_left, at_right))
+                return _check_limits(left, right, track, via)
             except PathError as error:
                 first = first or error
     assert first is not None
     raise first
 
 
-def path_through(
+def plan_path_through(
     left: ArmGeometry,
     right: ArmGeometry,
     corners: Sequence[SheetMotion],
@@ -387,16 +389,16 @@ def path_through(
     left_rad: Floats,
     right_rad: Floats,
 ) -> SheetPath:
-    """The way for both arms through all corners, straight between each two; else PathError.
+    """Plan the path for both arms through all corners, straight between them.
 
-    left_rad, right_rad: joints (6,) at the first of them.
+    left_rad, right_rad: joints (6,) at the first corner.  Raises PathError if it is blocked.
     """
-    begin = Step(
+    begin = PathStep(
         corners[0],
-        _joints_there(left, corners[0], left_rad, share=0.0),
-        _joints_there(right, corners[0], right_rad, share=0.0),
+        _solve_joints(left, corners[0], left_rad, fraction=0.0),
+        _solve_joints(right, corners[0], right_rad, fraction=0.0),
     )
-    return _checked(left, right, _track(left, right, corners, begin), None)
+    return _check_limits(left, right, _sample_path(left, right, corners, begin), None)
 
 
 def _shifted(
@@ -415,67 +417,67 @@ def _shifted(
     ]
 
 
-def _track(
-    left: ArmGeometry, right: ArmGeometry, corners: Sequence[SheetMotion], begin: Step
-) -> list[Step]:
-    """Places through all corners, each part straight, so near that no joint leaps; PathError."""
+def _sample_path(
+    left: ArmGeometry, right: ArmGeometry, corners: Sequence[SheetMotion], begin: PathStep
+) -> list[PathStep]:
+    """Sample a path through all corners so densely that no joint jumps; raises PathError."""
     track = [begin]
     for number, (near, far) in enumerate(pairwise(corners)):
-        share, step = 0.0, 0.25
-        while share < 1.0:
-            ahead = min(share + step, 1.0)
-            place, before = sheet_between(near, far, ahead), track[-1]
+        fraction, step = 0.0, 0.25
+        while fraction < 1.0:
+            ahead = min(fraction + step, 1.0)
+            place, before = interpolate_sheet(near, far, ahead), track[-1]
             whole = (number + ahead) / (len(corners) - 1)
-            there = Step(
+            there = PathStep(
                 place,
-                _joints_there(left, place, before.left_rad, share=whole),
-                _joints_there(right, place, before.right_rad, share=whole),
+                _solve_joints(left, place, before.left_rad, fraction=whole),
+                _solve_joints(right, place, before.right_rad, fraction=whole),
             )
-            leaps = [
+            jumps_rad = [
                 float(np.abs(there.left_rad - before.left_rad).max()),
                 float(np.abs(there.right_rad - before.right_rad).max()),
             ]
-            if max(leaps) <= LARGEST_STEP_RAD:
+            if max(jumps_rad) <= MAX_STEP_RAD:
                 track.append(there)
-                share, step = ahead, min(2.0 * step, 0.25)
-            elif step > FINEST_SHARE:
+                fraction, step = ahead, min(2.0 * step, 0.25)
+            elif step > MIN_FRACTION:
                 step *= 0.5
             else:
-                at_left = leaps[0] > leaps[1]
+                at_left = jumps_rad[0] > jumps_rad[1]
                 arm, other = (left, right) if at_left else (right, left)
                 joints = before.left_rad if at_left else before.right_rad
-                raise _leap(arm, other, place, joints, share=whole)
+                raise _explain_jump(arm, other, place, joints, fraction=whole)
     return track
 
 
-def _leap(
+def _explain_jump(
     arm: ArmGeometry,
     other: ArmGeometry,
     there: SheetMotion,
     before_rad: Floats,
     *,
-    share: float,
+    fraction: float,
 ) -> PathError:
-    """Why an arm's branch does not go on to a place next to where its joints were `before_rad`."""
-    reach = arm_reach(arm, other, _places([there]), branch_of(before_rad))
+    """Return why an arm's branch ends between joints `before_rad` and the next pose."""
+    reach = compute_reach(arm, other, _make_poses([there]), find_branch(before_rad))
     binding = int(reach.binding[0])
-    limit = "leap" if binding < 0 else LIMITS[binding]
-    why = "its joints would leap" if binding < 0 else f"its branch ends: {limit}"
+    limit = "jump" if binding < 0 else LIMITS[binding]
+    why = "its joints would jump" if binding < 0 else f"its branch ends: {limit}"
     return PathError(
-        why, side=arm.side, limit=limit, share=share, world_from_sheet=there.world_from_sheet
+        why, side=arm.side, limit=limit, fraction=fraction, world_from_sheet=there.world_from_sheet
     )
 
 
 def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[Floats]:
-    """Joints (6,) with which an arm may begin: those given, or of each branch in range.
+    """Return the joints (6,) with which an arm may begin: given ones, or of each branch in range.
 
-    The branch with the most room to the ranges comes first.
+    The branch with the largest distance to the ranges comes first.
     """
     if given is not None:
-        return [_joints_there(arm, start, given, share=0.0)]
-    pose = arm.base_from_world @ flange_poses(arm, _places([start]))[0]
+        return [_solve_joints(arm, start, given, fraction=0.0)]
+    pose = arm.base_from_world @ flange_poses(arm, _make_poses([start]))[0]
     turns = np.array([0.0, 2.0 * np.pi, -2.0 * np.pi])
-    lowest, highest = arm.joint_limits.lowest_rad, arm.joint_limits.highest_rad
+    lowest, highest = arm.joint_limits.min_rad, arm.joint_limits.max_rad
     found: list[tuple[float, Floats]] = []
     for solution in branches(pose, CENTRE_RAD):
         turned = np.array(solution)[:, None] + turns
@@ -484,14 +486,14 @@ def _starts(arm: ArmGeometry, start: SheetMotion, given: Floats | None) -> list[
         found.append((float(room.max(axis=1).min()), joints))
     found.sort(key=lambda one: -one[0])
     in_range = [joints for room, joints in found if room >= 0.0]
-    return in_range or [_joints_there(arm, start, CENTRE_RAD, share=0.0)]
+    return in_range or [_solve_joints(arm, start, CENTRE_RAD, fraction=0.0)]
 
 
-def _joints_there(
-    arm: ArmGeometry, place: SheetMotion, near_rad: Floats, *, share: float
+def _solve_joints(
+    arm: ArmGeometry, place: SheetMotion, near_rad: Floats, *, fraction: float
 ) -> Floats:
     try:
-        pose = flange_poses(arm, _places([place]))[0]
+        pose = flange_poses(arm, _make_poses([place]))[0]
         return next_joints(arm.base_from_world @ pose, near_rad)
     except UnreachableError as error:
         limit = error.limit if error.limit == "reach" else f"{error.limit} range"
@@ -499,30 +501,30 @@ def _joints_there(
             str(error),
             side=arm.side,
             limit=limit,
-            share=share,
+            fraction=fraction,
             world_from_sheet=place.world_from_sheet,
         ) from error
 
 
-def hold_step(
-    left: ArmGeometry, right: ArmGeometry, sheet: SheetMotion, near: Step, *, share: float
-) -> Step:
-    """Both arms' joints that hold the sheet there, near those of another step; else PathError.
+def solve_step(
+    left: ArmGeometry, right: ArmGeometry, sheet: SheetMotion, near: PathStep, *, fraction: float
+) -> PathStep:
+    """Solve both arms' joints for a pose of the sheet, near those of another step.
 
-    All limits of commands are kept: ranges, workspace, distance of the flanges and edge force, but
-    not the distances to singularities.  share: of the path, for the error.
+    Raises PathError if a limit of commands is violated: range, workspace, flange distance or edge
+    force.  Distances to singularities are not checked.  fraction: of the path, for the error.
     """
-    step = Step(
+    step = PathStep(
         sheet,
-        _joints_there(left, sheet, near.left_rad, share=share),
-        _joints_there(right, sheet, near.right_rad, share=share),
+        _solve_joints(left, sheet, near.left_rad, fraction=fraction),
+        _solve_joints(right, sheet, near.right_rad, fraction=fraction),
     )
-    places = _places([sheet])
+    places = _make_poses([sheet])
     flanges = [flange_poses(arm, places) for arm in (left, right)]
     for number, (arm, joints) in enumerate(((left, step.left_rad), (right, step.right_rad))):
         margins = _margins(
             arm,
-            branch_of(joints),
+            find_branch(joints),
             joints=joints[None],
             flanges=flanges[number],
             others=flanges[1 - number],
@@ -531,44 +533,44 @@ def hold_step(
         for limit in COMMAND_LIMITS:
             if not margins[limit][0] >= 0.0:
                 raise PathError(
-                    f"{limit} is not kept",
+                    f"{limit} is violated",
                     side=arm.side,
                     limit=limit,
-                    share=share,
+                    fraction=fraction,
                     world_from_sheet=sheet.world_from_sheet,
                 )
     return step
 
 
-def sheet_between(start: SheetMotion, goal: SheetMotion, share: float) -> SheetMotion:
-    """The sheet at rest on the straight way between two places."""
+def interpolate_sheet(start: SheetMotion, goal: SheetMotion, fraction: float) -> SheetMotion:
+    """Return the resting sheet at a fraction of the straight path between two poses."""
     begin, end = start.world_from_sheet, goal.world_from_sheet
     turn = vector_from_rotation(end[:3, :3] @ begin[:3, :3].T)
-    rotation = rotation_from_vector(share * turn) @ begin[:3, :3]
-    position = begin[:3, 3] + share * (end[:3, 3] - begin[:3, 3])
-    stretch = start.stretch_ratio + share * (goal.stretch_ratio - start.stretch_ratio)
+    rotation = rotation_from_vector(fraction * turn) @ begin[:3, :3]
+    position = begin[:3, 3] + fraction * (end[:3, 3] - begin[:3, 3])
+    stretch = start.stretch_ratio + fraction * (goal.stretch_ratio - start.stretch_ratio)
     return SheetMotion(transform(rotation, position), np.zeros(6), stretch, 0.0)
 
 
-def _places(motions: Sequence[SheetMotion]) -> Places:
-    return Places(
+def _make_poses(motions: Sequence[SheetMotion]) -> SheetPoses:
+    return SheetPoses(
         np.array([motion.world_from_sheet for motion in motions]),
         np.array([motion.stretch_ratio for motion in motions]),
         np.empty((len(motions), 0, 6)),
     )
 
 
-def _checked(
+def _check_limits(
     left: ArmGeometry,
     right: ArmGeometry,
-    track: Sequence[Step],
+    track: Sequence[PathStep],
     via: tuple[float, float, float] | None,
 ) -> SheetPath:
-    """The path if every place on it keeps all limits of both arms; PathError names the first.
+    """Return the path if all its poses keep the limits of both arms; raises PathError otherwise.
 
-    A limit that is not kept at the start need only not be broken further until the goal.
+    A limit that is violated at the start must not be violated further.
     """
-    places = _places([step.sheet for step in track])
+    places = _make_poses([step.sheet for step in track])
     joints = (
         np.array([step.left_rad for step in track]),
         np.array([step.right_rad for step in track]),
@@ -576,7 +578,7 @@ def _checked(
     flanges = [flange_poses(arm, places) for arm in (left, right)]
     times = np.zeros(len(track))
     for index, arm in enumerate((left, right)):
-        branch = branch_of(joints[index][0])
+        branch = find_branch(joints[index][0])
         own, other = flanges[index], flanges[1 - index]
         margins = _margins(
             arm, branch, joints=joints[index], flanges=own, others=other, places=places
@@ -585,14 +587,14 @@ def _checked(
             if margin[0] < 0.0:
                 margin[:-1] -= margin[0] - ROUNDING
         reach = ArmReach(branch, joints[index], margins)
-        broken = np.flatnonzero(~reach.reached)
+        broken = np.flatnonzero(~reach.reachable)
         if len(broken):
             limit = LIMITS[int(reach.binding[broken[0]])]
             raise PathError(
-                f"{limit} is not kept",
+                f"{limit} is violated",
                 side=arm.side,
                 limit=limit,
-                share=float(broken[0]) / max(len(track) - 1, 1),
+                fraction=float(broken[0]) / max(len(track) - 1, 1),
                 world_from_sheet=places.world_from_sheet[broken[0]],
             )
         steps = np.abs(np.diff(joints[index], axis=0)) / arm.joint_limits.speed_rad_per_s

@@ -1,4 +1,4 @@
-"""What a bridge says of its arm."""
+"""Build the message that a bridge publishes about its arm."""
 
 from __future__ import annotations
 
@@ -6,16 +6,17 @@ from dataclasses import dataclass
 
 from flexsheet.messages.base import Header
 from flexsheet.messages.types import ArmState
-from flexsheet.nodes.arm_bridge.control import ArmControl, OtherArm
+from flexsheet.nodes.arm_bridge.control import ArmControl
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 
 
 @dataclass(slots=True)
-class Exchanged:
-    """The newest exchange with the arm; all ns are this clock's, 0: never.
+class LastExchange:
+    """Hold times of the newest exchange with the arm, in ns of this computer's clock; 0: never.
 
-    target, received_ns: the header of the sheet target behind the command, and when it came.
-    sent_ns, measured_ns: when the command went out, and when an answer last came.
+    target, received_ns: header and arrival of the sheet target behind the command.
+    sent_ns, measured_ns: when the command was sent, and when an answer last arrived.
     """
 
     target: Header | None = None
@@ -24,18 +25,19 @@ class Exchanged:
     measured_ns: int = 0
     duration_s: float = 0.0
 
-    def answered(self, now_ns: int) -> None:
+    def on_answer(self, now_ns: int) -> None:
+        """Store when the answer has arrived."""
         self.measured_ns, self.duration_s = now_ns, (now_ns - self.sent_ns) * 1e-9
 
 
-def arm_state(
+def make_arm_state(
     control: ArmControl,
     geometry: ArmGeometry,
     other: OtherArm | None,
-    newest: Exchanged,
+    exchange: LastExchange,
     now_ns: int,
 ) -> ArmState:
-    """The state of an arm that has been measured at least once."""
+    """Return the state of an arm that has been measured at least once."""
     measured = control.last_measured_rad
     assert measured is not None
     if other is not None and other.invalid_reason is not None:
@@ -43,12 +45,13 @@ def arm_state(
     distance_m, force_n = geometry.sheet_state(
         measured, None if other is None else other.world_from_flange
     )
-    target = newest.target
+    target = exchange.target
     return ArmState(
         side=geometry.side,
         mode=control.mode,
         faults=control.all_faults,
         ready=control.ready,
+        estop_engaged=control.estop_reason is not None,
         reason=control.reason,
         path_blocked=control.path_blocked,
         auto_arming=control.auto_arming,
@@ -56,10 +59,10 @@ def arm_state(
         joints_commanded_rad=control.commanded_rad,
         world_from_flange=geometry.world_from_flange(measured),
         world_from_flange_commanded=geometry.world_from_flange(control.commanded_rad),
-        command_age_s=None if target is None else (now_ns - newest.received_ns) * 1e-9,
+        command_age_s=None if target is None else (now_ns - exchange.received_ns) * 1e-9,
         target_source_ns=0 if target is None else target.source_ns,
-        command_sent_ns=newest.sent_ns,
+        command_sent_ns=exchange.sent_ns,
         edge_distance_m=distance_m,
         edge_force_n=force_n,
-        cycle_s=newest.duration_s,
+        cycle_s=exchange.duration_s,
     )

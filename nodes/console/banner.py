@@ -146,7 +146,7 @@ def _remedy(state: GraphState, shown: BannerState) -> str:
             return "Check the power and the cable of the arm; it is connected again by itself."
         return f"Remove the cause, then press Reset the fault; {_after_reset(state)}."
     if shown is BannerState.WAITING and any(_awaits_person(arm) for arm in arms):
-        return "The arms stay where they are until: flexsheet arms ready."
+        return "The arms stay where they are until: flexsheet arms enable."
     return ""
 
 
@@ -157,7 +157,7 @@ def _awaits_person(arm: ArmState) -> bool:
 def _after_reset(state: GraphState) -> str:
     if state.arms and all(arm.auto_arming for arm in state.arms.values()):
         return "the arms then move at once"
-    return "the arms then stay where they are until: flexsheet arms ready"
+    return "the arms then stay where they are until: flexsheet arms enable"
 
 
 def _explain(state: GraphState, shown: BannerState) -> str:

@@ -7,9 +7,9 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexsheet.nodes.arm_bridge.pacing import Pace
+from flexsheet.nodes.arm_bridge.command_scheduler import CommandScheduler
 
-PACE = Pace(period_s=1 / 140, target_period_s=1 / 60, resting_period_s=1 / 40)
+PACE = CommandScheduler(period_s=1 / 140, target_period_s=1 / 60, idle_period_s=1 / 40)
 MS = 1_000_000
 
 
@@ -31,16 +31,16 @@ def test_a_command_covers_no_less_than_its_least_distance_and_no_long_silence(
 
 
 def test_the_beat_goes_on_between_targets_and_without_any() -> None:
-    assert PACE.is_beat(7 * MS, 1, 0)
-    assert PACE.is_beat(1, 0, 0), "nothing was sent yet"
-    assert PACE.is_beat(100 * MS, 90 * MS, 0), "targets have ceased"
-    assert not PACE.is_beat(3 * MS, 1, 0), "too soon after a command"
+    assert PACE.is_due(7 * MS, 1, 0)
+    assert PACE.is_due(1, 0, 0), "nothing was sent yet"
+    assert PACE.is_due(100 * MS, 90 * MS, 0), "targets have ceased"
+    assert not PACE.is_due(3 * MS, 1, 0), "too soon after a command"
 
 
 def test_the_beat_makes_room_for_a_target_that_is_due() -> None:
-    assert not PACE.is_beat(15 * MS, 8 * MS, 0)
-    assert not PACE.is_beat(18 * MS, 8 * MS, 0)
-    assert PACE.is_beat(21 * MS, 14 * MS, 0), "it is late: the arm must hear"
+    assert not PACE.is_due(15 * MS, 8 * MS, 0)
+    assert not PACE.is_due(18 * MS, 8 * MS, 0)
+    assert PACE.is_due(21 * MS, 14 * MS, 0), "it is late: the arm must hear"
 
 
 def test_in_steady_state_an_arm_hears_at_least_every_ten_milliseconds() -> None:
@@ -48,7 +48,7 @@ def test_in_steady_state_an_arm_hears_at_least_every_ten_milliseconds() -> None:
     for now_ns in range(0, 400 * MS, MS // 10):
         target_ns = now_ns - now_ns % 16_700_000
         arrives = now_ns == target_ns and now_ns > 0
-        if arrives or PACE.is_beat(now_ns, sent[-1], target_ns):
+        if arrives or PACE.is_due(now_ns, sent[-1], target_ns):
             assert PACE.wait_s(now_ns, sent[-1]) == 0.0
             sent.append(now_ns)
     gaps_ms = [(b - a) / MS for a, b in itertools.pairwise(sent[1:])]
@@ -60,7 +60,7 @@ def test_in_steady_state_an_arm_hears_at_least_every_ten_milliseconds() -> None:
 def test_an_arm_that_rests_hears_often_enough_for_its_watchdog(beat_ms: float) -> None:
     sent = [0]
     for now_ns in range(1, 2_000 * MS, round(beat_ms * MS)):
-        if PACE.is_resting_beat(now_ns, sent[-1]):
+        if PACE.is_due_when_idle(now_ns, sent[-1]):
             sent.append(now_ns)
     gaps_ms = [(b - a) / MS for a, b in itertools.pairwise(sent[1:])]
     assert min(gaps_ms) >= 25.0

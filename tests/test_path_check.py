@@ -15,10 +15,15 @@ from numpy.typing import NDArray
 from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.types import SheetTarget, Side
-from flexsheet.nodes.arm_bridge import way as way_module
+from flexsheet.nodes.arm_bridge import path_check
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
-from flexsheet.nodes.arm_bridge.way import Lookout, Way, rehearsed, trouble_on_way
+from flexsheet.nodes.arm_bridge.path_check import (
+    PathChecker,
+    PathCheckRequest,
+    check_path,
+    rehearse,
+)
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform_from_rpy
 from tests.test_arm_control import (
@@ -40,15 +45,21 @@ FAR = replace(HOME, world_from_sheet=transform_from_rpy([0.12, 0.0, 0.0], [0.0, 
 """The sheet so far to the right that the left arm's J3 ends."""
 
 
-def way_between(start: SheetMotion, goal: SheetMotion) -> Way:
+def way_between(start: SheetMotion, goal: SheetMotion) -> PathCheckRequest:
     """As the left bridge asks."""
     own, other = (Arm.holding(side, start).joints for side in ("left", "right"))
-    return Way(start, goal, own, other)
+    return PathCheckRequest(start, goal, own, other)
 
 
-def mirrored(way: Way) -> Way:
+def mirrored(way: PathCheckRequest) -> PathCheckRequest:
     """As the right bridge asks it."""
     return replace(way, own_rad=way.other_rad, other_rad=way.own_rad)
+
+
+def find_violation(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> str | None:
+    """Return why the path is blocked; None where it is clear, without its alignment."""
+    result = check_path(arm, other, request)
+    return result if isinstance(result, str) else None
 
 
 def run_asking(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
@@ -57,12 +68,12 @@ def run_asking(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
         for arm, other in (arms, arms[::-1]):
             control = arm.control
             command = control.step(arm.geometry, on_time(goal), other.as_other(), STEP_S)
-            if control.question is not None:
-                trouble = trouble_on_way(arm.geometry, other.geometry, control.question)
-                control.take_way(control.question, trouble)
+            if control.pending_check is not None:
+                trouble = find_violation(arm.geometry, other.geometry, control.pending_check)
+                control.on_path_result(control.pending_check, trouble)
             if command.mode == "move":
                 arm.joints = command.joints_rad
-            control.take_measurement(arm.joints, ())
+            control.on_measurement(arm.joints, ())
 
 
 def sheet_of(arms: tuple[Arm, Arm]) -> SheetMotion:
@@ -77,8 +88,8 @@ def test_a_barred_way_is_named_and_nothing_moves() -> None:
         assert (arm.control.mode, arm.control.faults) == ("hold", ())
         assert (arm.joints == place).all()
         reason = arm.control.reason
-        assert reason.startswith("no way: left arm, at ")
-        assert "% of the way, sheet at (" in reason
+        assert reason.startswith("no path: left arm, at ")
+        assert "% of the path, sheet at (" in reason
         assert "J3 at 5" in reason
     assert arms[0].control.reason == arms[1].control.reason
 
@@ -102,14 +113,16 @@ def test_where_only_one_bridge_finds_the_way_clear_neither_moves(barred: int) ->
         for number, (arm, other) in enumerate((arms, arms[::-1])):
             control = arm.control
             command = control.step(arm.geometry, on_time(sheet_at(0.03)), other.as_other(), STEP_S)
-            if control.question is not None:
-                control.take_way(control.question, "no way" if number == barred else None)
+            if control.pending_check is not None:
+                control.on_path_result(
+                    control.pending_check, "no path" if number == barred else None
+                )
             if command.mode == "move":
                 arm.joints = command.joints_rad
-            control.take_measurement(arm.joints, ())
+            control.on_measurement(arm.joints, ())
     assert arms[barred].control.mode == "hold"
     assert [arm.control.path_blocked for arm in arms] == [number == barred for number in (0, 1)]
-    arms[barred].control.interrupt()
+    arms[barred].control.on_scene_changed()
     assert not arms[barred].control.path_blocked
     assert arms[1 - barred].control.reason == "waits for the other arm"
     for arm, place in zip(arms, places, strict=True):
@@ -119,19 +132,19 @@ def test_where_only_one_bridge_finds_the_way_clear_neither_moves(barred: int) ->
 def test_it_is_asked_before_the_first_motion_and_after_each_stop_and_not_in_between() -> None:
     arms = pair()
     control = arms[0].control
-    asked: list[Way] = []
+    asked: list[PathCheckRequest] = []
     for goal in (sheet_at(0.03), None, sheet_at(0.05), None, sheet_at(0.01)):
         for _ in range(120):
             for arm, other in (arms, arms[::-1]):
                 arm.command = arm.control.step(
                     arm.geometry, None if goal is None else on_time(goal), other.as_other(), STEP_S
                 )
-                if (question := arm.control.question) is not None:
+                if (question := arm.control.pending_check) is not None:
                     asked += [question] if arm.control is control else []
-                    arm.control.take_way(question, None)
+                    arm.control.on_path_result(question, None)
                 if arm.command.mode == "move":
                     arm.joints = arm.command.joints_rad
-                arm.control.take_measurement(arm.joints, ())
+                arm.control.on_measurement(arm.joints, ())
     assert [round(float(way.goal.world_from_sheet[1, 3]), 6) for way in asked] == [0.03, 0.05, 0.01]
     assert asked[1].start.world_from_sheet[1, 3] == pytest.approx(0.03, abs=1e-3)
 
@@ -144,20 +157,20 @@ def test_an_answer_to_a_question_no_longer_asked_is_thrown_away() -> None:
         control.step(arms[0].geometry, on_time(goal), arms[1].as_other(), STEP_S)
 
     step(HOME)
-    old = control.question
+    old = control.pending_check
     assert old is not None
-    control.interrupt()
+    control.on_scene_changed()
     step(HOME)
     step(HOME)
-    control.take_way(old, None)
+    control.on_path_result(old, None)
     step(HOME)
-    assert control.reason == "looks whether the way is clear"
-    assert control.question is not None
-    control.take_way(control.question, None)
+    assert control.reason == "checks the path to the target"
+    assert control.pending_check is not None
+    control.on_path_result(control.pending_check, None)
     step(sheet_at(0.1))
     assert control.mode == "hold", "the target has gone elsewhere since"
-    assert control.question is not None
-    control.take_way(control.question, None)
+    assert control.pending_check is not None
+    control.on_path_result(control.pending_check, None)
     step(sheet_at(0.101))
     assert control.mode == "follow"
 
@@ -166,17 +179,17 @@ def test_an_answer_that_comes_when_nothing_is_to_be_begun_is_not_kept() -> None:
     arms = pair()
     control, geometry = arms[0].control, arms[0].geometry
     control.step(geometry, on_time(HOME), arms[1].as_other(), STEP_S)
-    assert control.question is not None
-    control.take_way(control.question, None)
+    assert control.pending_check is not None
+    control.on_path_result(control.pending_check, None)
     control.step(geometry, None, arms[1].as_other(), STEP_S)
     control.step(geometry, on_time(HOME), arms[1].as_other(), STEP_S)
     assert control.mode == "hold"
-    assert control.question is not None
+    assert control.pending_check is not None
 
 
 def test_the_sheet_goes_as_it_was_rehearsed() -> None:
     arms, goal = pair(), sheet_at(0.05, z=0.04, tilt=0.9, stretch=1.07)
-    corners = rehearsed(HOME, goal, LEFT.edge_bound)
+    corners = rehearse(HOME, goal, LEFT.edge_bound)
     numbers = np.linspace(0, len(corners) - 1, 40 * len(corners))
     columns = [
         np.array([corner.world_from_sheet[1, 3] for corner in corners]),
@@ -211,10 +224,10 @@ def test_a_way_that_is_clear_is_gone_without_a_fault_and_both_bridges_agree(
 ) -> None:
     goal = SheetMotion(transform_from_rpy(shift, lean), np.zeros(6), stretch, 0.0)
     way = way_between(HOME, goal)
-    trouble = trouble_on_way(LEFT, RIGHT, way)
-    assert trouble == trouble_on_way(RIGHT, LEFT, mirrored(way))
+    trouble = find_violation(LEFT, RIGHT, way)
+    assert trouble == find_violation(RIGHT, LEFT, mirrored(way))
     if trouble is not None:
-        assert trouble.startswith(("no way: left arm", "no way: right arm"))
+        assert trouble.startswith(("no path: left arm", "no path: right arm"))
         return
     arms = pair()
     for _ in range(60):
@@ -227,10 +240,10 @@ def test_a_way_that_is_clear_is_gone_without_a_fault_and_both_bridges_agree(
 
 def test_from_beyond_a_limit_there_is_a_way_back_but_none_further() -> None:
     beyond = sheet_at(stretch=1.0872)
-    assert trouble_on_way(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.05))) is None
-    further = trouble_on_way(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.0875)))
+    assert find_violation(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.05))) is None
+    further = find_violation(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.0875)))
     assert further is not None
-    assert "edge force is not kept" in further
+    assert "edge force is violated" in further
 
 
 @pytest.mark.parametrize("broken", [np.nan, np.inf])
@@ -244,7 +257,7 @@ def test_numbers_that_are_none_bar_the_way(broken: float) -> None:
             start=replace(HOME, world_from_sheet=start),
             goal=replace(HOME, world_from_sheet=goal),
         )
-        assert trouble_on_way(LEFT, RIGHT, asked) is not None
+        assert find_violation(LEFT, RIGHT, asked) is not None
 
 
 async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
@@ -253,24 +266,24 @@ async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
     threads: list[int] = []
     go_on = threading.Event()
 
-    def slow(arm: ArmGeometry, other: ArmGeometry, way: Way) -> str | None:
+    def slow(arm: ArmGeometry, other: ArmGeometry, way: PathCheckRequest) -> str | None:
         threads.append(threading.get_ident())
         assert go_on.wait(DEADLINE_S)
         return "barred"
 
-    monkeypatch.setattr(way_module, "check_way", slow)
-    lookout, way = Lookout(LEFT, RIGHT), way_between(HOME, HOME)
-    assert lookout.answer(None) is None
+    monkeypatch.setattr(path_check, "check_path", slow)
+    checker, way = PathChecker(LEFT, RIGHT), way_between(HOME, HOME)
+    assert checker.poll(None) is None
     for _ in range(5):
-        assert lookout.answer(way) is None
+        assert checker.poll(way) is None
         await asyncio.sleep(0)
     go_on.set()
     await asyncio.get_running_loop().shutdown_default_executor()
     await asyncio.sleep(0)
-    assert lookout.answer(way) == (way, "barred")
+    assert checker.poll(way) == (way, "barred")
     assert len(threads) == 1
     assert threads[0] != threading.get_ident()
-    assert lookout.answer(None) is None
+    assert checker.poll(None) is None
 
 
 @pytest.mark.parametrize(
@@ -291,7 +304,7 @@ async def test_targets_are_due_at_the_cameras_rate_unless_told_otherwise(
     scene = SCENE.model_copy(update={"camera": camera})
     await node.step("scene", scene, Header(1, 0, 0, "virtual", "test", 1))
     assert node.errors == 0, node.last_error
-    assert (node._timing.target_period_s, node._pace.target_period_s) == (due_s, due_s)
+    assert (node._timing.target_period_s, node._scheduler.target_period_s) == (due_s, due_s)
     await node.close()
 
 
@@ -322,11 +335,10 @@ async def test_the_twins_arms_stand_before_a_barred_way_and_go_a_clear_one() -> 
         servos = [nodes["twin"].servers[side].controller.servo for side in sides]
         places = [servo.joints_rad.copy() for servo in servos]
         task = asyncio.create_task(aim(rig, nodes, FAR))
-        await until(lambda: all("no way" in nodes[side].note for side in sides))
+        await until(lambda: all("no path" in nodes[side].note for side in sides))
         assert {rig.newest(side).mode for side in sides} == {"hold"}
         assert nodes["left"].note.split(";")[0] == nodes["right"].note.split(";")[0]
         assert "left arm, at " in nodes["left"].note
-        assert nodes["left"].note.endswith("; joints by closed_form_continuous")
         for servo, place in zip(servos, places, strict=True):
             assert (servo.joints_rad == place).all()
         task.cancel()

@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 from flexsheet.nodes.arm_bridge.control import ArmControl
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.kinematics import UnreachableError
-from flexsheet.nodes.arm_bridge.reach import PathError, path_through
+from flexsheet.nodes.arm_bridge.path_check import Alignment, PathCheckRequest, check_path, rehearse
+from flexsheet.nodes.arm_bridge.reach import PathError, plan_path_through
 from flexsheet.nodes.arm_bridge.standstill import SETTLED_COUNT
-from flexsheet.nodes.arm_bridge.way import Alignment, Way, check_way, rehearsed
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform_from_rpy
+from tests.arm_states import connect_control
 from tests.test_arm_control import (
     GUESS,
     HOME,
-    PATIENCE,
     SCENE,
     STEP_S,
+    TIMEOUTS,
     Arm,
     Command,
     on_time,
@@ -35,7 +36,7 @@ from tests.test_arm_control import (
 
 Floats = NDArray[np.float64]
 LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
-LOWEST, HIGHEST = LEFT.joint_limits.lowest_rad, LEFT.joint_limits.highest_rad
+LOWEST, HIGHEST = LEFT.joint_limits.min_rad, LEFT.joint_limits.max_rad
 Joints = tuple[Floats, Floats]
 
 
@@ -49,11 +50,11 @@ def stopped_joints(target: SheetMotion, behind: int, deviation: Floats) -> Joint
     behind: by so many tenths of a second one arm trails the other; even: the left one.  deviation
     (2, 6): how far each joint has come to rest from its command.
     """
-    reached: list[Joints] = [
+    reachable: list[Joints] = [
         (LEFT.joints_for_sheet(HOME, GUESS), RIGHT.joints_for_sheet(HOME, GUESS))
     ]
-    for sheet in rehearsed(HOME, target, LEFT.edge_bound)[1:]:
-        before = reached[-1]
+    for sheet in rehearse(HOME, target, LEFT.edge_bound)[1:]:
+        before = reachable[-1]
         try:
             after = (
                 LEFT.joints_for_sheet(sheet, before[0]),
@@ -64,31 +65,31 @@ def stopped_joints(target: SheetMotion, behind: int, deviation: Floats) -> Joint
         changes = [float(np.abs(a - b).max()) for a, b in zip(after, before, strict=True)]
         if max(changes) > 0.35 or not all(in_range(joints) for joints in after):
             break
-        reached.append(after)
+        reachable.append(after)
     else:
         return None
-    late = max(0, len(reached) - 1 - behind // 2)
-    left, right = reached[-1]
+    late = max(0, len(reachable) - 1 - behind // 2)
+    left, right = reachable[-1]
     if behind % 2:
-        right = reached[late][1]
+        right = reachable[late][1]
     else:
-        left = reached[late][0]
+        left = reachable[late][0]
     return (
         np.clip(left + deviation[0], LOWEST, HIGHEST),
         np.clip(right + deviation[1], LOWEST, HIGHEST),
     )
 
 
-def way_from(joints: Joints, goal: SheetMotion) -> Way:
+def way_from(joints: Joints, goal: SheetMotion) -> PathCheckRequest:
     """As the left bridge asks."""
     edges = LEFT.world_from_edge(joints[0]), RIGHT.world_from_edge(joints[1])
-    return Way(LEFT.sheet_between(*edges), goal, *joints)
+    return PathCheckRequest(LEFT.sheet_between(*edges), goal, *joints)
 
 
 def keeps_length(joints: Joints) -> bool:
     """Whether the sheet between is one that a fault can leave: the limits of commands."""
     way = way_from(joints, HOME)
-    return way.start.stretch_ratio * 0.24 <= LEFT.sheet_limits.longest_m
+    return way.start.stretch_ratio * 0.24 <= LEFT.sheet_limits.max_length_m
 
 
 shift = st.tuples(st.floats(-0.15, 0.15), st.floats(-0.25, 0.25), st.floats(-0.2, 0.25))
@@ -118,9 +119,9 @@ def test_from_wherever_a_path_ends_there_is_one_back(
     if joints is None or not keeps_length(joints):
         return
     way = way_from(joints, HOME)
-    found = check_way(LEFT, RIGHT, way)
+    found = check_path(LEFT, RIGHT, way)
     assert isinstance(found, Alignment), found
-    other = check_way(RIGHT, LEFT, replace(way, own_rad=joints[1], other_rad=joints[0]))
+    other = check_path(RIGHT, LEFT, replace(way, own_rad=joints[1], other_rad=joints[0]))
     assert isinstance(other, Alignment)
     assert other.duration_s == pytest.approx(found.duration_s, abs=1e-9)
     assert other.sheet.world_from_sheet == pytest.approx(found.sheet.world_from_sheet, abs=1e-12)
@@ -140,10 +141,10 @@ def test_from_wherever_a_path_ends_there_is_one_back(
 def standing(side: str, joints: Floats) -> Arm:
     """An arm that stands there, as if its bridge had just been started."""
     geometry = LEFT if side == "left" else RIGHT
-    control = ArmControl(PATIENCE, largest_lag_rad=0.12, by_itself=True)
+    control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.12, auto_arming=True)
     for _ in range(SETTLED_COUNT):
-        control.take_measurement(joints, ())
-    control.mode = "idle"
+        control.on_measurement(joints, ())
+    connect_control(control)
     return Arm(geometry, control, joints, Command("idle", joints))
 
 
@@ -153,15 +154,15 @@ def run_checked(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
         for arm, other in (arms, arms[::-1]):
             control = arm.control
             command = control.step(arm.geometry, on_time(goal), other.as_other(), STEP_S)
-            if control.question is not None:
-                found = check_way(arm.geometry, other.geometry, control.question)
-                control.take_way(control.question, found)
+            if control.pending_check is not None:
+                found = check_path(arm.geometry, other.geometry, control.pending_check)
+                control.on_path_result(control.pending_check, found)
             if command.mode == "move":
                 shift = arm.geometry.tool_points(command.joints_rad)
                 shift -= arm.geometry.tool_points(arm.joints)
                 assert np.linalg.norm(shift, axis=1).max() <= 0.25 * STEP_S
                 arm.joints = command.joints_rad
-            control.take_measurement(arm.joints, ())
+            control.on_measurement(arm.joints, ())
 
 
 def assert_goes_home(arms: tuple[Arm, Arm]) -> None:
@@ -229,8 +230,8 @@ def test_some_of_these_starts_cannot_be_held_evenly() -> None:
         found += 1
         way = way_from(joints, HOME)
         try:
-            corners = rehearsed(way.start, HOME, LEFT.edge_bound)
-            path_through(LEFT, RIGHT, corners, left_rad=joints[0], right_rad=joints[1])
+            corners = rehearse(way.start, HOME, LEFT.edge_bound)
+            plan_path_through(LEFT, RIGHT, corners, left_rad=joints[0], right_rad=joints[1])
         except PathError:
             failed += 1
     assert failed > 0

@@ -1,0 +1,76 @@
+"""Represent the other arm as its bridge reports it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.types import ArmMode, ArmState
+from flexsheet.nodes.models.rigid import is_rigid
+
+Floats = NDArray[np.float64]
+
+MAX_FUTURE_S = 0.02
+"""Largest accepted age below zero.  Measured clock offsets are smaller.  A state from the future
+would otherwise stay fresh until its time has come."""
+
+
+@dataclass(frozen=True)
+class OtherArm:
+    """Hold the other arm's joints (6,) rad, its world poses (4, 4), its mode and its state's age.
+
+    ready: it may move.  estop_engaged: its bridge holds an e-stop.
+    """
+
+    joints_rad: Floats
+    world_from_flange: Floats
+    world_from_flange_commanded: Floats
+    mode: ArmMode
+    faults: tuple[str, ...]
+    age_s: float
+    ready: bool
+    estop_engaged: bool
+
+    @classmethod
+    def from_state(cls, state: ArmState, age_s: float) -> OtherArm:
+        """Convert the other bridge's message, received `age_s` ago."""
+        return cls(
+            state.joints_rad,
+            state.world_from_flange,
+            state.world_from_flange_commanded,
+            state.mode,
+            state.faults,
+            age_s,
+            state.ready,
+            state.estop_engaged,
+        )
+
+    @cached_property
+    def invalid_reason(self) -> str | None:
+        """Why this state must not be used, or None."""
+        if not np.isfinite(self.joints_rad).all():
+            return "its joints are not finite"
+        if not (is_rigid(self.world_from_flange) and is_rigid(self.world_from_flange_commanded)):
+            return "its flange is not a rigid pose"
+        if self.age_s < -MAX_FUTURE_S:
+            return f"it is of {-self.age_s:.3g} s in the future"
+        return None
+
+    @property
+    def estopped(self) -> bool:
+        """Whether an e-stop stops it; then neither arm moves, not even to slacken the sheet."""
+        return self.mode == "estop" or self.estop_engaged
+
+    @property
+    def interlock_reason(self) -> str | None:
+        """Why this arm must not move together with it, or None."""
+        if self.faults:
+            return f"other arm: {self.faults[0]}"
+        if self.mode in ("disconnected", "fault", "estop"):
+            return f"other arm: {self.mode}"
+        if self.mode == "starting":
+            return "waiting for the other arm"
+        return None

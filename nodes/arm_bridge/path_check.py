@@ -1,0 +1,264 @@
+"""Check before a motion whether both arms can move the sheet to its target.
+
+Each bridge knows both arms' joints.  It simulates the sheet's motion, and checks at each position
+whether both arms hold it within their limits.  A check takes some milliseconds and therefore runs
+outside the cycle that sends commands.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
+from flexsheet.nodes.arm_bridge.limiter import (
+    SheetLimits,
+    check_flange,
+    check_sheet,
+    relax_limits,
+)
+from flexsheet.nodes.arm_bridge.reach import (
+    PathError,
+    PathStep,
+    interpolate_sheet,
+    plan_path_through,
+    solve_step,
+)
+from flexsheet.nodes.arm_bridge.standstill import edge_shift_m
+from flexsheet.nodes.models.motion import EdgeBound, SheetBounds, SheetMotion, follow_sheet
+from flexsheet.nodes.models.rigid import is_rigid, vector_from_rotation
+
+Floats = NDArray[np.float64]
+
+# From rest to the target, where a person may touch the sheet: a quarter of the tool speed.
+START_BOUNDS = SheetBounds(
+    speed_m_per_s=0.06,
+    acceleration_m_per_s2=0.3,
+    turn_rad_per_s=0.5,
+    turn_acceleration_rad_per_s2=2.5,
+    stretch_rate_per_s=0.03,
+    stretch_acceleration_per_s2=0.2,
+)
+
+REHEARSAL_STEP_S = 0.05
+MAX_REHEARSAL_S = 60.0
+"""Longest simulated motion; with START_BOUNDS it crosses the workspace in less."""
+
+CORNER_EVERY = 4
+"""Steps between two corners of the checked path; it deviates by less than 1 mm between them."""
+
+NEAR_M, NEAR_RAD, NEAR_STRETCH = 0.03, 0.2, 0.02
+"""Distance of a target from the checked one up to which the check still holds."""
+
+MAX_START_MOTION_RAD = 0.002
+"""Joint motion since the check up to which the check still holds."""
+
+ALIGN_FRACTIONS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Fractions of the path at which the arms may align to the sheet; the first feasible one is used.
+"""
+
+MAX_ALIGN_STEP_RAD = 0.02
+"""Largest joint step between two checked points of an alignment."""
+
+MAX_ALIGN_RAD = 1.0
+"""Largest joint motion of an alignment; beyond it the arm would change its branch."""
+
+ALIGN_SPEED_M_PER_S, ALIGN_SPEED_RAD_PER_S = 0.06, 0.5
+"""Largest speed of any point of an edge, and of any joint, during an alignment."""
+
+PEAK_TO_MEAN_SPEED = 1.5
+"""Ratio of the largest to the mean speed of the smoothstep 3 x^2 - 2 x^3."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathCheckRequest:
+    """Hold a path to check: the sheet's start and target, and both arms' joints (6,) rad."""
+
+    start: SheetMotion
+    goal: SheetMotion
+    own_rad: Floats
+    other_rad: Floats
+
+    def begins_at(self, own_rad: Floats, other_rad: Floats) -> bool:
+        """Whether both arms still stand where the path begins."""
+        moved_rad = max(
+            float(np.abs(own_rad - self.own_rad).max()),
+            float(np.abs(other_rad - self.other_rad).max()),
+        )
+        return moved_rad <= MAX_START_MOTION_RAD
+
+    def leads_to(self, target: SheetMotion) -> bool:
+        """Whether a target that has moved since is still near the end of this path."""
+        distance_m, angle_rad = measure_distance(self.goal, target)
+        stretch = abs(target.stretch_ratio - self.goal.stretch_ratio)
+        return distance_m <= NEAR_M and angle_rad <= NEAR_RAD and stretch <= NEAR_STRETCH
+
+
+def measure_distance(sheet: SheetMotion, target: SheetMotion) -> tuple[float, float]:
+    """Return distance (m) and angle (rad) between two sheet poses."""
+    rotation = target.world_from_sheet[:3, :3] @ sheet.world_from_sheet[:3, :3].T
+    offset = target.world_from_sheet[:3, 3] - sheet.world_from_sheet[:3, 3]
+    return float(np.linalg.norm(offset)), float(np.linalg.norm(vector_from_rotation(rotation)))
+
+
+def rehearse(start: SheetMotion, goal: SheetMotion, edges: EdgeBound) -> list[SheetMotion]:
+    """Simulate the bridges' motion from the start to a resting goal; return its corners."""
+    resting = replace(goal, twist_world=np.zeros(6), stretch_rate_per_s=0.0)
+    sheet, corners = start, [start]
+    for step in range(1, round(MAX_REHEARSAL_S / REHEARSAL_STEP_S)):
+        sheet = follow_sheet(
+            sheet, resting, bounds=START_BOUNDS, edges=edges, step_s=REHEARSAL_STEP_S
+        )
+        distance_m, angle_rad = measure_distance(sheet, resting)
+        stretch = abs(resting.stretch_ratio - sheet.stretch_ratio)
+        if not max(distance_m, angle_rad, stretch) > 1e-6:
+            break
+        if step % CORNER_EVERY == 0:
+            corners.append(sheet)
+    return [*corners, resting]
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """Move an arm straight in its joints from where it stands onto the sheet's path.
+
+    Two arms that a fault has stopped may hold the sheet twisted, skewed or at the end of a joint's
+    range.  No pose of a flat sheet may exist there that both can hold.
+
+    sheet: the first pose on the path that both arms can hold.
+    from_rad, to_rad: this arm's joints (6,) at both ends.
+    duration_s: equal for both arms; 0: they stand there already.
+    """
+
+    sheet: SheetMotion
+    from_rad: Floats
+    to_rad: Floats
+    duration_s: float
+
+    def joints_at(self, time_s: float) -> Floats:
+        """Return the joints (6,) rad at a time since the start."""
+        part = min(1.0, time_s / self.duration_s) if self.duration_s > 0.0 else 1.0
+        eased: Floats = self.from_rad + part * part * (3.0 - 2.0 * part) * (
+            self.to_rad - self.from_rad
+        )
+        return eased
+
+
+def check_path(arm: ArmGeometry, other: ArmGeometry, request: PathCheckRequest) -> Alignment | str:
+    """Return how this arm begins on the path, or why an arm cannot follow it.
+
+    The reason names the arm, the limit and the position.
+    """
+    left, right = (arm, other) if arm.left else (other, arm)
+    if not (is_rigid(request.start.world_from_sheet) and is_rigid(request.goal.world_from_sheet)):
+        return "no path: the sheet's pose is not rigid at the start or at the target"
+    own_rad, other_rad = request.own_rad, request.other_rad
+    left_rad, right_rad = (own_rad, other_rad) if arm.left else (other_rad, own_rad)
+    begin = PathStep(request.start, left_rad, right_rad)
+    first: PathError | None = None
+    blocked = -1.0
+    for fraction in ALIGN_FRACTIONS:
+        if fraction <= blocked:
+            continue
+        sheet = interpolate_sheet(request.start, request.goal, fraction)
+        try:
+            there = solve_step(left, right, sheet, begin, fraction=fraction)
+            _check_alignment(left, right, begin, there)
+        except PathError as error:
+            first = first or error
+            continue
+        try:
+            corners = rehearse(sheet, request.goal, arm.edge_bound)
+            plan_path_through(
+                left, right, corners, left_rad=there.left_rad, right_rad=there.right_rad
+            )
+        except PathError as error:
+            first = first or error
+            # A start before the blocked position would lead to it again.
+            blocked = fraction + error.fraction * (1.0 - fraction)
+            continue
+        to_rad = there.left_rad if arm.left else there.right_rad
+        return Alignment(sheet, own_rad, to_rad, _find_duration_s(begin, there))
+    assert first is not None
+    return f"no path: {first}"
+
+
+def _check_alignment(
+    left: ArmGeometry, right: ArmGeometry, begin: PathStep, there: PathStep
+) -> None:
+    """Raise PathError unless both arms can move straight in their joints between two steps.
+
+    The limits of the sheet hold all along, except those that are exceeded at the beginning.
+    """
+    changes = there.left_rad - begin.left_rad, there.right_rad - begin.right_rad
+    max_change_rad = max(float(np.abs(change).max()) for change in changes)
+    count = max(1, int(np.ceil(min(max_change_rad, MAX_ALIGN_RAD) / MAX_ALIGN_STEP_RAD)))
+    arms = (left, right)
+    limits: list[SheetLimits] = []
+    for part in np.linspace(0.0, 1.0, count + 1):
+        joints = begin.left_rad + part * changes[0], begin.right_rad + part * changes[1]
+        flanges = [arm.world_from_flange(rad) for arm, rad in zip(arms, joints, strict=True)]
+        edges = [flange @ arm.flange_from_edge for arm, flange in zip(arms, flanges, strict=True)]
+        for number, arm in enumerate(arms):
+            poses = flanges[number], edges[number], flanges[1 - number], edges[1 - number]
+            if part == 0.0:
+                limits.append(relax_limits(arm.sheet_limits, *poses, left=arm.left))
+            violation = check_flange(poses[0], poses[2], limits[number]) or check_sheet(
+                poses[1], poses[3], left=arm.left, limits=limits[number]
+            )
+            if violation is None and max_change_rad > MAX_ALIGN_RAD:
+                violation = "its joints would jump onto the path"
+            if violation is not None:
+                raise PathError(
+                    violation,
+                    side=arm.side,
+                    limit="alignment",
+                    fraction=0.0,
+                    world_from_sheet=there.sheet.world_from_sheet,
+                )
+
+
+def _find_duration_s(begin: PathStep, there: PathStep) -> float:
+    """Return the duration of an alignment at its speeds."""
+    duration_s = 0.0
+    for start, end in (
+        (begin.left_rad, there.left_rad),
+        (begin.right_rad, there.right_rad),
+    ):
+        travel_m = edge_shift_m(start, end)
+        change_rad = float(np.abs(end - start).max())
+        duration_s = max(
+            duration_s, travel_m / ALIGN_SPEED_M_PER_S, change_rad / ALIGN_SPEED_RAD_PER_S
+        )
+    return PEAK_TO_MEAN_SPEED * duration_s
+
+
+class PathChecker:
+    """Check one path after another in a thread, so that the cycles continue meanwhile."""
+
+    def __init__(self, arm: ArmGeometry, other: ArmGeometry) -> None:
+        self._arm, self._other = arm, other
+        self._running: tuple[PathCheckRequest, asyncio.Future[Alignment | str]] | None = None
+
+    def poll(
+        self, request: PathCheckRequest | None
+    ) -> tuple[PathCheckRequest, Alignment | str] | None:
+        """Return a finished request with its result, or None; call in every cycle.
+
+        A request is started while none runs.
+        """
+        if self._running is None:
+            if request is not None:
+                result = asyncio.get_running_loop().run_in_executor(
+                    None, check_path, self._arm, self._other, request
+                )
+                self._running = request, result
+            return None
+        running, result = self._running
+        if not result.done():
+            return None
+        self._running = None
+        return running, result.result()
