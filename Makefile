@@ -10,7 +10,7 @@ SKIPPED := $(CURDIR)/build/skipped.txt
 SITE_VENV := .venv-docs
 SITE_STAMP := $(SITE_VENV)/.installed
 
-.PHONY: setup demo try test lint bench bench-peers faults deploy-trial soak fuzz limits pages charts \
+.PHONY: setup demo try test lint cached bench bench-peers faults deploy-trial soak fuzz limits pages charts \
 	docs lock clean
 
 # What runs; what tests and checks comes with `make test` and `make lint`.
@@ -57,17 +57,21 @@ lint: $(DEV_STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+# What tests would else compute one by one, in each of their processes.
+cached: $(DEV_STAMP)
+	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
+
 # Threads of BLAS would only spin against the processes that tests start.  Tests that keep time with
 # other processes have the machine for themselves; the others share its cores.  Both parts run, even
 # if the first fails; the last lines say what was skipped in either, and why.
-test: $(DEV_STAMP) lint
+test: $(DEV_STAMP)
 	@$(BIN)/python -m flexsheet.launch.health.system --tests
 	@mkdir -p build && : > $(SKIPPED)
-	$(BIN)/flexsheet precompute launch/scenes/cylinder.yaml
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint cached
 	@status=0; \
 	export OPENBLAS_NUM_THREADS=1 SKIPPED_FILE=$(SKIPPED); set -x; \
-	$(BIN)/pytest -m "not alone" --numprocesses auto --dist worksteal || status=$$?; \
-	$(BIN)/pytest -m alone || status=$$?; \
+	$(BIN)/pytest -m "not alone" --durations=25 --numprocesses auto --dist worksteal || status=$$?; \
+	$(BIN)/pytest -m alone --durations=15 $$(grep -l mark.alone tests/test_*.py) || status=$$?; \
 	{ set +x; } 2> /dev/null; \
 	if [ -s $(SKIPPED) ]; then echo "skipped tests:"; sort $(SKIPPED) | uniq -c; \
 	else echo "no test was skipped"; fi; \

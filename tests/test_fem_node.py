@@ -6,6 +6,7 @@ import asyncio
 import threading
 import time
 from collections.abc import AsyncIterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,13 @@ from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import Topic
 from flexsheet.messages.types import Fingertip, Skin, SoftBody
-from flexsheet.nodes.fem_solver import precompute, snapshots
+from flexsheet.nodes.fem_solver import precompute, precompute_table, snapshots
 from flexsheet.nodes.fem_solver.body import SceneBody
+from flexsheet.nodes.fem_solver.mesh import cylinder
 from flexsheet.nodes.fem_solver.node import FemSolver
 from flexsheet.nodes.fem_solver.parameters import FemSolverParameters
 from tests.fingertips import fingertip as even_fingertip
+from tests.soft_bodies import Here
 from tests.waiting import DEADLINE_S
 
 SCENES = Path(__file__).parents[1] / "launch" / "scenes"
@@ -322,6 +325,9 @@ def few_pushes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(snapshots, "SPACING_RATIO", 1.0)
     monkeypatch.setattr(snapshots, "STATIONS", (0.0,))
     monkeypatch.setattr(snapshots, "ANGLE_STEP_RAD", 2.0)
+    monkeypatch.setattr(cylinder, "FOCUS_GROWTH", 0.8)
+    # Processes in the background take minutes to start beside other tests.
+    monkeypatch.setattr(precompute_table, "local_processes", lambda count: nullcontext(Here()))
 
 
 async def test_the_table_is_made_while_the_linear_method_answers(

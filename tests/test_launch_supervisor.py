@@ -452,58 +452,6 @@ def wait_for_words(process: subprocess.Popen[str], words: str) -> None:
     pytest.fail(f'"{words}" was never said: {"".join(seen)}')
 
 
-@pytest.fixture(scope="module")
-def start_up_s(tmp_path_factory: pytest.TempPathFactory) -> float:
-    """How long a launcher takes now from its start until its nodes are ready."""
-    folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))
-    path = write(tmp_path_factory.mktemp("graph"), {"beacon": beacon(), "listener": LISTENER})
-    begun_s = time.monotonic()
-    process = subprocess.Popen(
-        [*FLEXSHEET, "launch", str(path)],
-        stderr=subprocess.PIPE,
-        text=True,
-        env={**os.environ, runs.ROOT_VARIABLE: str(folder)},
-        preexec_fn=partial(set_sigint, signal.SIG_DFL, blocked=False),  # noqa: PLW1509
-    )
-    try:
-        wait_for_words(process, "are ready")
-        return time.monotonic() - begun_s
-    finally:
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=DEADLINE_S)
-        shutil.rmtree(folder)
-
-
-FRACTIONS = [*(0.05 * i for i in range(1, 21)), None]
-
-
-@pytest.mark.parametrize("fraction", FRACTIONS)
-def test_interrupted_at_any_moment_the_command_leaves_nothing(
-    tmp_path: Path,
-    runs_root: Path,
-    started: list[subprocess.Popen[str]],
-    start_up_s: float,
-    fraction: float | None,
-) -> None:
-    """After a fraction of the start-up, or when it is over (None).
-
-    The interpreter's own start is left out: SIGINT is blocked until our first statement.
-    """
-    path = write(tmp_path, {"beacon": beacon(), "listener": LISTENER})
-    process = start_command(started, "launch", str(path), blocked=True)
-    if fraction is None:
-        wait_for_words(process, "are ready")
-    else:
-        time.sleep(fraction * start_up_s)
-    process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=DEADLINE_S)
-    # Before the loop runs there is nothing to stop, and the default action ends the process.
-    assert process.returncode in ((0,) if fraction is None else (0, -signal.SIGINT)), said
-    assert "Traceback" not in said
-    assert "Exception ignored" not in said
-    assert_nothing_left(runs_root)
-
-
 @pytest.mark.parametrize("arguments", [["launch", "graph.yaml"], ["--node", "config.json"]])
 def test_an_interrupt_from_before_the_first_statement_ends_commands_and_nodes(
     started: list[subprocess.Popen[str]], arguments: list[str]

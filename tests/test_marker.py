@@ -262,7 +262,8 @@ def test_no_picture_breaks_the_search(seed: int) -> None:
             assert np.linalg.eigvalsh(marker.covariance).min() > 0
 
 
-def test_the_mark_family_tells_the_methods_apart() -> None:
+def test_the_mark_family_tells_the_methods_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(families, "MARKER_IMAGES", 12)
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
     points = [measure_trial(trial, repeats=1) for trial in MARKER.trials(scene)]
     worst = {

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
-import math
-from contextlib import suppress
-
 import numpy as np
 import pytest
 
@@ -13,20 +9,19 @@ from tests.test_arm_loop import (
     AT_FRONT,
     both_follow,
     play_finger,
+    pointing,
     presented_errors,
     running_rig,
-    still,
     stroke_path,
-    until,
 )
+from tests.waiting import until
 
 pytestmark = pytest.mark.alone
 
 
 @pytest.mark.parametrize("driver", ["mxt", "mxt_pose"])
 async def test_a_stroke_is_presented_over_the_real_time_control(driver: str) -> None:
-    # Four cycles of patience, for a machine that runs other things too.
-    async with running_rig({"protocol": "mxt"}, driver=driver, timeout_s=0.03) as (rig, nodes):
+    async with running_rig({"protocol": "mxt"}, driver=driver) as (rig, nodes):
         planner = nodes["planner"]
         await both_follow(rig, planner, AT_FRONT)
         path = stroke_path(rig.scene.object.geometry.radius_m, 0.001, 2.0)
@@ -37,24 +32,22 @@ async def test_a_stroke_is_presented_over_the_real_time_control(driver: str) -> 
             assert server.controller.error == ""
             assert server.controller.refused == 0
         distances, angles = presented_errors(rig, path, begin_ns)
-        assert distances.mean() < 0.002
-        assert math.degrees(angles.mean()) < 1.5
+        # Half of the time at least the machine did not pause; what is judged is the arms.
+        assert np.median(distances) < 0.001
+        assert np.degrees(np.median(angles)) < 0.75
         stretches = np.array([sample.edge_distance_m for sample in rig.samples])
         assert np.ptp(stretches) < 0.002
 
 
 async def test_an_error_of_one_controller_stops_both_arms_until_its_operator_came() -> None:
     twin = {"protocol": "mxt", "restart_after_s": 0.5}
-    async with running_rig(twin, driver="mxt", timeout_s=0.03) as (rig, nodes):
+    async with running_rig(twin, driver="mxt") as (rig, nodes):
         planner = nodes["planner"]
         await both_follow(rig, planner, AT_FRONT)
-        task = asyncio.create_task(play_finger(rig, planner, still(AT_FRONT), 20.0))
-        nodes["twin"].servers["left"].controller._fail("drill")
-        await until(lambda: rig.newest("left").mode == "disconnected")
-        assert "no answer" in rig.newest("left").faults[0]
-        await until(lambda: rig.newest("right").mode in ("stopping", "relax", "idle"))
-        await until(lambda: {rig.newest(side).mode for side in ("left", "right")} == {"follow"})
-        assert nodes["twin"].servers["left"].controller.error == ""
-        task.cancel()
-        with suppress(asyncio.CancelledError):
-            await task
+        async with pointing(rig, planner, AT_FRONT):
+            nodes["twin"].servers["left"].controller._fail("drill")
+            await until(lambda: rig.newest("left").mode == "disconnected")
+            assert "no answer" in rig.newest("left").faults[0]
+            await until(lambda: rig.newest("right").mode in ("stopping", "relax", "idle"))
+            await until(lambda: {rig.newest(side).mode for side in ("left", "right")} == {"follow"})
+            assert nodes["twin"].servers["left"].controller.error == ""
