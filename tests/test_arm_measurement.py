@@ -259,7 +259,7 @@ def test_nothing_starts_before_fresh_measurements_confirm_a_standstill() -> None
         arms[0].control.on_measurement(arms[0].reported, (), Freshness.FIRST)
         arms[0].freshness = freshness
         stroke(arms, 0.5)
-        assert arms[0].control.reason == "waits until the arm stands still"
+        assert arms[0].control.reason == "waits for the arm to stand still"
         assert arms[0].command.mode != "move"
     arms[0].freshness = Freshness.FRESH
     stroke(arms, 0.5)

@@ -156,7 +156,7 @@ class Link:
         command = encode_command(
             sequence=self.sequence, time_us=0, mode=mode, joints_rad=joints_rad
         )
-        assert controller.take(command)
+        assert controller.receive_command(command)
         self.bench.speeds.append(controller.servo.velocity_rad_per_s.copy())
         await self.bench.sleep(ANSWER_S)
         self.bench.twin._advance(self.side)

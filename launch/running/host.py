@@ -338,13 +338,13 @@ def shows_estop(state: ArmState) -> bool:
 
 
 def arms_of(plan: Plan) -> list[str]:
-    """List the addresses of the plan's arms; a bridge without one counts by its name."""
+    """List the plan's arms by the address of each; a bridge without one counts by its name."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
 
 def waits_for_a_person(plan: Plan) -> bool:
-    """Return whether a person has to arm the arms; simulated ones may arm themselves."""
+    """Whether arms move at a person's word only; those that go by themselves are simulated."""
     return any(node.parameters.get("arming") == "manual" for node in plan.nodes.values())
 
 
