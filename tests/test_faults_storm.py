@@ -161,7 +161,7 @@ class Link:
         await self.bench.sleep(ANSWER_S)
         self.bench.twin._advance(self.side)
         status = decode_status(controller.status_registers())
-        freshness = self.counters.judge(
+        freshness = self.counters.classify(
             (status.time_us, status.cycle),
             sent_ns=now_ns,
             received_ns=self.bench.clock.now_ns(),

@@ -33,8 +33,8 @@ from flexsheet.nodes.arm_bridge.mxt import (
     PACKET_BYTES,
     TYPE_JOINTS,
     TYPE_POSE,
-    Field,
     MxtLink,
+    PacketField,
     decode_answer,
     encode,
     encode_joints,
@@ -50,7 +50,7 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "mxt.md"
 ME = ("127.0.0.1", 4711)
 
 
-def offsets() -> Iterator[tuple[int, Field]]:
+def offsets() -> Iterator[tuple[int, PacketField]]:
     at = 0
     for field in PACKET:
         yield at, field
