@@ -778,7 +778,7 @@ def run_modbus(data: bytes) -> bool:
         decode_status(registers)
     controller = Controller(AT_REST_RAD, servo_lag_s=0.02, noise_rad=0.0, watchdog_s=0.1)
     for block in (registers[:20], registers):
-        controller.take(block)
+        controller.receive_command(block)
         controller.advance(0.01)
     assert in_range(controller.servo.joints_rad)
     assert len(controller.status_registers()) == _REGISTERS
@@ -795,7 +795,7 @@ def in_range(joints_rad: np.ndarray[Any, Any]) -> bool:
 
 def mxt_seeds() -> list[bytes]:
     controller = _mxt_controller()
-    controller.take(encode_mxt(0), ("a", 1))
+    controller.receive_command(encode_mxt(0), ("a", 1))
     controller.advance(0.0075)
     answer = controller.answers[0][0]
     move = encode_mxt(1, send_type=2, data=AT_REST_RAD.tolist())
@@ -819,7 +819,7 @@ def run_mxt(data: bytes) -> bool:
         assert np.isfinite(status.joints_rad).all()
     controller = _mxt_controller()
     for start in range(0, min(len(data), 40 * PACKET_BYTES), PACKET_BYTES):
-        controller.take(data[start : start + PACKET_BYTES], ("a", 1))
+        controller.receive_command(data[start : start + PACKET_BYTES], ("a", 1))
         controller.advance(0.0072)
         assert in_range(controller.servo.joints_rad)
     return taken

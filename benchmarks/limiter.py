@@ -1,21 +1,22 @@
-"""Whether any command leads an arm out of its limits: a great many, random and adversarial.
+"""Verify that no command leads an arm out of its limits, with random and adversarial commands.
 
     python -m benchmarks.limiter [--commands 1000000] [--seed 0] [--json]
 
-Nine commands in ten are joint goals: NaN, leaps, edges of the range, alternating extremes, lying
-velocities, spinning wrists, pushes at the tool's speed, and sequences that hypothesis hunted for;
-they go through the limiter and from there into the twin's joint servos.  The others are sheet
-targets for two bridges' controls that share a sheet: leaps, nonsense, late targets, frozen and
-lagging arms, e-stops, resets, measurements that are frozen, lagging, offset, swapped, replayed or
-stale, second masters, and combinations of them; whether there is a path to a target they are told
-unseen.  Commands come as unevenly as bridges send them.
+Nine commands in ten are joint goals: NaN, jumps, edges of the range, alternating extremes, false
+velocities, rotating wrists, motions at the tool's speed limit, and sequences that hypothesis
+searched for.  They pass the limiter and then the simulated joint servos.
 
-Judged are the commands, and each millisecond of the simulated joints, by kinematics of this file.
-Counted apart are commands that brake harder than the acceleration because range or tool speed could
-not be kept otherwise, arms that were frozen and catch up by themselves, and arms that a second
-master moves.
-Prints the violations (there should be none), the worst share of each limit, and how long a pass
-takes.  Some minutes on one core.
+The others are sheet targets for the controls of two bridges that hold a sheet: jumps, invalid
+numbers, late targets, frozen and lagging arms, e-stops and resets.  Measurements are frozen,
+lagging, offset, swapped, replayed or stale; a second master commands an arm; faults are combined.
+Every path check reports a clear path.  Commands are sent as unevenly as bridges send them.
+
+The kinematics of this file judge the commands and each millisecond of the simulated joints.
+Counted apart are commands that exceed the acceleration because range or tool speed need it, frozen
+arms that catch up by themselves, and arms that a second master moves.
+
+Prints the violations (there should be none), the worst ratio to each limit, and the time of a
+pass.  Takes some minutes on one core.
 """
 
 from __future__ import annotations
@@ -66,36 +67,36 @@ Flags = NDArray[np.bool_]
 Random = np.random.Generator
 
 SCENE_FILE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
-BEAT_S = 1.0 / 140.0
+PERIOD_S = 1.0 / 140.0
 JITTER_S = 0.0015
-"""How unevenly the network may deliver commands."""
+"""Largest jitter of the delivery of commands."""
 SERVO_LAG_S = 0.025
 LANES = 96
 """Arms that are simulated side by side."""
 SIDES: tuple[Side, Side] = ("left", "right")
 PAIRS = 32
 LIFE = 400
-"""Commands after which an arm starts anew somewhere else."""
-SHEET_SHARE = 0.2
+"""Commands after which an arm restarts at another position."""
+SHEET_FRACTION = 0.2
 THAW_S = 0.4
-"""How long an arm that was frozen may take to catch up: sixteen lags of its servos."""
+"""Time in which a frozen arm catches up: sixteen lags of its servos."""
 WITHIN = 1.0 + 1e-6
 NOISE_RAD = 5e-6
-"""Of encoders."""
+"""Standard deviation of encoder noise."""
 HISTORY = 150
-"""Measurements that a false one may come from."""
+"""Number of past measurements that a false one may repeat."""
 FALSE_CHANCE, FALSE_CHANCE_MOVING, SECOND_CHANCE = 0.0005, 0.01, 0.0005
-"""Per arm and cycle: that its measurement becomes false, that a second master commands it."""
+"""Probabilities per arm and cycle of a false measurement, and of a second master."""
 MAX_UNCHANGED_CYCLES = 7
-"""Counters that stand still for longer are stalled."""
+"""Cycles after which unchanged counters are stalled."""
 HUNTS = 80
-"""Sequences that hypothesis tries in search of bad ones."""
+"""Number of sequences that hypothesis tries."""
 START_GUESS_RAD = np.radians([0.0, 25.0, 118.0, 0.0, -54.0, 0.0])
 
 
 @dataclass
 class Under:
-    """What arms did under one adversary: cycles, those in which they were moved, tool speed."""
+    """Count cycles and cycles with motion under one adversary, and the largest tool speed."""
 
     cycles: int = 0
     moved: int = 0
@@ -104,7 +105,7 @@ class Under:
 
 @dataclass
 class Tally:
-    """What was counted: violations by name, the worst share of each limit, times of a pass."""
+    """Count violations by name, the worst ratio to each limit, and the times of a pass."""
 
     commands: int = 0
     violations: dict[str, int] = field(default_factory=lambda: defaultdict(int))
@@ -114,7 +115,7 @@ class Tally:
     under: dict[str, Under] = field(default_factory=lambda: defaultdict(Under))
 
     def judge(self, name: str, share: Floats | float, allowed: Flags | bool = False) -> None:
-        """share: of a limit, 1 being all of it; more is counted apart where it is `allowed`."""
+        """Count ratios to a limit above 1; those that are `allowed` are counted apart."""
         shares = np.atleast_1d(np.asarray(share, dtype=np.float64))
         if shares.size == 0:
             return
@@ -125,9 +126,9 @@ class Tally:
 
 
 def flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
-    """Rotations (n, 3, 3) and places (n, 3) of flanges, base frame, of joints (n, 6).
+    """Return rotations (n, 3, 3) and positions (n, 3) m of flanges in the base, of joints (n, 6).
 
-    The twin's chain, its joints one after another, for many arms at once.
+    Multiplies the joints of the simulated arm, for many arms at once.
     """
     q = joints_rad.T
     axes = "zyyzyz"
@@ -147,14 +148,14 @@ def flange_poses(joints_rad: Floats) -> tuple[Floats, Floats]:
 
 
 def points_on_tool(joints_rad: Floats, tool: Floats) -> Floats:
-    """(n, points, 3) of the tool's points (points, 3, flange frame), in the base."""
+    """Return the tool's points (n, points, 3) in the base, from (points, 3) in the flange."""
     turns, places = flange_poses(joints_rad)
     found: Floats = np.einsum("nij,pj->npi", turns, tool) + places[:, None, :]
     return found
 
 
-def tool_of(scene: Scene) -> Floats:
-    """Middle and ends of the left clamped edge, and the flange's own centre (4, 3)."""
+def find_tool_points(scene: Scene) -> Floats:
+    """Return centre and ends of the left clamped edge, and the flange's centre (4, 3) m."""
     clamp = scene.arms.left.flange_from_edge
     pose, half = transform_from_rpy(clamp.position_m, clamp.rpy_rad), 0.5 * scene.sheet.height_m
     edge = pose[:3, 3] + np.array([[0.0], [-half], [half]]) * pose[:3, 1]
@@ -162,15 +163,15 @@ def tool_of(scene: Scene) -> Floats:
 
 
 class Judged:
-    """Joint servos of n arms, watched each millisecond."""
+    """Simulate the joint servos of n arms, and judge each millisecond."""
 
     def __init__(self, joints_rad: Floats, scene: Scene, tally: Tally) -> None:
         self.servo = Servo(joints_rad.copy(), SERVO_LAG_S)
         self.servo.velocity_rad_per_s = np.zeros_like(joints_rad)
-        self._tool, self._fastest = tool_of(scene), scene.arms.max_tool_speed_m_per_s
+        self._tool, self._fastest = find_tool_points(scene), scene.arms.max_tool_speed_m_per_s
         self._tally = tally
         self.speed_share = np.zeros(len(joints_rad))
-        """The largest share of the tool speed of each arm in the last `advance`."""
+        """Largest ratio to the tool speed of each arm in the last `advance`."""
 
     def advance(
         self,
@@ -180,9 +181,10 @@ class Judged:
         *,
         thawing: Flags | bool = False,
     ) -> None:
-        """moving (n,): 1 for an arm that obeys, 0 for one that brakes, -1 for a frozen one.
+        """Advance all arms by `duration_s`.
 
-        thawing (n,): it was frozen, and catches up as fast as it can, whatever it is told.
+        moving (n,): 1 for an arm that obeys, 0 for one that decelerates, -1 for a frozen one.
+        thawing (n,): it was frozen, and catches up as fast as it can.
         """
         steps = int(np.ceil(duration_s / 1e-3))
         step_s = duration_s / steps
@@ -206,7 +208,7 @@ class Judged:
             self.speed_share = np.maximum(self.speed_share, speed / self._fastest)
 
     def _hold_back(self, joints: Floats, velocity: Floats, moving: Floats, step_s: float) -> None:
-        """Undo the step of frozen arms; let stopping ones brake instead."""
+        """Undo the step of frozen arms; decelerate stopping ones instead."""
         servo, still, braking = self.servo, moving < 0, moving == 0
         servo.joints_rad[still], servo.velocity_rad_per_s[still] = joints[still], 0.0
         slower = decelerate(velocity, step_s)
@@ -219,7 +221,7 @@ class Judged:
 
 @dataclass
 class Lane:
-    """One arm under one adversary: what the limiter was last told and answered."""
+    """Hold one arm under one adversary, with the limiter's last input and output."""
 
     joints_rad: Floats
     velocity: Floats
@@ -242,7 +244,7 @@ def _anywhere(random: Random, limits: JointLimits, beyond: float = 0.0) -> Float
 
 
 def leaps(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Goals anywhere, in range or beyond, each for a while."""
+    """Yield goals anywhere, in range or beyond, each for some cycles."""
     while True:
         goal = _anywhere(random, limits, 0.5)
         for _ in range(random.integers(1, 60)):
@@ -250,7 +252,7 @@ def leaps(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
 
 
 def nonsense(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Numbers that are none, and huge ones, among goals that make sense."""
+    """Yield invalid and huge numbers among valid goals."""
     odd = np.array([np.nan, np.inf, -np.inf, 1e300, -1e300, 1e-300, 0.0])
     while True:
         goal, along = _anywhere(random, limits), random.normal(0.0, 1.0, 6)
@@ -261,7 +263,7 @@ def nonsense(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[
 
 
 def extremes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """From one end of each joint's range to the other, at periods from two cycles to many."""
+    """Yield alternating ends of each joint's range, at periods from two cycles to many."""
     while True:
         up, each = random.random(6) < 0.5, int(random.integers(1, 40))
         goal = np.where(up, limits.max_rad, limits.min_rad)
@@ -271,7 +273,7 @@ def extremes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[
 
 
 def edges(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """On the ends of the range, and a hair inside and outside of them."""
+    """Yield the ends of the range, and goals slightly inside and outside of them."""
     while True:
         end = np.where(random.random(6) < 0.5, limits.max_rad, limits.min_rad)
         for _ in range(random.integers(5, 80)):
@@ -279,7 +281,7 @@ def edges(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
 
 
 def liars(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Goals that claim to move as they do not."""
+    """Yield goals with false velocities."""
     while True:
         goal = lane.joints_rad + random.normal(0.0, 0.3, 6)
         claim = random.choice([1.0, -1.0, 1e6, -1e6], 6) * limits.speed_rad_per_s
@@ -288,7 +290,7 @@ def liars(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
 
 
 def spins(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """J4 against J6 with J5 near zero, then J5 away from it: the wrist's singularity."""
+    """Yield J4 against J6 with J5 near zero, then J5 away from it: the wrist singularity."""
     while True:
         goal = lane.joints_rad.copy()
         goal[4] = 0.0
@@ -305,7 +307,7 @@ def spins(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Flo
 
 
 def pushes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """Each joint the way that moves the tool fastest in some direction, then the way back."""
+    """Yield motions of each joint that move the tool fastest, forth and back."""
     while True:
         direction = random.normal(0.0, 1.0, 3)
         nudged = lane.joints_rad + np.vstack([np.zeros(6), 1e-4 * np.eye(6)])
@@ -318,12 +320,12 @@ def pushes(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Fl
 
 
 def walks(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-    """A goal that goes its own way, with its true velocity, and now and then turns."""
+    """Yield a moving goal with its true velocity, which changes now and then."""
     goal, speed = lane.joints_rad.copy(), np.zeros(6)
     while True:
         if random.random() < 0.05:
             speed = random.uniform(-1.5, 1.5, 6) * limits.speed_rad_per_s
-        goal = goal + speed * BEAT_S
+        goal = goal + speed * PERIOD_S
         yield goal, speed
 
 
@@ -333,12 +335,12 @@ ADVERSARIES = (leaps, nonsense, extremes, edges, liars, spins, pushes, walks)
 def joint_goals(
     commands: int, random: Random, scene: Scene, hunted: Sequence[Sequence[Floats]], tally: Tally
 ) -> None:
-    """Run that many joint goals through the limiter into simulated arms."""
+    """Pass this number of joint goals through the limiter to simulated arms."""
     geometry = ArmGeometry(scene, "left")
     limits = geometry.joint_limits
 
     def replay(random: Random, limits: JointLimits, lane: Lane) -> Iterator[tuple[Floats, Floats]]:
-        """A sequence that hypothesis found, in a version of its own."""
+        """Yield a variation of a sequence that hypothesis found."""
         while True:
             shift = random.normal(0.0, random.choice([0.0, 0.02]), 6)
             for goal in hunted[int(random.integers(len(hunted)))]:
@@ -358,7 +360,7 @@ def joint_goals(
         arms = Judged(np.array([lane.joints_rad for lane in lanes]), scene, tally)
         delay_s = 0.0
         for _ in range(min(LIFE, max(1, (commands - tally.commands) // LANES))):
-            step_s = BEAT_S * float(random.choice([0.5, 1.0, 2.0, random.uniform(0.5, 2.0)]))
+            step_s = PERIOD_S * float(random.choice([0.5, 1.0, 2.0, random.uniform(0.5, 2.0)]))
             held = np.array([lane.joints_rad for lane in lanes])
             old = np.array([lane.velocity for lane in lanes])
             later_s = random.uniform(0.0, JITTER_S)
@@ -384,7 +386,7 @@ def joint_goals(
             judge_commands(
                 tally,
                 geometry,
-                tool=tool_of(scene),
+                tool=find_tool_points(scene),
                 held=held,
                 now=now,
                 velocities=(old, new),
@@ -403,7 +405,7 @@ def judge_commands(
     velocities: tuple[Floats, Floats],
     step_s: float,
 ) -> None:
-    """Commands (n, 6) after those held, with the velocities (n, 6) of the step before and this."""
+    """Judge commands (n, 6) after `held` ones, with the velocities (n, 6) of both steps."""
     limits, fastest = geometry.joint_limits, geometry.max_tool_speed
     old, new = velocities
     beyond = np.maximum(limits.min_rad - now, now - limits.max_rad).max(axis=1)
@@ -417,22 +419,22 @@ def judge_commands(
         return furthest / (min(step_s, MAX_TRAVEL_STEP_S) * fastest)
 
     tally.judge("commanded tool speed", tool_share(new))
-    # Excused where to slow all that may be was not enough for tool speed or range.
+    # Excused where the full deceleration does not keep tool speed or range.
     most = limits.acceleration_rad_per_s2 * step_s
     slowest = np.sign(old) * np.maximum(np.abs(old) - most, 0.0)
     stopping_s = (np.abs(old) / limits.acceleration_rad_per_s2).max(axis=1, keepdims=True)
-    decelerate = old * np.maximum(0.0, 1.0 - step_s / np.maximum(stopping_s, 1e-12))
+    slowed = old * np.maximum(0.0, 1.0 - step_s / np.maximum(stopping_s, 1e-12))
     there = held + slowest * step_s
-    decelerate = clamp_to_range(held, old, decelerate, limits=limits, step_s=step_s)
-    forced = (tool_share(decelerate) > 1.0) | (
-        (there < limits.min_rad) | (there > limits.max_rad)
-    ).any(axis=1)
+    slowed = clamp_to_range(held, old, slowed, limits=limits, step_s=step_s)
+    forced = (tool_share(slowed) > 1.0) | ((there < limits.min_rad) | (there > limits.max_rad)).any(
+        axis=1
+    )
     share = (np.abs(new - old) / most).max(axis=1)
     tally.judge("commanded acceleration", share, allowed=forced)
 
 
 def hunt(scene: Scene) -> list[list[Floats]]:
-    """Sequences of goals that hypothesis drove towards the limits: the worst by each of them."""
+    """Search for sequences of goals near the limits with hypothesis; return the worst ones."""
     geometry = ArmGeometry(scene, "left")
     limits = geometry.joint_limits
     width = limits.max_rad - limits.min_rad
@@ -460,10 +462,10 @@ def hunt(scene: Scene) -> list[list[Floats]]:
             velocity = limit_velocity(
                 joints, velocity, goal, STILL,
                 tool_points=geometry.tool_points, max_tool_speed=geometry.max_tool_speed,
-                limits=limits, step_s=2.0 * BEAT_S,
+                limits=limits, step_s=2.0 * PERIOD_S,
             )  # fmt: skip
-            joints = joints + velocity * 2.0 * BEAT_S
-            arm.advance(joints[None, :], 2.0 * BEAT_S, np.ones(1))
+            joints = joints + velocity * 2.0 * PERIOD_S
+            arm.advance(joints[None, :], 2.0 * PERIOD_S, np.ones(1))
         speed, place = tally.worst["simulated tool speed"], tally.worst["simulated position"]
         target(speed, label="tool speed")
         target(place, label="position")
@@ -484,7 +486,7 @@ History = deque[Floats]
 
 @dataclass
 class FalseMeasurement:
-    """How an arm's status lies, for so many cycles; the kinds are applied one after another."""
+    """Falsify an arm's measurement for some cycles; the kinds are applied one after another."""
 
     kinds: tuple[str, ...]
     cycles: int
@@ -508,7 +510,7 @@ class FalseMeasurement:
         )
 
     def report(self, history: History, arm: int) -> tuple[Floats, Freshness]:
-        """Joints (6,) that the arm's status reports, and what its counters say."""
+        """Return the joints (6,) that the arm reports, and the freshness of its counters."""
         joints, freshness = history[-1][arm], Freshness.FRESH
         for kind in self.kinds:
             joints, fresh = FALSE_KINDS[kind](self, history, arm, joints)
@@ -518,12 +520,12 @@ class FalseMeasurement:
         return joints, freshness
 
     def frozen(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
-        """The first one for ever, while the counters go on."""
+        """Repeat the first measurement while the counters advance."""
         self.held_rad = joints if self.held_rad is None else self.held_rad
         return self.held_rad, Freshness.FRESH
 
     def stale(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
-        """The first one for ever, and its counters."""
+        """Repeat the first measurement and its counters."""
         held, _ = self.frozen(history, arm, joints)
         stalled = self.begun >= MAX_UNCHANGED_CYCLES
         return held, Freshness.STALLED if stalled else Freshness.REPEATED
@@ -543,14 +545,14 @@ class FalseMeasurement:
         return history[-1][arm ^ 1], Freshness.FRESH
 
     def replayed(self, history: History, arm: int, joints: Floats) -> tuple[Floats, Freshness]:
-        """A piece of the past again and again, with new counters."""
+        """Repeat a part of the past with new counters."""
         past = (2 * self.begun + self.lag - self.begun % self.lag) % HISTORY
         return history[-1 - min(past, len(history) - 1)][arm], Freshness.FRESH
 
     def replayed_whole(
         self, history: History, arm: int, joints: Floats
     ) -> tuple[Floats, Freshness]:
-        """The same with the counters of the past."""
+        """Repeat a part of the past with its counters."""
         return self.replayed(history, arm, joints)[0], Freshness.REVERSED
 
 
@@ -568,9 +570,9 @@ FALSE_KINDS: dict[str, Callable[..., tuple[Floats, Freshness]]] = {
 
 @dataclass
 class SecondMaster:
-    """Another client that commands the same arm, for so many cycles, as fast as the arm may go.
+    """Command the same arm from another client for some cycles, at up to half the tool speed.
 
-    refuses: the controller takes its commands and refuses the bridge's; else it takes both in turn.
+    refuses: the controller rejects the bridge's commands; otherwise it obeys both in turn.
     """
 
     joints_rad: Floats
@@ -598,7 +600,7 @@ class SecondMaster:
 
 @dataclass
 class Bridge:
-    """One bridge's control, and for how many cycles more its arm stands or does not answer."""
+    """Hold one bridge's control, and the remaining cycles of its arm's faults."""
 
     geometry: ArmGeometry
     control: ArmControl
@@ -609,7 +611,7 @@ class Bridge:
 
     @property
     def adversary(self) -> str:
-        """What this arm suffers from now."""
+        """Name this arm's present adversary."""
         if self.second is not None:
             return "second master"
         if self.lie is not None:
@@ -617,7 +619,7 @@ class Bridge:
         return "frozen arm" if self.frozen else "silent arm" if self.unanswered else "none"
 
     def state(self, age_s: float) -> OtherArm:
-        """What the other bridge hears of it."""
+        """Return the state that the other bridge receives."""
         joints_rad = self.control.last_measured_rad
         assert joints_rad is not None
         return OtherArm(
@@ -631,8 +633,8 @@ class Bridge:
             self.control.estop_reason is not None,
         )
 
-    def hear(self, history: History, arm: int) -> None:
-        """The arm's answer to the last command, or none."""
+    def receive(self, history: History, arm: int) -> None:
+        """Pass the arm's answer to the control, or a failed exchange."""
         if self.second is not None and self.second.refuses:
             self.control.on_exchange_failed("the arm refused the command", silent=False)
         elif self.unanswered == 0:
@@ -646,7 +648,7 @@ class Bridge:
             self.control.on_exchange_failed("no answer", silent=True)
 
     def other_command(self, random: Random, joints_rad: Floats, step_s: float) -> Floats | None:
-        """Joints (6,) that a second master sends in this cycle after the bridge, or None."""
+        """Return joints (6,) that a second master sends in this cycle, or None."""
         if self.second is None and random.random() < SECOND_CHANCE:
             self.second = second_master(random, self.geometry, joints_rad)
         if self.second is None:
@@ -655,8 +657,8 @@ class Bridge:
         self.second = second if second.cycles > 0 else None
         return theirs if second.refuses or second.cycles % 2 else None
 
-    def suffer(self, random: Random, stamp_ns: int) -> None:
-        """Now and then the arm freezes or falls silent, somebody stops it, or clears it."""
+    def draw_faults(self, random: Random, stamp_ns: int) -> None:
+        """Draw faults of the arm, e-stops and resets."""
         chance = random.random()
         false = FALSE_CHANCE if self.control.at_rest else FALSE_CHANCE_MOVING
         if self.lie is None and random.random() < false:
@@ -672,7 +674,7 @@ class Bridge:
 
 
 def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
-    """Targets: leaps near and far, moving ones, nonsense, stretches beyond the sheet, late ones."""
+    """Yield targets: jumps, moving, invalid, overstretched and late ones."""
     while True:
         reach = random.choice([0.02, 0.1, 0.3])
         place, turn = random.normal(0.0, reach, 3), random.normal(0.0, 2.0 * reach, 3)
@@ -686,9 +688,9 @@ def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
         if random.random() < 0.02:
             stretch = float(random.choice([np.nan, -1.0, 1e9]))
         for number in range(int(random.integers(1, 60))):
-            moved = transform(pose[:3, :3], pose[:3, 3] + twist[:3] * number * BEAT_S)
+            moved = transform(pose[:3, :3], pose[:3, 3] + twist[:3] * number * PERIOD_S)
             motion = SheetMotion(moved, twist, float(stretch), float(rate))
-            # Nonsense stays as it is; transform() would mend its last row.
+            # Invalid poses stay as they are; transform() would correct their last row.
             yield Goal(
                 motion if np.isfinite(pose).all() else replace(motion, world_from_sheet=pose),
                 late_s,
@@ -696,7 +698,7 @@ def sheet_goals(random: Random, scene: Scene) -> Iterator[Goal]:
 
 
 def sheet_targets(commands: int, random: Random, scene: Scene, tally: Tally) -> None:
-    """Run that many commands of pairs of bridges, side by side, into simulated arms."""
+    """Run this number of commands of pairs of bridges with simulated arms."""
     end = tally.commands + commands
     while tally.commands < end:
         left = (end - tally.commands) // (2 * PAIRS) + 1
@@ -704,7 +706,7 @@ def sheet_targets(commands: int, random: Random, scene: Scene, tally: Tally) -> 
 
 
 def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> None:
-    """Pairs of arms that hold a sheet, from a start in the scene's middle."""
+    """Run pairs of arms that hold a sheet, from a start in the scene's centre."""
     timeouts = Timeouts(hold_after_s=0.02, stop_after_s=0.1)
     home = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
     geometries = [ArmGeometry(scene, side) for side in SIDES]
@@ -725,7 +727,7 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
     sent: list[Floats | None] = [None] * len(bridges)
     goals = [sheet_goals(random, scene) for _ in range(PAIRS)]
     for cycle in range(cycles):
-        step_s = BEAT_S * float(random.uniform(0.5, 2.0))
+        step_s = PERIOD_S * float(random.uniform(0.5, 2.0))
         arms.advance(wanted, step_s, moving, thawing=thaw_s > 0.0)
         noise = NOISE_RAD * random.standard_normal(arms.servo.joints_rad.shape)
         history.append(arms.servo.joints_rad + noise)
@@ -734,7 +736,7 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
         pair_goals = [next(goal) for goal in goals]
         for number, bridge in enumerate(bridges):
             control, other = bridge.control, number ^ 1
-            bridge.hear(history, number)
+            bridge.receive(history, number)
             age_s = float(random.choice([0.005] * 20 + [0.03, 0.2]))
             seen, before = bridges[other].state(age_s), sent[number]
             began_ns = time.thread_time_ns()
@@ -761,14 +763,14 @@ def bridge_pairs(cycles: int, random: Random, scene: Scene, tally: Tally) -> Non
             if bridge.frozen > 0:
                 bridge.frozen -= 1
                 moving[number], thaw_s[number] = -1.0, THAW_S
-            bridge.suffer(random, cycle)
+            bridge.draw_faults(random, cycle)
         tally.commands += len(bridges)
 
 
 def note_adversaries(
     tally: Tally, bridges: list[Bridge], speed_share: Floats, *, moving: Floats, thawing: Flags
 ) -> None:
-    """Note how fast the arms (n,) went under their adversaries; thawing ones are left out."""
+    """Record the arms' tool speeds (n,) by adversary; thawing arms are excluded."""
     for number, bridge in enumerate(bridges):
         under = tally.under[bridge.adversary]
         under.cycles += 1
@@ -778,7 +780,7 @@ def note_adversaries(
 
 
 def second_master(random: Random, geometry: ArmGeometry, joints_rad: Floats) -> SecondMaster:
-    """One that takes the arm from where it is."""
+    """Return a second master that starts at the arm's joints."""
     lane = Lane(joints_rad.copy(), np.zeros(6), iter(()))
     goals = walks(random, geometry.joint_limits, lane)
     return SecondMaster(
@@ -794,7 +796,7 @@ def judge_bridge(
     before: Floats | None,
     step_s: float,
 ) -> None:
-    """A bridge's command (6,) after the last one; before: None if that did not move the arm."""
+    """Judge a bridge's command (6,); before: the last one, None if it did not move the arm."""
     if command.mode != "move":
         return
     joints, limits = command.joints_rad, geometry.joint_limits
@@ -807,13 +809,13 @@ def judge_bridge(
 
 
 def stroke_passes(scene: Scene) -> list[int]:
-    """CPU time (ns) of inverse kinematics and limiter along strokes, as a bridge does them."""
+    """Measure the CPU time (ns) of inverse kinematics and limiter along strokes."""
     geometry, times = ArmGeometry(scene, "left"), []
     home = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
     joints, velocity = geometry.joints_for_sheet(home, START_GUESS_RAD), np.zeros(6)
     before = joints
     for cycle in range(STROKE_CYCLES):
-        tilt_rad = np.sin(cycle * BEAT_S) * scene.working_range.tilt_rad
+        tilt_rad = np.sin(cycle * PERIOD_S) * scene.working_range.tilt_rad
         turned = transform_from_rpy(np.zeros(3), [tilt_rad, 0.0, 0.0])
         began_ns = time.thread_time_ns()
         goal = geometry.joints_for_sheet(replace(home, world_from_sheet=turned), joints)
@@ -821,19 +823,19 @@ def stroke_passes(scene: Scene) -> list[int]:
             joints,
             velocity,
             goal,
-            (goal - before) / BEAT_S,
+            (goal - before) / PERIOD_S,
             tool_points=geometry.tool_points,
             max_tool_speed=geometry.max_tool_speed,
             limits=geometry.joint_limits,
-            step_s=BEAT_S,
+            step_s=PERIOD_S,
         )
         times.append(time.thread_time_ns() - began_ns)
-        joints, before = joints + velocity * BEAT_S, goal
+        joints, before = joints + velocity * PERIOD_S, goal
     return times
 
 
 def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) -> dict[str, Any]:
-    """What was counted, for people and programs."""
+    """Return the counts for people and programs."""
     names = sorted(set(tally.worst) | set(sheets.worst))
     return {
         "commands": tally.commands + sheets.commands,
@@ -859,13 +861,13 @@ def report(tally: Tally, sheets: Tally, stroke_ns: list[int], seconds: float) ->
 
 
 def percentiles_us(times_ns: Sequence[int]) -> dict[str, float]:
-    """p50 and p99 of the processor's time, in microseconds."""
+    """Return p50 and p99 of the processor's time, in microseconds."""
     p50, p99 = np.percentile(times_ns, [50.0, 99.0]) * 1e-3 if len(times_ns) else (0.0, 0.0)
     return {"p50": round(float(p50), 1), "p99": round(float(p99), 1)}
 
 
 def run(commands: int, seed: int, *, hunting: bool = True) -> dict[str, Any]:
-    """The whole benchmark."""
+    """Run the whole benchmark."""
     began_s = time.perf_counter()
     scene, random = load_scene(SCENE_FILE), np.random.default_rng(seed)
     check = random.uniform(-1.0, 1.0, (5, 6))
@@ -873,7 +875,7 @@ def run(commands: int, seed: int, *, hunting: bool = True) -> dict[str, Any]:
         assert np.allclose(forward(joints), transform(turn, place), atol=1e-12)
     joints_tally, sheets_tally = Tally(), Tally()
     hunted = hunt(scene) if hunting else []
-    sheets = int(SHEET_SHARE * commands)
+    sheets = int(SHEET_FRACTION * commands)
     joint_goals(commands - sheets, random, scene, hunted, joints_tally)
     sheet_targets(commands - joints_tally.commands, random, scene, sheets_tally)
     seconds = time.perf_counter() - began_s
@@ -884,7 +886,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--commands", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", action="store_true", help="one line for programs")
+    parser.add_argument("--json", action="store_true", help="print one line of JSON")
     options = parser.parse_args()
     result = run(options.commands, options.seed)
     if options.json:

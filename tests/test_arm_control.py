@@ -1,4 +1,4 @@
-"""The bridge's decisions, cycle by cycle, without sockets."""
+"""Test the arm control's decisions cycle by cycle, without sockets."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ruamel.yaml import YAML
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import ArmState, EStop, Side
+from flexsheet.nodes.arm_bridge import other_arm
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command, Timeouts
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal, extrapolate_goal, sync_factor
@@ -24,7 +25,7 @@ from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.other_arm import OtherArm
 from flexsheet.nodes.arm_bridge.standstill import STANDSTILL_COUNT
 from flexsheet.nodes.models.motion import SheetMotion
-from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation
+from flexsheet.nodes.models.rigid import is_rigid, transform_from_rpy, vector_from_rotation
 from flexsheet.nodes.models.sheet import edge_poses
 from tests.arm_states import connect_control
 from tests.twists import twist_between
@@ -48,7 +49,7 @@ def sheet_at(
 
 @dataclass
 class Arm:
-    """One controlled arm that does at once what it is told."""
+    """Simulate one controlled arm that reaches its command at once."""
 
     geometry: ArmGeometry
     control: ArmControl
@@ -149,7 +150,7 @@ def test_a_far_target_is_reached_slowly_and_together() -> None:
 
 
 def test_the_arm_that_is_ahead_waits_for_the_one_behind() -> None:
-    """One arm misses every second cycle, as a busy machine would have it: no fault, both arrive."""
+    """One arm misses every second cycle, as on a busy computer; both arrive without a fault."""
     arms = pair()
     run(arms, on_time(HOME), 60)
     goal = on_time(sheet_at(0.02, tilt=1.0))
@@ -373,6 +374,21 @@ def test_an_estop_of_the_other_arm_is_read_from_its_typed_field_not_from_text() 
     assert replace(other, estop_engaged=True).estopped
 
 
+def test_the_other_arms_poses_are_checked_once_per_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    checked: list[Floats] = []
+
+    def count(pose: Floats) -> bool:
+        checked.append(pose)
+        return is_rigid(pose)
+
+    monkeypatch.setattr(other_arm, "is_rigid", count)
+    arms = pair()
+    other = arms[1].as_other()
+    arms[0].cycle(on_time(HOME), other)
+    assert other.invalid_reason is None
+    assert len(checked) == 2
+
+
 def test_only_the_typed_watchdog_fault_restarts_the_arm(monkeypatch: pytest.MonkeyPatch) -> None:
     for fault in ArmFault:
         monkeypatch.setitem(FAULT_TEXTS, fault, "watchdog: no command")
@@ -490,7 +506,7 @@ def test_a_reset_from_before_the_stop_does_not_clear_it() -> None:
 
 
 def test_last_words_of_several_writers_may_come_in_any_order() -> None:
-    """To a bridge that is started anew: the newest stop counts, not the one that came last."""
+    """For a restarted bridge the newest stop counts, not the one received last."""
     control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.1)
     stop, reset = EStop(engaged=True, reason="hand"), EStop(engaged=False, reason="")
     assert control.on_estop(stop, 30, 100) is None
@@ -618,7 +634,7 @@ def test_measured_flanges_outside_the_workspace_or_too_near_are_faults() -> None
 
 
 def test_an_arm_that_does_not_let_go_is_not_led_on() -> None:
-    """Frozen while the sheet shall be slackened: its command stops where the arm may trail it."""
+    """The command of an arm that freezes while it relaxes stops at the largest tracking error."""
     arms = pair(sheet_at(stretch=1.08))
     run(arms, on_time(sheet_at(stretch=1.08)), 30)
     arms[0].control.faults = ("drill",)
@@ -686,7 +702,7 @@ def test_a_slack_sheet_is_held_as_told_until_the_flanges_come_too_near() -> None
 def test_a_sheet_measured_twisted_or_too_taut_stops_both_at_once(
     shift: tuple[float, ...], turn: tuple[float, ...], words: str
 ) -> None:
-    """Something has dragged the other arm off its command: both bridges see it."""
+    """Both bridges detect that the other arm was moved off its command."""
     arms = pair()
     run(arms, on_time(HOME), 60)
     moved = transform_from_rpy(shift, turn)
@@ -704,7 +720,7 @@ def test_a_sheet_measured_twisted_or_too_taut_stops_both_at_once(
 
 
 def lifted(y: float, aside_rad: float) -> SheetMotion:
-    """The sheet turned aside a little, at a height; at 0.16 m both forearms are level: J5 = 0."""
+    """Return the sheet yawed at a height; at 0.16 m both forearms are level, so J5 = 0."""
     pose = transform_from_rpy([0.0, y, 0.0], [0.0, aside_rad, 0.0])
     return replace(HOME, world_from_sheet=pose)
 
@@ -716,7 +732,7 @@ def lifted(y: float, aside_rad: float) -> SheetMotion:
 def test_past_the_wrists_singularity_both_go_on_together_or_both_stop(
     aside_rad: float, *, through: bool, ends: str
 ) -> None:
-    """J5 goes through zero, or past it at a distance: no joint too fast, no twisted sheet."""
+    """J5 passes zero, or passes near it, without a fast joint or a twisted sheet."""
     arms, speed = pair(lifted(0.1, aside_rad)), 0.05
     run(arms, on_time(lifted(0.1, aside_rad)), 60)
     fifth, widest = [], 0.0

@@ -1,4 +1,4 @@
-"""Measurements that are frozen, lagging, offset, swapped, stale or replayed move no arm too fast.
+"""Test that false measurements (frozen, lagging, offset, swapped, replayed) cause no fast motion.
 
 The arms are simulated joint servos of the twin; their tool speed comes from its kinematics.
 """
@@ -43,7 +43,7 @@ Reading = Callable[[Floats], Floats]
 
 @dataclass
 class ServoArm:
-    """A controlled arm whose joints follow as servos; `reading` is what it reports of them."""
+    """Simulate a controlled arm with servos; `reading` falsifies its measured joints."""
 
     geometry: ArmGeometry
     control: ArmControl
@@ -74,7 +74,7 @@ class ServoArm:
         self.control.on_measurement(self.reported, (), self.freshness)
 
     def tool_points(self) -> Floats:
-        """Both ends of the edge and the flange (3, 3), by the twin's kinematics."""
+        """Return both ends of the edge and the flange (3, 3) m, by the simulator's kinematics."""
         clamp = SCENE.arms.left.flange_from_edge
         edge = transform_from_rpy(clamp.position_m, clamp.rpy_rad)
         half = 0.5 * SCENE.sheet.height_m
@@ -123,7 +123,7 @@ def servo_pair() -> Arms:
 
 
 def stroke_goal(time_s: float) -> Goal:
-    """The sheet goes by +-50 mm at 0.4 Hz."""
+    """Return the sheet's motion by +-50 mm at 0.4 Hz."""
     rate = 2.0 * np.pi * 0.4
     twist = np.array([0.0, 0.05 * rate * np.cos(rate * time_s), 0.0, 0.0, 0.0, 0.0])
     motion = replace(sheet_at(0.05 * np.sin(rate * time_s)), twist_world=twist)
@@ -131,7 +131,7 @@ def stroke_goal(time_s: float) -> Goal:
 
 
 def stroke(arms: Arms, seconds: float, *, begin_s: float = 0.0) -> float:
-    """Let both arms follow the stroke; returns the time at its end."""
+    """Run both arms along the stroke; return the time at its end."""
     cycles = round(seconds / STEP_S)
     for number in range(cycles):
         goal = stroke_goal(begin_s + number * STEP_S)
@@ -142,7 +142,7 @@ def stroke(arms: Arms, seconds: float, *, begin_s: float = 0.0) -> float:
 
 
 def frozen(arm: ServoArm) -> Reading:
-    """What was measured last, again and again."""
+    """Repeat the last measurement."""
     joints = arm.reported.copy()
     return lambda _: joints
 
@@ -156,7 +156,7 @@ def swapped(arm: ServoArm) -> Reading:
 
 
 def lagging(arm: ServoArm) -> Reading:
-    """Everything 0.3 s late."""
+    """Delay measurements by 0.3 s."""
     history = [arm.reported.copy()] * 42
 
     def late(joints: Floats) -> Floats:
@@ -177,7 +177,7 @@ def assert_no_leap(arms: Arms) -> None:
 
 @pytest.mark.parametrize("reading", READINGS)
 def test_no_arm_leaps_by_a_false_measurement(reading: Callable[[ServoArm], Reading]) -> None:
-    """Also after the fault, after a reset while the measurement is still false, and afterwards."""
+    """The same holds after the fault, after a reset with a false measurement, and later."""
     arms = servo_pair()
     time_s = stroke(arms, 1.2)
     assert {arm.control.mode for arm in arms} == {"follow"}
@@ -259,7 +259,7 @@ def test_nothing_starts_before_fresh_measurements_confirm_a_standstill() -> None
         arms[0].control.on_measurement(arms[0].reported, (), Freshness.FIRST)
         arms[0].freshness = freshness
         stroke(arms, 0.5)
-        assert arms[0].control.reason == "waits until the arm stands still"
+        assert arms[0].control.reason == "waits for the arm to stand still"
         assert arms[0].command.mode != "move"
     arms[0].freshness = Freshness.FRESH
     stroke(arms, 0.5)
@@ -274,12 +274,12 @@ MS = 10**6
 def classify(
     monitor: CounterMonitor, counters: tuple[int, ...], at_ns: int, *, may_restart: bool
 ) -> Freshness:
-    """An answer that comes at once."""
+    """Classify an answer that arrives at once."""
     return monitor.classify(counters, sent_ns=at_ns, received_ns=at_ns, may_restart=may_restart)
 
 
 def test_counters_of_answers_that_came_late_are_not_stalled() -> None:
-    """Two answers of the same cycle: the one came 0.1 s late, the other at once or late too."""
+    """Two answers of one cycle: one arrives 0.1 s late, the other at once or late."""
     for received_ns in (101 * MS, 300 * MS):
         monitor = CounterMonitor()
         monitor.classify((5, 6), sent_ns=0, received_ns=100 * MS, may_restart=False)
@@ -351,7 +351,7 @@ def test_a_standstill_takes_fresh_unchanged_measurements_after_the_last_motion()
 
 def test_a_jump_is_a_change_off_the_commanded_path_that_is_too_fast() -> None:
     def after(*readings: float, commands: int = 40) -> bool:
-        """Joint 1 follows its command by 0.5 rad/s and then reads so."""
+        """Move joint 1 at 0.5 rad/s and report it."""
         monitor = StandstillMonitor()
         velocity = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
         joints = np.zeros(6)
@@ -423,7 +423,7 @@ def test_a_bounded_step_keeps_joint_speeds_and_tool_speed(
 
 @pytest.mark.parametrize("leap", [0.5, np.nan])
 def test_no_decision_commands_a_leap(leap: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A defect anywhere in the decisions: the one place where commands are made bounds it."""
+    """`_send` bounds the command of a defective decision."""
     arms = servo_pair()
     time_s = stroke(arms, 1.2)
     control, geometry = arms[0].control, arms[0].geometry

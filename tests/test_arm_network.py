@@ -1,4 +1,4 @@
-"""The network between the computers is cut in mid-stroke: real sockets on real interfaces."""
+"""Test network cuts between the computers during a stroke, on real interfaces."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LONGEST_M = 0.24 * 1.09
 
 @dataclass
 class Watch:
-    """What both bridges say."""
+    """Hold the states that both bridges publish."""
 
     states: dict[str, list[ArmState]] = field(default_factory=lambda: {side: [] for side in SIDES})
     clocks: dict[str, tuple[Clocks, str]] = field(default_factory=dict)
@@ -48,7 +48,7 @@ class Watch:
         self.clocks[host] = clocks, header.clock_id
 
     def worst_clock_error_s(self) -> float:
-        """Of what the hosts know of one another's clocks; infinite if somebody is not known."""
+        """Return the largest uncertainty of the hosts' clocks; infinite for an unknown host."""
         ahead_s = {clock_id: AHEAD_S[host] for host, (_, clock_id) in self.clocks.items()}
         errors = [
             abs(one.offset_ns * 1e-9 - (ahead_s[one.clock_id] - AHEAD_S[host]))
@@ -64,7 +64,7 @@ class Watch:
         return {self.states[side][-1].mode if self.states[side] else "none" for side in SIDES}
 
     async def lasts(self, count: int) -> dict[str, list[ArmState]]:
-        """The next so many states of each arm."""
+        """Return the next `states` states of each arm."""
         began = {side: len(self.states[side]) for side in SIDES}
         await until(lambda: all(len(self.states[side]) >= began[side] + count for side in SIDES))
         return {side: self.states[side][began[side] :] for side in SIDES}
@@ -100,11 +100,11 @@ def config(
 
 
 AHEAD_S = {"main": 0, "left": 7 * 3600, "right": 123}
-"""How long the computers have been up before main was: their clocks have nothing in common."""
+"""Uptime of the computers before main started; their clocks are unrelated."""
 
 
 def clock_config(host: str, folder: Path, tcp: dict[str, str], keys: Path, limit_s: float) -> str:
-    """The clock node of a host."""
+    """Return the clock node of a host."""
     pings = tuple(
         Source(f"{address}:7003", f"clock_{other}", other)
         for other, address in tcp.items()
@@ -125,7 +125,7 @@ def clock_config(host: str, folder: Path, tcp: dict[str, str], keys: Path, limit
 
 @asynccontextmanager
 async def three_computers(*, clock_limit_s: float = 0.05) -> AsyncIterator[tuple[Computers, Watch]]:
-    """main strokes; left and right have an arm and its bridge each.  Yields once all have begun."""
+    """Run the stroke on main, and an arm with its bridge on left and right."""
     if missing := Computers.missing():
         pytest.skip(missing)
     folder = Path(tempfile.mkdtemp(prefix="fs-", dir="/tmp"))

@@ -1,4 +1,4 @@
-"""The order in which nodes start is no fault of an arm."""
+"""Test that the order in which nodes start causes no fault of an arm."""
 
 from __future__ import annotations
 

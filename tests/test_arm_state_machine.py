@@ -1,4 +1,4 @@
-"""The arm control's transition table: complete, and no path to motion without arming."""
+"""Test the arm control's transition table: complete, and no motion without arming."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def apply(state: State, event: Event) -> State:
 
 
 def reachable(starts: Collection[State], events: Collection[Event]) -> set[State]:
-    """Every state that some sequence of the events leads to."""
+    """Return every state that a sequence of the events leads to."""
     found, open_states = set(starts), list(starts)
     while open_states:
         state = open_states.pop()

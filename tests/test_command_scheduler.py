@@ -1,4 +1,4 @@
-"""When an arm is sent its next command."""
+"""Test when an arm is sent its next command."""
 
 from __future__ import annotations
 

@@ -156,12 +156,12 @@ class Link:
         command = encode_command(
             sequence=self.sequence, time_us=0, mode=mode, joints_rad=joints_rad
         )
-        assert controller.take(command)
+        assert controller.receive_command(command)
         self.bench.speeds.append(controller.servo.velocity_rad_per_s.copy())
         await self.bench.sleep(ANSWER_S)
         self.bench.twin._advance(self.side)
         status = decode_status(controller.status_registers())
-        freshness = self.counters.judge(
+        freshness = self.counters.classify(
             (status.time_us, status.cycle),
             sent_ns=now_ns,
             received_ns=self.bench.clock.now_ns(),

@@ -45,7 +45,7 @@ STOPPED = {"idle", "stopping", "hold", "relax", "fault"}
 
 
 def tool_points(side: str, joints_rad: Floats) -> Floats:
-    """Both ends of the clamped edge and the flange (3, 3), in the arm's base."""
+    """Return both ends of the clamped edge and the flange (3, 3) m, in the arm's base."""
     arm = SCENE.arms.left if side == "left" else SCENE.arms.right
     clamp = transform_from_rpy(arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad)
     half = 0.5 * SCENE.sheet.height_m * clamp[:3, 1]
@@ -55,7 +55,7 @@ def tool_points(side: str, joints_rad: Floats) -> Floats:
 
 
 class Immediate(PathChecker):
-    """Answers at once: a thread would take real time, and here time is virtual."""
+    """Check paths at once, since time is virtual here."""
 
     def poll(
         self, question: PathCheckRequest | None
@@ -66,7 +66,7 @@ class Immediate(PathChecker):
 
 
 def edge_distance_m(joints_rad: Mapping[str, Floats]) -> float:
-    """Between the middles of both clamped edges, by the simulator's kinematics."""
+    """Return the distance (m) of both edges' centres, by the simulator's kinematics."""
     places = []
     for side, arm in (("left", SCENE.arms.left), ("right", SCENE.arms.right)):
         world_from_base = transform_from_rpy(
@@ -278,7 +278,7 @@ Forge = Callable[[ArmState, Random], dict[str, Any]]
 
 
 def moved_pose(pose: Floats, random: Random) -> Floats:
-    """The pose with an offset and a rotation that may be small or large."""
+    """Return the pose with a small or large offset and rotation."""
     shift = random.normal(0.0, random.choice([0.005, 0.05, 0.5]), 3)
     turn = random.normal(0.0, random.choice([0.02, 0.3, 2.0]), 3)
     return np.asarray(transform_from_rpy(shift, turn) @ pose)
@@ -316,7 +316,7 @@ STATES: dict[str, Forge] = {
 def forger(
     kinds: list[str], random: Random, share: float
 ) -> Callable[[ArmState, Header], tuple[ArmState, Header]]:
-    """Replace that share of the states."""
+    """Replace this fraction of the states."""
 
     def forge(state: ArmState, header: Header) -> tuple[ArmState, Header]:
         if random.random() > share:

@@ -1,4 +1,4 @@
-"""RV-1A kinematics: against the twin's own arm, all branches there and back, singularities."""
+"""Test the RV-1A kinematics against the simulator, on all branches and near singularities."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ any_turn = arrays(np.float64, 6, elements=st.floats(-np.pi, np.pi))
 
 
 def chain(joints_rad: Floats) -> Floats:
-    """Link by link, each a turn about an axis and then a shift, by scipy's rotations."""
+    """Return the pose by scipy's rotations, link by link."""
     links = (
         ("z", (0.0, 0.0, 0.165 + 0.135), 0),
         ("y", (0.0, 0.0, 0.25), 1),
@@ -230,7 +230,7 @@ def test_each_singularity_is_at_distance_zero(joint: int, angle_rad: float, dist
 
 
 def _above_the_shoulder(q3: float) -> float:
-    """J2 that brings the wrist centre onto the axis of J1."""
+    """Return the J2 that brings the wrist centre onto the axis of J1."""
     out = 0.16 * np.sin(q3) - 0.09 * np.cos(q3)
     up = 0.25 + 0.09 * np.sin(q3) + 0.16 * np.cos(q3)
     return float(-np.arctan2(out, up))
@@ -263,7 +263,7 @@ def wrist_path(past_rad: float, step_rad: float, bend_rad: float = 0.0) -> list[
 
 
 def follow(poses: list[Floats]) -> tuple[Floats, Floats]:
-    """Joints (n, 6) along the poses, and the errors of orientation (n,) rad."""
+    """Return joints (n, 6) along the poses, and the orientation errors (n,) rad."""
     present = inverse_kinematics(poses[0], CENTRE_RAD)
     joints, errors = [present], [0.0]
     for pose in poses[1:]:

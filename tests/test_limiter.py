@@ -1,4 +1,4 @@
-"""The limiter: whatever comes in, nothing out of bounds goes out."""
+"""Test that the limiter's output is within its limits for any input."""
 
 from __future__ import annotations
 
@@ -300,7 +300,7 @@ def test_the_turn_between_edges_is_the_angle_of_their_rotation(
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_no_random_or_adversarial_command_moves_an_arm_out_of_its_limits(seed: int) -> None:
-    """Shorter than `python -m benchmarks.limiter`, and with its judges."""
+    """Run a short `python -m benchmarks.limiter` with its judging code."""
     result = run(5000, seed, hunting=False)
     assert result["commands"] >= 5000
     assert not any(result["violations"].values()), result

@@ -107,9 +107,9 @@ def test_a_command_is_taken_by_the_arm_and_no_damaged_one(sequence: int, time_us
     assert len(registers) == register_count(COMMAND)
     damaged = registers.copy()
     damaged[10] ^= 1
-    assert not controller.take(damaged)
-    assert controller.take(registers)
-    assert not controller.take(registers)
+    assert not controller.receive_command(damaged)
+    assert controller.receive_command(registers)
+    assert not controller.receive_command(registers)
     assert controller.wanted_rad == pytest.approx(JOINTS, abs=1e-6)
 
 

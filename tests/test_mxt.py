@@ -33,8 +33,8 @@ from flexsheet.nodes.arm_bridge.mxt import (
     PACKET_BYTES,
     TYPE_JOINTS,
     TYPE_POSE,
-    Field,
     MxtLink,
+    PacketField,
     decode_answer,
     encode,
     encode_joints,
@@ -51,7 +51,7 @@ DOCUMENT = Path(__file__).parent.parent / "docs" / "mxt.md"
 ME = ("127.0.0.1", 4711)
 
 
-def offsets() -> Iterator[tuple[int, Field]]:
+def offsets() -> Iterator[tuple[int, PacketField]]:
     at = 0
     for field in PACKET:
         yield at, field
@@ -196,7 +196,7 @@ def controller(**changed: float) -> MxtController:
 
 def ask(arm: MxtController, packet: bytes, sender: tuple[str, int] = ME) -> bytes | None:
     """One cycle with that packet; the answer, if there was one."""
-    arm.take(packet, sender)
+    arm.receive_command(packet, sender)
     arm.advance(CONTROLLER_CYCLE_S)
     answers, arm.answers = arm.answers, []
     assert len(answers) <= 1
@@ -210,7 +210,7 @@ def joints_of(packet: bytes | None) -> Floats:
 
 def test_it_answers_each_packet_at_the_end_of_its_cycle_and_counts() -> None:
     arm = controller()
-    arm.take(encode(COMMAND_NONE), ME)
+    arm.receive_command(encode(COMMAND_NONE), ME)
     arm.advance(0.007)
     assert arm.answers == []
     arm.advance(0.0002)

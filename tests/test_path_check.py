@@ -1,4 +1,4 @@
-"""Whether there is a way for both arms, before they begin: asked, answered, and what follows."""
+"""Test the check of the path for both arms before a motion, and its effect."""
 
 from __future__ import annotations
 
@@ -42,17 +42,17 @@ from tests.waiting import DEADLINE_S, until
 Floats = NDArray[np.float64]
 LEFT, RIGHT = ArmGeometry(SCENE, "left"), ArmGeometry(SCENE, "right")
 FAR = replace(HOME, world_from_sheet=transform_from_rpy([0.12, 0.0, 0.0], [0.0, 0.0, 0.0]))
-"""The sheet so far to the right that the left arm's J3 ends."""
+"""Sheet so far to the right that the left arm's J3 is out of range."""
 
 
-def way_between(start: SheetMotion, goal: SheetMotion) -> PathCheckRequest:
-    """As the left bridge asks."""
+def make_request(start: SheetMotion, goal: SheetMotion) -> PathCheckRequest:
+    """Return the request of the left bridge."""
     own, other = (Arm.holding(side, start).joints for side in ("left", "right"))
     return PathCheckRequest(start, goal, own, other)
 
 
 def mirrored(way: PathCheckRequest) -> PathCheckRequest:
-    """As the right bridge asks it."""
+    """Return the same request from the right bridge."""
     return replace(way, own_rad=way.other_rad, other_rad=way.own_rad)
 
 
@@ -62,8 +62,8 @@ def find_violation(arm: ArmGeometry, other: ArmGeometry, request: PathCheckReque
     return result if isinstance(result, str) else None
 
 
-def run_asking(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
-    """As `run`, but each arm's question is looked into, in no time."""
+def run_with_checks(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
+    """Run both arms like `run`, and check each requested path at once."""
     for _ in range(cycles):
         for arm, other in (arms, arms[::-1]):
             control = arm.control
@@ -83,7 +83,7 @@ def sheet_of(arms: tuple[Arm, Arm]) -> SheetMotion:
 def test_a_barred_way_is_named_and_nothing_moves() -> None:
     arms = pair()
     places = [arm.joints.copy() for arm in arms]
-    run_asking(arms, FAR, 30)
+    run_with_checks(arms, FAR, 30)
     for arm, place in zip(arms, places, strict=True):
         assert (arm.control.mode, arm.control.faults) == ("hold", ())
         assert (arm.joints == place).all()
@@ -96,11 +96,11 @@ def test_a_barred_way_is_named_and_nothing_moves() -> None:
 
 def test_a_target_within_reach_again_is_gone_to() -> None:
     arms = pair()
-    run_asking(arms, FAR, 30)
+    run_with_checks(arms, FAR, 30)
     goal = sheet_at(0.02, tilt=0.3)
-    run_asking(arms, goal, 30)
+    run_with_checks(arms, goal, 30)
     assert {arm.control.mode for arm in arms} == {"hold"}, "it is looked at again every half second"
-    run_asking(arms, goal, 400)
+    run_with_checks(arms, goal, 400)
     assert {arm.control.mode for arm in arms} == {"follow"}
     assert sheet_of(arms).world_from_sheet == pytest.approx(goal.world_from_sheet, abs=1e-6)
 
@@ -223,7 +223,7 @@ def test_a_way_that_is_clear_is_gone_without_a_fault_and_both_bridges_agree(
     shift: tuple[float, ...], lean: tuple[float, ...], stretch: float
 ) -> None:
     goal = SheetMotion(transform_from_rpy(shift, lean), np.zeros(6), stretch, 0.0)
-    way = way_between(HOME, goal)
+    way = make_request(HOME, goal)
     trouble = find_violation(LEFT, RIGHT, way)
     assert trouble == find_violation(RIGHT, LEFT, mirrored(way))
     if trouble is not None:
@@ -240,8 +240,8 @@ def test_a_way_that_is_clear_is_gone_without_a_fault_and_both_bridges_agree(
 
 def test_from_beyond_a_limit_there_is_a_way_back_but_none_further() -> None:
     beyond = sheet_at(stretch=1.0872)
-    assert find_violation(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.05))) is None
-    further = find_violation(LEFT, RIGHT, way_between(beyond, sheet_at(stretch=1.0875)))
+    assert find_violation(LEFT, RIGHT, make_request(beyond, sheet_at(stretch=1.05))) is None
+    further = find_violation(LEFT, RIGHT, make_request(beyond, sheet_at(stretch=1.0875)))
     assert further is not None
     assert "edge force is violated" in further
 
@@ -250,7 +250,7 @@ def test_from_beyond_a_limit_there_is_a_way_back_but_none_further() -> None:
 def test_numbers_that_are_none_bar_the_way(broken: float) -> None:
     pose = np.eye(4)
     pose[1, 3] = broken
-    way = way_between(HOME, HOME)
+    way = make_request(HOME, HOME)
     for start, goal in ((pose, np.eye(4)), (np.eye(4), pose)):
         asked = replace(
             way,
@@ -272,7 +272,7 @@ async def test_ways_are_looked_at_beside_the_loop_and_one_at_a_time(
         return "barred"
 
     monkeypatch.setattr(path_check, "check_path", slow)
-    checker, way = PathChecker(LEFT, RIGHT), way_between(HOME, HOME)
+    checker, way = PathChecker(LEFT, RIGHT), make_request(HOME, HOME)
     assert checker.poll(None) is None
     for _ in range(5):
         assert checker.poll(way) is None
@@ -309,7 +309,7 @@ async def test_targets_are_due_at_the_cameras_rate_unless_told_otherwise(
 
 
 async def aim(rig: Rig, nodes: dict[str, ArmBridge], sheet: SheetMotion) -> None:
-    """Hand both bridges that target, over and over."""
+    """Send this target to both bridges repeatedly."""
     while True:
         target = SheetTarget(
             phase="wait",

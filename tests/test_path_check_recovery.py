@@ -1,4 +1,4 @@
-"""From wherever a fault has stopped the arms there is a path back to where both can hold the sheet.
+"""Test that a path back exists from wherever a fault has stopped the arms.
 
 A path is judged by its own rehearsal and by arms that are sent along it.
 """
@@ -81,13 +81,13 @@ def stopped_joints(target: SheetMotion, behind: int, deviation: Floats) -> Joint
 
 
 def way_from(joints: Joints, goal: SheetMotion) -> PathCheckRequest:
-    """As the left bridge asks."""
+    """Return the request of the left bridge."""
     edges = LEFT.world_from_edge(joints[0]), RIGHT.world_from_edge(joints[1])
     return PathCheckRequest(LEFT.sheet_between(*edges), goal, *joints)
 
 
 def keeps_length(joints: Joints) -> bool:
-    """Whether the sheet between is one that a fault can leave: the limits of commands."""
+    """Return whether a fault can leave the sheet like this, by the limits of commands."""
     way = way_from(joints, HOME)
     return way.start.stretch_ratio * 0.24 <= LEFT.sheet_limits.max_length_m
 
@@ -139,7 +139,7 @@ def test_from_wherever_a_path_ends_there_is_one_back(
 
 
 def standing(side: str, joints: Floats) -> Arm:
-    """An arm that stands there, as if its bridge had just been started."""
+    """Return an arm that stands at these joints, with a new bridge."""
     geometry = LEFT if side == "left" else RIGHT
     control = ArmControl(TIMEOUTS, max_tracking_error_rad=0.12, auto_arming=True)
     for _ in range(SETTLED_COUNT):
@@ -149,7 +149,7 @@ def standing(side: str, joints: Floats) -> Arm:
 
 
 def run_checked(arms: tuple[Arm, Arm], goal: SheetMotion, cycles: int) -> None:
-    """As bridges do: each question is looked into, and its answer taken."""
+    """Run both arms like bridges, and check each requested path."""
     for _ in range(cycles):
         for arm, other in (arms, arms[::-1]):
             control = arm.control
@@ -189,7 +189,7 @@ def assert_goes_home(arms: tuple[Arm, Arm]) -> None:
 def test_stopped_where_no_even_sheet_can_be_held_both_go_home(
     target: SheetMotion, behind: int
 ) -> None:
-    """One arm at the end of its range and the other beside: the mean sheet is out of reach."""
+    """One arm is at the end of its range, so the mean sheet is out of reach."""
     deviation = np.array([[0.0, 0.03, -0.03, 0.01, 0.0, 0.0], [0.0, 0.0, 0.02, 0.0, 0.01, 0.0]])
     joints = stopped_joints(target, behind, deviation)
     assert joints is not None
@@ -202,7 +202,7 @@ def test_stopped_where_no_even_sheet_can_be_held_both_go_home(
 def test_where_the_mean_sheet_is_out_of_reach_the_path_begins_at_the_measured_joints(
     y_m: float, fifth_deg: float
 ) -> None:
-    """Found with real bridges: no inverse kinematics of the mean sheet, for good."""
+    """The mean sheet has no inverse kinematics; found with real bridges."""
     pose = transform_from_rpy([-0.005, y_m, 0.0], [0.0, 0.0, 0.0])
     joints = stopped_joints(replace(HOME, world_from_sheet=pose), 0, np.zeros((2, 6)))
     sheet = replace(HOME, world_from_sheet=pose)
@@ -213,7 +213,7 @@ def test_where_the_mean_sheet_is_out_of_reach_the_path_begins_at_the_measured_jo
 
 
 def test_some_of_these_starts_cannot_be_held_evenly() -> None:
-    """The tests above cover what they are about: paths that begin at the mean sheet fail there."""
+    """Paths that begin at the mean sheet fail for some starts of the tests above."""
     random, failed, found = np.random.default_rng(1), 0, 0
     while found < 12:
         target = SheetMotion(

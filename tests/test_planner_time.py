@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexsheet.nodes.arm_bridge.goal import goal_ahead
+from flexsheet.nodes.arm_bridge.goal import extrapolate_goal
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.planner.lead import next_lead_s
 from flexsheet.nodes.planner.order import STEPPED_AFTER, Order
@@ -61,5 +61,5 @@ def test_the_lead_goes_slowly_and_no_further_than_fingertips_say(
 
 def test_a_target_for_a_moment_too_far_ahead_is_overdue() -> None:
     still = SheetMotion(np.eye(4), np.zeros(6), 1.02, 0.0)
-    assert goal_ahead(still, -0.05, -0.01, furthest_s=0.06).overdue_s < 0.0
-    assert goal_ahead(still, -30.0, -0.01, furthest_s=0.06).overdue_s > 29.0
+    assert extrapolate_goal(still, -0.05, -0.01, max_extrapolation_s=0.06).overdue_s < 0.0
+    assert extrapolate_goal(still, -30.0, -0.01, max_extrapolation_s=0.06).overdue_s > 29.0

@@ -1,4 +1,4 @@
-"""What the arms reach: margins of many places, ways between two, and the check of a whole scene."""
+"""Test the reach of the arms: margins of poses, paths, and the check of a scene."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def places(*motions: SheetMotion, twists: Floats | None = None) -> SheetPoses:
 
 
 def edges_by_the_twin(left_rad: Floats, right_rad: Floats) -> tuple[Floats, Floats]:
-    """World poses of both edges, by the twin's own arm."""
+    """Return world poses of both edges by the simulator's kinematics."""
     left, right = (
         arm.world_from_base @ twin_forward(joints) @ arm.flange_from_edge
         for arm, joints in ((LEFT, left_rad), (RIGHT, right_rad))
@@ -79,7 +79,7 @@ def edges_by_the_twin(left_rad: Floats, right_rad: Floats) -> tuple[Floats, Floa
 
 
 def turned_about_the_left_edge(yaw_rad: float) -> SheetMotion:
-    """The left edge stays at the front and turns about the world's z; at -0.6 rad its J5 is 0."""
+    """Return a left edge that rotates about the world's z; at -0.6 rad its J5 is 0."""
     turn = transform_from_rpy((0.0, 0.0, 0.0), (0.0, 0.0, yaw_rad))[:3, :3]
     half = np.array([0.5 * 1.04 * 0.24, 0.0, 0.0])
     return sheet(turn @ half - half, (0.0, 0.0, yaw_rad))
@@ -169,7 +169,7 @@ def test_no_places_are_all_reached() -> None:
 
 
 def assert_sound(path: Any, start: SheetMotion, goal: SheetMotion) -> None:
-    """Both edges agree with the sheet all the way, no joint leaps, nothing is too fast."""
+    """Both edges agree with the sheet along the path; no joint jumps or is too fast."""
     assert path.places.world_from_sheet[0] == pytest.approx(start.world_from_sheet)
     assert path.places.world_from_sheet[-1] == pytest.approx(goal.world_from_sheet)
     assert path.places.stretch_ratio[-1] == pytest.approx(goal.stretch_ratio)
@@ -269,7 +269,7 @@ def test_an_arm_taken_through_the_wrists_singularity_goes_on_and_the_check_says_
 
 
 def barred_scene() -> Scene:
-    """The left base stands so far off that much of the range is out of its reach."""
+    """Return a scene whose left base is so far off that much is out of its reach."""
     return with_base_moved(SCENE, "left", np.array([-0.1, -0.05, 0.06]))
 
 

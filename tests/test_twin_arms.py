@@ -103,7 +103,7 @@ def command(
 
 def controller() -> Controller:
     result = Controller(JOINTS, servo_lag_s=0.025, noise_rad=0.0, watchdog_s=0.1)
-    assert result.take(command(1, mode=0))
+    assert result.receive_command(command(1, mode=0))
     return result
 
 
@@ -122,7 +122,7 @@ def controller() -> Controller:
 )
 def test_what_is_not_a_new_command_is_refused(registers: list[int]) -> None:
     arm = controller()
-    assert not arm.take(registers)
+    assert not arm.receive_command(registers)
     assert arm.refused == 1
     assert (arm.state, arm.accepted) == (STATE_IDLE, 1)
 
@@ -137,21 +137,21 @@ def test_what_is_not_a_new_command_is_refused(registers: list[int]) -> None:
 )
 def test_what_an_arm_must_not_do_is_a_fault_that_idle_clears(joints: Floats, bit: int) -> None:
     arm = controller()
-    assert arm.take(command(2, joints))
+    assert arm.receive_command(command(2, joints))
     assert (arm.state, arm.faults) == (STATE_FAULT, bit)
-    assert arm.take(command(3))
+    assert arm.receive_command(command(3))
     arm.advance(0.1)
     assert arm.state == STATE_FAULT
     assert arm.servo.joints_rad == pytest.approx(JOINTS, abs=1e-12)
-    assert arm.take(command(1, mode=0))
+    assert arm.receive_command(command(1, mode=0))
     assert (arm.state, arm.faults) == (STATE_IDLE, 0)
-    assert arm.take(command(2))
+    assert arm.receive_command(command(2))
     assert arm.state == STATE_MOVING
 
 
 def test_the_watchdog_stops_an_arm_that_is_no_longer_commanded() -> None:
     arm = controller()
-    arm.take(command(2, JOINTS + 0.1))
+    arm.receive_command(command(2, JOINTS + 0.1))
     arm.advance(0.09)
     assert arm.state == STATE_MOVING
     arm.advance(0.02)
@@ -163,9 +163,9 @@ def test_the_watchdog_stops_an_arm_that_is_no_longer_commanded() -> None:
 def test_hold_brakes_and_a_counter_may_wrap() -> None:
     arm = controller()
     arm.accepted = 2**32 - 2
-    assert arm.take(command(2**32 - 1, JOINTS + 0.05))
+    assert arm.receive_command(command(2**32 - 1, JOINTS + 0.05))
     arm.advance(0.01)
-    assert arm.take(command(0, mode=2))
+    assert arm.receive_command(command(0, mode=2))
     assert arm.state == STATE_HOLDING
     arm.advance(0.3)
     assert arm.servo.velocity_rad_per_s == pytest.approx(np.zeros(6), abs=1e-12)
@@ -198,14 +198,14 @@ def test_however_an_arm_is_stopped_it_stays_on_its_way(how: str) -> None:
     """Fast and slow joints end together: a straight line in the joints remains one."""
     arm, way = controller(), np.array([0.08, -0.01, 0.02, 0.1, -0.05, 0.03])
     for number in range(20):
-        assert arm.take(command(number + 2, JOINTS + way * number / 10.0))
+        assert arm.receive_command(command(number + 2, JOINTS + way * number / 10.0))
         arm.advance(0.007)
     speed = arm.servo.velocity_rad_per_s
     if how == "watchdog":
         arm.advance(0.3)
         assert arm.faults == FAULT_WATCHDOG
     else:
-        assert arm.take(
+        assert arm.receive_command(
             command(50, JOINTS + 3.0) if how == "fault" else command(50, mode=3 * (how == "stop"))
         )
         before = arm.servo.joints_rad
@@ -325,9 +325,9 @@ def test_set_points_act_at_once_or_at_the_next_cycle() -> None:
         JOINTS, servo_lag_s=0.025, noise_rad=0.0, watchdog_s=0.1, cycle_s=CONTROLLER_CYCLE_S
     )
     for arm in (at_once, in_cycles):
-        arm.take(command(1, mode=0))
+        arm.receive_command(command(1, mode=0))
         arm.advance(0.001)
-        assert arm.take(command(2, JOINTS + 0.1))
+        assert arm.receive_command(command(2, JOINTS + 0.1))
         arm.advance(0.006)
     assert (at_once.servo.joints_rad > JOINTS + 1e-4).all()
     assert (in_cycles.servo.joints_rad == JOINTS).all()
@@ -341,7 +341,7 @@ def test_a_lagging_arm_does_the_same_fifty_milliseconds_later() -> None:
     tracks: dict[int, list[Floats]] = {0: [], 1: []}
     for number in range(60):
         for which, arm in enumerate((prompt, lagging)):
-            arm.take(command(number + 2, JOINTS + 0.1 * np.sin(0.1 * number)))
+            arm.receive_command(command(number + 2, JOINTS + 0.1 * np.sin(0.1 * number)))
             for _ in range(5):
                 arm.advance(0.001)
                 tracks[which].append(arm.servo.joints_rad)
@@ -352,9 +352,9 @@ def test_a_lagging_arm_does_the_same_fifty_milliseconds_later() -> None:
 def test_stopping_forgets_what_was_still_to_be_done() -> None:
     arm = controller()
     arm.fault = "lagging"
-    arm.take(command(2, JOINTS + 0.1))
+    arm.receive_command(command(2, JOINTS + 0.1))
     arm.advance(0.01)
-    arm.take(command(3, mode=3))
+    arm.receive_command(command(3, mode=3))
     arm.advance(0.5)
     assert arm.servo.joints_rad == pytest.approx(JOINTS, abs=1e-12)
 

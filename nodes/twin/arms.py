@@ -109,10 +109,10 @@ _HOME[:3, 3] = _FLANGE_AT_ZERO
 
 def forward(joints_rad: Floats) -> Floats:
     """base_from_flange (4, 4) of joints (6,): exp(S1 q1) ... exp(S6 q6) M."""
-    return reduce(np.matmul, (*_turns(joints_rad), _HOME))
+    return reduce(np.matmul, (*_rotations(joints_rad), _HOME))
 
 
-def _turns(joints_rad: Floats) -> Floats:
+def _rotations(joints_rad: Floats) -> Floats:
     """exp(S q) of each joint (6, 4, 4)."""
     angles = joints_rad[:, None, None]
     return np.asarray(np.eye(4) + np.sin(angles) * _CROSS + (1.0 - np.cos(angles)) * _SQUARE)
@@ -126,7 +126,7 @@ def solve_inverse_kinematics(base_from_flange: Floats, guess_rad: Floats) -> Flo
     """
     joints = guess_rad.copy()
     for _ in range(200):
-        *ahead, last = accumulate((np.eye(4), *_turns(joints)), np.matmul)
+        *ahead, last = accumulate((np.eye(4), *_rotations(joints)), np.matmul)
         pose = last @ _HOME
         error = _pose_error(base_from_flange, pose)
         if np.abs(error).max() < 1e-10:
@@ -225,7 +225,7 @@ class Controller:
         watchdog_s: float,
         backlash_rad: float = 0.0,
         cycle_s: float = 0.0,
-        largest_step_rad: float = 0.15,
+        max_step_rad: float = 0.15,
         seed: int = 0,
     ) -> None:
         self.servo = Servo(np.array(joints_rad, dtype=np.float64), servo_lag_s, backlash_rad)
@@ -237,20 +237,20 @@ class Controller:
         self.wanted_rad = self.servo.joints_rad.copy()
         self.fault: Fault = "none"
         self._acting_rad = self.wanted_rad
-        self._orders: deque[tuple[float, Floats]] = deque()
+        self._pending: deque[tuple[float, Floats]] = deque()
         self._time_s = 0.0
         self._command_at_s = 0.0
         self._watchdog_s = watchdog_s
         self._cycle_s = cycle_s
-        self._largest_step_rad = largest_step_rad
+        self._max_step_rad = max_step_rad
         self._noise_rad = noise_rad
         self._random = np.random.default_rng(seed)
 
     def advance(self, duration_s: float) -> None:
         """Advance by `duration_s`; trips the watchdog."""
         end_s = self._time_s + duration_s
-        while self._orders and self._orders[0][0] <= end_s:
-            due_s, wanted_rad = self._orders.popleft()
+        while self._pending and self._pending[0][0] <= end_s:
+            due_s, wanted_rad = self._pending.popleft()
             self._run_until(due_s)
             self._acting_rad = wanted_rad
         self._run_until(end_s)
@@ -262,7 +262,7 @@ class Controller:
         if duration_s > 0.0 and self.fault != "frozen":
             self.servo.advance(self._acting_rad, duration_s, braking=self.state != STATE_MOVING)
 
-    def take(self, registers: list[int]) -> bool:
+    def receive_command(self, registers: list[int]) -> bool:
         """Check a written command block; False rejects it by a Modbus exception."""
         block = struct.pack(f">{len(registers)}H", *registers)
         if len(block) != _COMMAND.size:
@@ -278,7 +278,7 @@ class Controller:
         self.commands += 1
         self._command_at_s = self._time_s
         if mode == _IDLE:
-            self._orders.clear()
+            self._pending.clear()
             self.faults, self.state = 0, STATE_IDLE
         elif self.state != STATE_FAULT:
             self._obey(mode, np.array(joints))
@@ -286,7 +286,7 @@ class Controller:
 
     def _obey(self, mode: int, joints: Floats) -> None:
         if mode != _MOVE:
-            self._orders.clear()
+            self._pending.clear()
             self.state = STATE_HOLDING if mode == _HOLD else STATE_STOPPED
             return
         before = self.wanted_rad if self.state == STATE_MOVING else self.servo.joints_rad
@@ -294,13 +294,13 @@ class Controller:
             self._fail(FAULT_FINITE)
         elif (joints < RANGE_RAD[:, 0]).any() or (joints > RANGE_RAD[:, 1]).any():
             self._fail(FAULT_RANGE)
-        elif np.abs(joints - before).max() > self._largest_step_rad:
+        elif np.abs(joints - before).max() > self._max_step_rad:
             self._fail(FAULT_STEP)
         else:
             if self.state != STATE_MOVING:
                 self._acting_rad = self.servo.joints_rad.copy()
             self.state, self.wanted_rad = STATE_MOVING, joints
-            self._orders.append((self._due_s(), joints))
+            self._pending.append((self._due_s(), joints))
 
     def _due_s(self) -> float:
         """Return the time at which a set-point that arrives now takes effect."""
@@ -308,7 +308,7 @@ class Controller:
         return math.ceil(due_s / self._cycle_s) * self._cycle_s if self._cycle_s else due_s
 
     def _fail(self, bit: int) -> None:
-        self._orders.clear()
+        self._pending.clear()
         self.faults |= bit
         self.state = STATE_FAULT
 
@@ -395,7 +395,9 @@ class ArmServer:
         if written or function_code != _READ_AND_WRITE:
             self._before()
         if written:
-            if address != 0 or not self.controller.take([int(value) for value in written]):
+            if address != 0 or not self.controller.receive_command(
+                [int(value) for value in written]
+            ):
                 return ExcCodes.ILLEGAL_VALUE
             return None
         if address == _STATUS_AT:

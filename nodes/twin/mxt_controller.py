@@ -85,7 +85,7 @@ class MxtController:
         self.answers: list[tuple[bytes, Address]] = []
         self._filtered_rad = self.wanted_rad
         self._filter_share = 1.0 - math.exp(-CONTROLLER_CYCLE_S / filter_s) if filter_s else 1.0
-        self._largest_step_rad = STEP_CYCLES * SPEED_RAD_PER_S * CONTROLLER_CYCLE_S
+        self._max_step_rad = STEP_CYCLES * SPEED_RAD_PER_S * CONTROLLER_CYCLE_S
         self._timeout_cycles = round(timeout_s / CONTROLLER_CYCLE_S)
         self._restart_cycles = restart_after_s / CONTROLLER_CYCLE_S
         self._noise_rad = noise_rad
@@ -103,7 +103,7 @@ class MxtController:
         self._moved = False
         self._count = self._timeouts = self._missing = 0
 
-    def take(self, packet: bytes, sender: Address) -> None:
+    def receive_command(self, packet: bytes, sender: Address) -> None:
         """A packet has come; the next cycle takes the newest.
 
         One of another length, and one of somebody else while external control is on, is ignored.
@@ -203,7 +203,7 @@ class MxtController:
         step = np.abs(joints - before)
         if not self._moved and step.max() > FIRST_STEP_RAD:
             raise MxtError("a first set-point away from the arm")
-        if (step > self._largest_step_rad).any():
+        if (step > self._max_step_rad).any():
             raise MxtError("a set-point too far")
         self._moved, self.wanted_rad = True, joints
 
@@ -312,7 +312,7 @@ class MxtServer:
 
     def _received(self, packet: bytes, sender: Address) -> None:
         self._before()
-        self.controller.take(packet, sender)
+        self.controller.receive_command(packet, sender)
         self._wait_for_cycle()
 
     def _wait_for_cycle(self) -> None:
