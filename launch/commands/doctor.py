@@ -88,14 +88,16 @@ def check_scene(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="PICTURE", help="Draw what is out of reach there."),
+        typer.Option(
+            "-o", "--output", metavar="PICTURE", help="Draw the reachable range to this file."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that both arms reach a scene's whole working range; exit code 1 when they do not.
+    """Check that both arms reach a scene's whole working range; exit code 1 if they do not.
 
-    Every contact within the scene's tilt, pushed up to its depth, at the least and the largest
-    stretch.  Also said: how fast a finger may move for the arms to follow.
+    The check covers every contact within the scene's tilt and depth, at the minimum and maximum
+    stretch.  It also reports how fast a finger may move for the arms to follow.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, layout_result
     from flexsheet.launch.plans.plan import load_scene

@@ -20,7 +20,7 @@ FAILED, BAD_INPUT, OTHER_THAN_LIVE = 1, 2, 3
 
 
 class CommandError(Exception):
-    """End a command with a message and an exit code."""
+    """Ends a command with a sentence and an exit code."""
 
     def __init__(self, text: str, code: int = FAILED) -> None:
         super().__init__(text)

@@ -85,7 +85,7 @@ class Problem:
 
 
 class BadInputError(ValueError):
-    """The input cannot be used; `problems` holds all errors that were found."""
+    """Input that cannot be used; `problems` holds all that was found."""
 
     def __init__(self, problems: Sequence[Problem]) -> None:
         super().__init__("\n".join(str(problem) for problem in problems))

@@ -344,7 +344,7 @@ def list_arms(plan: ResolvedGraph) -> list[str]:
 
 
 def has_manual_arming(plan: ResolvedGraph) -> bool:
-    """Return whether some arm moves only after a person enables it; others are simulated."""
+    """Whether arms move at a person's word only; those that go by themselves are simulated."""
     return any(node.parameters.get("arming") == "by_command" for node in plan.nodes.values())
 
 

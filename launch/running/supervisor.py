@@ -75,7 +75,7 @@ Report = Callable[[str, str], None]
 
 
 class NodeFailedError(RuntimeError):
-    """A node failed: it ended or missed its start deadline more often than its policy allows."""
+    """A node failed for good: it ended, or was not ready in time, more often than it may."""
 
 
 class Child:
