@@ -37,7 +37,7 @@ import numpy as np
 import psutil
 
 from benchmarks.faults import LONGEST_M, Result, Span, kill, kill_launcher, tried
-from flexsheet.launch.running.runs import FINISHED_RUNS_KEPT, RUN_VARIABLE
+from flexsheet.launch.running.runs import MAX_FINISHED_RUNS, RUN_VARIABLE
 from flexsheet.launch.running.tools import READER_RECONNECT_S
 from flexsheet.messages.bag import FLUSH_PERIOD_S
 from tests.lab import HOSTS, LIGHT, Lab
@@ -208,7 +208,7 @@ class Watch:
     def _look_at_runs(self, host: str, launchers: set[int]) -> None:
         directories = [one for one in (self.lab.folder / host / "r").iterdir() if one.is_dir()]
         # The sweep of a start leaves so many finished ones, beside which that start is.
-        if len(directories) > FINISHED_RUNS_KEPT + 1:
+        if len(directories) > MAX_FINISHED_RUNS + 1:
             self.violations.append(f"{len(directories)} directories of runs on {host}")
         for directory in directories:
             launcher = int(directory.name.removeprefix(".begun-").partition(".")[0])

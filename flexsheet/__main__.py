@@ -1,10 +1,10 @@
 """Entry point of the `flexsheet` command and, with `--node CONFIG`, of a node's process.
 
-The first statements give SIGINT its default action, which ends a process without a trace of it.
-Python's own handler raises an exception in whatever runs: as a traceback in an import, or ignored
-in a callback of the garbage collector.  Commands that clean up get it back in `launch.cli`; graphs
-and nodes handle SIGINT in their event loop (`nodes.signals`).  A SIGINT that is ignored or blocked
-by inheritance is taken like any other: docs/launch-files.md says why.
+The first statements give SIGINT its default action, which ends a process without a traceback.
+Python's own handler raises an exception wherever the code is: in an import it prints a traceback,
+in a callback of the garbage collector it is ignored.  `launch.cli` restores the handler for
+commands that clean up; graphs and nodes handle SIGINT in their event loop (`nodes.signals`).  A
+SIGINT that is ignored or blocked by inheritance is enabled again; docs/launch-files.md says why.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ import sys
 
 NODE_FLAG = "--node"
 
-# Pydantic would ask every installed package for plugins; none is used.
+# Pydantic would search every installed package for plugins; none is used.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 
 def main() -> None:
-    """Run the command, or with `--node CONFIG` one node (the launcher starts those)."""
+    """Run the command, or with `--node CONFIG` one node, as the launcher does."""
     if len(sys.argv) == 3 and sys.argv[1] == NODE_FLAG:
         from flexsheet.launch.running.child import apply_niceness, exit_with_parent
 
@@ -45,7 +45,7 @@ def main() -> None:
         sys.exit(run_node(sys.argv[2]))
     _avoid_garbage_collection()
     if sys.argv[1:3] == ["arms", "stop"]:
-        # The command line takes several times as long to import as the stop to arrive.
+        # Importing the command line takes several times longer than sending the stop.
         from flexsheet.launch.running.stopping import send_early
 
         send_early(sys.argv[3:])

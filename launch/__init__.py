@@ -1,1 +1,1 @@
-"""What runs where: launch files, scenes, supervisor, experiments, charts, the command line."""
+"""Launch files, scenes, supervisor, experiments, benchmarks of methods, and command line."""

@@ -1,7 +1,7 @@
 """The `flexsheet` command.
 
-A command is a line of `COMMANDS`; its module in `launch.commands` is imported when it is called, so
-that nobody waits for the others.
+A command is a line of `COMMANDS`; its module in `launch.commands` is imported only when it is
+called, so that commands start fast.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ FORMER_NAMES = {"prepare": "precompute", "service": "systemd"}
 
 @cache
 def load_command(name: str) -> Any:
-    """The click command of a name in `COMMANDS`."""
+    """Return the click command of a name in `COMMANDS`."""
     first, *further = (
         import_module(f"flexsheet.launch.commands.{module}") for module in COMMANDS[name]
     )
@@ -64,14 +64,15 @@ def load_command(name: str) -> Any:
     return command
 
 
-ENDED_AT_ONCE = frozenset({"launch", "try", "topic", "arms"})
-"""Commands that hold nothing that an interrupt could leave behind before their event loop handles
-it: until then SIGINT ends the process.  In the others Python's own handler raises, and they clean
-up."""
+INTERRUPTED_AT_ONCE = frozenset({"launch", "try", "topic", "arms"})
+"""Commands that SIGINT may end without cleanup until their event loop handles it.
+
+In the others Python's own handler raises KeyboardInterrupt, and they clean up.
+"""
 
 
 class CommandTable(Mapping[str, Any]):
-    """The commands of `COMMANDS`, each imported when it is looked up."""
+    """Map names to commands, and import each command on first use."""
 
     def __getitem__(self, name: str) -> Any:
         return load_command(FORMER_NAMES.get(name, name))
@@ -84,16 +85,16 @@ class CommandTable(Mapping[str, Any]):
 
 
 class CommandGroup(TyperGroup):
-    """A typer group whose commands are those of the table."""
+    """Define a typer group whose commands are those of `CommandTable`."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.commands = CommandTable()  # type: ignore[assignment]  # nobody adds to it
+        self.commands = CommandTable()  # type: ignore[assignment]  # a read-only mapping
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find the command; once its module is imported, an interrupt is its own affair."""
+        """Find the command; after its import Python's interrupt handler is active."""
         found = super().resolve_command(ctx, args)
-        if found[0] not in ENDED_AT_ONCE:
+        if found[0] not in INTERRUPTED_AT_ONCE:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         return found
 
@@ -131,7 +132,7 @@ def flexsheet(
 
 
 def main() -> None:
-    """Run the command line; what people can put right is said in a sentence, without a trace."""
+    """Run the command line; print errors that users can correct without a traceback."""
     try:
         app(prog_name="flexsheet")
     except Exception as error:

@@ -226,13 +226,13 @@ async def run_keys(links: Links) -> None:
         links.renew_keys()
 
 
-async def run_status(node: Node, process: psutil.Process, sign_of_life: Callable[[], None]) -> None:
+async def run_status(node: Node, process: psutil.Process, beat: Callable[[], None]) -> None:
     """Publish the node's status once a second, and tell the launcher that the loop still turns."""
     process.cpu_percent()
     while True:
         await asyncio.sleep(STATUS_PERIOD_S)
         node.status.publish(status_of(node, "running", process))
-        sign_of_life()
+        beat()
 
 
 def status_of(node: Node, state: Any, process: psutil.Process) -> Status:
@@ -292,15 +292,15 @@ async def run_node(config: NodeConfig, stop: asyncio.Event) -> None:
             asyncio.create_task(run_timer(node, number, timer))
             for number, timer in enumerate(timers_of(class_))
         ]
-        life = Life(config.ready_fd)
-        tasks.append(asyncio.create_task(run_status(node, process, life.sign)))
+        heartbeat = Heartbeat(config.ready_fd)
+        tasks.append(asyncio.create_task(run_status(node, process, heartbeat.beat)))
         tasks.append(asyncio.create_task(stop.wait()))
         if links.keys is not None:
             tasks.append(asyncio.create_task(run_keys(links)))
         # What setup built lives on; without this the collector walks it in the middle of a cycle.
         gc.collect()
         gc.freeze()
-        life.sign()
+        heartbeat.beat()
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         for task in done:
             task.result()
@@ -326,11 +326,10 @@ async def end_tasks(tasks: list[asyncio.Task[Any]]) -> None:
         _, pending = await asyncio.wait(pending, timeout=CANCEL_AGAIN_S)
 
 
-class Life:
-    """The pipe to the launcher: the first byte says that the node is set up, others that it lives.
+class Heartbeat:
+    """Write a byte to the launcher's pipe when the node is set up, and one in each status period.
 
-    fd: the pipe's end, None where nobody listens.  A launcher that does not read keeps no node
-    waiting.
+    fd: the pipe's end; None without a launcher.  A full pipe does not block the node.
     """
 
     def __init__(self, fd: int | None) -> None:
@@ -338,10 +337,10 @@ class Life:
         if fd is not None:
             os.set_blocking(fd, False)
 
-    def sign(self) -> None:
+    def beat(self) -> None:
         if self._fd is not None:
-            # Full, the pipe holds enough signs; broken, the launcher is gone, and its lifeline
-            # ends this process.
+            # A full pipe holds enough beats.  A broken one means that the launcher is gone; its
+            # lifeline ends this process.
             with suppress(BlockingIOError, BrokenPipeError):
                 os.write(self._fd, b".")
 

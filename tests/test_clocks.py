@@ -341,5 +341,5 @@ def test_limits_come_from_the_launch_file(tmp_path: Path) -> None:
     ) == {"listener"}
     with pytest.raises(BadInputError, match=r"clocks\.max_offset_uncertanty_s: unknown key"):
         load_graph(write(tmp_path, nodes, hosts=hosts, clocks={"max_offset_uncertanty_s": 1}))
-    with pytest.raises(BadInputError, match='"clock_left" is taken'):
+    with pytest.raises(BadInputError, match='"clock_left" is reserved'):
         load_graph(write(tmp_path, {**nodes, "clock_left": beacon()}, hosts=hosts))

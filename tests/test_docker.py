@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from flexsheet.launch.cli import app
 from flexsheet.launch.plans.plan import load_graph
-from flexsheet.launch.running.systemd_unit import files_of
+from flexsheet.launch.running.systemd import make_files
 
 ROOT = Path(__file__).resolve().parent.parent
 DOCKER = ROOT / "docker"
@@ -63,7 +63,7 @@ def test_each_host_has_a_container_that_ends_in_order_and_remembers(name: str) -
 def test_the_unit_is_one_that_systemd_understands(tmp_path: Path) -> None:
     lab = ROOT / "launch" / "lab.yaml"
     # Some command that is there: the unit is looked at, not started.
-    made = list(files_of(launch_file=lab, host="left", user="root", root=tmp_path,
+    made = list(make_files(launch_file=lab, host="left", user="root", root=tmp_path,
                          flexsheet=Path("/bin/true")))  # fmt: skip
     assert "FLEXSHEET_STATE=/var/lib/flexsheet" in made[0].text
     assert not re.search("@[A-Z]+@", made[0].text)

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from flexsheet.launch.commands.doctor_hosts import check_hosts, host_here
+from flexsheet.launch.commands.doctor_hosts import check_hosts, find_host
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.health import probe as probe_module
 from flexsheet.launch.health.doctor_hosts import (
@@ -387,13 +387,13 @@ def test_which_host_this_is(
 ) -> None:
     two = plan_of(folder)
     monkeypatch.setattr("flexsheet.launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.2"})
-    assert host_here(two, None, None) == "left"
+    assert find_host(two, None, None) == "left"
     monkeypatch.setattr(
         "flexsheet.launch.health.doctor_hosts.own_addresses", lambda: {f"{NET}.1", f"{NET}.2"}
     )
-    assert host_here(two, None, None) == MAIN
-    assert host_here(two, None, "left") == "left"
+    assert find_host(two, None, None) == MAIN
+    assert find_host(two, None, "left") == "left"
     with pytest.raises(CommandError, match="none of the addresses"):
-        host_here(three, None, None)
+        find_host(three, None, None)
     with pytest.raises(CommandError, match='did you mean "left"'):
-        host_here(two, None, "lef")
+        find_host(two, None, "lef")

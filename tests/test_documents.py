@@ -90,7 +90,7 @@ def test_errors_name_no_class(tmp_path: Path, text: str) -> None:
     file.write_text(text)
     with pytest.raises(BadInputError) as refused:
         load_graph(file)
-    assert "it must hold keys and values" in str(refused.value)
+    assert "write a mapping of keys and values" in str(refused.value)
     for word in ("instance", "dictionary", "Spec"):
         assert word not in str(refused.value)
 

@@ -9,7 +9,7 @@ import pytest
 from flexsheet.launch.plans.documents import BadInputError, parse_value
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
-from flexsheet.launch.plans.routing import FIRST_PORT, PORTS, _ports
+from flexsheet.launch.plans.routing import FIRST_PORT, PORT_COUNT, _assign_ports
 
 ROOT = Path(__file__).resolve().parent.parent
 BEACON = "tests.launch_nodes:Beacon"
@@ -91,19 +91,19 @@ nodes:
 
 def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
     links = [("main", f"node_{i}", "status") for i in range(300)]
-    ports = _ports(links)
+    ports = _assign_ports(links)
     assert len(set(ports.values())) == 300
-    assert all(FIRST_PORT <= port < FIRST_PORT + PORTS for port in ports.values())
-    assert ports == _ports(links)
+    assert all(FIRST_PORT <= port < FIRST_PORT + PORT_COUNT for port in ports.values())
+    assert ports == _assign_ports(links)
 
 
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         ("", "is empty"),
-        ("- a\n", "it must hold keys and values"),
+        ("- a\n", "write a mapping of keys and values"),
         ("nodes: {a: [}\n", "graph.yaml:1: not YAML"),
-        ("nodes: {}\n", "there is no node"),
+        ("nodes: {}\n", "the graph has no node"),
         ("nodes:\n  a: {type: x}\n  a: {type: y}\n", "duplicate key"),
         (GRAPH + "hots: {}\n", 'graph.yaml:9: hots: unknown key "hots"; did you mean "hosts"?'),
         (
@@ -115,7 +115,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         (GRAPH.replace(f"type: {BEACON}", "type: no.such:Thing"), "cannot be imported"),
         (GRAPH.replace(f"type: {BEACON}", "type: '../x:Y'"), 'unknown node type "../x:Y"'),
         (GRAPH.replace(f"type: {BEACON}", "type: ':Y'"), 'unknown node type ":Y"'),
-        (GRAPH.replace(f"type: {BEACON}", "type: pathlib:Path"), "is no node class"),
+        (GRAPH.replace(f"type: {BEACON}", "type: pathlib:Path"), "is not a node class"),
         (GRAPH.replace(f"    type: {LISTENER}", "    host: main"), '"type" is missing'),
         (
             GRAPH.replace("rate_hz", "rate"),
@@ -124,7 +124,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH.replace("rate_hz: 20", "rate_hz: fast"),
-            "graph.yaml:6: nodes.beacon.parameters.rate_hz: 'fast' does not fit",
+            "graph.yaml:6: nodes.beacon.parameters.rate_hz: 'fast' is invalid",
         ),
         (
             GRAPH + "  triangulator: {type: triangulator, parameters: {ahead_s: 0.1}}\n",
@@ -132,16 +132,16 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH + "  triangulator: {type: triangulator, parameters: {tracking: hand}}\n",
-            "'hand' does not fit; it is now \"singer_tremor\"",
+            "'hand' is invalid; it is now \"singer_tremor\"",
         ),
-        (GRAPH + "    host: left\n", 'unknown host "left"; there are: main'),
+        (GRAPH + "    host: left\n", 'unknown host "left"; choose one of: main'),
         (GRAPH + "hosts: {left: {address: 127.0.0.1}}\n", 'no host is named "main"'),
         (GRAPH + "hosts: {main: {}}\n", 'graph.yaml:9: hosts.main: "address" is missing'),
-        (GRAPH + "hosts: {main: {address: left.lab}}\n", '"left.lab" is no IP address'),
-        (GRAPH + "hosts: {main: {address: 0.0.0.0}}\n", "names no single host"),
+        (GRAPH + "hosts: {main: {address: left.lab}}\n", '"left.lab" is not an IP address'),
+        (GRAPH + "hosts: {main: {address: 0.0.0.0}}\n", "is not the address of one host"),
         (
             GRAPH + "hosts: {main: {address: 127.0.0.1}, left: {address: 127.0.0.1}}\n",
-            'is the address of host "main" too',
+            'is also the address of host "main"',
         ),
         (
             GRAPH + "    topics: {finger: twin/finger}\n",
@@ -158,17 +158,17 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
         ),
         (
             GRAPH + f"  second: {{type: '{BEACON}'}}\n",
-            'topic "twin/finger" is written by "beacon" already; a topic has one writer',
+            'topic "twin/finger" is written by "beacon" already; connect one of the two ports',
         ),
         (
             f"nodes: {{listener: {{type: '{LISTENER}'}}}}\n",
             'no node writes topic "twin/finger"; add a node that writes it',
         ),
-        (GRAPH + "scene: nowhere.yaml\n", '"nowhere.yaml" is no file'),
+        (GRAPH + "scene: nowhere.yaml\n", '"nowhere.yaml" does not exist'),
         (GRAPH + "external_topics: [fingertp]\n", 'did you mean "fingertip"?'),
         (GRAPH + "external_topics: [twin/finger]\n", 'is written by "beacon" already'),
-        (GRAPH + f"  tools: {{type: '{LISTENER}'}}\n", '"tools" is taken'),
-        (GRAPH + f"  plan: {{type: '{LISTENER}'}}\n", '"plan" is taken'),
+        (GRAPH + f"  tools: {{type: '{LISTENER}'}}\n", '"tools" is reserved'),
+        (GRAPH + f"  plan: {{type: '{LISTENER}'}}\n", '"plan" is reserved'),
         (GRAPH + "    restart: {policy: somtimes}\n", "'never', 'on_failure' or 'always'"),
         (GRAPH + "record: {bagg: a.mcap}\n", 'did you mean "bag"?'),
         (GRAPH + "record: {bag: a.mcap, topics: [stereo]}\n", 'no node writes topic "stereo"'),
@@ -176,7 +176,7 @@ def test_ports_stay_in_their_range_and_are_unique_when_hashes_meet() -> None:
             GRAPH.replace(f"type: {BEACON}", "type: arm_bridge").replace(
                 "rate_hz: 20", "side: left"
             ),
-            'port "arm" is not connected; say in "topics" which it is: arm_left or arm_right',
+            'port "arm" is not connected; name its topic in "topics": arm_left or arm_right',
         ),
     ],
 )
@@ -210,10 +210,10 @@ def test_a_wrong_key_in_a_scene_names_file_and_line(tmp_path: Path) -> None:
     ("setting", "said"),
     [
         ("beacon", "write node.parameter=value"),
-        ("beacn.rate_hz=3", 'there is no node "beacn"; did you mean "beacon"?'),
+        ("beacn.rate_hz=3", 'unknown node "beacn"; did you mean "beacon"?'),
         ("beacon.rate=3", '--set beacon.rate=3: nodes.beacon.parameters.rate: unknown key "rate"'),
         ("beacon.rate_hz=slow", "--set beacon.rate_hz=slow: nodes.beacon.parameters.rate_hz"),
-        ("beacon.rate_hz.deep=3", "holds no further keys"),
+        ("beacon.rate_hz.deep=3", "is not a mapping"),
     ],
 )
 def test_wrong_settings_are_named(tmp_path: Path, setting: str, said: str) -> None:

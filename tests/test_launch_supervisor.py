@@ -27,7 +27,7 @@ from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.launch.running import runs, supervisor
 from flexsheet.launch.running.priority import min_nice_step
-from flexsheet.launch.running.starvation import ProcessorTime, starved_s
+from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph
 from flexsheet.messages.bag import BagReader
 from tests.waiting import DEADLINE_S, wait_until
@@ -115,7 +115,7 @@ async def test_a_node_takes_precedence_where_the_user_may_give_it(tmp_path: Path
         assert psutil.Process(pid).nice() == own + max(-7, least)
         assert session_niceness(pid) in (None, max(-7, least))
         log = (graph.run.logs / "launch.log").read_text()
-        assert ("may not give precedence" in log) is (least > -7)
+        assert ("may not set nice below" in log) is (least > -7)
 
 
 async def test_a_graph_comes_up_and_leaves_nothing(tmp_path: Path, runs_root: Path) -> None:
@@ -220,7 +220,7 @@ async def test_a_node_that_hangs_is_killed_says_where_and_comes_back(tmp_path: P
         assert graph.hangs["stopped"] == graph.hangs["stuck"] == 1
         assert graph.restarts["beacon"] == graph.hangs["beacon"] == 0
         assert "launch_nodes.py" in (graph.run.logs / "stuck.log").read_text()
-    told = "hung: no sign of life for 2 s; its log shows where; starts again in 0.01 s"
+    told = "hung: no sign of life for 2 s; its log holds the stacks; starts again in 0.01 s"
     assert f"stuck {told}" in said
     assert not any("launch_nodes.py" in line for line in said)
 
@@ -254,11 +254,11 @@ def test_the_kernel_counts_how_long_processes_wait_for_a_processor() -> None:
     code = f"import os; os.sched_setaffinity(0, {{{processor}}})\nwhile True: pass"
     spinning = [subprocess.Popen([sys.executable, "-c", code]) for _ in range(2)]
     try:
-        if ProcessorTime.of(os.getpid()) is None:
+        if ProcessorTime.read(os.getpid()) is None:
             pytest.skip("this kernel keeps no statistics of its scheduler")
 
         def waited() -> bool:
-            found = [ProcessorTime.of(process.pid) for process in spinning]
+            found = [ProcessorTime.read(process.pid) for process in spinning]
             return all(one and one.state == "R" and one.wait_s > 0.1 < one.run_s for one in found)
 
         wait_until(waited, "both to run and to wait")
@@ -266,7 +266,7 @@ def test_the_kernel_counts_how_long_processes_wait_for_a_processor() -> None:
         for process in spinning:
             process.kill()
             process.wait()
-    assert ProcessorTime.of(spinning[0].pid) is None
+    assert ProcessorTime.read(spinning[0].pid) is None
 
 
 @pytest.mark.parametrize(
@@ -290,7 +290,7 @@ def test_what_counts_as_starved_in_half_a_second(
     """Asleep, suspended, in a loop of its own; sometimes and always waiting for a processor."""
     earlier = None if before is None else ProcessorTime(*before)
     later = None if now is None else ProcessorTime(*now)
-    assert starved_s(earlier, later, 0.5) == pytest.approx(starved)
+    assert compute_starved_s(earlier, later, 0.5) == pytest.approx(starved)
 
 
 async def test_silence_that_the_launcher_itself_was_absent_for_is_no_hang(tmp_path: Path) -> None:

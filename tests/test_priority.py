@@ -9,7 +9,7 @@ import pytest
 
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running import priority
-from flexsheet.launch.running.priority import MIN_NICE, min_nice_step, precedence_problem
+from flexsheet.launch.running.priority import MIN_NICE, describe_nice_problem, min_nice_step
 
 ROOT = Path(__file__).resolve().parent.parent
 DEMO = load_graph(ROOT / "launch" / "demo.yaml")
@@ -17,7 +17,7 @@ DEMO = load_graph(ROOT / "launch" / "demo.yaml")
 
 def allow(monkeypatch: pytest.MonkeyPatch, *, capable: bool, limit: int) -> None:
     """Let the user have the capability or not, and this soft limit of niceness."""
-    monkeypatch.setattr(priority, "_may_take_any", lambda: capable)
+    monkeypatch.setattr(priority, "_has_cap_sys_nice", lambda: capable)
     monkeypatch.setattr(priority.resource, "getrlimit", lambda which: (limit, limit))
     monkeypatch.setattr(os, "getpriority", lambda which, who: 0)
 
@@ -43,9 +43,9 @@ def test_who_may_not_give_precedence_is_told_once_for_all_nodes(
 ) -> None:
     nodes = list(DEMO.nodes.values())
     allow(monkeypatch, capable=True, limit=0)
-    assert precedence_problem(nodes) is None
+    assert describe_nice_problem(nodes) is None
     allow(monkeypatch, capable=False, limit=0)
-    problem = precedence_problem(nodes)
+    problem = describe_nice_problem(nodes)
     assert problem is not None
     assert "arm_left_bridge" in problem
     assert "renderer" not in problem

@@ -167,7 +167,7 @@ def test_install_changes_one_key_and_nothing_else(tmp_path: Path) -> None:
     assert "# upstairs" in text
     for host, key, said in (
         ("lft", keys_tried[0], 'no host "lft"; did you mean "left"'),
-        ("left", "nonsense", '"nonsense" is no public key'),
+        ("left", "nonsense", '"nonsense" is not a public key'),
     ):
         with pytest.raises(BadInputError, match=said):
             install(file, host, key)
@@ -191,9 +191,9 @@ ONE, TWO = new_key_pair()[0], new_key_pair()[0]
 @pytest.mark.parametrize(
     ("main", "left", "said"),
     [
-        (ONE, None, "hosts.left: has no key, others have; make one there .flexsheet keys new left"),
-        (ONE, ONE, 'hosts.left.key: is the key of host "main" too; each host has its own'),
-        (ONE, "secret", 'hosts.left.key: "secret" is no public key'),
+        (ONE, None, "hosts.left: has no key, but other hosts do; create one on that host"),
+        (ONE, ONE, 'hosts.left.key: is also the key of host "main"; give each host its own key'),
+        (ONE, "secret", 'hosts.left.key: "secret" is not a public key'),
     ],
     ids=["one without", "two alike", "no key"],  # keys are drawn anew; names of tests must not be
 )

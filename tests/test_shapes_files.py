@@ -107,7 +107,7 @@ def test_scenes_hold_every_shape_under_one_name(tmp_path: Path, geometry: dict[s
         ({"shape": "torus"}, 'object.geometry.shape: unknown shape "torus"'),
         ({"shape": "sper", "radius_m": 1.0}, 'did you mean "sphere"?'),
         ({"shape": "mesh"}, 'did you mean "mesh_file"?'),
-        ({"shape": "sphere", "radius_m": 0.0}, "object.geometry.radius_m: 0.0 does not fit"),
+        ({"shape": "sphere", "radius_m": 0.0}, "object.geometry.radius_m: 0.0 is invalid"),
         ({"shape": "sphere", "radius": 0.1}, 'unknown key "radius"; did you mean "radius_m"?'),
         ({"shape": "ellipsoid", "semi_axes_m": [0.1, 0.1, -0.1]}, "semi_axes_m.2: -0.1"),
         (

@@ -78,7 +78,8 @@ def test_a_package_that_cannot_be_had_keeps_out_no_other_and_fails_no_test(
     lines = capsys.readouterr().err.splitlines()
     assert any("chromium failed with exit code 100" in line for line in lines)
     assert lines[-1] == (
-        "cannot be used: browser tests (no chromium); on Debian: sudo apt-get install -y chromium"
+        "missing system packages: browser tests (no chromium); "
+        "on Debian: sudo apt-get install -y chromium"
     )
 
 

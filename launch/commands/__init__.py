@@ -1,4 +1,4 @@
-"""The subcommands of `flexsheet`, one file per noun.
+"""Define the subcommands of `flexsheet`, one module per command.
 
-Their libraries are imported when a command runs, so that help and `topic list` come at once.
+Libraries are imported when a command runs, so that help and `topic list` start fast.
 """

@@ -1,4 +1,4 @@
-"""`flexsheet demo`: the whole system once on this machine."""
+"""`flexsheet demo`: run the whole system once on this computer."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def demo(
         str | None,
         typer.Option(
             metavar="NAME_OR_FILE",
-            help="A gesture by name, or a recorded finger (CSV with t_s,x_mm,y_mm,z_mm), instead "
-            "of the strokes.",
+            help="Gesture name, or recorded finger path (CSV with t_s,x_mm,y_mm,z_mm), instead of "
+            "the strokes.",
             autocompletion=complete.gestures,
         ),
     ] = None,
     output: OutputOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run the whole system on this machine: stroke, tilt and push the sheet; then pictures."""
+    """Stroke, tilt and push the simulated sheet on this computer, and draw the results."""
     from flexsheet.launch.experiments.demo import run_demo
     from flexsheet.launch.experiments.gestures import finger_path as path_of
 

@@ -1,4 +1,4 @@
-"""`flexsheet doctor`: is this machine fit, do the arms reach; and if not, what is to be done."""
+"""`flexsheet doctor`: check this computer, the arms' reach, and the hosts of a graph."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from flexsheet.launch.commands.output import (
 app = typer.Typer(
     add_completion=False,
     invoke_without_command=True,
-    help="Check this machine; with a graph of several computers, all of them.",
+    help="Check this computer, and all hosts of the running graph.",
     epilog=examples("flexsheet doctor", "flexsheet doctor --sweep", "flexsheet doctor --json"),
 )
 
@@ -35,30 +35,31 @@ app = typer.Typer(
 def doctor(
     context: typer.Context,
     sweep: Annotated[
-        bool, typer.Option("--sweep", help="First end what launchers that are gone left running.")
+        bool,
+        typer.Option("--sweep", help="First end the processes that ended launchers have left."),
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check this machine; exit code 1 when something must be put right.
+    """Check this computer; exit code 1 if a check fails.
 
-    Where a graph of several computers runs here, all of them are asked too.
+    If a graph of several computers runs here, all of them are checked, too.
     """
     if context.invoked_subcommand is not None:
         return
-    from flexsheet.launch.commands.doctor_hosts import ask_running, print_findings
+    from flexsheet.launch.commands.doctor_hosts import check_running_graph, print_findings
     from flexsheet.launch.health.doctor import check_all
     from flexsheet.launch.running.runs import sweep as sweep_leftovers
 
     if sweep:
         ended = sweep_leftovers()
-        words.print(f"ended {len(ended)} left-over processes")
+        words.print(f"ended {len(ended)} processes of ended launchers")
     findings = []
     with words.status("checking") as status:
         for finding in check_all():
             status.update(f"checked {finding.check}")
             findings.append(finding)
-        status.update("asking all hosts")
-        of_hosts = ask_running()
+        status.update("checking all hosts")
+        of_hosts = check_running_graph()
     if as_json:
         print_json([asdict(one) for one in findings] + [asdict(one) for one in of_hosts])
     else:
@@ -87,14 +88,16 @@ def check_scene(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", metavar="PICTURE", help="Draw what is out of reach there."),
+        typer.Option(
+            "-o", "--output", metavar="PICTURE", help="Draw the reachable range to this file."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Check that both arms reach a scene's whole working range; exit code 1 when they do not.
+    """Check that both arms reach a scene's whole working range; exit code 1 if they do not.
 
-    Every contact within the scene's tilt, pushed up to its depth, at the least and the largest
-    stretch.  Also said: how fast a finger may move for the arms to follow.
+    The check covers every contact within the scene's tilt and depth, at the minimum and maximum
+    stretch.  It also reports how fast a finger may move for the arms to follow.
     """
     from flexsheet.launch.health.layout import check_layout, draw_layout, layout_result
     from flexsheet.launch.plans.plan import load_scene

@@ -1,4 +1,4 @@
-"""`flexsheet doctor hosts`: are all computers of a launch file fit; if not, what is to be done."""
+"""`flexsheet doctor hosts`: check all hosts of a launch file, with a remedy for each fault."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TIMEOUT_S = 4.0
 
 
 def register(app: typer.Typer) -> None:
-    """Adds the command to `flexsheet doctor`."""
+    """Add the command to `flexsheet doctor`."""
     app.command(
         "hosts",
         epilog=examples(
@@ -46,31 +46,31 @@ def hosts(
         Path | None,
         typer.Argument(
             metavar="LAUNCH_FILE",
-            help="Without it: that of the graph that runs here.",
+            help="Launch file; default: that of the graph that runs here.",
             autocompletion=complete.yaml_files,
         ),
     ] = None,
     host: Annotated[
         str | None,
         typer.Option(
-            help="Which of its hosts this computer is; default: by its address.",
+            help="Name of this computer in the launch file; default: by its address.",
             autocompletion=complete.hosts,
         ),
     ] = None,
     patience: Annotated[
-        float, typer.Option(metavar="SECONDS", help="How long to wait for answers.", min=1.5)
+        float, typer.Option(metavar="SECONDS", help="Time to wait for answers.", min=1.5)
     ] = TIMEOUT_S,
     as_json: JsonOption = False,
 ) -> None:
-    """Ask all hosts of a launch file; exit code 1 when something must be put right.
+    """Check all hosts of a launch file; exit code 1 if a check fails.
 
-    Also before anything runs: then it says what this computer sees of itself and of the network.
+    Before the graph is started, the command checks this computer and the network.
     """
-    plan, run = _graph(launch_file)
-    here = host_here(plan, run, host)
+    plan, run = _find_graph(launch_file)
+    here = find_host(plan, run, host)
     if run is not None and run.host not in (None, here):
         run = None
-    with words.status("asking all hosts"):
+    with words.status("checking all hosts"):
         findings = asyncio.run(check_hosts(plan, here, run, patience))
     if as_json:
         print_json({"plan": plan.hash, "here": here, "findings": [asdict(one) for one in findings]})
@@ -81,8 +81,8 @@ def hosts(
         raise typer.Exit(FAILED)
 
 
-def ask_running(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
-    """Findings about all hosts of the graph that runs here; none where it has one alone."""
+def check_running_graph(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
+    """Return the findings about all hosts of the running graph; none for a single host."""
     from flexsheet.launch.running.runs import live_runs
     from flexsheet.launch.running.tools import tools_host
 
@@ -94,8 +94,9 @@ def ask_running(timeout_s: float = TIMEOUT_S) -> list[HostFinding]:
     return asyncio.run(check_hosts(plan, tools_host(run), run, timeout_s))
 
 
-def _graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
-    """The plan, and the graph of that launch file that runs here."""
+def _find_graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
+    """Return the resolved launch file, and its running graph on this computer, if any."""
+
     from flexsheet.launch.plans.plan import load_graph
 
     if launch_file is None:
@@ -109,8 +110,8 @@ def _graph(launch_file: Path | None) -> tuple[ResolvedGraph, Run | None]:
     return plan, run if same or running.hash == plan.hash else None
 
 
-def host_here(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
-    """Which host of the plan this computer is; CommandError where that cannot be told."""
+def find_host(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
+    """Return the name of this computer in the graph.  Raises CommandError if it is ambiguous."""
     from flexsheet.launch.health.doctor_hosts import own_addresses
     from flexsheet.launch.plans.documents import did_you_mean
     from flexsheet.launch.plans.plan_model import MAIN
@@ -119,7 +120,7 @@ def host_here(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
     if wanted is not None:
         if wanted not in plan.hosts:
             raise CommandError(
-                f"--host {wanted}: there is no such host; {did_you_mean(wanted, list(plan.hosts))}",
+                f"--host {wanted}: unknown host; {did_you_mean(wanted, list(plan.hosts))}",
                 BAD_INPUT,
             )
         return wanted
@@ -131,7 +132,7 @@ def host_here(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
         return MAIN if MAIN in found else found[0]
     raise CommandError(
         f"this computer has none of the addresses in {plan.launch_file} "
-        f"({', '.join(plan.hosts.values())}); say which host it is: --host NAME",
+        f"({', '.join(plan.hosts.values())}); name the host with --host NAME",
         BAD_INPUT,
     )
 
@@ -139,7 +140,7 @@ def host_here(plan: ResolvedGraph, run: Run | None, wanted: str | None) -> str:
 async def check_hosts(
     plan: ResolvedGraph, here: str, run: Run | None, timeout_s: float
 ) -> list[HostFinding]:
-    """All findings: what this computer sees, and what the others say."""
+    """Return all findings, from checks of this computer and from the probes of the hosts."""
     import tempfile
 
     from flexsheet.launch.health.doctor_hosts import (
@@ -169,7 +170,7 @@ async def check_hosts(
 
 
 def print_findings(findings: list[HostFinding]) -> None:
-    """One line per host and check; a host's name stands at its first."""
+    """Print one line per host and check; the first line of a host has its name."""
     rows = []
     before = ""
     for one in findings:

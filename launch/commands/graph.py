@@ -1,4 +1,4 @@
-"""Finding the graph that runs, and running a command's loop until it is interrupted."""
+"""Find the running graph, and run a command's event loop until it is interrupted."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ RunOption = Annotated[
     Path | None,
     typer.Option(
         "--run",
-        help="Directory of the run; without it the newest that is alive.",
+        help="Directory of the run; default: the newest run that is alive.",
         autocompletion=complete.runs,
     ),
 ]
@@ -37,14 +37,17 @@ class NoGraphError(CommandError):
 
 
 def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
-    """The ResolvedGraph and the Run of the graph in `directory`, or of the newest that is alive."""
+    """Return the graph and the run in `directory`, or of the newest run that is alive."""
     from flexsheet.launch.plans.plan_model import ResolvedGraph
     from flexsheet.launch.running.runs import Run, live_runs
 
     if directory is not None:
         run = Run(directory.resolve().name, directory.resolve())
         if not run.plan_file.is_file():
-            raise CommandError(f"--run {directory}: no plan.json there", BAD_INPUT)
+            raise CommandError(
+                f"--run {directory}: the directory has no plan.json; name the directory of a run",
+                BAD_INPUT,
+            )
     else:
         ready = [run for run in live_runs() if run.plan_file.is_file()]
         if not ready:
@@ -54,7 +57,7 @@ def running_graph(directory: Path | None) -> tuple[ResolvedGraph, Run]:
 
 
 def run_interruptible(work: Coroutine[Any, Any, int]) -> int:
-    """Run `work` in a loop; SIGINT and SIGTERM end it in order, and that is no failure."""
+    """Run `work` in an event loop; SIGINT and SIGTERM cancel it and return 0."""
 
     async def guarded() -> int:
         task = asyncio.ensure_future(work)

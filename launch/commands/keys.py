@@ -1,4 +1,4 @@
-"""`flexsheet keys`: make this host's key pair, show it, put public keys into a launch file."""
+"""`flexsheet keys`: create and show key pairs, and install public keys in a launch file."""
 
 from __future__ import annotations
 
@@ -22,36 +22,36 @@ from flexsheet.launch.commands.output import (
 
 KEY_LENGTH = 40
 
-app = typer.Typer(
-    add_completion=False, no_args_is_help=True, help="Keys between hosts: one pair per host."
-)
+app = typer.Typer(add_completion=False, no_args_is_help=True, help="Manage the key pairs of hosts.")
 
 
 class KeyCommand(TyperCommand):
-    """A command whose last argument may be a key that begins with "-"."""
+    """Accept a last argument that is a key and begins with "-"."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Put such a key where no option is looked for."""
+        """Move such a key behind "--", where click expects no option."""
         keys = [one for one in args if one.startswith("-") and len(one) == KEY_LENGTH]
         if keys and "--" not in args:
             args = [one for one in args if one not in keys] + ["--", *keys]
         return super().parse_args(ctx, args)
 
 
-HostArgument = Annotated[str, typer.Argument(metavar="HOST", help="Its name in the launch file.")]
+HostArgument = Annotated[
+    str, typer.Argument(metavar="HOST", help="Name of the host in the launch file.")
+]
 
 
 @app.command(epilog=examples("flexsheet keys new arm_left"))
 def new(
     host: HostArgument,
     replace: Annotated[
-        bool, typer.Option("--replace", help="Over the key that is there, which is then lost.")
+        bool, typer.Option("--replace", help="Replace the existing key, which is then lost.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Make a host's key pair, on that host; prints the public key.
+    """Create the key pair of a host, on that host, and print the public key.
 
-    The secret key stays in a file that its owner alone may read.
+    The secret key stays in a file that only its owner can read.
     """
     import re
 
@@ -59,7 +59,9 @@ def new(
     from flexsheet.messages.security import SecurityError, new_key_pair, write_secret
 
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,31}", host):
-        raise CommandError(f'"{host}" is no name of a host: small letters, digits, _', BAD_INPUT)
+        raise CommandError(
+            f'"{host}" is not a host name; use small letters, digits and _', BAD_INPUT
+        )
     public, secret = new_key_pair()
     file = secret_file(host)
     try:
@@ -78,16 +80,18 @@ def new(
 
 @app.command(epilog=examples("flexsheet keys show", "flexsheet keys show arm_left"))
 def show(
-    host: Annotated[str | None, typer.Argument(metavar="HOST", help="Without it: all.")] = None,
+    host: Annotated[
+        str | None, typer.Argument(metavar="HOST", help="Name of the host; default: all hosts.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Print the public keys whose secret halves are here; exit code 1 where one cannot be used."""
+    """Print the public keys of the key pairs here; exit code 1 if one cannot be used."""
     from flexsheet.launch.running.keys import directory, secret_file
     from flexsheet.messages.security import SecurityError, public_of, read_secret
 
     files = [secret_file(host)] if host else sorted(directory().glob("*.secret"))
     if not files:
-        raise CommandError(f"there are no keys in {directory()}; make one: flexsheet keys new HOST")
+        raise CommandError(f"{directory()} holds no keys; create one: flexsheet keys new HOST")
     rows = []
     problems = []
     for file in files:
@@ -120,19 +124,22 @@ def install(
         Path,
         typer.Argument(
             metavar="LAUNCH_FILE",
-            help="The same on every host.",
+            help="Launch file, the same on every host.",
             autocompletion=complete.yaml_files,
         ),
     ],
     host: HostArgument,
     key: Annotated[
-        str | None, typer.Argument(metavar="KEY", help="Without it: the one made here.")
+        str | None,
+        typer.Argument(
+            metavar="KEY", help="Public key; default: that of the key pair on this computer."
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Put a host's public key into a launch file.
+    """Write a host's public key into a launch file.
 
-    A graph that runs from that file takes it over within two seconds, without a restart.
+    A graph that runs from that file uses it within two seconds, without a restart.
     """
     from flexsheet.launch.running.keys import install as install_key
     from flexsheet.launch.running.keys import secret_file

@@ -1,4 +1,4 @@
-"""`flexsheet launch`: start a graph, keep it running, end it."""
+"""`flexsheet launch`: start a graph, keep it running, and end it."""
 
 from __future__ import annotations
 
@@ -47,33 +47,41 @@ def launch(
     host: Annotated[
         str | None,
         typer.Option(
-            help="Start only this host's nodes; all of them without it.",
+            help="Start only the nodes of this host; default: all nodes.",
             autocompletion=complete.hosts,
         ),
     ] = None,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check the file, print the plan, start nothing.")
+        bool,
+        typer.Option(
+            "--dry-run", help="Check the file and print the resolved graph; do not start it."
+        ),
     ] = False,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NODE.PARAM=VALUE", help="Over what the file says."),
+        typer.Option(
+            "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
+        ),
     ] = None,
     record: Annotated[
         Path | None, typer.Option(metavar="BAG", help="Record the logged topics to this bag.")
     ] = None,
     console: Annotated[
-        bool, typer.Option("--console", help="With a page in the browser, and a recorder for it.")
+        bool,
+        typer.Option("--console", help="Add the console in the browser, and a recorder for it."),
     ] = False,
     duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Stop by itself, counted from ready.")
+        float | None,
+        typer.Option(metavar="SECONDS", help="Stop this long after all nodes are ready."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Start the nodes of a launch file and keep them running until Ctrl-C.
 
-    With --json the plan is printed, or once all nodes are ready one line about the run.
+    With --json it prints one line about the run when all nodes are ready; with --dry-run the
+    resolved graph.
 
-    Exit codes: 0 stopped as asked, 1 a node failed for good, 2 the input is wrong.
+    Exit codes: 0 stopped on request, 1 a node failed, 2 the input is invalid.
     """
     from flexsheet.launch.plans.plan import load_graph
 
@@ -87,13 +95,13 @@ def launch(
 
     def ready(run: Run) -> None:
         if as_json:
-            print_json_line(about_run(plan, run, host))
+            print_json_line(describe_run(plan, run, host))
 
     raise typer.Exit(asyncio.run(run_graph(plan, host, duration, when_ready=ready)))
 
 
-def about_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
-    """What a script wants to know of a graph that is ready."""
+def describe_run(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Any]:
+    """Return what scripts need to know of a ready graph."""
     nodes = [node.name for node in plan.nodes_on(host)]
     return {"run": str(run.directory), "plan": plan.hash, "nodes": nodes}
 
@@ -105,39 +113,39 @@ async def run_graph(
     *,
     when_ready: Callable[[Run], None] = lambda run: None,
 ) -> int:
-    """Run the plan's nodes until a signal, or `duration_s` after they are ready; the exit code."""
+    """Run a graph until a signal, or `duration_s` after it is ready; return the exit code."""
     from flexsheet.launch.running.supervisor import RunningGraph
 
-    asked_to_stop = asyncio.Event()
-    graph = RunningGraph(plan, host=host, report=_say)
+    stop_requested = asyncio.Event()
+    graph = RunningGraph(plan, host=host, report=_print_log_line)
 
     def on_signal() -> None:
-        if asked_to_stop.is_set():
+        if stop_requested.is_set():
             graph.kill_all()
-        asked_to_stop.set()
+        stop_requested.set()
 
-    with handle_signals(on_signal, *_ending_signals()):
-        return await _run_until(graph, asked_to_stop, duration_s, when_ready)
+    with handle_signals(on_signal, *_list_end_signals()):
+        return await _run_until(graph, stop_requested, duration_s, when_ready)
 
 
-def _ending_signals() -> list[int]:
-    """The signals that end a graph; `nohup` ignores SIGHUP, and so it stays ignored."""
+def _list_end_signals() -> list[int]:
+    """Return the signals that end a graph; SIGHUP stays ignored under `nohup`."""
     hung_up = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
     return [signal.SIGINT, signal.SIGTERM, *hung_up]
 
 
 async def _run_until(
     graph: RunningGraph,
-    asked_to_stop: asyncio.Event,
+    stop_requested: asyncio.Event,
     duration_s: float | None,
     when_ready: Callable[[Run], None],
 ) -> int:
-    """Run the graph until `asked_to_stop`, or `duration_s` after it is ready; the exit code."""
-    from flexsheet.launch.running.notify import keep_telling, tell
+    """Run the graph until `stop_requested`, or `duration_s` after ready; return the exit code."""
     from flexsheet.launch.running.supervisor import NodeFailedError
+    from flexsheet.launch.running.systemd import beat_watchdog, notify_systemd
 
-    stop = asyncio.create_task(asked_to_stop.wait())
-    turning = asyncio.create_task(keep_telling())
+    stop = asyncio.create_task(stop_requested.wait())
+    watchdog = asyncio.create_task(beat_watchdog())
     try:
         async with graph:
             ready = asyncio.create_task(graph.wait_ready())
@@ -146,7 +154,7 @@ async def _run_until(
                 await asyncio.wait((ready, end, stop), return_when=asyncio.FIRST_COMPLETED)
                 if ready.done():
                     ready.result()
-                    tell("READY=1")
+                    notify_systemd("READY=1")
                     words.print(f"[green]all {len(graph.nodes)} nodes are ready[/]; Ctrl-C ends")
                     when_ready(graph.run)
                     await asyncio.wait(
@@ -155,7 +163,7 @@ async def _run_until(
                 if end.done():
                     end.result()
             finally:
-                tell("STOPPING=1")
+                notify_systemd("STOPPING=1")
                 ready.cancel()
                 end.cancel()
                 await asyncio.gather(ready, end, return_exceptions=True)
@@ -164,13 +172,13 @@ async def _run_until(
         return FAILED
     finally:
         stop.cancel()
-        turning.cancel()
+        watchdog.cancel()
     words.print("stopped")
     return 0
 
 
-def _say(node: str, line: str) -> None:
-    """One line of a node's log for people: JSON from structlog is put into words."""
+def _print_log_line(node: str, line: str) -> None:
+    """Print one line of a node's log; JSON from structlog becomes readable text."""
     style, text = "", line
     if line.startswith("{"):
         try:
@@ -189,15 +197,15 @@ def _say(node: str, line: str) -> None:
     words.print(f"{node:>16} | {text}", style=style, markup=False)
 
 
-def _settings(node: ResolvedNode) -> str:
-    """The parameters that are not what they would be without the launch file."""
+def _format_settings(node: ResolvedNode) -> str:
+    """Return the parameters that differ from their defaults, as text."""
     from pydantic_core import to_jsonable_python
 
     from flexsheet.nodes import node_class
     from flexsheet.nodes.node import parameters_of
 
     fields = parameters_of(node_class(node.type)).model_fields
-    # As they are written into a plan; a default that is made anew each time is no default here.
+    # As plans store them; a default factory has no fixed value to compare with.
     defaults = {
         name: to_jsonable_python(field.default)
         for name, field in fields.items()
@@ -226,12 +234,12 @@ def _print_plan(plan: ResolvedGraph, host: str | None) -> None:
                 node.type,
                 f"{node.host} ({plan.hosts[node.host]})",
                 node.restart.policy,
-                _settings(node),
+                _format_settings(node),
             )
             for node in plan.nodes_on(host)
         ],
     )
-    words.print("parameters that are not shown: flexsheet node describe TYPE", style="dim")
+    words.print("for parameters with default values: flexsheet node describe TYPE", style="dim")
     print()
     print_table(
         ("topic", "from", "endpoints", "to"),

@@ -1,4 +1,4 @@
-"""`flexsheet node`: which nodes there are, and what one takes and gives."""
+"""`flexsheet node`: list node types, and describe their ports and parameters."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from flexsheet.launch.commands.output import (
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="Nodes: which there are, what they take and give.",
+    help="List and describe nodes.",
 )
 
 
@@ -30,7 +30,7 @@ app = typer.Typer(
     epilog=examples("flexsheet node list"),
 )
 def list_nodes(as_json: JsonOption = False) -> None:
-    """The node types that a launch file can name, and the nodes of the graph that runs."""
+    """List the node types for launch files, and the nodes of the running graph."""
     from flexsheet.launch.running.runs import live_runs
     from flexsheet.nodes import NODES
 
@@ -63,11 +63,11 @@ def list_nodes(as_json: JsonOption = False) -> None:
 def describe(
     node: Annotated[
         str,
-        typer.Argument(help='Type of node, or "module:Class".', autocompletion=complete.node_types),
+        typer.Argument(help='Node type, or "module:Class".', autocompletion=complete.node_types),
     ],
     as_json: JsonOption = False,
 ) -> None:
-    """Ports, timers and parameters of a type of node."""
+    """Print the ports, timers and parameters of a node type."""
     from flexsheet.nodes import UnknownNodeError, node_class
     from flexsheet.nodes.node import parameters_of, ports_of, timers_of
 

@@ -1,4 +1,4 @@
-"""How commands speak: data on stdout, words on stderr, exit codes that mean something."""
+"""Print the output of commands: data on stdout, messages on stderr; define exit codes."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class CommandError(FlexsheetError):
 
 
 class Words:
-    """What is said to people, on stderr; rich is imported with the first word.
+    """Print messages for people on stderr; rich is imported with the first message.
 
-    Colours and bars are for terminals, and colours only where NO_COLOR is not set.
+    Colours and progress bars appear in terminals only, and colours not if NO_COLOR is set.
     """
 
     @cached_property
@@ -55,7 +55,7 @@ class Words:
         self.console.print(text, markup=markup, style=style)
 
     def status(self, text: str) -> Status:
-        """Shows what is being done until it is done; nothing where it is no terminal."""
+        """Show a status line during the work, in terminals only."""
         return self.console.status(text)
 
 
@@ -65,28 +65,28 @@ EXAMPLES = "[bold]Examples[/]"
 
 
 def examples(*lines: str) -> str:
-    """Calls of a command, as its help shows them at the end."""
+    """Format example calls for the end of a command's help."""
     return "\n".join([EXAMPLES, *(line.replace("[", r"\[") for line in lines)])
 
 
 def examples_in(epilog: str | None) -> list[str]:
-    """The calls that `examples` has put there."""
+    """Return the calls that `examples` has formatted."""
     heading, *lines = (epilog or "").split("\n")
     return [line.replace(r"\[", "[") for line in lines] if heading == EXAMPLES else []
 
 
 def print_json(data: Any) -> None:
-    """One JSON document on stdout; NaN and infinity, which JSON lacks, are null."""
+    """Print a JSON document on stdout; NaN and infinity become null."""
     print(json.dumps(finite(data), indent=2, allow_nan=False))
 
 
 def print_json_line(data: Any) -> None:
-    """One JSON document on one line of stdout, at once; see `print_json`."""
+    """Print a JSON document on one line of stdout, without buffering; see `print_json`."""
     print(json.dumps(finite(data), allow_nan=False), flush=True)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """A table on stdout; cells are folded only where it would be wider than the terminal."""
+    """Print a table on stdout; fold cells only if it is wider than the terminal."""
     cells = [[str(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(columns, *cells, strict=True)]
     in_terminal = sys.stdout.isatty()
@@ -113,7 +113,7 @@ def _print_folded(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None
 
 
 def print_fields(rows: Iterable[tuple[str, object]]) -> None:
-    """Names and values on stdout, one pair a line."""
+    """Print names and values on stdout, one pair per line."""
     pairs = [(name, str(value)) for name, value in rows]
     width = max(len(name) for name, _ in pairs)
     for name, value in pairs:
@@ -122,7 +122,7 @@ def print_fields(rows: Iterable[tuple[str, object]]) -> None:
 
 @contextmanager
 def progress_words() -> Iterator[Callable[[str], None]]:
-    """Shows on stderr what is being done and since when; a line each where it is no terminal."""
+    """Show progress messages with the elapsed time on stderr; one line each without a terminal."""
     if not words.is_terminal:
         yield lambda text: words.print(text, markup=False)
         return
@@ -136,7 +136,7 @@ def progress_words() -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float, float], None]]:
-    """A bar on stderr that is told (done, total), with the time left; only in a terminal."""
+    """Show a progress bar on stderr, updated by (done, total); in terminals only."""
     if not words.is_terminal:
         yield lambda done, total: None
         return
@@ -161,9 +161,9 @@ def progress_bar(what: str) -> Iterator[Callable[[float, float], None]]:
 
 
 def logs_on_stderr() -> None:
-    """What nodes and caches inside a command log goes to stderr, from warnings on.
+    """Send warnings and errors that nodes and caches log inside a command to stderr.
 
-    To be called before they are made: stdout is for what the command prints.
+    Call it before they are created; stdout is for the command's own output.
     """
     import logging
 
@@ -176,6 +176,6 @@ def logs_on_stderr() -> None:
             structlog.processors.format_exc_info,
             structlog.dev.ConsoleRenderer(colors=words.in_colour),
         ],
-        # Looked up for each line: who calls this as a library may put another in its place.
+        # sys.stderr is looked up for each line, because a caller may replace it.
         logger_factory=lambda *_: structlog.PrintLogger(sys.stderr),
     )

@@ -1,4 +1,4 @@
-"""`flexsheet precompute`: works out beforehand what a scene's nodes keep in the cache."""
+"""`flexsheet precompute`: compute a scene's cached tables before its graph starts."""
 
 from __future__ import annotations
 
@@ -34,29 +34,30 @@ def precompute(
     ],
     cache: Annotated[
         Path | None,
-        typer.Option("--cache", metavar="FOLDER", help="Where to keep it; default: the user's."),
+        typer.Option("--cache", metavar="FOLDER", help="Folder of the cache; default: the user's."),
     ] = None,
     skin_spacing_m: Annotated[
         float | None,
         typer.Option(
             "--skin-spacing",
             metavar="METRES",
-            help="Make the nonlinear table, too, of a soft body of this skin_spacing_m: minutes.",
+            help="Also compute the soft body's nonlinear table for this skin_spacing_m (minutes).",
         ),
     ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
             metavar="ADDRESS",
-            help="A dask.distributed scheduler, such as tcp://host:8786, whose workers make the "
-            "table; default: this machine's processors.",
+            help="Scheduler of dask.distributed, such as tcp://host:8786, whose workers compute "
+            "the table; default: the processors of this computer.",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Work out how a scene's sheet dents, once; experiments and the demo do so by themselves.
+    """Compute the deflection shapes of a scene's sheet, unless the cache has them.
 
-    Of a scene whose methods say sheet_force: table, that table as well: a minute or two.
+    For a scene with the method `sheet_force: table` it also computes that table, in about two
+    minutes.  Experiments and the demo compute missing shapes by themselves.
     """
     from flexsheet.launch.plans.plan import load_scene
     from flexsheet.launch.running.precompute import (
@@ -67,7 +68,10 @@ def precompute(
     )
 
     if scheduler is not None and skin_spacing_m is None:
-        raise typer.BadParameter("is for the table of --skin-spacing", param_hint="--scheduler")
+        raise typer.BadParameter(
+            "is used for the nonlinear table only; give --skin-spacing, too",
+            param_hint="--scheduler",
+        )
     scene = load_scene(scene_file)
     with progress_words() as progress:
         files = {"deflection_shapes": precompute_deflection_shapes(scene, cache, progress)}
@@ -79,7 +83,9 @@ def precompute(
                     scene, skin_spacing_m, cache, scheduler, progress
                 )
             except NoSoftBodyError as error:
-                raise CommandError(f"no soft body of {scene_file}: {error}", BAD_INPUT) from error
+                raise CommandError(
+                    f"{scene_file}: the soft body cannot be computed: {error}", BAD_INPUT
+                ) from error
     if as_json:
         print_json({name: str(file) for name, file in files.items()})
         return

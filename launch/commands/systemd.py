@@ -34,36 +34,45 @@ def install(
         Path,
         typer.Argument(
             metavar="LAUNCH_FILE",
-            help="The same on every host.",
+            help="Launch file, the same on every host.",
             autocompletion=complete.yaml_files,
         ),
     ],
-    host: Annotated[str, typer.Option(help="Which of its hosts this computer is.")],
-    user: Annotated[str, typer.Option(help="Who runs it; must exist.")] = "flexsheet",
-    root: Annotated[Path, typer.Option(help="Where the system lies.")] = Path("/"),
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print, write nothing.")] = False,
+    host: Annotated[str, typer.Option(help="Name of this computer in the launch file.")],
+    user: Annotated[
+        str, typer.Option(help="User that runs the service; it must exist.")
+    ] = "flexsheet",
+    root: Annotated[Path, typer.Option(help="Root folder of the system.")] = Path("/"),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print the files instead of writing them.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Write flexsheet@.service, the host's environment and settings for TCP; start nothing."""
+    """Write flexsheet@.service, the host's environment and settings for TCP.
+
+    The command does not start the service.
+    """
     from flexsheet.launch.plans.plan import load_graph
-    from flexsheet.launch.running.systemd_unit import STATE, files_of, list_bags
+    from flexsheet.launch.running.systemd import STATE_FOLDER, list_bags, make_files
 
     plan = load_graph(launch_file)
     if host not in plan.hosts:
         raise CommandError(
-            f'{launch_file}: there is no host "{host}"; there are: {", ".join(plan.hosts)}',
+            f'--host "{host}": {launch_file} has no such host; it has {", ".join(plan.hosts)}',
             BAD_INPUT,
         )
     if not user or set(user) - set(USER_PATTERN):
-        raise CommandError(f'--user "{user}" is no name of a user', BAD_INPUT)
+        raise CommandError(
+            f'--user "{user}": not a user name; use small letters, digits, _ and -', BAD_INPUT
+        )
     for bag in list_bags(plan, host):
-        if not bag.is_relative_to(STATE):
+        if not bag.is_relative_to(STATE_FOLDER):
             words.print(
-                f"{bag} cannot be recorded: the service may write to {STATE} only; change the "
-                "launch file",
+                f"{bag}: the service can write to {STATE_FOLDER} only; change the bag's path in "
+                "the launch file",
                 markup=False, style="yellow",
             )  # fmt: skip
-    files = list(files_of(launch_file=launch_file, host=host, user=user, root=root))
+    files = list(make_files(launch_file=launch_file, host=host, user=user, root=root))
     if as_json:
         print_json([{"path": str(file.path), "text": file.text} for file in files])
     for file in files:
@@ -76,13 +85,13 @@ def install(
             write_file(file.path, file.text, mode=file.mode)
         except OSError as error:
             raise CommandError(
-                f"{file.path}: cannot be written: {error.strerror}; as root?"
+                f"{file.path}: cannot be written: {error.strerror}; run the command as root"
             ) from error
         words.print(f"wrote {file.path}", markup=False)
     if not dry_run:
         words.print(
             f"next: sysctl -e -p /etc/sysctl.d/90-flexsheet.conf && systemctl daemon-reload && "
             f"systemctl enable --now flexsheet@{host}; "
-            f"its words: journalctl -fu flexsheet@{host}",
+            f"log: journalctl -fu flexsheet@{host}",
             markup=False,
         )

@@ -1,4 +1,4 @@
-"""`flexsheet try`: the whole display on this machine, with a page in the browser to touch it."""
+"""`flexsheet try`: simulate the whole display on this computer, and touch it in the browser."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 
 from flexsheet.launch.commands import complete
 from flexsheet.launch.commands.graph import JsonOption
-from flexsheet.launch.commands.launching import about_run, run_graph
+from flexsheet.launch.commands.launching import describe_run, run_graph
 from flexsheet.launch.commands.output import examples, print_json_line, progress_words, words
 from flexsheet.nodes.signals import keyboard_interrupts
 
@@ -30,24 +30,30 @@ def try_it(
     launch_file: Annotated[
         Path,
         typer.Option(
-            "--launch", metavar="FILE", help="Another graph.", autocompletion=complete.yaml_files
+            "--launch",
+            metavar="FILE",
+            help="Launch file of another graph.",
+            autocompletion=complete.yaml_files,
         ),
     ] = DEMO_FILE,
-    port: Annotated[int, typer.Option(help="Of the page.", min=1, max=65535)] = 8080,
+    port: Annotated[int, typer.Option(help="Port of the page.", min=1, max=65535)] = 8080,
     browser: Annotated[bool, typer.Option(help="Open the page in the browser.")] = True,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NODE.PARAM=VALUE", help="Over what the file says."),
+        typer.Option(
+            "--set", metavar="NODE.PARAM=VALUE", help="Override a parameter of the launch file."
+        ),
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Stop by itself, counted from ready.")
+        float | None,
+        typer.Option(metavar="SECONDS", help="Stop this long after all nodes are ready."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Touch a virtual object in the browser: no hardware is needed.
+    """Touch a virtual object in the browser, without hardware.
 
-    Starts the demo's graph with a console and prints its address; Ctrl-C ends it.  From another
-    computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address there.
+    The command starts the demo's graph with a console and prints its address; Ctrl-C ends it.  From
+    another computer: ssh -L 8080:127.0.0.1:8080 THIS_COMPUTER, then open the same address there.
     """
     from flexsheet.launch.plans.plan import load_graph
     from flexsheet.launch.running.precompute import precompute_graph
@@ -61,7 +67,7 @@ def try_it(
 
     def ready(run: Run) -> None:
         if as_json:
-            print_json_line({"page": url, **about_run(plan, run, None)})
+            print_json_line({"page": url, **describe_run(plan, run, None)})
         words.print(f"[bold]open {url}[/] and drag on the sheet")
         if browser and (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
             webbrowser.open(url)

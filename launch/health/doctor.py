@@ -1,4 +1,4 @@
-"""Checks of the machine that flexsheet is to run on, each with what to do about it."""
+"""Check the computer that runs flexsheet; each finding has a remedy."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from flexsheet.launch.health.system import OPENGL, opengl_problem
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.cpu import CpuWatch
-from flexsheet.launch.running.runs import is_free, live_runs, orphans, root
+from flexsheet.launch.running.runs import find_orphans, is_free, live_runs, root
 from flexsheet.messages.busy import BUSY_REMEDY, MAX_LOAD_RATIO, describe_pressure
 
 DEMO = Path(__file__).parent.parent / "demo.yaml"
 CLOCK_SOURCES = Path("/sys/devices/system/clocksource/clocksource0")
-QUICK_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "xen")
+FAST_CLOCKS = ("tsc", "kvm-clock", "hyperv_clocksource_tsc_page", "arch_sys_counter", "xen")
 MIN_FREE_DISK_BYTES = 2 << 30
 MIN_CORES = 2
 PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
@@ -31,7 +31,7 @@ PROBE_S, PROBE_PERIOD_S, PROBE_RUN_S = 1.0, 1.0 / 140.0, 0.001
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One check's outcome; `remedy` says what to do where it is not ok."""
+    """Hold the result of one check; `remedy` is what to do unless it is ok."""
 
     check: str
     state: Literal["ok", "warning", "failed"]
@@ -40,7 +40,7 @@ class Finding:
 
 
 def check_all() -> Iterator[Finding]:
-    """All checks, one after another."""
+    """Run all checks, one after another."""
     checks: tuple[Callable[[], Finding], ...] = (
         check_load,
         check_python,
@@ -59,9 +59,9 @@ def check_all() -> Iterator[Finding]:
 
 
 def check_load() -> Finding:
-    """Whether a program as light as an arm's node gets a processor when it needs one.
+    """Check that a program as light as an arm bridge gets a processor when it needs one.
 
-    This process computes for PROBE_RUN_S in each PROBE_PERIOD_S; what it waits is measured.
+    This process computes for PROBE_RUN_S in each PROBE_PERIOD_S and measures how long it waits.
     """
     watch, own = CpuWatch(), {"this check": os.getpid()}
     watch.update(own, measure_programs=True)
@@ -73,7 +73,7 @@ def check_load() -> Finding:
     pressure = watch.update(own, measure_programs=True)
     if pressure is None:
         load_ratio = os.getloadavg()[0] / (os.cpu_count() or 1)
-        text = f"{load_ratio:.1f} processes per core want to run"
+        text = f"load {load_ratio:.1f} per core"
         busy = load_ratio > MAX_LOAD_RATIO
     else:
         text, busy = describe_pressure(pressure), pressure.busy
@@ -83,16 +83,18 @@ def check_load() -> Finding:
 
 
 def check_python() -> Finding:
-    """Which Python this is; an older one than the project needs does not come this far."""
+    """Report the Python version; one that is too old cannot import this module."""
     return Finding("python", "ok", f"{sys.version.split()[0]} at {sys.executable}")
 
 
 def check_libraries() -> Finding:
-    """Every requirement of the distribution is installed."""
+    """Check that every requirement of the distribution is installed."""
     try:
         wanted = requires("flexsheet") or []
     except PackageNotFoundError:
-        return Finding("libraries", "warning", "flexsheet itself is not installed", "make setup")
+        return Finding(
+            "libraries", "warning", "the package flexsheet is not installed", "make setup"
+        )
     missing = []
     names = [
         match[0]
@@ -122,14 +124,14 @@ def check_opencv() -> Finding:
 def check_opengl() -> Finding:
     problem = opengl_problem()
     if problem is None:
-        return Finding("opengl", "ok", "a headless context can be made (EGL)")
+        return Finding("opengl", "ok", "a headless context can be created (EGL)")
     return Finding("opengl", "failed", problem, f"on Debian: {OPENGL.manual}")
 
 
 def check_cores() -> Finding:
     cores = len(os.sched_getaffinity(0))
     if cores < MIN_CORES:
-        return Finding("cores", "warning", str(cores), f"the demo wants {MIN_CORES}")
+        return Finding("cores", "warning", str(cores), f"the demo needs {MIN_CORES}")
     return Finding("cores", "ok", str(cores))
 
 
@@ -137,50 +139,58 @@ def check_disk() -> Finding:
     free = shutil.disk_usage(Path.cwd()).free
     text = f"{free / 2**30:.1f} GiB free at {Path.cwd()}"
     if free < MIN_FREE_DISK_BYTES:
-        return Finding("disk", "warning", text, "bags need room: 37 MB a second with pictures")
+        return Finding("disk", "warning", text, "free some: bags with images take 37 MB/s")
     return Finding("disk", "ok", text)
 
 
 def check_clock() -> Finding:
-    """The clock that stamps everything: quick to read, and fine enough."""
+    """Check the source and resolution of the clock that stamps all messages."""
     try:
         source = (CLOCK_SOURCES / "current_clocksource").read_text().strip()
     except OSError:
         source = "unknown"
     resolution_ns = time.get_clock_info("monotonic").resolution * 1e9
     text = f"{source}, resolution {resolution_ns:g} ns"
-    if source not in (*QUICK_CLOCKS, "unknown"):
-        return Finding("clock", "warning", text, "a slow source; see dmesg on why tsc is not used")
+    if source not in (*FAST_CLOCKS, "unknown"):
+        return Finding(
+            "clock",
+            "warning",
+            text,
+            "this source is slow; dmesg shows why the kernel does not use tsc",
+        )
     return Finding("clock", "ok", text)
 
 
 def check_sockets() -> Finding:
     directory = root()
     if not directory.exists():
-        return Finding("sockets", "ok", f"{directory} will be made")
+        return Finding("sockets", "ok", f"{directory} will be created")
     status = directory.lstat()
     if status.st_uid != os.getuid() or not os.access(directory, os.W_OK | os.X_OK):
         return Finding(
-            "sockets", "failed", f"{directory} is not ours", "set FLEXSHEET_RUNS to another folder"
+            "sockets",
+            "failed",
+            f"{directory} belongs to another user",
+            "set FLEXSHEET_RUNS to another folder",
         )
     return Finding("sockets", "ok", f"{directory}, {len(live_runs())} graphs are running")
 
 
 def check_leftovers() -> Finding:
-    found = orphans()
+    found = find_orphans()
     if found:
         pids = ", ".join(str(process.pid) for process in found)
         return Finding(
             "leftovers",
             "warning",
-            f"{len(found)} processes of launchers that are gone: {pids}",
+            f"{len(found)} processes of ended launchers: {pids}",
             "flexsheet doctor --sweep",
         )
     return Finding("leftovers", "ok", "none")
 
 
 def check_demo() -> Finding:
-    """The demo's launch file resolves, and the ports that its nodes listen on are free."""
+    """Check that the demo's launch file resolves and that ports free."""
     try:
         plan = load_graph(DEMO)
     except BadInputError as error:
@@ -188,5 +198,7 @@ def check_demo() -> Finding:
     taken = [port for _, port in plan.listening_nodes(None) if not is_free("127.0.0.1", port)]
     if taken:
         what = f"ports in use: {', '.join(map(str, taken))}"
-        return Finding("demo", "warning", what, "is a graph running? else change them with --set")
-    return Finding("demo", "ok", f"{len(plan.nodes)} nodes, plan {plan.hash}, its ports are free")
+        return Finding(
+            "demo", "warning", what, "end the running graph, or choose other ports with --set"
+        )
+    return Finding("demo", "ok", f"{len(plan.nodes)} nodes, plan {plan.hash}, ports free")

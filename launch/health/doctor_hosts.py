@@ -20,7 +20,7 @@ from flexsheet.launch.health.probe import HostProbe, Reachability
 from flexsheet.launch.health.system import OPENGL, opengl_problem
 from flexsheet.launch.plans.hosts import is_loopback
 from flexsheet.launch.plans.plan_model import ResolvedGraph, ResolvedNode
-from flexsheet.launch.plans.routing import FIRST_PORT, PORTS
+from flexsheet.launch.plans.routing import FIRST_PORT, PORT_COUNT
 from flexsheet.launch.running.host import (
     list_device_files,
     python_version,
@@ -156,7 +156,7 @@ def _check_reachability(
         "address": address,
         "file": plan.launch_file,
         "first": FIRST_PORT,
-        "last": FIRST_PORT + PORTS - 1,
+        "last": FIRST_PORT + PORT_COUNT - 1,
     }
     if probe.reachability in NETWORK_FAULTS:
         what, remedy = NETWORK_FAULTS[probe.reachability]
@@ -296,7 +296,7 @@ def _check_clocks(
             )
     if not words:
         return HostFinding(probe.host, "clocks", "not asked", "no other host reports")
-    what = f"{'; '.join(words)}; {1e3 * limit_s:g} ms allowed"
+    what = f"{'; '.join(words)}; {1e3 * limit_s:g} ms are allowed"
     if bad:
         return HostFinding(probe.host, "clocks", "failed", what, remedy)
     return HostFinding(probe.host, "clocks", "ok", what)

@@ -1,7 +1,7 @@
-"""Check the system packages, and install them where that is possible.
+"""Check the system packages, and install missing ones if possible.
 
-`python -m launch.health.system`: what the nodes need.  `--tests`: also what the tests need.
-As root on Debian and its kin, missing packages are installed; otherwise one line names them.
+`python -m flexsheet.launch.health.system` checks what the nodes need; `--tests` adds what the tests
+need.  Missing packages are installed as root on Debian and its derivatives, otherwise printed.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 SYSTEM_PATHS = ("/usr/sbin", "/sbin")
-"""Not in every user's PATH, and `ip` lives there."""
+"""Folders of `ip`, which are not in every user's PATH."""
 
 APT_OPTIONS = ("-qq", "-o", "DPkg::Lock::Timeout=120", "-o", "Acquire::Retries=2")
 
 
 @dataclass(frozen=True, slots=True)
 class SystemPackages:
-    """Debian packages for one purpose.
+    """Name the Debian packages for one purpose.
 
-    problem: returns why the purpose cannot be served; None if it can.
+    problem: returns why the packages do not work; None if they do.
     """
 
     purpose: str
@@ -35,14 +35,14 @@ class SystemPackages:
 
     @property
     def manual(self) -> str:
-        """The command that installs the packages."""
+        """Return the command that installs the packages."""
         return f"sudo apt-get install -y {' '.join(self.packages)}"
 
 
 def opengl_problem() -> str | None:
-    """Return why no headless OpenGL context can be made; None when one can.
+    """Return why no headless OpenGL context can be created; None if one can.
 
-    A driver that failed to load once stays failed in its process, so another process tries.
+    Another process tries it, because a driver that failed once fails again in its process.
     """
     code = "import moderngl; moderngl.create_standalone_context(backend='egl').release()"
     result = subprocess.run(
@@ -55,7 +55,7 @@ def opengl_problem() -> str | None:
 
 
 def missing_files(*, programs: Sequence[str] = (), libraries: Sequence[str] = ()) -> str | None:
-    """Return which programs and shared libraries are missing; None when all are there."""
+    """Return which programs and shared libraries are missing; None if none is."""
     path = os.pathsep.join([os.environ.get("PATH", os.defpath), *SYSTEM_PATHS])
     missing = [name for name in programs if shutil.which(name, path=path) is None]
     for name in libraries:
@@ -95,11 +95,11 @@ TABLE = (
         lambda: missing_files(programs=["systemd-analyze"]),
     ),
 )
-"""What must be there, for what, and what provides it on Debian."""
+"""System packages by purpose."""
 
 
 def can_install() -> bool:
-    """Whether this process may install Debian packages."""
+    """Return whether this process may install Debian packages."""
     return os.geteuid() == 0 and shutil.which("apt-get") is not None
 
 
@@ -120,9 +120,9 @@ def run_apt(*arguments: str) -> bool:
 
 
 def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
-    """Install the packages of each purpose; return the purposes that still cannot be served.
+    """Install the packages of each purpose, and return those that still do not work.
 
-    One transaction per purpose: a package that cannot be had does not keep out the others.
+    Each purpose is a transaction of its own, so that an unavailable package does not block others.
     """
     run_apt("update")
     for one in missing:
@@ -132,7 +132,7 @@ def install(missing: Sequence[SystemPackages]) -> list[SystemPackages]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Return 1 if the nodes miss something.  With --tests, 0: the tests show what is missing."""
+    """Return 1 if a package for nodes is missing; with --tests always 0, as tests report it."""
     parser = argparse.ArgumentParser(description="Check the system packages.")
     parser.add_argument("--tests", action="store_true", help="also what the tests need")
     tests = parser.parse_args(arguments).tests
@@ -143,7 +143,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if missing:
         reasons = "; ".join(f"{one.purpose} ({one.problem()})" for one in missing)
         packages = " ".join(package for one in missing for package in one.packages)
-        _report(f"cannot be used: {reasons}; on Debian: sudo apt-get install -y {packages}")
+        _report(
+            f"missing system packages: {reasons}; on Debian: sudo apt-get install -y {packages}"
+        )
     return int(bool(missing) and not tests)
 
 

@@ -1,7 +1,7 @@
-"""YAML files whose mistakes can be pointed at: file, line, key, value and remedy.
+"""Read YAML files, and report their errors with file, line, key, value and remedy.
 
-A file is read with its line numbers, checked against a pydantic model, and everything that is
-wrong with it is reported at once as `Problem`s.
+A file is read with its line numbers and validated against a pydantic model.  All errors are
+reported at once as `Problem`s.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ M = TypeVar("M", bound=BaseModel)
 MAX_TEXT_LENGTH = 1 << 18
 MAX_DEPTH = 50
 MAX_VALUES = 5000
-"""The largest file of launch/ has 300; the parser takes a second for these."""
+"""The largest file of launch/ has 300; the parser needs a second for the maximum."""
 
 OPENING_TOKENS = (
     BlockMappingStartToken,
@@ -67,18 +67,18 @@ SCALARS: tuple[tuple[type, type], ...] = (
     (ScalarInt, int),
     (ScalarString, str),
 )
-"""The parser's own kinds of values, which remember how they were written."""
+"""Value types of the parser, which preserve formatting, with Python's own types."""
 
-MAPPING_WANTED = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
-"""Kinds of pydantic's errors whose texts name a class."""
+MAPPING_ERROR_TYPES = ("model_type", "model_attributes_type", "dict_type", "mapping_type")
+"""Pydantic's error types whose texts name a class instead of a mapping."""
 
 Key = tuple[str | int, ...]
-"""Where a value sits in a document: ("nodes", "planner", "parameters", "lead_s")."""
+"""Path of a value in a document: ("nodes", "planner", "parameters", "touch_m")."""
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One thing that is wrong, where, and what to do about it."""
+    """Describe one error: location, key, what is wrong, and what to do."""
 
     where: str
     key: Key
@@ -107,7 +107,7 @@ class BadInputError(FlexsheetError, ValueError):
 
 @dataclass(slots=True)
 class Document:
-    """A YAML file as plain values, with the line of every key, and what was set over it."""
+    """Hold a YAML file as plain values, with the line of every key, and overridden values."""
 
     path: Path
     values: dict[str, Any]
@@ -116,7 +116,7 @@ class Document:
     overrides: dict[Key, str] = field(default_factory=dict)
 
     def where(self, key: Key) -> str:
-        """The file and line of `key` (or of the nearest thing around it), or the override."""
+        """Return file and line of `key` or its nearest parent, or the option that overrides it."""
         for length in range(len(key), 0, -1):
             part = key[:length]
             if part in self.overrides:
@@ -129,45 +129,45 @@ class Document:
         return Problem(self.where(key), key, what, remedy)
 
     def set(self, key: Key, value: Any, origin: str) -> None:
-        """Put `value` at `key`, making the mappings on the way; `origin` names it in errors."""
+        """Set the value at `key` and create missing mappings; errors name `origin`."""
         target: dict[Any, Any] = self.values
         for part in key[:-1]:
             if target.get(part) is None:
                 target[part] = {}
             if not isinstance(target[part], dict):
-                raise BadInputError([Problem(origin, key, f'"{part}" holds no further keys')])
+                raise BadInputError([Problem(origin, key, f'"{part}" is not a mapping')])
             target = target[part]
         target[key[-1]] = value
         self.overrides[key] = origin
 
 
 def parse_value(text: str) -> Any:
-    """A value as YAML reads it: "3" is a number, "[1, 2]" a list, "yes" a string.
+    """Parse a YAML value: "3" is a number, "[1, 2]" a list, "yes" a string.
 
     Raises YAMLError.
     """
-    return plain(_tree(text))
+    return plain(_parse_tree(text))
 
 
-def _tree(text: str) -> Any:
-    """The YAML tree of a text, with its comments; raises YAMLError and nothing else."""
+def _parse_tree(text: str) -> Any:
+    """Parse a text into a YAML tree with comments.  Raises YAMLError only."""
     try:
         _check_size(text)
         return YAML(typ="rt", pure=True).load(text)
     except YAMLError:
         raise
     except RecursionError as error:
-        raise YAMLError("values within values within values, too deep") from error
-    # Days and numbers that are none, and odd tags, make the parser raise what it likes.
+        raise YAMLError("values are nested too deeply") from error
+    # Invalid dates, numbers and tags make the parser raise errors of any type.
     except Exception as error:
-        raise YAMLError(f"holds a value that cannot be read: {error}"[:500]) from error
+        raise YAMLError(f"a value cannot be read: {error}"[:500]) from error
 
 
 def _check_size(text: str) -> None:
-    """Refuse a text whose parsing would take long; raises YAMLError.
+    """Refuse a text whose parsing would take too long.  Raises YAMLError.
 
-    The parser's time grows with the square of the depth and more, so tokens are counted first, and
-    that only where the punctuation does not rule too many of them out.
+    The parser's time grows at least quadratically with the depth, so tokens are counted first,
+    unless the punctuation shows that there are few.
     """
     lines = text.splitlines()
     columns = max((len(line) - len(line.lstrip(" -?\t")) for line in lines), default=0)
@@ -187,23 +187,24 @@ def _check_size(text: str) -> None:
 
 
 def parse_json(text: str) -> Any:
-    """A value as JSON has it, of any size: it knows no aliases, which could stand for more than is
-    there.  ValueError for what is no JSON; for NaN, infinity and a key that is said twice, too.
+    """Parse a JSON value of any size; JSON has no aliases that could expand it.
+
+    Raises ValueError for invalid JSON, NaN, infinity and duplicate keys.
     """
 
     def refuse(name: str) -> None:
-        raise ValueError(f"{name} is no JSON")
+        raise ValueError(f"{name} is not valid JSON")
 
     def mapping(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         found = dict(pairs)
         if len(found) < len(pairs):
-            raise ValueError("a key is said twice")
+            raise ValueError("duplicate key")
         return found
 
     try:
         return json.loads(text, parse_constant=refuse, object_pairs_hook=mapping)
     except RecursionError as error:
-        raise ValueError("values within values within values, too deep") from error
+        raise ValueError("values are nested too deeply") from error
 
 
 def read_document(path: Path) -> Document:
@@ -218,10 +219,10 @@ def read_document(path: Path) -> Document:
     except UnicodeDecodeError as error:
         raise BadInputError([Problem(str(path), (), f"is not UTF-8 text: {error}")]) from error
     if len(text) > MAX_TEXT_LENGTH:
-        what = f"has {len(text)} characters, at most {MAX_TEXT_LENGTH} are read"
+        what = f"has {len(text)} characters; at most {MAX_TEXT_LENGTH} are allowed"
         raise BadInputError([Problem(str(path), (), what)])
     try:
-        tree = _tree(text)
+        tree = _parse_tree(text)
         values = plain(tree)
     except DuplicateKeyError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 0
@@ -236,16 +237,18 @@ def read_document(path: Path) -> Document:
     except YAMLError as error:
         raise BadInputError([Problem(str(path), (), f"not YAML: {error}")]) from error
     if not isinstance(tree, CommentedMap):
-        kind = _kind_name(values)
-        raise BadInputError([Problem(str(path), (), f"is {kind}", "it must hold keys and values")])
+        kind = _name_type(values)
+        raise BadInputError(
+            [Problem(str(path), (), f"is {kind}", "write a mapping of keys and values")]
+        )
     return Document(path, values, text, dict(_lines(tree, ())))
 
 
 def plain(tree: Any) -> Any:
-    """A YAML tree without its comments and quoting, as Python's own types.
+    """Convert a YAML tree into Python's own types, without comments and quoting.
 
-    Raises YAMLError for keys that are more than a word or a number, and where aliases stand for
-    more values than anybody writes.
+    Raises YAMLError for keys other than words and numbers, and if aliases expand to more than
+    MAX_VALUES values.
     """
     left = MAX_VALUES
 
@@ -254,7 +257,7 @@ def plain(tree: Any) -> Any:
         left -= 1
         if left < 0:
             raise YAMLError(
-                f"more than {MAX_VALUES} values, those that aliases (*) repeat included"
+                f"more than {MAX_VALUES} values, including those that aliases (*) repeat"
             )
         if isinstance(value, Mapping):
             return {key(name): convert(item) for name, item in value.items()}
@@ -273,7 +276,7 @@ def plain(tree: Any) -> Any:
     try:
         return convert(tree)
     except RecursionError as error:
-        raise YAMLError("a value holds itself, or is nested too deeply") from error
+        raise YAMLError("a value contains itself or is nested too deeply") from error
 
 
 def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:
@@ -292,8 +295,8 @@ def _lines(tree: Any, key: Key) -> Iterator[tuple[Key, int]]:
             yield from _lines(item, (*key, i))
 
 
-def _kind_name(value: Any) -> str:
-    """What YAML calls a value of this kind."""
+def _name_type(value: Any) -> str:
+    """Return the YAML name of a value's type."""
     match value:
         case None:
             return "empty"
@@ -316,22 +319,22 @@ def did_you_mean(name: object, known: Sequence[str]) -> str:
     near = get_close_matches(str(name), known, n=1)
     if near:
         return f'did you mean "{near[0]}"?'
-    return f"there are: {', '.join(known)}" if known else "there are none"
+    return f"choose one of: {', '.join(known)}" if known else "there are none"
 
 
 def validate(model: type[M], document: Document, *, at: Key = ()) -> M:
-    """The values at `at` as a `model`; raises BadInputError with a problem per mistake."""
+    """Validate the values at `at` as a `model`.  Raises BadInputError with all problems."""
     values: Any = document.values
     for part in at:
         values = values[part]
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        problems = [_problem_of(item, model, document, at) for item in error.errors()]
+        problems = [_make_problem(item, model, document, at) for item in error.errors()]
         raise BadInputError(list(dict.fromkeys(problems))) from None
 
 
-def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key) -> Problem:
+def _make_problem(error: Any, model: type[BaseModel], document: Document, at: Key) -> Problem:
     location: Key = tuple(error["loc"])
     if error["type"] in ("extra_forbidden", "missing"):
         name = location[-1]
@@ -346,17 +349,17 @@ def _problem_of(error: Any, model: type[BaseModel], document: Document, at: Key)
             remedy = "remove it: only one method is left"
         return document.problem(key, f'unknown key "{name}"', remedy)
     key = _existing_part(document, (*at, *_walk(model, location)[0]))
-    if error["type"] in MAPPING_WANTED:
+    if error["type"] in MAPPING_ERROR_TYPES:
         return document.problem(
-            key, f"is {_kind_name(error['input'])}", "it must hold keys and values"
+            key, f"is {_name_type(error['input'])}", "write a mapping of keys and values"
         )
     renamed = VALUES.get(str(key[-1]) if key else "", {}).get(str(error["input"]))
     if renamed is not None:
-        what = f"{_shown(error['input'])} does not fit"
+        what = f"{_shorten(error['input'])} is invalid"
         return document.problem(key, what, f'it is now "{renamed}"')
     raised = error.get("ctx", {}).get("error")
     message = str(raised) if isinstance(raised, Exception) else error["msg"]
-    return document.problem(key, f"{_shown(error['input'])} does not fit", message)
+    return document.problem(key, f"{_shorten(error['input'])} is invalid", message)
 
 
 def _existing_part(document: Document, key: Key) -> Key:
@@ -383,15 +386,15 @@ def _renamed_keys(model: type[BaseModel], document: Document, key: Key) -> Mappi
     return SCENE_KEYS if issubclass(model, Scene) else LAUNCH_KEYS
 
 
-def _shown(value: Any) -> str:
+def _shorten(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def _walk(model: Any, location: Key) -> tuple[Key, Any]:
-    """The key in the file that pydantic's `location` stands for, and the type that sits there.
+    """Return the key of the file for pydantic's `location`, and the type at that key.
 
-    Inside a union of models pydantic's location also names the member that the tag chose.
+    Inside a union of models pydantic's location also names the chosen member.
     """
     key: list[str | int] = []
     for part in location:

@@ -1,4 +1,4 @@
-"""The hosts of a launch file: their addresses and keys, each a good one, each of one host."""
+"""Check the hosts of a launch file: valid addresses and keys, each for one host only."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from flexsheet.messages.security import is_key
 
 
 def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[Problem]) -> None:
-    """Addresses and keys: each a good one, each of one host."""
+    """Check that addresses and keys are valid and unique."""
     if MAIN not in hosts:
         problems.append(
             document.problem(
-                ("hosts",), f'no host is named "{MAIN}"', "the launcher and the tools need it"
+                ("hosts",), f'no host is named "{MAIN}"', "rename the host that runs the tools"
             )
         )
     _check_keys(hosts, document, problems)
@@ -34,20 +34,26 @@ def check_hosts(hosts: dict[str, HostSpec], document: Document, problems: list[P
             address = ipaddress.ip_address(host.address)
         except ValueError:
             problems.append(
-                document.problem(key, f'"{host.address}" is no IP address', 'as in "192.0.2.10"')
+                document.problem(
+                    key, f'"{host.address}" is not an IP address', 'write it as "192.0.2.10"'
+                )
             )
             continue
         if address.is_unspecified or address.is_multicast:
             problems.append(
                 document.problem(
-                    key, f'"{host.address}" names no single host', "give the address of its own"
+                    key,
+                    f'"{host.address}" is not the address of one host',
+                    "give the host's own address",
                 )
             )
         other = seen.setdefault(host.address, name)
         if other != name:
             problems.append(
                 document.problem(
-                    key, f'"{host.address}" is the address of host "{other}" too', "make them one"
+                    key,
+                    f'"{host.address}" is also the address of host "{other}"',
+                    "merge the two hosts",
                 )
             )
 
@@ -61,8 +67,8 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document, problems: list[P
                 problems.append(
                     document.problem(
                         ("hosts", name),
-                        "has no key, others have",
-                        f"make one there (flexsheet keys new {name}), then: "
+                        "has no key, but other hosts do",
+                        f"create one on that host (flexsheet keys new {name}), then: "
                         f"flexsheet keys install FILE {name} KEY",
                     )
                 )
@@ -70,20 +76,22 @@ def _check_keys(hosts: dict[str, HostSpec], document: Document, problems: list[P
             problems.append(
                 document.problem(
                     where,
-                    f'"{host.key}" is no public key',
-                    f"40 characters, as this prints: flexsheet keys show {name}",
+                    f'"{host.key}" is not a public key',
+                    f"give the 40 characters that `flexsheet keys show {name}` prints",
                 )
             )
         elif seen.setdefault(host.key, name) != name:
             problems.append(
                 document.problem(
-                    where, f'is the key of host "{seen[host.key]}" too', "each host has its own"
+                    where,
+                    f'is also the key of host "{seen[host.key]}"',
+                    "give each host its own key",
                 )
             )
 
 
 def load_keys(path: Path) -> dict[str, str]:
-    """The public key of each host in a launch file, which may have changed since it was started.
+    """Read the public key of each host from a launch file, which may have changed since the start.
 
     Raises BadInputError.
     """
@@ -97,12 +105,12 @@ def load_keys(path: Path) -> dict[str, str]:
 
 
 def launcher_on(host: str) -> str:
-    """The launcher of a host, as a writer."""
+    """Return the writer name of a host's launcher."""
     return LAUNCHER if host == MAIN else f"{LAUNCHER}_{host}"
 
 
 def clock_node(host: str) -> str:
-    """The node that measures the other hosts' clocks for a host."""
+    """Return the name of the node that measures the other hosts' clocks for a host."""
     return f"clock_{host}"
 
 

@@ -1,4 +1,4 @@
-"""What a launch file may say, and what the command line says over it."""
+"""Define the keys of launch files, and apply the options of the command line to them."""
 
 from __future__ import annotations
 
@@ -15,40 +15,43 @@ from flexsheet.launch.plans.documents import (
     did_you_mean,
     parse_value,
 )
-from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, Strict
+from flexsheet.launch.plans.plan_model import MAIN, RestartSpec, StrictModel
 from flexsheet.nodes import NodeRole, UnknownNodeError, node_class
 from flexsheet.nodes.node import role_of
 
 RECORDER_NICE = 5
-"""What it reads waits for it in queues; nothing else waits."""
+"""The recorder's messages wait in queues, so its delay affects no other node."""
 
 CONSOLE_NICE = 10
-"""Who looks on must not slow what is looked at."""
+"""Displays must not slow the nodes that they display."""
 
 RECORDINGS = Path("runs") / "%Y%m%d-%H%M%S.mcap"
-"""Where a recorder that waits for the console puts its bags, from where the command was given."""
+"""Path of the bags that the console records, relative to the working folder."""
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$", max_length=32)]
 
 
-class HostSpec(Strict):
-    """One computer."""
+class HostSpec(StrictModel):
+    """Configure one computer."""
 
-    address: str = Field(description="IP address that its nodes listen on")
-    key: str | None = Field(default=None, description="its public key: flexsheet keys show")
+    address: str = Field(description="IP address on which its nodes listen")
+    key: str | None = Field(
+        default=None, description="public key, as flexsheet keys show prints it"
+    )
     may_reset_estop: bool | None = Field(
-        default=None, description="whether its nodes may; null: on the main host alone"
+        default=None,
+        description="whether its nodes may reset an e-stop; null: only on the main host",
     )
 
 
-class NodeSpec(Strict):
-    """One node as the launch file has it."""
+class NodeSpec(StrictModel):
+    """Configure one node."""
 
-    type: str = Field(description='a name of the table of nodes, or "module:Class"')
+    type: str = Field(description='name of a node type, or "module:Class"')
     host: str = MAIN
     parameters: dict[str, Any] = Field(default={})
     topics: dict[str, str | None] = Field(
-        default={}, description="port: topic, where they differ; null leaves a port unconnected"
+        default={}, description="topic by port, if the names differ; null disconnects a port"
     )
     restart: RestartSpec = RestartSpec()
     start_deadline_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
@@ -56,37 +59,42 @@ class NodeSpec(Strict):
         default=15.0,
         ge=2.0,
         allow_inf_nan=False,
-        description="a node without a sign of life for so long hangs and is killed; null: never",
+        description="a node without a heartbeat for this time is killed as hung; null: never",
     )
     nice: int = Field(
         default=0,
         ge=-20,
         le=19,
-        description="how much it gives way to others on a busy computer; below 0: it takes "
-        "precedence, where the user may give it",
+        description="niceness of the process; below 0 it takes precedence, if the user may set it",
     )
 
 
-class ClocksSpec(Strict):
-    """What is asked of the hosts' clocks where there are several; see docs/clocks.md."""
+class ClocksSpec(StrictModel):
+    """Configure the required accuracy of the hosts' clocks; see docs/clocks.md."""
 
     max_offset_uncertainty_s: float = Field(
-        default=0.005, gt=0, allow_inf_nan=False, description="beyond it the arms do not move"
+        default=0.005,
+        gt=0,
+        allow_inf_nan=False,
+        description="with a larger uncertainty the arms do not move",
     )
     max_drift_ratio: float = Field(
-        default=5e-4, gt=0, lt=0.1, description="by how much one clock may gain on another"
+        default=5e-4,
+        gt=0,
+        lt=0.1,
+        description="maximum relative drift of one clock against another",
     )
-    rate_hz: float = Field(default=8.0, ge=1, le=100, description="of the pings")
+    rate_hz: float = Field(default=8.0, ge=1, le=100, description="rate of the clock pings")
 
 
-class LaunchFile(Strict):
-    """A launch file's keys."""
+class LaunchFile(StrictModel):
+    """Define the keys of a launch file."""
 
-    scene: str | None = Field(default=None, description="scene file, relative to this one")
+    scene: str | None = Field(default=None, description="scene file, relative to the launch file")
     hosts: dict[Name, HostSpec] = Field(default={MAIN: HostSpec(address="127.0.0.1")})
     nodes: dict[Name, NodeSpec]
     external_topics: list[str] = Field(
-        default=[], description="topics that a tool writes into the graph, as `bag play` does"
+        default=[], description="topics that tools such as `bag play` write"
     )
     clocks: ClocksSpec = ClocksSpec()
     record: dict[str, Any] | None = Field(
@@ -99,7 +107,9 @@ def apply_setting(document: Document, setting: str) -> None:
     target, equals, text = setting.partition("=")
     node, dot, parameter = target.partition(".")
     if not (equals and dot and node and parameter):
-        raise BadInputError([Problem(origin, (), "is not a setting", "write node.parameter=value")])
+        raise BadInputError(
+            [Problem(origin, (), "has no node, parameter or value", "write node.parameter=value")]
+        )
     names = document.values.get("nodes")
     known = list(names) if isinstance(names, dict) else []
     inner = tuple(parameter.split("."))
@@ -108,17 +118,23 @@ def apply_setting(document: Document, setting: str) -> None:
     except YAMLError as error:
         reason = str(error).splitlines()[0]
         raise BadInputError(
-            [Problem(origin, (), f'"{text}" is not a value in YAML: {reason}', "quote it?")]
+            [Problem(origin, (), f'"{text}" is not a value in YAML: {reason}', "quote the value")]
         ) from error
     if node in known:
         if not isinstance(document.values["nodes"][node], dict):
-            raise BadInputError([document.problem(("nodes", node), "holds no keys")])
+            raise BadInputError(
+                [
+                    document.problem(
+                        ("nodes", node), "is not a mapping", "write the node's keys below it"
+                    )
+                ]
+            )
         document.set(("nodes", node, "parameters", *inner), value, origin)
     elif node == "recorder" and "record" in document.values:
         document.set(("record", *inner), value, origin)
     else:
         raise BadInputError(
-            [Problem(origin, (), f'there is no node "{node}"', did_you_mean(node, known))]
+            [Problem(origin, (), f'unknown node "{node}"', did_you_mean(node, known))]
         )
 
 
@@ -126,11 +142,11 @@ def apply_record(document: Document, bag: Path) -> None:
     origin = f"--record {bag}"
     if bag.exists():
         raise BadInputError(
-            [Problem(origin, (), "exists already", "a bag is never written over; name another")]
+            [Problem(origin, (), "exists already", "name a new file; bags are never overwritten")]
         )
     names = document.values.get("nodes")
     for name, spec in names.items() if isinstance(names, dict) else ():
-        if isinstance(spec, dict) and _role(spec.get("type")) is NodeRole.RECORDER:
+        if isinstance(spec, dict) and _find_role(spec.get("type")) is NodeRole.RECORDER:
             document.set(("nodes", name, "parameters", "bag"), str(bag), origin)
             return
     document.set(("record", "bag"), str(bag), origin)
@@ -140,7 +156,7 @@ def apply_console(document: Document) -> None:
     origin = "--console"
     nodes = document.values.get("nodes")
     specs = [one for one in nodes.values() if isinstance(one, dict)] if nodes else []
-    roles = {_role(spec.get("type")) for spec in specs}
+    roles = {_find_role(spec.get("type")) for spec in specs}
     if NodeRole.CONSOLE not in roles:
         added: dict[str, Any] = {"type": "console", "nice": CONSOLE_NICE}
         if NodeRole.FINGER_SIMULATOR not in roles:
@@ -152,8 +168,8 @@ def apply_console(document: Document) -> None:
         document.set(("nodes", "recorder"), recorder, origin)
 
 
-def _role(type_name: object) -> NodeRole | None:
-    """The role of a node type; None also for one that resolving will report as unknown."""
+def _find_role(type_name: object) -> NodeRole | None:
+    """Return the role of a node type; None if it has none or cannot be imported."""
     try:
         return role_of(node_class(str(type_name)))
     except (UnknownNodeError, ImportError, AttributeError, TypeError):

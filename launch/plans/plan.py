@@ -65,10 +65,10 @@ def load_graph(
 ) -> ResolvedGraph:
     """Read, check and resolve a launch file.
 
-    settings: "node.parameter=value" each, value in YAML, over what the file says.
-    record: a bag to record to, over what the file says.
-    console: add a console, and a recorder that waits for its word, where the file has none.
-    Raises BadInputError with everything that is wrong.
+    settings: "node.parameter=value" each, with a YAML value; they override the file.
+    record: bag to record to; it overrides the file.
+    console: add a console and a paused recorder, unless the file has them.
+    Raises BadInputError with all errors of the file.
     """
     document = read_document(path)
     if record is not None:
@@ -95,7 +95,7 @@ def load_graph(
     addresses = {name: host.address for name, host in spec.hosts.items()}
     endpoints = make_endpoints(writers, addresses)
     nodes = {
-        entry.name: _planned(entry, endpoints, document, resolve_paths=True) for entry in entries
+        entry.name: _make_node(entry, endpoints, document, resolve_paths=True) for entry in entries
     }
     scene_values = None if scene is None else scene.model_dump(mode="json")
     resetters = tuple(
@@ -108,7 +108,7 @@ def load_graph(
         "estop_resetters": resetters,
         "scene": scene_values,
         "nodes": [
-            _planned(entry, endpoints, document, resolve_paths=False).model_dump(mode="json")
+            _make_node(entry, endpoints, document, resolve_paths=False).model_dump(mode="json")
             for entry in sorted(entries, key=lambda entry: entry.name)
         ],
     }
@@ -136,7 +136,7 @@ def _load_scene(
     if not path.is_file():
         problems.append(
             document.problem(
-                ("scene",), f'"{spec.scene}" is no file', f"it is looked for at {path}"
+                ("scene",), f'"{spec.scene}" does not exist', f"create {path} or correct the name"
             )
         )
         return None, None
@@ -153,7 +153,7 @@ def load_scene(path: Path) -> Scene:
     return scene_from_document(read_document(path))
 
 
-def _planned(
+def _make_node(
     entry: NodeEntry,
     endpoints: dict[str, tuple[Writer, ...]],
     document: Document,
@@ -161,7 +161,7 @@ def _planned(
     resolve_paths: bool,
 ) -> ResolvedNode:
     host = entry.spec.host
-    assert entry.type is not None  # a entry without a class is a problem
+    assert entry.type is not None  # otherwise the load has failed
     assert entry.parameters is not None
     parameters = dump_parameters(entry, document, resolve_paths=resolve_paths)
     return ResolvedNode(

@@ -1,7 +1,7 @@
-"""A resolved launch file: what is started where, and where each topic is read.
+"""Define the resolved form of a launch file: its nodes, their hosts, and the topics' endpoints.
 
-Apart from what resolves it (`launch.plans.plan`), because tools that look into a graph that runs
-need no more than this, and start at once.
+The module is separate from the resolver (`launch.plans.plan`), so that tools which inspect a
+running graph start fast.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes import NodeRole
 
 MAIN = "main"
-"""The host of the launcher's own topics, of the recorder and of the command-line tools."""
+"""Host of the launcher's own topics, the recorder and the command-line tools."""
 
 LAUNCHER, TOOLS = "launch", "tools"
-"""Writers that are no nodes: the launching process, and command-line tools and experiments."""
+"""Writers that are not nodes: the launcher, and command-line tools with experiments."""
 
 RUN_DIRECTORY = "@run"
-"""Stands for the run's directory in endpoints and parameters; known only when the run starts."""
+"""Placeholder of the run's directory in endpoints and parameters until the run starts."""
 
 
 ROLES_OF_TYPES = {
@@ -34,22 +34,24 @@ ROLES_OF_TYPES = {
     "renderer": NodeRole.RENDERER,
     "twin_finger": NodeRole.FINGER_SIMULATOR,
 }
-"""Roles of the node types that plans in bags name, from before plans held roles."""
+"""Roles by node type, for plans in older bags that have no roles."""
 
 
 OLD_CALIBRATIONS = ("calibration", "sheet_calibration")
-"""Parameters that hold calibration files in plans from before plans listed calibrations."""
+"""Names of calibration parameters, for plans in older bags that list no calibrations."""
 
 
-class Strict(LimitedModel):
+class StrictModel(LimitedModel):
+    """Base of immutable models that refuse unknown keys."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class RestartSpec(Strict):
-    """What happens when a node's process ends by itself.
+class RestartSpec(StrictModel):
+    """Configure what happens when a node's process ends by itself.
 
-    The delay doubles from `delay_s` with each restart inside the window, up to `max_delay_s`; after
-    `max_restarts` in `window_s` the node has failed for good and the whole run ends.
+    The delay doubles from `delay_s` with each restart inside the window, up to `max_delay_s`.
+    After `max_restarts` in `window_s` the node has failed, and the run ends.
     """
 
     policy: Literal["never", "on_failure", "always"] = "on_failure"
@@ -59,8 +61,8 @@ class RestartSpec(Strict):
     window_s: float = Field(default=60.0, gt=0, allow_inf_nan=False)
 
 
-class Writer(Strict):
-    """One writer of a topic and what it binds: ipc for its own host, tcp for the others."""
+class Writer(StrictModel):
+    """One writer of a topic, and the endpoints it binds: ipc for its own host, tcp for others."""
 
     name: str
     host: str
@@ -77,21 +79,21 @@ class Writer(Strict):
         return self.tcp
 
     def source_for(self, host: str) -> Source:
-        """Where a subscriber on `host` connects to, and whose words alone it takes there."""
+        """Return the endpoint for a subscriber on `host`, with the writer that it accepts."""
         far = host != self.host and self.tcp is not None
         return Source(self.endpoint_for(host), self.name, self.host if far else None)
 
 
-class ResolvedPort(Strict):
-    """A port, its topic, and the endpoints: bound for an output, connected to for an input."""
+class ResolvedPort(StrictModel):
+    """A port with its topic and endpoints: an output binds them, an input connects to them."""
 
     port: str
     topic: str
     endpoints: tuple[str, ...]
 
 
-class ResolvedNode(Strict):
-    """All that is needed to start one node."""
+class ResolvedNode(StrictModel):
+    """Everything needed to start one node."""
 
     name: str
     type: str
@@ -108,12 +110,12 @@ class ResolvedNode(Strict):
     device_files: tuple[str, ...] = Field(default=(), description="paths that the node opens")
     calibrations: dict[str, str] = Field(default={}, description="file by parameter")
     role: NodeRole | None = Field(default=None, description="declared by the node's class")
-    liveness_s: float | None = Field(default=None, description="none in bags from before")
-    nice: int = Field(default=0, description="bags from before there was one have none")
+    liveness_s: float | None = Field(default=None, description="older bags have none")
+    nice: int = Field(default=0, description="older bags have none")
 
     @property
     def arm_side(self) -> str | None:
-        """Which arm's state the node publishes, "left" or "right"; None: of none."""
+        """Return the side of the arm whose state the node publishes, or None."""
         sides = {"arm_left": "left", "arm_right": "right"}
         return next((sides[port.topic] for port in self.outputs if port.topic in sides), None)
 
@@ -135,7 +137,7 @@ class ResolvedNode(Strict):
         return {**derived, **values}
 
 
-class ResolvedGraph(Strict):
+class ResolvedGraph(StrictModel):
     """A resolved launch file."""
 
     launch_file: str
@@ -146,24 +148,26 @@ class ResolvedGraph(Strict):
     hosts: dict[str, str] = Field(description="address by name")
     nodes: dict[str, ResolvedNode]
     writers: dict[str, tuple[Writer, ...]] = Field(description="by topic")
-    keys: dict[str, str] = Field(default={}, description="public key by host; no part of the hash")
-    estop_resetters: tuple[str, ...] = Field(default=(MAIN,), description="hosts that may")
+    keys: dict[str, str] = Field(default={}, description="public key by host; not part of the hash")
+    estop_resetters: tuple[str, ...] = Field(
+        default=(MAIN,), description="hosts that may reset an e-stop"
+    )
     hash: str
 
     def writer(self, topic: str, name: str) -> Writer | None:
-        """The writer `name` of `topic`; None when it may not write it."""
+        """Return the writer `name` of `topic`; None if it may not write it."""
         return next((one for one in self.writers.get(topic, ()) if one.name == name), None)
 
     def endpoints_to_read(self, topic: str, host: str = MAIN) -> tuple[str, ...]:
-        """Where a subscriber of `topic` on `host` connects to."""
+        """Return the endpoints for a subscriber of `topic` on `host`."""
         return tuple(writer.endpoint_for(host) for writer in self.writers.get(topic, ()))
 
     def sources_to_read(self, topic: str, host: str = MAIN) -> tuple[Source, ...]:
-        """The same, with who may write there."""
+        """Return the endpoints for a subscriber of `topic` on `host`, with their writers."""
         return tuple(writer.source_for(host) for writer in self.writers.get(topic, ()))
 
     def may_reset_estop(self) -> tuple[str, ...]:
-        """Writers of e-stops whose hosts may reset one."""
+        """Return the writers of e-stops that may reset one."""
         return tuple(
             writer.name
             for writer in self.writers.get("estop", ())
@@ -171,11 +175,11 @@ class ResolvedGraph(Strict):
         )
 
     def nodes_on(self, host: str | None) -> list[ResolvedNode]:
-        """The nodes of one host, or of all."""
+        """Return the nodes of one host, or of all."""
         return [node for node in self.nodes.values() if host is None or node.host == host]
 
     def listening_nodes(self, host: str | None) -> list[tuple[str, int]]:
-        """(node, TCP port) for each port on which a node itself listens."""
+        """Return (node, TCP port) for each port on which a node itself listens."""
         return [(node.name, port) for node in self.nodes_on(host) for port in node.listen_ports]
 
     def scene_message(self) -> Scene | None:
@@ -183,5 +187,5 @@ class ResolvedGraph(Strict):
 
 
 def tools_on(host: str) -> str:
-    """The command-line tools of a host, as a writer."""
+    """Return the writer name of the command-line tools on a host."""
     return TOOLS if host == MAIN else f"{TOOLS}_{host}"

@@ -1,4 +1,4 @@
-"""The nodes of a launch file under check: class, ports with their topics, parameters."""
+"""Resolve the nodes of a launch file: class, ports with their topics, parameters."""
 
 from __future__ import annotations
 
@@ -36,14 +36,17 @@ from flexsheet.nodes.node import (
 from flexsheet.nodes.parameter_marks import ParameterMark, find_marked
 
 RUN_FILES = ("plan", "git", "launcher")
-"""What a run's directory has files of, beside one named after each node."""
+"""Files of a run's directory besides those named after nodes."""
 
-_PARAMETERS_THEMSELVES: tuple[Key, ...] = (("record",), ("clocks",))
-"""Keys of the launch file that hold a node's parameters; other nodes have them one key deeper."""
+_PARAMETER_SECTIONS: tuple[Key, ...] = (("record",), ("clocks",))
+"""Keys that hold the parameters of a node; other nodes have a key `parameters`."""
 
 
 class NodeEntry:
-    """A node under check: its spec, class, ports with their topics, and validated parameters."""
+    """Collect what is known of a node while its launch file is checked.
+
+    type, parameters: None until they are resolved.  ports, unconnected: ports with their topics.
+    """
 
     def __init__(self, name: str, spec: NodeSpec, key: Key) -> None:
         self.name, self.spec, self.key = name, spec, key
@@ -76,7 +79,9 @@ def collect_entries(
         taken = (*map(tools_on, spec.hosts), *map(clock_node, spec.hosts), TOOLS, *RUN_FILES)
         if name in taken or name.partition("_")[0] == LAUNCHER:
             problems.append(
-                document.problem(("nodes", name), f'"{name}" is taken', "give another name")
+                document.problem(
+                    ("nodes", name), f'the name "{name}" is reserved', "choose another name"
+                )
             )
         if node_spec.host not in spec.hosts:
             problems.append(
@@ -87,14 +92,14 @@ def collect_entries(
                 )
             )
     if not entries:
-        problems.append(document.problem(("nodes",), "there is no node", "add one"))
+        problems.append(document.problem(("nodes",), "the graph has no node", "add a node"))
     if spec.record is not None:
         if "recorder" in spec.nodes:
             problems.append(
                 document.problem(
                     ("record",),
-                    'there is a node "recorder" already',
-                    'keep either "record" or the node',
+                    'the graph has a node "recorder" already',
+                    'remove either "record" or the node',
                 )
             )
         else:
@@ -116,7 +121,7 @@ def _clock_entry(host: str, clocks: ClocksSpec) -> NodeEntry:
 
 
 def resolve_entry(entry: NodeEntry, document: Document, problems: list[Problem]) -> None:
-    """Find the entry's class, connect its ports to topics, check its parameters."""
+    """Find the node's class, connect its ports to topics, and check its parameters."""
     key = entry.key
     type_name = entry.spec.type
     try:
@@ -133,29 +138,37 @@ def resolve_entry(entry: NodeEntry, document: Document, problems: list[Problem])
     except (ImportError, AttributeError, SyntaxError) as error:
         problems.append(
             document.problem(
-                (*key, "type"), f'"{type_name}" cannot be imported: {error}', "see flexsheet doctor"
+                (*key, "type"),
+                f'"{type_name}" cannot be imported: {error}',
+                "check the Python path and flexsheet doctor",
             )
         )
         return
     if not (isinstance(class_, type) and issubclass(class_, Node)):
-        problems.append(document.problem((*key, "type"), f'"{type_name}" is no node class'))
+        problems.append(
+            document.problem(
+                (*key, "type"),
+                f'"{type_name}" is not a node class',
+                "name a class that derives from Node",
+            )
+        )
         return
     entry.type = class_
     _connect_ports(entry, class_, document, problems)
 
-    parameters_key = key if key in _PARAMETERS_THEMSELVES else (*key, "parameters")
+    parameters_key = key if key in _PARAMETER_SECTIONS else (*key, "parameters")
     try:
         entry.parameters = parameters_of(class_).model_validate(entry.spec.parameters)
     except ValidationError:
-        _put(document, parameters_key, entry.spec.parameters)
+        _ensure_key(document, parameters_key, entry.spec.parameters)
         try:
             validate(parameters_of(class_), document, at=parameters_key)
         except BadInputError as error:
             problems.extend(error.problems)
 
 
-def _put(document: Document, key: Key, value: dict[str, Any]) -> None:
-    """Make sure that `key` is there to be checked (a node without parameters has no such key)."""
+def _ensure_key(document: Document, key: Key, value: dict[str, Any]) -> None:
+    """Insert `value` at `key` unless the document has that key already."""
     target: Any = document.values
     for part in key[:-1]:
         target = target[part]
@@ -196,7 +209,7 @@ def _connect_ports(
                 document.problem(
                     key,
                     f'port "{port.name}" is not connected',
-                    f'say in "topics" which it is: {names or "no topic fits"}',
+                    f'name its topic in "topics": {names or "no topic has this type"}',
                 )
             )
         elif topic.message is not port.message:
@@ -266,12 +279,15 @@ def check_calibrations(
 
 
 def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool) -> dict[str, Any]:
-    """The parameters in full, defaults too; paths that the file gives are relative to the file."""
-    assert entry.parameters is not None  # a entry without parameters is a problem
+    """Return all parameters of a node as JSON values, defaults included.
+
+    resolve_paths: make paths absolute; those of the file are relative to the file.
+    """
+    assert entry.parameters is not None  # otherwise the load has failed
     values = entry.parameters.model_dump(mode="json")
     if not resolve_paths:
         return values
-    section = entry.key if entry.key in _PARAMETERS_THEMSELVES else (*entry.key, "parameters")
+    section = entry.key if entry.key in _PARAMETER_SECTIONS else (*entry.key, "parameters")
     for name in entry.parameters.model_fields_set:
         base = _base(document, (*section, name))
         values[name] = _with_absolute_paths(getattr(entry.parameters, name), values[name], base)
@@ -279,12 +295,12 @@ def dump_parameters(entry: NodeEntry, document: Document, *, resolve_paths: bool
 
 
 def _base(document: Document, key: Key) -> Path:
-    """What paths at `key` are relative to: the file, or where the command was given."""
+    """Return the folder to which paths at `key` are relative: the file's, or the working folder."""
     return Path.cwd() if key in document.overrides else document.path.parent
 
 
 def _with_absolute_paths(value: Any, dumped: Any, base: Path) -> Any:
-    """`dumped`, the plain form of `value`, with each path in it made absolute from `base`."""
+    """Return `dumped`, the JSON form of `value`, with its paths made absolute from `base`."""
     if isinstance(value, Path):
         return _absolute(value, base)
     if isinstance(value, BaseModel):

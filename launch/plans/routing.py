@@ -1,4 +1,4 @@
-"""Who writes which topic, who reads it, and at which endpoint."""
+"""Assign writers, readers and endpoints to topics."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from flexsheet.launch.plans.plan_model import LAUNCHER, MAIN, RUN_DIRECTORY, TOO
 from flexsheet.launch.plans.resolve_nodes import NodeEntry
 from flexsheet.messages.topics import TOPICS
 
-SAID_FROM_ANYWHERE = ("estop",)
-"""What tools on the other hosts may write too: a stop, by whoever stands beside the arm."""
+WRITABLE_ON_ALL_HOSTS = ("estop",)
+"""Topics that tools on every host may write, so that a stop is possible beside each arm."""
 
-LAUNCHERS_TOPICS = ("host", "estop")
-"""What the launcher of each host writes: how the host is, and an e-stop that it keeps."""
+LAUNCHER_TOPICS = ("host", "estop")
+"""Topics that the launcher of each host writes."""
 
-FIRST_PORT, PORTS = 20_000, 10_000
-"""TCP ports lie below the range that Linux gives to outgoing connections (32768 and up)."""
+FIRST_PORT, PORT_COUNT = 20_000, 10_000
+"""TCP ports lie below the range of outgoing connections on Linux (32768 and above)."""
 
 
 def list_writers(
@@ -31,7 +31,7 @@ def list_writers(
     *,
     has_scene: bool,
 ) -> dict[str, list[tuple[str, str]]]:
-    """(writer, host) of every topic, in the order of the file."""
+    """Return the (writer, host) pairs of every topic, in the order of the file."""
     writers: dict[str, list[tuple[str, str]]] = {}
     has_editor = any(topic.name == "scene" for one in entries for _, topic in one.topics("output"))
     if has_scene and not has_editor:
@@ -44,7 +44,7 @@ def list_writers(
                     document.problem(
                         (*entry.key, "topics", port_name),
                         f'topic "{topic.name}" is written by "{others[0]}" already',
-                        "a topic has one writer",
+                        "connect one of the two ports to another topic, or to null",
                     )
                 )
             else:
@@ -63,17 +63,17 @@ def list_writers(
                 document.problem(
                     ("external_topics", i),
                     f'topic "{name}" is written by "{writers[name][0][0]}" already',
-                    "a topic has one writer",
+                    "remove it from external_topics, or remove the node",
                 )
             )
         elif not TOPICS[name].many_writers:
             writers[name] = [(TOOLS, MAIN)]
-    for name, host in product(LAUNCHERS_TOPICS, spec.hosts):
+    for name, host in product(LAUNCHER_TOPICS, spec.hosts):
         writers.setdefault(name, []).append((launcher_on(host), host))
     for topic in TOPICS.values():
         if topic.many_writers and topic.open_to_tools:
             writers.setdefault(topic.name, []).append((TOOLS, MAIN))
-    for name, host in product(SAID_FROM_ANYWHERE, spec.hosts):
+    for name, host in product(WRITABLE_ON_ALL_HOSTS, spec.hosts):
         if host != MAIN:
             writers.setdefault(name, []).append((tools_on(host), host))
     return writers
@@ -85,7 +85,7 @@ def resolve_further_inputs(
     document: Document,
     problems: list[Problem],
 ) -> None:
-    """Ask the entries that subscribe by their parameters (the recorder) which topics they want."""
+    """Add the inputs of nodes whose topics depend on their parameters, such as the recorder."""
     written = [topic for topic in TOPICS.values() if topic.name in writers]
     for entry in entries:
         if entry.type is None or entry.parameters is None:
@@ -128,9 +128,9 @@ def check_inputs(
 def make_endpoints(
     writers: dict[str, list[tuple[str, str]]], addresses: dict[str, str]
 ) -> dict[str, tuple[Writer, ...]]:
-    """The endpoints of every writer: ipc for its host, tcp where there are others.
+    """Return the endpoints of every writer: ipc for its own host, tcp for other hosts.
 
-    Each topic can be read on each host, for the tools there; nothing is sent to who does not ask.
+    Each topic can be read on each host; nothing is sent without a subscriber.
     """
     far = sorted(
         (host, writer, topic)
@@ -138,14 +138,14 @@ def make_endpoints(
         for writer, host in entries
         if addresses.keys() - {host}
     )
-    ports = _ports(far)
+    ports = _assign_ports(far)
     return {
         topic: tuple(
             Writer(
                 name=writer,
                 host=host,
                 ipc=f"ipc://{RUN_DIRECTORY}/{writer}.{topic.replace('/', '.')}",
-                tcp=_tcp(addresses[host], ports.get((host, writer, topic))),
+                tcp=_make_tcp_endpoint(addresses[host], ports.get((host, writer, topic))),
             )
             for writer, host in entries
         )
@@ -153,24 +153,23 @@ def make_endpoints(
     }
 
 
-def _tcp(address: str, port: int | None) -> str | None:
+def _make_tcp_endpoint(address: str, port: int | None) -> str | None:
     if port is None:
         return None
     return f"tcp://[{address}]:{port}" if ":" in address else f"tcp://{address}:{port}"
 
 
-def _ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
-    """A TCP port for each (host, writer, topic), from the hash of its name.
+def _assign_ports(links: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
+    """Return a TCP port for each (host, writer, topic), from the hash of its name.
 
-    Two that fall on one port are told apart in the order of their names, so that adding a topic
-    moves no other's port unless they meet.  Ports are unique over all hosts: hosts may share a
-    machine.
+    Collisions are resolved in the order of the names, so that a new topic changes no other port
+    unless the two collide.  Ports are unique over all hosts, as hosts may share a computer.
     """
     taken: dict[int, tuple[str, str, str]] = {}
     for link in links:
         digest = hashlib.sha256("/".join(link).encode()).digest()
-        offset = int.from_bytes(digest[:4], "big") % PORTS
+        offset = int.from_bytes(digest[:4], "big") % PORT_COUNT
         while FIRST_PORT + offset in taken:
-            offset = (offset + 1) % PORTS
+            offset = (offset + 1) % PORT_COUNT
         taken[FIRST_PORT + offset] = link
     return {link: port for port, link in taken.items()}

@@ -1,4 +1,4 @@
-"""What a node's process does first: it ends with its launcher, and gives way as it is told."""
+"""Set up a node's process: it ends with its launcher and takes the configured niceness."""
 
 from __future__ import annotations
 
@@ -12,26 +12,28 @@ from pathlib import Path
 
 PARENT_VARIABLE = "FLEXSHEET_PARENT"
 LIFELINE_VARIABLE = "FLEXSHEET_LIFELINE"
-"""File descriptor of a pipe that nobody writes to: it reads as closed when the launcher is gone."""
+"""File descriptor of a pipe without writes; it reads as closed once the launcher is gone."""
 
 NICE_VARIABLE = "FLEXSHEET_NICE"
 
 AUTOGROUP = Path("/proc/self/autogroup")
-"""Where Linux weighs sessions against one another, a process's own niceness counts for little: each
-node is a session of its own, and the session has to be told."""
+"""Linux schedules sessions against each other by this niceness.
+
+Each node is a session of its own, so the niceness of its process alone has little effect.
+"""
 
 AUTOGROUP_TRIES, AUTOGROUP_WAIT_S = 20, 0.11
-"""Without privileges the kernel lets one be told in a tenth of a second, of all that ask."""
+"""Without privileges the kernel accepts one write in 0.1 s, over all processes."""
 
 GRACE_S = 3.0
 _PR_SET_PDEATHSIG = 1
 
 
 def exit_with_parent() -> None:
-    """End with the launcher, however it ends: asked to first, killed after `GRACE_S`.
+    """End this process when its launcher ends: SIGTERM first, SIGKILL after `GRACE_S`.
 
-    The kernel's death signal reaches a process that hangs in its loop; the lifeline's thread also
-    kills one that does not listen, with all that it started.
+    The kernel's death signal also ends a process whose loop hangs.  The lifeline's thread kills a
+    process that ignores the signal, with all that it started.
     """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None:
@@ -40,10 +42,12 @@ def exit_with_parent() -> None:
     if os.getppid() != int(parent):
         sys.exit("the launcher is gone")
     lifeline = int(os.environ[LIFELINE_VARIABLE])
-    threading.Thread(target=_end_with, args=(lifeline,), name="lifeline", daemon=True).start()
+    threading.Thread(
+        target=_end_with_lifeline, args=(lifeline,), name="lifeline", daemon=True
+    ).start()
 
 
-def _end_with(lifeline: int) -> None:
+def _end_with_lifeline(lifeline: int) -> None:
     os.read(lifeline, 1)
     os.kill(os.getpid(), signal.SIGTERM)
     time.sleep(GRACE_S)
@@ -51,9 +55,9 @@ def _end_with(lifeline: int) -> None:
 
 
 def apply_niceness() -> None:
-    """Be nicer than the launcher by what the launcher allows this node, and so its session.
+    """Add the niceness that the launcher gives this node to the process and its session.
 
-    Less than 0 takes precedence.  OSError where the system does not let it.
+    A negative niceness takes precedence.  Raises OSError if the system does not permit it.
     """
     nice = int(os.environ.get(NICE_VARIABLE, "0"))
     if nice == 0:

@@ -2,8 +2,8 @@
 
 Linux counts for each thread how long it was ready to run but did not (`/proc/PID/schedstat`).  The
 main thread of a node runs its loop, so its waiting delays all that the node does.  Counters of the
-whole system (load, /proc/pressure) also count programs that wait because they give way to others,
-and therefore do not say whether nodes are late.
+whole system (load, /proc/pressure) also count programs of high niceness, which wait by design;
+they therefore do not show whether nodes are late.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from pathlib import Path
 from flexsheet.messages.types import CpuPressure, ProgramCpu
 
 MAX_WAIT_RATIO = 0.25
-"""Fraction of the time for which a node may wait; beyond it the computer is called busy."""
+"""Fraction of the time that a node may wait; above it the computer is busy."""
 
 WINDOW_S = 3.0
 BACKGROUND_NICE = 10
-"""Nodes of this niceness and above give way to all others: that they wait says nothing."""
+"""Nodes of this niceness or more wait by design and are not counted."""
 
-PROGRAMS_SHOWN = 3
+MAX_PROGRAMS = 3
 MIN_CORES = 0.1
 PROC = Path("/proc")
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
@@ -32,16 +32,16 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 @dataclass(frozen=True, slots=True)
 class Waits:
-    """The time waited so far (s) by process id, at one time (s)."""
+    """Hold the total waiting time (s) by process id at one time (s)."""
 
     time_s: float
     waited_s: dict[int, float]
 
 
 class CpuWatch:
-    """Compares the kernel's counters with those of WINDOW_S before; call `update` once a second.
+    """Compare the kernel's counters with those of WINDOW_S before; call `update` once a second.
 
-    proc: the folder of the kernel's counters.  now_s: a steady clock.
+    proc: folder of the kernel's counters.  now_s: monotonic clock.
     """
 
     def __init__(self, proc: Path = PROC, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -56,11 +56,11 @@ class CpuWatch:
         *,
         measure_programs: bool = False,
     ) -> CpuPressure | None:
-        """Return the pressure since the oldest sample of the window; None where it is unknown.
+        """Return the pressure since the oldest sample of the window; None if it is unknown.
 
-        watched: process ids, by node, of those whose waiting counts.  named: process ids of all
-        nodes, to call them by name among the programs; default: those that are watched.
-        measure_programs: even while the computer is not known to be busy.
+        watched: process ids by node, for the nodes whose waiting counts.  named: process ids of
+        all nodes, to name them among the programs; default: `watched`.
+        measure_programs: measure programs even if the computer is not busy.
         """
         now_s = self._now_s()
         counted = {pid: self._waited_s(pid) for pid in watched.values()}
@@ -86,15 +86,15 @@ class CpuWatch:
         return next((one for one in self._history if pid in one.waited_s), None)
 
     def _waited_s(self, pid: int) -> float | None:
-        """Return how long a process's main thread has waited so far; None where it is unknown."""
+        """Return how long a process's main thread has waited so far (s); None if it is unknown."""
         try:
             fields = (self._proc / str(pid) / "schedstat").read_text().split()
         except OSError:
-            return None  # it has just ended, or the kernel was built without these counters
+            return None  # the process has ended, or the kernel lacks these counters
         return int(fields[1]) * 1e-9
 
     def _programs(self, now_s: float, named: Mapping[str, int]) -> tuple[ProgramCpu, ...]:
-        """Return who takes most since the last call; nothing at the first of a busy time."""
+        """Return the programs that use most since the last call; none at the first call."""
         names = {pid: name for name, pid in named.items()}
         used = {(names.get(pid, program), pid): s for program, pid, s in self._cpu_times()}
         before, self._cpu_before = self._cpu_before, (now_s, used)
@@ -104,7 +104,7 @@ class CpuWatch:
         for key, seconds in used.items():
             if key in before[1]:
                 cores[key[0]] += (seconds - before[1][key]) / (now_s - before[0])
-        largest = sorted(cores.items(), key=lambda one: -one[1])[:PROGRAMS_SHOWN]
+        largest = sorted(cores.items(), key=lambda one: -one[1])[:MAX_PROGRAMS]
         return tuple(ProgramCpu(name=name, cores=one) for name, one in largest if one >= MIN_CORES)
 
     def _cpu_times(self) -> Iterator[tuple[str, int, float]]:
@@ -115,7 +115,7 @@ class CpuWatch:
             try:
                 text = (folder / "stat").read_text(errors="replace")
             except OSError:
-                continue  # it has just ended
+                continue  # the process has ended
             # The name is in brackets and may hold brackets; user and system time are fields 14, 15.
             head, _, tail = text.rpartition(")")
             user, system = tail.split()[11:13]

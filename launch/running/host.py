@@ -1,9 +1,9 @@
-"""What a launcher says of its host, and the e-stop that it keeps for nodes that come late.
+"""Publish the state of a host, and latch e-stops for nodes that start later.
 
-An e-stop is said by whoever sees the danger, and he may be gone when a bridge is started anew: a
-tool, a node that has crashed.  Each launcher therefore repeats the last one to its host's nodes, as
-a writer of its own, until one who may resets it.  Where arms wait for a person's word it is written
-down too, for the case that all launchers end.
+The writer of an e-stop (a tool, or a node that crashed) may be gone when a bridge restarts.  Each
+launcher therefore latches the last e-stop and repeats it to its host's nodes, as a writer of its
+own, until a permitted writer resets it.  With manual arming it also stores the e-stop in a file,
+in case all launchers end.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ from flexsheet.nodes.stop_socket import StopSocket
 PERIOD_S = 1.0
 BUSY_REPORT_PERIOD_S = 60.0
 REASON_LENGTH = 1000
-"""What is longer is cut: an e-stop must fit into every message that repeats it."""
+"""Longer reasons are cut: an e-stop must fit into every message that repeats it."""
 
 RESET_WITHIN_S = 5.0
-"""How long the arms have to say that a reset has been taken."""
+"""Time within which all arms must report that a reset was accepted."""
 
 ARMS = ("arm_left", "arm_right")
 
@@ -51,11 +51,11 @@ Sources = Callable[[list[Source]], tuple[Source, ...]]
 
 
 class HostAgent:
-    """The launcher's part in the graph, for one host; use between `start` and `close`.
+    """Publish the host's status and latch e-stops, between `start` and `close`.
 
-    endpoints, sources: fill in the run's directory.  code: the commit, for `HostStatus`.
-    run_directory: where the socket for e-stops is made; None: there is none.
-    pids: process ids by node of those that run now.
+    endpoints, sources: functions that fill in the run's directory.  code: commit for `HostStatus`.
+    run_directory: folder of the socket for e-stops; None for no socket.
+    pids: returns the process ids of the running nodes by node.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class HostAgent:
         self._sources = sources
         self._clock = SystemClock()
         self._name, self._epoch = launcher_on(host), self._clock.now_ns()
-        # Started anew, it learns from the others; what it knows already is no news from them.
+        # After a restart it learns the e-stop from other launchers, which repeat known ones, too.
         self._launchers = {launcher_on(name) for name in plan.hosts}
         self._sequence = {"host": 0, "estop": 0}
         self.publishers: dict[str, Publisher] = {}
@@ -94,7 +94,7 @@ class HostAgent:
                     on_refused=on_problem,
                 )
         self._clock_table = ClockTable(self._clock.id)
-        self._heard: list[Subscriber] = []
+        self._subscribers: list[Subscriber] = []
         self._task: asyncio.Task[None] | None = None
         self._kept: EStop | None = None
         self._engaged_ns = 0
@@ -105,14 +105,14 @@ class HostAgent:
             if run_directory is None
             else StopSocket(run_directory, "launcher", self._name, self._stop)
         )
-        self._unwritten = False
-        self._untold = ""
+        self._file_outdated = False
+        self._status_error = ""
         nodes = plan.nodes_on(host)
         self._devices, self._folder = list_device_files(nodes), recording_folder(nodes)
         self._background = {node.name for node in nodes if node.nice >= BACKGROUND_NICE}
 
     def start(self) -> None:
-        """Begin to listen and to speak; needs a running loop."""
+        """Subscribe and publish; needs a running event loop."""
         if self._stop_socket is not None:
             self._stop_socket.open()
         remembered = None if self._file is None else self._file.read()
@@ -127,15 +127,17 @@ class HostAgent:
             for source in self._plan.sources_to_read("estop", self._host)
             if source.writer != self._name
         ]
-        self._heard.append(self._hear("estop", others, self._latch_estop))
+        self._subscribers.append(self._subscribe("estop", others, self._latch_estop))
         measured = self._plan.writer("clocks", clock_node(self._host))
         if measured is not None:
             source = measured.source_for(self._host)
             take = self._clock_table.update
-            self._heard.append(self._hear("clocks", [source], lambda clocks, _: take(clocks)))
+            self._subscribers.append(
+                self._subscribe("clocks", [source], lambda clocks, _: take(clocks))
+            )
         self._task = asyncio.create_task(self._publish_loop(), name=f"host {self._host}")
 
-    def _hear(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
+    def _subscribe(self, topic: str, sources: list[Source], handler: Handler) -> Subscriber:
         subscriber = Subscriber(
             topic_named(topic),
             self._sources(sources),
@@ -149,21 +151,21 @@ class HostAgent:
         return subscriber
 
     def renew_keys(self, change: KeyChange) -> None:
-        """Take over keys that have been read anew."""
+        """Use reloaded keys."""
         for publisher in self.publishers.values():
             publisher.renew_keys(change)
-        for subscriber in self._heard:
+        for subscriber in self._subscribers:
             subscriber.renew_keys(change)
 
     async def close(self) -> None:
-        """Fall silent; may be called twice."""
+        """Stop publishing and close all sockets; may be called twice."""
         if self._stop_socket is not None:
             self._stop_socket.close()
         for task in (self._task, self._resetting):
             if task is not None:
                 task.cancel()
                 await asyncio.gather(task, return_exceptions=True)
-        for subscriber in self._heard:
+        for subscriber in self._subscribers:
             subscriber.close()
         for publisher in self.publishers.values():
             publisher.close()
@@ -201,7 +203,7 @@ class HostAgent:
         self._engaged_ns = max(self._engaged_ns, at_ns)
         self._publish("estop", self._kept)
         if known != self._kept:
-            self._write_down()
+            self._update_file()
 
     async def _reset(self, writer: str, kept: EStop) -> None:
         """Forget the e-stop once all arms say that they have: they refuse while they move."""
@@ -215,7 +217,7 @@ class HostAgent:
                 all_clear.set()
 
         arms = [
-            self._hear(topic, list(self._plan.sources_to_read(topic, self._host)), take)
+            self._subscribe(topic, list(self._plan.sources_to_read(topic, self._host)), take)
             for topic in stopped
         ]
         begun_ns = self._engaged_ns
@@ -237,10 +239,10 @@ class HostAgent:
             self._on_problem(f"e-stop reset by {writer}")
             self._kept = None
             self.publishers["estop"].forget()
-            self._write_down()
+            self._update_file()
 
-    def _write_down(self) -> None:
-        """Let the file be as what is kept; what fails is tried again."""
+    def _update_file(self) -> None:
+        """Write the latched e-stop to the file, or remove the file; repeat it later if it fails."""
         if self._file is None:
             return
         try:
@@ -249,7 +251,7 @@ class HostAgent:
             else:
                 self._file.write(self._kept)
         except OSError as error:
-            if not self._unwritten:
+            if not self._file_outdated:
                 after = (
                     "stands though it was reset" if self._kept is None else "knows nothing of it"
                 )
@@ -257,9 +259,9 @@ class HostAgent:
                     f"e-stop: {self._file.path} cannot be written ({error.strerror}); should all "
                     f"launchers end, the next start {after}"
                 )
-            self._unwritten = True
+            self._file_outdated = True
         else:
-            self._unwritten = False
+            self._file_outdated = False
 
     def _publish(self, topic: str, message: Message) -> None:
         if topic not in self.publishers:
@@ -284,12 +286,12 @@ class HostAgent:
                 self._publish("host", status)
                 self._report_busy(status)
             except OSError as error:
-                untold = f"how this host is cannot be told: {error}"
-                if untold != self._untold:
-                    self._on_problem(untold)
-                self._untold = untold
-            if self._unwritten:
-                self._write_down()
+                problem = f"the status of this host cannot be read: {error}"
+                if problem != self._status_error:
+                    self._on_problem(problem)
+                self._status_error = problem
+            if self._file_outdated:
+                self._update_file()
             await asyncio.sleep(PERIOD_S)
 
     def _report_busy(self, status: HostStatus) -> None:
@@ -303,7 +305,7 @@ class HostAgent:
     def _status(self) -> HostStatus:
         disk = os.statvfs(self._folder)
         processes, pids = self._processes(), self._pids()
-        # A node that starts imports for seconds and waits meanwhile; nothing of it is late yet.
+        # A starting node imports for seconds; its waiting delays no message yet.
         watched = {
             one.name: pids[one.name]
             for one in processes
@@ -336,7 +338,7 @@ def shows_estop(state: ArmState) -> bool:
 
 
 def list_arms(plan: ResolvedGraph) -> list[str]:
-    """List the plan's arms by the address of each; a bridge without one counts by its name."""
+    """Return the address of each arm; for a bridge without one, its host and name."""
     bridges = [node for node in plan.nodes.values() if node.role is NodeRole.ARM_BRIDGE]
     return [bridge.device_address or f"{bridge.host}/{bridge.name}" for bridge in bridges]
 
@@ -351,7 +353,7 @@ def python_version() -> str:
 
 
 def software() -> str:
-    """Versions of what all hosts should have alike."""
+    """Return the versions that all hosts should share."""
     try:
         own = version("flexsheet")
     except PackageNotFoundError:
@@ -365,7 +367,7 @@ def list_device_files(nodes: Sequence[ResolvedNode]) -> list[str]:
 
 
 def recording_folder(nodes: list[ResolvedNode]) -> Path:
-    """Where the host's recorder writes; the working folder where there is none, or not yet."""
+    """Return the folder of the recorder's bag; the working folder if there is none yet."""
     for node in nodes:
         if node.role is NodeRole.RECORDER:
             folder = Path(str(node.parameters["bag"])).parent

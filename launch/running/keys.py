@@ -1,8 +1,8 @@
-"""Where key pairs lie, how they come into a launch file, and what a run's processes are told.
+"""Store key pairs, install public keys in launch files, and pass keys to a run's processes.
 
-A host's secret key is a file of its name in `directory()`; its public key is `hosts.NAME.key` of
-the launch file.  A run's directory has, for each host of it that runs there, a file from which the
-host's processes take both.
+The secret key of a host is a file named after it in `directory()`; its public key is
+`hosts.NAME.key` of the launch file.  For each host that runs here, the run's directory holds a file
+from which the host's processes read both.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ KEYS_VARIABLE = "FLEXSHEET_KEYS"
 
 
 def directory() -> Path:
-    """Where this user's secret keys are."""
+    """Return the folder of this user's secret keys."""
     given = os.environ.get(KEYS_VARIABLE)
     if given:
         return Path(given)
@@ -39,7 +39,7 @@ def secret_file(host: str) -> Path:
 
 
 def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, KeyRing]:
-    """The keys of one host of a plan, or of all, checked; BadInputError."""
+    """Write and check the key files of one host, or of all.  Raises BadInputError."""
     rings = {}
     problems = []
     for name in plan.hosts if host is None else [host]:
@@ -55,15 +55,18 @@ def make_rings(plan: ResolvedGraph, run: Run, host: str | None) -> dict[str, Key
 
 
 class KeyWatch:
-    """Passes on to a run's processes what changes about the keys in its launch file."""
+    """Detect changes of the keys in a launch file, and pass them to a run's processes."""
 
     def __init__(self, plan: ResolvedGraph, run: Run, rings: dict[str, KeyRing]) -> None:
         self._launch_file, self._run, self._rings = Path(plan.launch_file), run, rings
         self._public = plan.keys
         self._read_ns = 0
 
-    def look(self) -> dict[str, KeyChange]:
-        """What has changed since the last look, by host; BadInputError, SecurityError, OSError."""
+    def read_changes(self) -> dict[str, KeyChange]:
+        """Return the changes since the last call, by host.
+
+        Raises BadInputError, SecurityError and OSError.
+        """
         changed_ns = self._launch_file.stat().st_mtime_ns
         if changed_ns != self._read_ns:
             public = load_keys(self._launch_file)
@@ -77,7 +80,7 @@ class KeyWatch:
 
 
 def install(launch_file: Path, host: str, key: str) -> None:
-    """Put a host's public key into a launch file, and change nothing else; BadInputError."""
+    """Write a host's public key into a launch file.  Raises BadInputError."""
     document = read_document(launch_file)
     hosts = document.values.get("hosts")
     if not isinstance(hosts, dict) or not isinstance(hosts.get(host), dict):
@@ -91,8 +94,8 @@ def install(launch_file: Path, host: str, key: str) -> None:
                 Problem(
                     "KEY",
                     (),
-                    f'"{key}" is no public key',
-                    f"40 characters, as this prints on that host: flexsheet keys show {host}",
+                    f'"{key}" is not a public key',
+                    f"give the 40 characters that `flexsheet keys show {host}` prints on that host",
                 )
             ]
         )
@@ -100,7 +103,7 @@ def install(launch_file: Path, host: str, key: str) -> None:
     yaml.preserve_quotes = True
     yaml.width = 1 << 16
     tree: CommentedMap = yaml.load(document.text)
-    # Plain, a key that begins with "?" would make no YAML.
+    # An unquoted key that begins with "?" would be invalid YAML.
     tree["hosts"][host]["key"] = SingleQuotedScalarString(key)
     text = StringIO()
     yaml.dump(tree, text)

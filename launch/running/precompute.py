@@ -1,4 +1,4 @@
-"""Compute before a graph starts what its nodes cache."""
+"""Compute the cached tables of a graph's nodes before it starts."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from flexsheet.nodes.renderer import deflection_cache
 
 Progress = Callable[[str], None]
 
-TOLD_SHARE = 0.1
-"""Steps in which progress is reported."""
+REPORT_STEP_RATIO = 0.1
+"""Fraction of the work between two progress reports."""
 
 
 class NoSoftBodyError(FlexsheetError, RuntimeError):
@@ -30,16 +30,18 @@ class NoSoftBodyError(FlexsheetError, RuntimeError):
 
 
 def precompute_graph(plan: ResolvedGraph, progress: Progress) -> None:
-    """Compute the deflection shapes of the plan's scene, for each of its renderers."""
+    """Compute the deflection shapes of the graph's scene for each of its renderers."""
     scene = plan.scene_message()
     if scene is None:
         return
     for node in plan.nodes.values():
-        if node.role is NodeRole.RENDERER and _takes_dents(scene, node.parameters["sheet_shape"]):
+        if node.role is NodeRole.RENDERER and _uses_deflection_shapes(
+            scene, node.parameters["sheet_shape"]
+        ):
             precompute_deflection_shapes(scene, node.parameters["cache_dir"], progress)
 
 
-def _takes_dents(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
+def _uses_deflection_shapes(scene: Scene, requested: SheetShapeMethod | Literal["auto"]) -> bool:
     """Return whether a renderer draws a pushed sheet by the membrane's deflection shapes."""
     shape: SheetShapeMethod = chosen(requested, scene.methods.sheet_shape, "reduced_order")
     return shape == "reduced_order"
@@ -65,14 +67,14 @@ def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]
     """Return a function that reports (done, total) in steps, with the time left."""
     from flexsheet.nodes.cache import EtaEstimator
 
-    remaining, next_share = EtaEstimator(), 0.0
+    eta, next_ratio = EtaEstimator(), 0.0
 
     def on_progress(done: int, total: int) -> None:
-        nonlocal next_share
-        far = remaining.text(done, total, time.monotonic())
-        if done >= next_share * total:
-            progress(f"{what}: {far}")
-            next_share = done / total + TOLD_SHARE
+        nonlocal next_ratio
+        progress_text = eta.text(done, total, time.monotonic())
+        if done >= next_ratio * total:
+            progress(f"{what}: {progress_text}")
+            next_ratio = done / total + REPORT_STEP_RATIO
 
     return on_progress
 
@@ -80,7 +82,7 @@ def _with_time_left(what: str, progress: Progress) -> Callable[[int, int], None]
 def precompute_force_table(scene: Scene, cache_dir: Path | None, progress: Progress) -> Path:
     """Return the file with the table of a scene's sheet force, computed if it does not exist.
 
-    Raises NoEquilibriumError for a sheet of which the membrane finds none.
+    Raises NoEquilibriumError if the membrane has no equilibrium.
     """
     from flexsheet.nodes.planner import force_table
 
@@ -96,11 +98,10 @@ def precompute_soft_body(
     scheduler: str | None,
     progress: Progress,
 ) -> Path:
-    """Return the file with the nonlinear table of a scene's soft body, computed if it does not
-    exist.
+    """Return the file with the nonlinear table of a soft body, computed if it does not exist.
 
-    scheduler: as the fem_solver node's parameter. Raises NoSoftBodyError where the scheduler cannot
-    be used, the body cannot be meshed, or memory is insufficient.
+    scheduler: as the parameter of the node fem_solver.  Raises NoSoftBodyError if the
+    scheduler cannot be used, the body cannot be meshed, or memory is insufficient.
     """
     from flexsheet.nodes.cache import EtaEstimator
     from flexsheet.nodes.fem_solver import body, precompute_table
@@ -108,20 +109,20 @@ def precompute_soft_body(
     from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory
 
     folder = cache_dir or default_cache_dir()
-    remaining, reported_percent = EtaEstimator(), -1
+    eta, reported_percent = EtaEstimator(), -1
 
-    def made(done: int, total: int, need: WorkBudget) -> None:
+    def on_progress(done: int, total: int, need: WorkBudget) -> None:
         nonlocal reported_percent
-        far = remaining.text(done, total, time.monotonic())
+        progress_text = eta.text(done, total, time.monotonic())
         if 100 * done // total != reported_percent:
-            progress(f"computing the soft body: {far} ({need.text()})")
+            progress(f"computing the soft body: {progress_text} ({need.text()})")
             reported_percent = 100 * done // total
 
-    maker = SoftBodyFactory(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
+    factory = SoftBodyFactory(skin_spacing_m=skin_spacing_m, cache_dir=folder, scheduler=scheduler)
     try:
-        bodies = maker.bodies(scene, "auto", made)
+        bodies = factory.bodies(scene, "auto", on_progress)
         if len(bodies) == 1:
-            maker.build_table(scene, bodies[0], made)
+            factory.build_table(scene, bodies[0], on_progress)
     except (ValueError, MemoryError, precompute_table.WorkersError) as error:
         raise NoSoftBodyError(str(error)) from error
     spec = body.make_table_spec(scene, bodies[0].spec)

@@ -15,27 +15,27 @@ CAP_SYS_NICE = 23
 
 
 def min_nice_step() -> int:
-    """Return the least niceness, relative to this process's own, that a child of it may take."""
+    """Return the lowest niceness that a child may take, relative to this process."""
     own = os.getpriority(os.PRIO_PROCESS, 0)
     # RLIMIT_NICE counts from 20 downwards: 25 allows -5.
     soft_limit, _ = resource.getrlimit(resource.RLIMIT_NICE)
-    allowed = MIN_NICE if _may_take_any() else 20 - soft_limit
+    allowed = MIN_NICE if _has_cap_sys_nice() else 20 - soft_limit
     return min(0, max(MIN_NICE, allowed) - own)
 
 
-def _may_take_any() -> bool:
+def _has_cap_sys_nice() -> bool:
     lines = Path("/proc/self/status").read_text().splitlines()
     effective = next(line.split()[1] for line in lines if line.startswith("CapEff:"))
     return bool(int(effective, 16) >> CAP_SYS_NICE & 1)
 
 
-def precedence_problem(nodes: Sequence[ResolvedNode]) -> str | None:
-    """Say which nodes cannot take the precedence that their launch file gives; None: all can."""
+def describe_nice_problem(nodes: Sequence[ResolvedNode]) -> str | None:
+    """Describe which nodes cannot take the niceness of their launch file; None if all can."""
     least = min_nice_step()
     names = [node.name for node in nodes if node.nice < least]
     if not names:
         return None
     return (
-        f"{', '.join(names)}: this user may not give precedence (nice below {least}), so they run "
-        "as any program; to allow it, start as root or set `nice` in /etc/security/limits.conf"
+        f"{', '.join(names)}: this user may not set nice below {least}, so these nodes run without "
+        "precedence; start as root or set `nice` in /etc/security/limits.conf"
     )

@@ -1,8 +1,8 @@
-"""Runs of graphs on this machine: their directories, which are alive, and what dead ones left.
+"""Manage the runs of graphs on this computer: their directories, and processes that they left.
 
-A run is named after its launcher's process: pid, start time, and a count.  So anybody can tell
-whether the launcher still lives, and a process tagged with a dead launcher's run is an orphan.
-Imports are light: `flexsheet arms stop` finds the runs before it loads anything else.
+A run is named after its launcher's process: pid, start time and a count.  The name shows whether
+the launcher is alive; a process tagged with the run of an ended launcher is an orphan.
+The module imports little, because `flexsheet arms stop` finds the runs before all else.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ RUN_VARIABLE = "FLEXSHEET_RUN"
 ROOT_VARIABLE = "FLEXSHEET_RUNS"
 """Environment variable that moves the directory of runs."""
 
-FINISHED_RUNS_KEPT = 10
+MAX_FINISHED_RUNS = 10
 ORPHAN_GRACE_S = 3.5
 
 HOST_FILE = "host"
 _LAUNCHER_FILE = "launcher.json"
-_BEGUN_PREFIX = ".begun-"
+_INCOMPLETE_PREFIX = ".begun-"
 _count = itertools.count(1)
 
 
@@ -51,7 +51,7 @@ class RunDirectoryError(FlexsheetError, RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """A run and its directory: sockets, configurations, plan and logs."""
+    """Identify a run and its directory of sockets, configurations, plan and logs."""
 
     id: str
     directory: Path
@@ -66,37 +66,37 @@ class Run:
 
     @property
     def host(self) -> str | None:
-        """The host whose nodes it has; None: all hosts of its plan."""
+        """Return the host whose nodes run in it; None for all hosts of its graph."""
         try:
             return (self.directory / HOST_FILE).read_text()
         except FileNotFoundError:
             return None
 
     def is_alive(self) -> bool:
-        """Whether its launcher still runs it."""
+        """Return whether its launcher still runs it."""
         return (self.directory / _LAUNCHER_FILE).exists() and launcher_is_alive(self.id)
 
     def end(self) -> None:
-        """Remove what is of no use after the run; logs and plan stay for whoever asks why."""
+        """Remove the sockets and the launcher's marker; keep plan and logs for diagnosis."""
         for entry in self.directory.iterdir():
             if stat.S_ISSOCK(entry.lstat().st_mode) or entry.name == _LAUNCHER_FILE:
                 entry.unlink(missing_ok=True)
 
 
 def ring_file(run: Run, host: str) -> Path:
-    """What processes of `host` in a run read their keys from."""
+    """Return the file from which the processes of a host read their keys."""
     return run.directory / f"keys-{host}.json"
 
 
 def local_endpoints(run: Run, endpoints: tuple[str, ...]) -> tuple[str, ...]:
-    """Endpoints of a plan with the run's directory filled in."""
+    """Return endpoints with the run's directory filled in."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(one.replace(RUN_DIRECTORY, str(run.directory)) for one in endpoints)
 
 
 def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
-    """Sources of a plan with the run's directory filled in."""
+    """Return sources with the run's directory filled in."""
     from flexsheet.launch.plans.plan_model import RUN_DIRECTORY
 
     return tuple(
@@ -106,58 +106,61 @@ def local_sources(run: Run, sources: Iterable[Source]) -> tuple[Source, ...]:
 
 
 def root() -> Path:
-    """The directory of this user's runs; short, since a socket's path has 107 bytes at most."""
+    """Return the folder of this user's runs; short, as socket paths have at most 107 bytes."""
     return Path(os.environ.get(ROOT_VARIABLE) or f"/tmp/flexsheet-{os.getuid()}")
 
 
 def create_run() -> Run:
-    """Make the directory of a new run of this process, closed to others."""
+    """Create the directory of a new run of this process, which other users cannot read.
+
+    Raises RunDirectoryError.
+    """
     directory = root()
     directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     status = directory.lstat()
     if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid():
         raise RunDirectoryError(
-            f"{directory} belongs to somebody else; set {ROOT_VARIABLE} to a directory of your own"
+            f"{directory} belongs to another user; set {ROOT_VARIABLE} to a directory of your own"
         )
     directory.chmod(0o700)
     run_id = f"{os.getpid()}.{_start_ticks(os.getpid())}.{next(_count)}"
     run = Run(run_id, directory / run_id)
-    # Under its name it is complete, so that no sweep of another launcher takes it for a dead run.
-    begun = Run(run_id, directory / f"{_BEGUN_PREFIX}{run_id}")
-    begun.directory.mkdir(mode=0o700)
-    begun.logs.mkdir()
+    # It gets its name when it is complete, so that no other launcher removes it as a dead run.
+    incomplete = Run(run_id, directory / f"{_INCOMPLETE_PREFIX}{run_id}")
+    incomplete.directory.mkdir(mode=0o700)
+    incomplete.logs.mkdir()
     marker = {"pid": os.getpid(), "pid_namespace": _pid_namespace()}
-    write_file(begun.directory / _LAUNCHER_FILE, json.dumps(marker))
-    begun.directory.rename(run.directory)
+    write_file(incomplete.directory / _LAUNCHER_FILE, json.dumps(marker))
+    incomplete.directory.rename(run.directory)
     return run
 
 
 def all_runs() -> list[Run]:
-    """All runs that have a directory, newest first."""
+    """Return all runs that have a directory, newest first."""
     if not root().is_dir():
         return []
     runs = [
         Run(entry.name, entry)
         for entry in root().iterdir()
-        if entry.is_dir() and not entry.name.startswith(_BEGUN_PREFIX)
+        if entry.is_dir() and not entry.name.startswith(_INCOMPLETE_PREFIX)
     ]
     return sorted(runs, key=lambda run: run.directory.stat().st_ctime_ns, reverse=True)
 
 
 def live_runs() -> list[Run]:
-    """Runs whose launcher lives, newest first."""
+    """Return the runs whose launcher is alive, newest first."""
     return [run for run in all_runs() if run.is_alive()]
 
 
 def launcher_is_alive(run_id: str) -> bool:
-    """Whether the process that named the run is still there (and no other with its number)."""
+    """Return whether the launcher of the run is alive, and not another process with its number."""
     pid, _, rest = run_id.partition(".")
     start, _, _ = rest.partition(".")
     return pid.isdigit() and str(_start_ticks(int(pid))) == start
 
 
-def orphans() -> list[psutil.Process]:
-    """Processes of this user that are tagged with the run of a launcher that is gone."""
+def find_orphans() -> list[psutil.Process]:
+    """Return this user's processes that are tagged with the run of an ended launcher."""
     import psutil
 
     found = []
@@ -166,39 +169,39 @@ def orphans() -> list[psutil.Process]:
             if process.uids().real != os.getuid() or process.pid == os.getpid():
                 continue
             run_id = process.environ().get(RUN_VARIABLE)
-            # In another namespace (a container's) the launcher's pid means another process.
+            # In another PID namespace (a container) the number belongs to another process.
             same_namespace = _pid_namespace(process.pid) == _pid_namespace()
             if run_id and same_namespace and not launcher_is_alive(run_id):
                 found.append(process)
         except (psutil.Error, OSError):
-            # One that may not be looked into, or has ended meanwhile: not ours to sweep.
+            # The process has ended or may not be read; it is not an orphan of this user.
             continue
     return found
 
 
 def sweep() -> list[int]:
-    """End orphans and tidy up the directories of dead runs; returns the pids that were ended."""
+    """End orphans, clean up the directories of dead runs, and return the ended process ids."""
     import psutil
 
-    found = orphans()
+    found = find_orphans()
     _signal(found, signal.SIGTERM)
     _, alive = psutil.wait_procs(found, timeout=ORPHAN_GRACE_S)
     _signal(alive, signal.SIGKILL)
     psutil.wait_procs(alive, timeout=ORPHAN_GRACE_S)
     dead = [run for run in all_runs() if not run.is_alive() and _is_of_our_namespace(run)]
     for i, run in enumerate(dead):
-        if i < FINISHED_RUNS_KEPT:
+        if i < MAX_FINISHED_RUNS:
             run.end()
         else:
             shutil.rmtree(run.directory, ignore_errors=True)
-    for begun in root().glob(f"{_BEGUN_PREFIX}*"):
-        if not launcher_is_alive(begun.name.removeprefix(_BEGUN_PREFIX)):
-            shutil.rmtree(begun, ignore_errors=True)
+    for incomplete in root().glob(f"{_INCOMPLETE_PREFIX}*"):
+        if not launcher_is_alive(incomplete.name.removeprefix(_INCOMPLETE_PREFIX)):
+            shutil.rmtree(incomplete, ignore_errors=True)
     return [process.pid for process in found]
 
 
 def is_free(address: str, port: int) -> bool:
-    """Whether a TCP port can be listened on."""
+    """Return whether a process can listen on a TCP port."""
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -220,7 +223,7 @@ def _signal(processes: Iterable[psutil.Process], number: int) -> None:
 
 
 def _is_of_our_namespace(run: Run) -> bool:
-    """Whether its launcher's pid means anything to us: a container may share the directory."""
+    """Return whether the launcher ran in our PID namespace; a container may share the folder."""
     try:
         marker = json.loads((run.directory / _LAUNCHER_FILE).read_text())
     except FileNotFoundError:
@@ -235,7 +238,7 @@ def _pid_namespace(pid: int | str = "self") -> int:
 
 
 def _start_ticks(pid: int) -> int | None:
-    """Start time of a process in clock ticks since boot; None when it is gone or a zombie."""
+    """Return the start time of a process in clock ticks since boot; None once it has ended."""
     try:
         text = Path(f"/proc/{pid}/stat").read_text()
     except (FileNotFoundError, ProcessLookupError):

@@ -1,4 +1,4 @@
-"""Whether a process that gives no sign of life hangs, or gets no processor."""
+"""Distinguish a process that hangs from one that gets no processor."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ RUNNABLE = "R"
 
 @dataclass(frozen=True, slots=True)
 class ProcessorTime:
-    """What the kernel counts of a process's main thread, in seconds.
+    """Hold the kernel's counters of a process's main thread, in seconds.
 
-    run_s: on a processor.  wait_s: runnable without one, as far as it has run since.  state: as in
-    /proc/PID/stat (R, S, D, T, ...).
+    run_s: time on a processor.  wait_s: time runnable without one, up to its last run.
+    state: letter of /proc/PID/stat (R, S, D, T, ...).
     """
 
     run_s: float
@@ -22,23 +22,25 @@ class ProcessorTime:
     state: str
 
     @classmethod
-    def of(cls, process: int) -> Self | None:
-        """Of a process as it is now; None where the kernel does not count, or it has ended."""
+    def read(cls, process: int) -> Self | None:
+        """Read the counters of a process; None without counters or once it has ended."""
         try:
             run, wait, slices = Path(f"/proc/{process}/schedstat").read_text().split()
             stat = Path(f"/proc/{process}/stat").read_text()
         except (OSError, ValueError):
             return None
-        # A kernel without these statistics shows zeros.
+        # A kernel without these statistics writes zeros.
         if slices == "0":
             return None
         return cls(int(run) * 1e-9, int(wait) * 1e-9, stat[stat.rindex(")") + 2])
 
 
-def starved_s(before: ProcessorTime | None, now: ProcessorTime | None, elapsed_s: float) -> float:
-    """How long of `elapsed_s` between two readings a process waited for a processor.
+def compute_starved_s(
+    before: ProcessorTime | None, now: ProcessorTime | None, elapsed_s: float
+) -> float:
+    """Return how long a process waited for a processor between two readings, at most `elapsed_s`.
 
-    A wait that lasts is counted by the kernel when it is over; one that is runnable meanwhile has
+    The kernel counts a wait only when it ends.  A process that is runnable now has therefore
     waited whenever it did not run.
     """
     if before is None or now is None:

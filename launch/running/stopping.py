@@ -1,13 +1,13 @@
-"""An e-stop from outside of a graph, by paths that no other tool can hold.
+"""Send an e-stop to graphs from outside, on paths that no other tool can block.
 
-Each launcher and each arm bridge of this computer has a socket of its own for it
-(`nodes.stop_socket`).  All are asked at once.  A launcher publishes the stop to every host and
-keeps it; a bridge stops its own arm.  Those that do not answer are sent SIGCONT, for they may have
-been suspended.  If no launcher has answered then, bridges that do not answer are killed, and the
-watchdogs of their arms stop the arms.  If nobody has answered at all, the nodes that send sheet
-targets are killed: without targets the bridges of all hosts stop.
+Each launcher and each arm bridge of this computer has a socket for e-stops (`nodes.stop_socket`);
+all get the request at once.  A launcher latches the stop and publishes it to every host; a bridge
+stops its own arm.  Receivers that do not answer get SIGCONT, as they may be suspended.  If no
+launcher has answered then, the bridges that do not answer are killed, and their arms' watchdogs
+stop the arms.  Without any answer, the nodes that send sheet targets are killed: without targets
+the bridges of all hosts stop.
 
-Imports are light: nobody who stops the arms waits for the rest of flexsheet.
+The module imports little, so that the stop is sent without delay.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ TARGET_TOPIC = "sheet_target"
 
 
 class StopPath(StrEnum):
-    """The way by which an e-stop was sent."""
+    """Name the path on which an e-stop was sent."""
 
     LAUNCHER = "launcher"
     NODE = "node"
@@ -42,11 +42,11 @@ class StopPath(StrEnum):
 
 
 class StopOutcome(StrEnum):
-    """What came of it.
+    """Name the outcome of an attempt.
 
-    confirmed: the receiver has engaged the stop.  silent: it was sent, and may be taken later.
-    absent: nobody listens.  published: on the topic, without an answer.  refused: the topic's
-    endpoint is held by another tool.  killed: the process was ended.
+    confirmed: the receiver has engaged the stop.  silent: it was sent and may be received later.
+    absent: no process listens.  published: sent on the topic, without an answer.  refused: another
+    tool uses the topic's endpoint.  killed: the process was killed.
     """
 
     CONFIRMED = "confirmed"
@@ -59,7 +59,7 @@ class StopOutcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class StopAttempt:
-    """One path, to whom, what came of it, and when: after the first packet was sent."""
+    """Record one attempt: path, receiver, outcome, and time since the first packet (ms)."""
 
     path: StopPath
     receiver: str
@@ -68,7 +68,7 @@ class StopAttempt:
 
     @property
     def worked(self) -> bool:
-        """Whether an arm stops by it for certain."""
+        """Return whether the attempt is certain to stop an arm."""
         return self.outcome in (StopOutcome.CONFIRMED, StopOutcome.KILLED)
 
 
@@ -83,8 +83,8 @@ class _Receiver:
 def send_early(arguments: Sequence[str]) -> None:
     """Send the stop of `flexsheet arms stop ARGUMENTS` before the command line is imported.
 
-    Nothing is sent with arguments that are not options of that command; it refuses them later.
-    The command finds what came of it in `sent_early`.
+    Nothing is sent with arguments that are not options of that command, which refuses them later.
+    `sent_early` holds the attempts for the command.
     """
     options = {"--run": "", "--reason": DEFAULT_REASON}
     rest = [argument for argument in arguments if argument != "--json"]
@@ -103,7 +103,7 @@ sent_early: list[list[StopAttempt]] = []
 
 
 def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
-    """Engage the e-stop in these runs (their directories); takes `KILL_AFTER_S` at most."""
+    """Engage the e-stop in the runs with these directories, within `KILL_AFTER_S`."""
     begun_s = time.monotonic()
     attempts: list[StopAttempt] = []
 
@@ -128,10 +128,10 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
                 note(receiver.path, receiver.name, StopOutcome.CONFIRMED)
             for receiver in waiting if signalled else ():
                 _send_signal(receiver.process, signalled or 0)
-        # A bridge gets the stop of a launcher as soon as it runs; until then it commands no arm.
-        kept = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
+        # A suspended bridge commands no arm, and gets the launcher's latched stop when it resumes.
+        is_latched = any(one.path is StopPath.LAUNCHER and one.worked for one in attempts)
         for receiver in waiting:
-            kill = receiver.path is StopPath.NODE and not kept
+            kill = receiver.path is StopPath.NODE and not is_latched
             if kill and _send_signal(receiver.process, signal.SIGKILL):
                 note(StopPath.SIGNAL, receiver.name, StopOutcome.KILLED)
             else:
@@ -146,7 +146,7 @@ def stop_arms(runs: Iterable[Path], reason: str) -> list[StopAttempt]:
 
 
 def _send_request(file: Path, request: bytes) -> socket.socket | None:
-    """The connection on which the answer comes; None where nobody listens."""
+    """Send a request and return the connection for the answer; None if no process listens."""
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
     try:
         connection.connect(os.fspath(file))
@@ -158,7 +158,7 @@ def _send_request(file: Path, request: bytes) -> socket.socket | None:
 
 
 def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
-    """Take those out of `waiting` that confirm before `until_s` of the monotonic clock."""
+    """Remove and return the receivers that confirm before `until_s` of the monotonic clock."""
     confirmed = []
     poll = select.poll()
     by_number = {one.connection.fileno(): one for one in waiting}
@@ -180,7 +180,7 @@ def _await_answers(waiting: list[_Receiver], until_s: float) -> list[_Receiver]:
 
 
 def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
-    """Kill the nodes of these runs that publish sheet targets; their names."""
+    """Kill the nodes of these runs that publish sheet targets, and return their names."""
     killed = []
     for directory in directories:
         try:
@@ -196,7 +196,7 @@ def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
             try:
                 named = senders.keys() & set(entry.read_bytes().split(b"\0"))
             except OSError:
-                # It has ended meanwhile, or belongs to somebody else.
+                # The process has ended, or belongs to another user.
                 continue
             if named and _send_signal(int(entry.parent.name), signal.SIGKILL):
                 killed.append(senders[named.pop()])
@@ -204,7 +204,7 @@ def _kill_target_senders(directories: Iterable[Path]) -> list[str]:
 
 
 def _send_signal(process: int, number: int) -> bool:
-    """Whether the process was there to get it; 0 is one that this computer does not know."""
+    """Return whether the signal was sent; process 0 is unknown on this computer."""
     if process <= 0:
         return False
     try:

@@ -1,12 +1,12 @@
-"""Starts a plan's nodes, keeps them running, and leaves nothing behind.
+"""Start the nodes of a graph, restart those that fail, and remove all traces at the end.
 
     async with RunningGraph(plan) as graph:
         await graph.wait_ready()
         ...
 
-Every node is a process in a session of its own.  It says through a pipe that it is set up; when it
-ends by itself its restart policy decides.  At the end each gets SIGINT, then SIGTERM, then SIGKILL.
-No thread is used: exits come as readable pidfds, logs and readiness through pipes.
+Every node is a process in a session of its own.  It reports through a pipe that it is set up.  When
+it ends by itself, its restart policy decides.  To stop, each gets SIGINT, SIGTERM, then SIGKILL.
+No thread is used: exits arrive as readable pidfds, logs and readiness through pipes.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from flexsheet.launch.running.child import LIFELINE_VARIABLE, NICE_VARIABLE, PAR
 from flexsheet.launch.running.code_state import git_state
 from flexsheet.launch.running.host import HostAgent
 from flexsheet.launch.running.keys import KeyWatch, make_rings
-from flexsheet.launch.running.priority import min_nice_step, precedence_problem
+from flexsheet.launch.running.priority import describe_nice_problem, min_nice_step
 from flexsheet.launch.running.runs import (
     HOST_FILE,
     RUN_VARIABLE,
@@ -51,7 +51,7 @@ from flexsheet.launch.running.runs import (
     ring_file,
     sweep,
 )
-from flexsheet.launch.running.starvation import ProcessorTime, starved_s
+from flexsheet.launch.running.starvation import ProcessorTime, compute_starved_s
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher
 from flexsheet.messages.clock import SystemClock
@@ -65,14 +65,14 @@ from flexsheet.nodes.runner import NodeConfig, PortConfig
 SOFTWARE = Path(__file__).resolve().parents[2]
 STOP_GRACE_S = 3.0
 KEYS_PERIOD_S = 1.0
-LIVENESS_TURN_S = 0.5
-LAST_WORDS_S = 0.5
-"""For a hanging node to write where it is."""
+LIVENESS_PERIOD_S = 0.5
+STACK_DUMP_S = 0.5
+"""Time for a hanging node to write its stacks to its log."""
 
 LOG_READ_BYTES = 65_536
 
 Report = Callable[[str, str], None]
-"""Gets each line of a node's log, and the launcher's own words as those of "launch"."""
+"""Function of (node, line) for each line of log; the launcher's lines have the node "launch"."""
 
 
 class NodeFailedError(FlexsheetError, RuntimeError):
@@ -86,7 +86,7 @@ class NodeFailedError(FlexsheetError, RuntimeError):
 
 
 class Child:
-    """One start of a node's process."""
+    """Run a node's process once."""
 
     def __init__(
         self,
@@ -105,12 +105,12 @@ class Child:
         self._log = (run.logs / f"{config.name}.log").open("ab", buffering=0)
         self._output, output_write = os.pipe()
         self._ready_fd, ready_write = os.pipe()
-        self._signs = 0
+        self._beats = 0
         self._reports = True
         try:
             with_pipe = config.model_copy(update={"ready_fd": ready_write})
             write_file(config_file, with_pipe.model_dump_json())
-            # While Python starts, SIGINT would raise; the node's first statement unblocks it.
+            # SIGINT would raise while Python starts; the node's first statement unblocks it.
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             try:
                 self._process = subprocess.Popen(
@@ -136,7 +136,7 @@ class Child:
         os.set_blocking(self._output, False)
         os.set_blocking(self._ready_fd, False)
         self._loop.add_reader(self._output, self._read_output)
-        self._loop.add_reader(self._ready_fd, self._read_life)
+        self._loop.add_reader(self._ready_fd, self._read_heartbeat)
         self._loop.add_reader(self._pidfd, self._reap)
 
     @property
@@ -144,59 +144,58 @@ class Child:
         return self._process.pid
 
     def signal(self, number: int) -> None:
-        """Signal the node and all that it started; nothing if it has ended."""
+        """Send a signal to the node and all processes that it started, unless it has ended."""
         if not self.exited.done():
-            # Not reaped yet, so the number still is its own.
+            # It is not reaped yet, so its process id is still its own.
             os.killpg(self.pid, number)
 
     def kill_now(self) -> None:
-        """Kill and reap without waiting for the loop: for when the loop is being torn down."""
+        """Kill and reap the process without the event loop, which may be closing."""
         self.signal(signal.SIGKILL)
         if not self.exited.done():
             self._process.wait()
             self._reap()
 
-    def _read_life(self) -> None:
-        signs = os.read(self._ready_fd, 4096)
-        self._signs += len(signs)
-        if signs and not self.ready.done():
+    def _read_heartbeat(self) -> None:
+        beats = os.read(self._ready_fd, 4096)
+        self._beats += len(beats)
+        if beats and not self.ready.done():
             self.ready.set_result(None)
-        if not signs:
+        if not beats:
             self._loop.remove_reader(self._ready_fd)
 
-    async def silent_for(self, seconds: float, on_starved: Callable[[float], None]) -> None:
-        """Until it has given no sign of life for so long, though we have listened all the while.
+    async def wait_until_silent(self, seconds: float, on_starved: Callable[[float], None]) -> None:
+        """Wait until the node has sent no heartbeat for `seconds` of this launcher's own polling.
 
-        What counts is our own turns, not the clock: a launcher that stood still itself (suspended,
-        starved) has heard nobody, and that is nobody's fault.  Nor does the time count in which the
-        process waited for a processor; `on_starved` is called once with that time when it alone
-        has kept the process from being taken for hanging.
+        Polls are counted instead of clock time: a launcher that was suspended or starved itself
+        has received no heartbeat either.  Time in which the process waited for a processor does
+        not count.  When only that time prevents the timeout, `on_starved` is called with it, once.
         """
-        heard, silence_s, waited_s, reported = self._signs, 0.0, 0.0, False
-        before = ProcessorTime.of(self.pid)
+        beats, silence_s, waited_s, reported = self._beats, 0.0, 0.0, False
+        before = ProcessorTime.read(self.pid)
         while silence_s < seconds:
-            await asyncio.sleep(LIVENESS_TURN_S)
-            now = ProcessorTime.of(self.pid)
-            starved = starved_s(before, now, LIVENESS_TURN_S)
+            await asyncio.sleep(LIVENESS_PERIOD_S)
+            now = ProcessorTime.read(self.pid)
+            starved = compute_starved_s(before, now, LIVENESS_PERIOD_S)
             before, silence_s, waited_s = (
                 now,
-                silence_s + LIVENESS_TURN_S - starved,
+                silence_s + LIVENESS_PERIOD_S - starved,
                 waited_s + starved,
             )
-            if self._signs != heard:
-                heard, silence_s, waited_s = self._signs, 0.0, 0.0
+            if self._beats != beats:
+                beats, silence_s, waited_s = self._beats, 0.0, 0.0
             elif not reported and silence_s < seconds <= silence_s + waited_s:
                 reported = True
                 on_starved(waited_s)
 
     def end_hanging(self) -> None:
-        """Make it write to its log where it hangs (Python's fault handler does), then kill it."""
+        """Let Python's fault handler write the stacks to the log, then kill the process."""
         self._reports = False
         self.signal(signal.SIGABRT)
-        self._loop.call_later(LAST_WORDS_S, self.signal, signal.SIGKILL)
+        self._loop.call_later(STACK_DUMP_S, self.signal, signal.SIGKILL)
 
     def _read_output(self) -> bool:
-        """Copy a piece of output to the log and report its lines; False when none is left."""
+        """Copy a piece of output to the log and report its lines; return False at the end."""
         try:
             piece = os.read(self._output, LOG_READ_BYTES)
         except BlockingIOError:
@@ -215,11 +214,11 @@ class Child:
             self._report(self._node, line.decode(errors="replace"))
 
     def _reap(self) -> None:
-        """The process has ended: end what it started, read the rest of its words, let go."""
+        """Handle the end of the process: kill its children, read its last output, close pipes."""
         if self.exited.done():
             return
         if self._process.returncode is None:
-            # A zombie keeps its group's number from being taken by others.
+            # The zombie reserves the number of its process group.
             os.killpg(self.pid, signal.SIGKILL)
             self._process.wait()
         for fd in (self._pidfd, self._output, self._ready_fd):
@@ -235,10 +234,10 @@ class Child:
 
 
 class RunningGraph:
-    """A plan's nodes as processes.
+    """Run the nodes of a graph as processes.
 
-    host: start only that host's nodes; None: all, which needs all hosts to be this machine.
-    report: called with (node, line) for every line of log; all is in `run.logs` anyway.
+    host: start only the nodes of this host; None starts all, on this computer.
+    report: called with (node, line) for every line of log; `run.logs` holds all lines, too.
     """
 
     def __init__(
@@ -263,20 +262,20 @@ class RunningGraph:
 
     @property
     def run(self) -> Run:
-        """The run's directory, logs and identity; there once the graph was started."""
+        """Return the run: its directory, logs and id.  Raises RuntimeError before the start."""
         if self._run is None:
             raise RuntimeError("the graph has not been started")
         return self._run
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process ids of the nodes that run now."""
+        """Return the process ids of the running nodes."""
         return {
             name: child.pid for name, child in self._children.items() if not child.exited.done()
         }
 
     def is_ready(self, node: str) -> bool:
-        """Whether the node's present process has said that it is set up."""
+        """Return whether the node's current process has reported that it is set up."""
         return self._ready[node].is_set()
 
     async def __aenter__(self) -> Self:
@@ -296,7 +295,7 @@ class RunningGraph:
         await self.stop()
 
     async def wait_ready(self, timeout_s: float | None = None) -> None:
-        """Until every node is set up; raises NodeFailedError when one cannot be, TimeoutError."""
+        """Wait until every node is set up.  Raises NodeFailedError and TimeoutError."""
         waiting = [asyncio.ensure_future(event.wait()) for event in self._ready.values()]
         everyone = asyncio.ensure_future(asyncio.gather(*waiting))
         end = asyncio.ensure_future(self.wait())
@@ -307,7 +306,7 @@ class RunningGraph:
             if everyone.done():
                 return
             if end.done():
-                # Nodes that finished their work before all were ready count as ready.
+                # Nodes that finish before all are ready count as ready.
                 end.result()
                 return
         finally:
@@ -315,10 +314,10 @@ class RunningGraph:
             everyone.cancel()
             await asyncio.gather(end, everyone, *waiting, return_exceptions=True)
         late = [name for name, event in self._ready.items() if not event.is_set()]
-        raise TimeoutError(f"not ready within {timeout_s} s: {', '.join(late)}")
+        raise TimeoutError(f"not ready within {timeout_s} s: {', '.join(late)}; see their logs")
 
     async def wait_ready_again(self, node: str, restarts: int) -> None:
-        """Until the node was restarted `restarts` times in all and is ready."""
+        """Wait until the node was restarted `restarts` times in total and is ready."""
         while self.restarts[node] < restarts or not self._ready[node].is_set():
             if self._supervisors[node].done():
                 self._supervisors[node].result()
@@ -326,7 +325,7 @@ class RunningGraph:
             await asyncio.sleep(0.02)
 
     async def wait(self) -> None:
-        """Until every node has ended by itself; raises NodeFailedError when one failed for good."""
+        """Wait until every node has ended by itself.  Raises NodeFailedError."""
         pending: set[asyncio.Task[None]] = set(self._supervisors.values())
         while pending:
             done, pending = await asyncio.wait(pending, return_when=asyncio.FIRST_COMPLETED)
@@ -335,11 +334,11 @@ class RunningGraph:
                     supervisor.result()
 
     def kill(self, node: str, number: int = signal.SIGKILL) -> None:
-        """Send a signal to a node's process, as trouble would."""
+        """Send a signal to a node's process to simulate a fault."""
         os.kill(self.pids[node], number)
 
     def kill_all(self) -> None:
-        """Kill all nodes at once, for somebody who will not wait for `stop`."""
+        """Kill all nodes immediately, without the grace periods of `stop`."""
         for child in self._children.values():
             child.signal(signal.SIGKILL)
 
@@ -370,22 +369,22 @@ class RunningGraph:
                 self._run.end()
 
     async def _end_children(self) -> None:
-        """End the nodes; those that only listen come last, to hear the others' last words."""
-        listeners = {
+        """End the nodes; those that only read come last, to receive the final messages."""
+        readers = {
             node.name
             for node in self.nodes
             if all(port.topic == "status" for port in node.outputs) and node.inputs
         }
-        speakers = self._children.keys() - listeners
-        for names in (speakers, listeners):
-            await _end([self._children[name] for name in names if name in self._children])
+        writers = self._children.keys() - readers
+        for names in (writers, readers):
+            await _terminate([self._children[name] for name in names if name in self._children])
 
     def _start(self) -> None:
-        _refuse_open_network(self.plan, self._host)
+        _check_network(self.plan, self._host)
         swept = sweep()
         self._run = create_run()
         if swept:
-            self._report(LAUNCHER, f"ended {len(swept)} processes of launchers that are gone")
+            self._report(LAUNCHER, f"ended {len(swept)} processes that ended launchers had left")
         _check_ports(self.plan, self._host)
         if self.plan.keys:
             self._rings = make_rings(self.plan, self.run, self._host)
@@ -397,7 +396,7 @@ class RunningGraph:
         for host in self.plan.hosts if self._host is None else [self._host]:
             self._start_agent(host)
         self._report(LAUNCHER, f"run {self.run.id}, plan {self.plan.hash}: {len(self.nodes)} nodes")
-        if problem := precedence_problem(self.nodes):
+        if problem := describe_nice_problem(self.nodes):
             self._report(LAUNCHER, problem)
         for node in self.nodes:
             self._supervisors[node.name] = asyncio.create_task(
@@ -466,21 +465,21 @@ class RunningGraph:
         )
 
     async def _watch_keys(self) -> None:
-        """Pass on what changes about the keys in the launch file or in our own files of them."""
+        """Distribute changes of the keys in the launch file and of this user's key files."""
         watch = KeyWatch(self.plan, self.run, self._rings)
-        said = ""
+        reported = ""
         while True:
             await asyncio.sleep(KEYS_PERIOD_S)
             try:
-                changes = watch.look()
+                changes = watch.read_changes()
             except (BadInputError, SecurityError, OSError) as error:
-                if str(error) != said:
-                    said = str(error)
-                    self._report(LAUNCHER, f"keys stay as they were: {said}")
+                if str(error) != reported:
+                    reported = str(error)
+                    self._report(LAUNCHER, f"keys not changed: {reported}")
                 continue
             for host, change in changes.items():
-                said = ""
-                self._report(LAUNCHER, f"keys of {host} are read anew")
+                reported = ""
+                self._report(LAUNCHER, f"keys of {host} reloaded")
                 if host == MAIN:
                     for publisher in self._publishers:
                         publisher.renew_keys(change)
@@ -488,7 +487,7 @@ class RunningGraph:
                     self._agents[host].renew_keys(change)
 
     async def _supervise(self, node: ResolvedNode) -> None:
-        """Run the node again and again, as its policy says; NodeFailedError when for good."""
+        """Run the node and restart it as its policy says.  Raises NodeFailedError."""
         policy = node.restart
         recent: deque[float] = deque()
         loop = asyncio.get_running_loop()
@@ -516,7 +515,7 @@ class RunningGraph:
             self.restarts[node.name] += 1
 
     async def _run_once(self, node: ResolvedNode) -> str | None:
-        """One life of a node; returns what was wrong with its end, None if nothing was."""
+        """Run a node once and return why it failed; None if it ended without error."""
         child = self._spawn(node)
         await asyncio.wait(
             (child.ready, child.exited),
@@ -529,8 +528,8 @@ class RunningGraph:
         elif child.ready.done():
             self._ready[node.name].set()
             self._report(LAUNCHER, f"{node.name} is ready, pid {child.pid}")
-        hangs = not late and await self._outlives(child, node)
-        # The future must outlive this task's cancellation: `stop` waits for it too.
+        hangs = not late and await self._detect_hang(child, node)
+        # `stop` awaits the future too, so a cancelled task must not cancel it.
         code = await asyncio.shield(child.exited)
         self._ready[node.name].clear()
         self.exit_codes[node.name] = code
@@ -538,11 +537,11 @@ class RunningGraph:
             return f"was not ready within {node.start_deadline_s:g} s"
         if hangs:
             self.hangs[node.name] += 1
-            return f"hung: no sign of life for {node.liveness_s:g} s; its log shows where"
+            return f"hung: no sign of life for {node.liveness_s:g} s; its log holds the stacks"
         return describe_exit(code)
 
-    async def _outlives(self, child: Child, node: ResolvedNode) -> bool:
-        """Whether the process hangs, and so has to be ended; False when it ends by itself."""
+    async def _detect_hang(self, child: Child, node: ResolvedNode) -> bool:
+        """Return True and end the process if it hangs; return False when it ends by itself."""
         if node.liveness_s is None:
             return False
 
@@ -550,10 +549,10 @@ class RunningGraph:
             self._report(
                 LAUNCHER,
                 f"{node.name} is starved, not hung: it waited {waited_s:.1f} s for a processor; "
-                "this computer has too much to do",
+                "this computer is overloaded",
             )
 
-        silence = asyncio.ensure_future(child.silent_for(node.liveness_s, on_starved))
+        silence = asyncio.ensure_future(child.wait_until_silent(node.liveness_s, on_starved))
         try:
             await asyncio.wait((silence, child.exited), return_when=asyncio.FIRST_COMPLETED)
             hangs = silence.done() and not child.exited.done()
@@ -574,7 +573,7 @@ class RunningGraph:
             "PYTHONUNBUFFERED": "1",
             "PYTHONFAULTHANDLER": "1",
         }
-        # A process per node already uses the cores; threads of BLAS would spin against them.
+        # One process per node uses the cores already; BLAS threads would compete with them.
         for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
             environment.setdefault(variable, "1")
         config = node_config(self.plan, node, self.run)
@@ -583,7 +582,7 @@ class RunningGraph:
         return child
 
     def _write_run_files(self) -> None:
-        """What a recorder attaches and what tools find the graph by."""
+        """Write the files that a recorder attaches and by which tools find the graph."""
         directory = self.run.directory
         write_file(directory / "launch.yaml", self.plan.launch_text)
         write_file(directory / "scene.yaml", self.plan.scene_text)
@@ -592,19 +591,19 @@ class RunningGraph:
             write_file(directory / HOST_FILE, self._host)
         if any(port.topic == "scene" for node in self.nodes for port in node.outputs):
             self._write_scenes(directory / "scenes")
-        # Last and at once: tools that look for a graph read this file.
+        # Last and atomically: tools look for this file to find a graph.
         text = self.plan.model_dump_json(indent=1)
         write_file(self.run.plan_file, text)
 
     def _write_scenes(self, folder: Path) -> None:
-        """The scenes that a node may publish: those beside the plan's own, checked, as JSON."""
+        """Write the scenes that a node may publish, as JSON: those beside the graph's own."""
         folder.mkdir()
         own = self.plan.scene_file
         for path in [] if own is None else sorted(Path(own).parent.glob("*.yaml")):
             try:
                 write_file(folder / f"{path.stem}.json", load_scene(path).model_dump_json())
             except BadInputError as error:
-                self._report(LAUNCHER, f"scene {path.name} is left out: {error}")
+                self._report(LAUNCHER, f"scene {path.name} is skipped: {error}")
 
     def _fail(self, text: str) -> NodeFailedError:
         self.failure = NodeFailedError(f"{text}; its log is {self.run.logs}")
@@ -619,7 +618,7 @@ class RunningGraph:
             self._report_to(node, line)
 
 
-async def _end(children: list[Child]) -> None:
+async def _terminate(children: list[Child]) -> None:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         alive = [child for child in children if not child.exited.done()]
         if not alive:
@@ -630,7 +629,7 @@ async def _end(children: list[Child]) -> None:
 
 
 def node_config(plan: ResolvedGraph, node: ResolvedNode, run: Run) -> NodeConfig:
-    """What a node's process is told, with the run's directory filled in."""
+    """Return the configuration of a node's process, with the run's directory filled in."""
 
     def outputs(planned: tuple[ResolvedPort, ...]) -> tuple[PortConfig, ...]:
         return tuple(
@@ -680,7 +679,7 @@ def _clocks_port(plan: ResolvedGraph, host: str, run: Run) -> PortConfig | None:
 
 
 def describe_exit(code: int) -> str | None:
-    """An exit code in words; None for a good one."""
+    """Describe an exit code; None for 0."""
     if code == 0:
         return None
     if code < 0:
@@ -698,7 +697,7 @@ def _fill_run(value: Any, run: Run) -> Any:
     return value
 
 
-def _refuse_open_network(plan: ResolvedGraph, host: str | None) -> None:
+def _check_network(plan: ResolvedGraph, host: str | None) -> None:
     if host is not None and host not in plan.hosts:
         raise BadInputError(
             [Problem("--host", (), f'unknown host "{host}"', f"there are: {', '.join(plan.hosts)}")]
@@ -709,16 +708,16 @@ def _refuse_open_network(plan: ResolvedGraph, host: str | None) -> None:
                 [
                     read_document(Path(plan.launch_file)).problem(
                         ("hosts", name, "address"),
-                        f"{address} is beyond loopback and there are no keys",
-                        f"make one on each host (flexsheet keys new {name}) and put all of them "
-                        f"here: flexsheet keys install {plan.launch_file} {name} KEY",
+                        f"{address} is beyond loopback, and the hosts have no keys",
+                        f"create a key on each host (flexsheet keys new {name}) and install all "
+                        f"of them: flexsheet keys install {plan.launch_file} {name} KEY",
                     )
                 ]
             )
 
 
 def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
-    """Every TCP port that this launcher's processes will listen on must be free."""
+    """Check that every TCP port on which this launcher's processes will listen is free."""
     wanted = [
         (f'topic "{topic}" of {writer.name}', *writer.tcp.removeprefix("tcp://").rsplit(":", 1))
         for topic, writers in plan.writers.items()
@@ -731,7 +730,7 @@ def _check_ports(plan: ResolvedGraph, host: str | None) -> None:
             plan.launch_file,
             (),
             f"port {port} of {address}, for {what}, is in use",
-            "is a graph running already? other ports go by --set NODE.PARAMETER=PORT",
+            "end the other graph or program, or choose another port: --set NODE.PARAMETER=PORT",
         )
         for what, address, port in wanted
         if not is_free(address.strip("[]"), int(port))

@@ -1,7 +1,7 @@
-"""Reading a graph and writing into it from outside, on any of its hosts.
+"""Read topics of a running graph, and write to it, from tools on any of its hosts.
 
-Each plan foresees the tools as writers: those of the main host write what no node does, those of
-the other hosts e-stops alone.  They speak with the keys of the host where they run.
+Tools are writers of every graph.  On the main host they write the topics that no node writes; on
+other hosts they write e-stops only.  They use the keys of their host.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
     from flexsheet.launch.running.supervisor import RunningGraph
 
 READER_RECONNECT_S = 1.0
-"""Readers look for a writer that was not there at most every half second."""
+"""Exceeds the half second after which readers look for a missing writer again."""
 
 
 @dataclass(slots=True)
-class Counts:
-    """What a tool's subscriber has lost or refused."""
+class ToolCounts:
+    """Count the messages that a tool's subscriber lost or refused."""
 
     dropped: int = 0
     gaps: int = 0
@@ -39,17 +39,17 @@ class Counts:
 
 
 def tools_host(run: Run) -> str:
-    """The host whose tools we are."""
+    """Return the host whose tools this process belongs to."""
     return run.host or MAIN
 
 
 def topics_for_tools(plan: ResolvedGraph, host: str = MAIN) -> list[str]:
-    """Topics that a tool on a host may write in this plan."""
+    """Return the topics that a tool on a host may write in this graph."""
     return [topic for topic in plan.writers if plan.writer(topic, tools_on(host)) is not None]
 
 
 def load_tool_keys(plan: ResolvedGraph, run: Run) -> KeyRing | None:
-    """The keys of the host where we are; None where the plan has none."""
+    """Return the keys of this host; None if the graph has none."""
     return KeyRing(ring_file(run, tools_host(run))) if plan.keys else None
 
 
@@ -62,17 +62,17 @@ def make_subscriber(
     on_problem: Problem,
     unopened: bool = False,
 ) -> Subscriber:
-    """A subscriber, not yet started, to all writers of a topic in a running graph."""
+    """Make a subscriber to all writers of a topic in a running graph, not started yet."""
     wanted = topic_named(topic)
     return Subscriber(
         wanted,
         local_sources(run, plan.sources_to_read(topic, tools_host(run))),
         on_message,
-        Counts(),
+        ToolCounts(),
         on_problem=on_problem,
         unopened=unopened,
         keys=load_tool_keys(plan, run),
-        # Who does not run our plan must be seen most of all.
+        # Nodes and hosts of another plan must be reported, too.
         plan=None if wanted.message in (Status, HostStatus) else plan.hash,
     )
 
@@ -82,10 +82,10 @@ async def read_topic(
 ) -> AsyncIterator[tuple[Message, Header]]:
     """Yield the messages of a topic of a running graph with their headers, as they arrive.
 
-    count: how many; None: until the caller stops.  On a slow reader messages queue up.
+    count: number of messages; None for no end.  A slow reader's messages queue up.
     Raises KeyError for a topic that does not exist.
     """
-    # Commands that look into a graph start faster without it.
+    # Commands that inspect a graph start faster without it.
     import structlog
 
     arrived: asyncio.Queue[tuple[Message, Header]] = asyncio.Queue()
@@ -105,9 +105,9 @@ async def read_topic(
 
 
 class GraphWriter:
-    """Publishers for some topics of a running graph; needs a running loop.
+    """Publish topics of a running graph from outside; needs a running event loop.
 
-    Raises BadInputError for a topic that is a node's, BusError when another tool writes it now.
+    Raises BadInputError for a topic that a node writes, BusError if another tool writes it now.
     """
 
     def __init__(self, plan: ResolvedGraph, run: Run, topics: Iterable[str]) -> None:
@@ -121,7 +121,7 @@ class GraphWriter:
             for name in topics:
                 writer = plan.writer(name, self._name)
                 if writer is None:
-                    raise _refusal(plan, name, host)
+                    raise _make_refusal(plan, name, host)
                 endpoints = local_endpoints(run, writer.endpoints)
                 self._publishers[name] = Publisher(topic_named(name), endpoints, keys=keys)
         except BaseException:
@@ -129,7 +129,10 @@ class GraphWriter:
             raise
 
     def publish(self, topic: str, message: Message, *, source_ns: int | None = None) -> None:
-        """Send a message with the next sequence number, stamped now (or as `source_ns` says)."""
+        """Send a message with the next sequence number.
+
+        source_ns: stamp of the data; default: now.
+        """
         self._sequences[topic] = self._sequences.get(topic, 0) + 1
         now_ns = self._clock.now_ns()
         self._publishers[topic].send(
@@ -150,19 +153,19 @@ class GraphWriter:
             publisher.close()
 
 
-def _refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
-    """Why tools on a host do not write a topic, and who may."""
+def _make_refusal(plan: ResolvedGraph, topic: str, host: str) -> BadInputError:
+    """Make the error for a topic that tools on a host may not write."""
     from flexsheet.launch.plans import documents
 
     may = ", ".join(topics_for_tools(plan, host))
     if topic in topics_for_tools(plan):
         key: tuple[str, ...] = ("hosts", host)
-        what = f'topic "{topic}" is not for tools on this computer, host "{host}"'
-        remedy = f'say it on host "{MAIN}" ({plan.hosts[MAIN]}); from here: {may}'
+        what = f'topic "{topic}" cannot be written by tools on host "{host}"'
+        remedy = f'run the tool on host "{MAIN}" ({plan.hosts[MAIN]}); open here: {may}'
     else:
         key = ("external_topics",)
         owners = ", ".join(one.name for one in plan.writers.get(topic, ()))
         what = f'topic "{topic}" '
         what += f"is written by {owners}" if owners else "is not part of the graph"
-        remedy = f'list it in "external_topics"; open are: {may}'
+        remedy = f'list it in "external_topics"; open now: {may}'
     return documents.BadInputError([documents.Problem(plan.launch_file, key, what, remedy)])
