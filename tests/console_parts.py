@@ -29,7 +29,7 @@ class Shelf:
             for name, message in messages.items()
         }
 
-    def newest(self, name: str, kind: Any) -> Any:
+    def latest(self, name: str, kind: Any) -> Any:
         return self.held.get(name)
 
 

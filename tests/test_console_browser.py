@@ -18,9 +18,9 @@ from playwright.async_api import async_playwright, expect
 
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.console import panels
+from flexsheet.nodes.console.access_control import AccessControl, start_server
 from flexsheet.nodes.console.banner import GraphState
-from flexsheet.nodes.console.desk import Sliders
-from flexsheet.nodes.console.guard import Guard, start_server
+from flexsheet.nodes.console.controller import Sliders
 from flexsheet.nodes.console.history import History
 from flexsheet.nodes.console.page import Page
 from tests.arm_states import arm_state
@@ -141,7 +141,7 @@ async def measure_layout(page: Page, tab: BrowserTab, found: Findings) -> None:
 
 async def draw_a_single_sample(page: Page, tab: BrowserTab, found: Findings) -> None:
     history = History()
-    history.take(0.0, Shelf(fingertip=fingertip(np.zeros(3))))
+    history.add(0.0, Shelf(fingertip=fingertip(np.zeros(3))))
     page.graph.show("<p id=single>single</p>", history.columns())
     await tab.get_by_role("tab", name="Graph").click()
     await expect(tab.locator("#single")).to_be_visible()
@@ -186,7 +186,7 @@ async def open_in_frames(url: str, tab: BrowserTab, found: Findings) -> None:
 
 async def visit() -> Findings:
     found = Findings()
-    server = start_server("127.0.0.1", 0, Guard("127.0.0.1", None), "flexsheet")
+    server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "flexsheet")
     page = Page(server, lambda *_: None, with_finger=True, others_may=(MARKUP,))
     url = f"http://127.0.0.1:{server.get_port()}/"
     try:

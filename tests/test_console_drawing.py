@@ -14,7 +14,13 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.arm_bridge import kinematics
 from flexsheet.nodes.console.arms import PIECES, link_poses, rounded_box
 from flexsheet.nodes.console.creases import split_creases
-from flexsheet.nodes.console.picture import picture_of, ray_vertices, rays
+from flexsheet.nodes.console.scene_view import (
+    LINES_LIFT_M,
+    SHEET_LIFT_M,
+    finger_mesh,
+    lift_sheet,
+    line_segments,
+)
 from flexsheet.nodes.console.sheet import (
     COLUMNS,
     ROWS,
@@ -23,13 +29,7 @@ from flexsheet.nodes.console.sheet import (
     sheet_points,
     sheet_triangles,
 )
-from flexsheet.nodes.console.view import (
-    LINES_LIFT_M,
-    SHEET_LIFT_M,
-    finger_mesh,
-    lift_sheet,
-    line_segments,
-)
+from flexsheet.nodes.console.snapshot import ray_vertices, rays, take_snapshot
 from flexsheet.nodes.models.rigid import rotation_from_vector, transform
 from tests.arm_states import arm_state
 from tests.console_parts import Shelf, cylinder
@@ -157,10 +157,10 @@ def test_rays_that_miss_have_no_segments(scene: Scene) -> None:
 
 
 def test_a_picture_of_what_is_known(scene: Scene) -> None:
-    nothing = picture_of(scene, Shelf())
+    nothing = take_snapshot(scene, Shelf())
     assert (nothing.links, nothing.sheet, nothing.finger) == ({}, None, None)
     left, right = edges()
-    both = picture_of(
+    both = take_snapshot(
         scene,
         Shelf(
             arm_left=arm_state("left", world_from_flange=left),

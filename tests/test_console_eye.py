@@ -18,8 +18,15 @@ from flexsheet.messages.types import (
     TwinEye,
 )
 from flexsheet.nodes.console import panels
-from flexsheet.nodes.console.desk import CAPTURE_S, MAX_TRACING_S, Desk, Files, Look, LookState
-from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.controller import (
+    CAPTURE_S,
+    MAX_TRACING_S,
+    ConsoleController,
+    ConsoleFiles,
+    EyeViewRequester,
+    EyeViewState,
+)
+from flexsheet.nodes.console.finger import FingerController
 from tests.console_parts import cylinder
 
 Floats = NDArray[np.float64]
@@ -37,28 +44,28 @@ def test_looking_puts_back_what_another_had_set(scene: Scene) -> None:
         assert isinstance(message, Display)
         sent.append(message)
 
-    look = Look(publish, scene)
-    look.advance(1.0)
+    eye_view = EyeViewRequester(publish, scene)
+    eye_view.advance(1.0)
     assert not sent, "nobody wants to look"
     anothers = Display(correction="one_plane", stereo="anaglyph", label="mine")
-    look.on_others_display(anothers)
-    look.wanted = True
-    look.advance(2.0)
+    eye_view.on_others_display(anothers)
+    eye_view.wanted = True
+    eye_view.advance(2.0)
     asked = sent[0]
     assert (asked.stereo, asked.pixels_every > 0) == ("mono", True)
     pixel = np.zeros((2, 2, 3), np.uint8)
     eye = TwinEye(label="x", correction="none", metres_per_px=1e-3, seen=pixel, expected=pixel)
-    assert not look.got(eye, 2.5)
-    assert look.got(eye.model_copy(update={"label": asked.label}), 3.0)
+    assert not eye_view.on_image(eye, 2.5)
+    assert eye_view.on_image(eye.model_copy(update={"label": asked.label}), 3.0)
     assert sent[-1] is anothers
-    look.advance(3.1)
+    eye_view.advance(3.1)
     assert len(sent) == 2, "not at once again"
-    look.again()
-    look.advance(3.2)
-    assert look.state is LookState.DRAWING
-    look.advance(60.0)
+    eye_view.request_now()
+    eye_view.advance(3.2)
+    assert eye_view.state is EyeViewState.DRAWING
+    eye_view.advance(60.0)
     assert sent[-1] is anothers, "a frame that is never drawn is given up"
-    look.follow(scene)
+    eye_view.on_scene(scene)
     assert len(sent) == 4, "a scene changes nothing of what another has set"
 
 
@@ -74,28 +81,30 @@ def test_after_a_look_each_scene_has_its_own_correction_until_one_is_picked(
     for name, correction in (("flat", "one_plane"), ("silent", None)):
         (tmp_path / f"{name}.json").write_text(corrected_by(correction).model_dump_json())
     sent: list[Message] = []
-    files = Files(tmp_path / "plan.json", tmp_path, tmp_path, tmp_path / "console.json")
-    desk = Desk(sent.append, files, Finger(sent.append, speed_m_per_s=0.1), print)
+    files = ConsoleFiles(tmp_path / "plan.json", tmp_path, tmp_path, tmp_path / "console.json")
+    controller = ConsoleController(
+        sent.append, files, FingerController(sent.append, speed_m_per_s=0.1), print
+    )
 
     def corrections() -> list[str]:
         return [message.correction for message in sent if isinstance(message, Display)]
 
-    desk.begin()
-    desk.scenes.choose("flat")
+    controller.begin()
+    controller.scenes.choose("flat")
     assert corrections() == [], "the renderer follows the scene by itself"
-    desk.scenes.choose("silent")
-    desk.look.follow(corrected_by("four_triangles"))
-    desk.look.wanted = True
-    desk.look.advance(1.0)
-    desk.look.advance(60.0)
+    controller.scenes.choose("silent")
+    controller.eye_view.on_scene(corrected_by("four_triangles"))
+    controller.eye_view.wanted = True
+    controller.eye_view.advance(1.0)
+    controller.eye_view.advance(60.0)
     rested = sent[-1]
     assert isinstance(rested, Display)
     assert corrections() == ["four_triangles", "four_triangles"]
-    desk.scenes.choose("flat")
-    desk.scenes.choose("silent")
+    controller.scenes.choose("flat")
+    controller.scenes.choose("silent")
     assert corrections()[2:] == ["one_plane", "two_pass"]
-    desk.look.picked = "none"
-    desk.scenes.choose("flat")
+    controller.eye_view.picked = "none"
+    controller.scenes.choose("flat")
     assert corrections()[4:] == ["none"]
 
 
@@ -119,56 +128,56 @@ def frame(label: str, *, pixels: bool = True) -> Frame:
 def test_a_picture_that_takes_long_is_shown_all_the_same(scene: Scene) -> None:
     """On a busy computer each picture came after the next was asked for, and none was shown."""
     sent: list[Message] = []
-    look = Look(sent.append, scene)
-    look.wanted = True
-    look.advance(1.0)
-    look.on_frame(frame("another"), 1.5)
-    look.on_frame(frame(look.label, pixels=False), 1.5)
-    states = [look.state]
-    look.on_frame(frame(look.label), 2.0)
-    states.append(look.state)
-    assert states == [LookState.DRAWING, LookState.TRACING]
+    eye_view = EyeViewRequester(sent.append, scene)
+    eye_view.wanted = True
+    eye_view.advance(1.0)
+    eye_view.on_frame(frame("another"), 1.5)
+    eye_view.on_frame(frame(eye_view.label, pixels=False), 1.5)
+    states = [eye_view.state]
+    eye_view.on_frame(frame(eye_view.label), 2.0)
+    states.append(eye_view.state)
+    assert states == [EyeViewState.DRAWING, EyeViewState.TRACING]
     assert len(sent) == 1
-    look.advance(2.0 + 1.1 * CAPTURE_S)
+    eye_view.advance(2.0 + 1.1 * CAPTURE_S)
     rested = sent[-1]
     assert isinstance(rested, Display)
     assert rested.label == "console rests", "the display is not held while a picture is traced"
-    label = look.label
+    label = eye_view.label
     for second in range(4, 80):
-        look.advance(float(second))
-    assert (look.label, len(sent)) == (label, 2), "nothing else is asked for meanwhile"
-    assert look.waited_s(80.0) == 78.0
+        eye_view.advance(float(second))
+    assert (eye_view.label, len(sent)) == (label, 2), "nothing else is asked for meanwhile"
+    assert eye_view.waited_s(80.0) == 78.0
     pixel = np.zeros((2, 2, 3), np.uint8)
     eye = TwinEye(label=label, correction="none", metres_per_px=1e-3, seen=pixel, expected=pixel)
-    assert look.got(eye, 80.0)
-    assert (look.state, len(sent)) == (LookState.RESTING, 2)
-    look.advance(90.0)
-    assert look.label != label
-    assert look.got(eye, 91.0), "one from before is shown too"
-    assert look.state is LookState.DRAWING
+    assert eye_view.on_image(eye, 80.0)
+    assert (eye_view.state, len(sent)) == (EyeViewState.RESTING, 2)
+    eye_view.advance(90.0)
+    assert eye_view.label != label
+    assert eye_view.on_image(eye, 91.0), "one from before is shown too"
+    assert eye_view.state is EyeViewState.DRAWING
 
 
 def test_a_picture_that_never_comes_is_given_up(scene: Scene) -> None:
-    look = Look(lambda message: None, scene)
-    look.wanted = True
-    look.advance(1.0)
-    look.on_frame(frame(look.label), 2.0)
-    look.advance(2.0 + 1.1 * MAX_TRACING_S)
-    assert look.state is LookState.RESTING
+    eye_view = EyeViewRequester(lambda message: None, scene)
+    eye_view.wanted = True
+    eye_view.advance(1.0)
+    eye_view.on_frame(frame(eye_view.label), 2.0)
+    eye_view.advance(2.0 + 1.1 * MAX_TRACING_S)
+    assert eye_view.state is EyeViewState.RESTING
 
 
 @pytest.mark.parametrize(
     ("state", "ago_s", "expected"),
     [
-        (LookState.DRAWING, None, "renderer to draw a frame: 7 s."),
-        (LookState.TRACING, None, "busy computer: 7 s."),
-        (LookState.TRACING, 31.0, "The last picture came 31 s ago"),
-        (LookState.RESTING, 3.0, "Taken 3 s ago"),
-        (LookState.RESTING, None, "no frame or no picture"),
+        (EyeViewState.DRAWING, None, "renderer to draw a frame: 7 s."),
+        (EyeViewState.TRACING, None, "busy computer: 7 s."),
+        (EyeViewState.TRACING, 31.0, "The last image came 31 s ago"),
+        (EyeViewState.RESTING, 3.0, "Rendered 3 s ago"),
+        (EyeViewState.RESTING, None, "no frame or no image"),
     ],
 )
 def test_the_eye_tab_says_what_it_waits_for(
-    state: LookState, ago_s: float | None, expected: str
+    state: EyeViewState, ago_s: float | None, expected: str
 ) -> None:
     html = panels.eye(possible=True, wanted=True, state=state, waited_s=7.0, ago_s=ago_s)
     assert expected in html

@@ -14,11 +14,17 @@ import pytest
 
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.types import Display, FingerPath, Recording, Status
-from flexsheet.nodes.console.desk import MAX_DRAWING_S, SETTLE_S, Desk, Files, LookState
-from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.access_control import AccessControl, start_server
+from flexsheet.nodes.console.controller import (
+    MAX_DRAWING_S,
+    SETTLE_S,
+    ConsoleController,
+    ConsoleFiles,
+    EyeViewState,
+)
+from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
-from flexsheet.nodes.console.guard import Guard, start_server
-from flexsheet.nodes.console.newest import Newest
+from flexsheet.nodes.console.latest_messages import LatestMessages
 from flexsheet.nodes.console.operator import Operator
 from flexsheet.nodes.console.touch_tab import LIFT, LOWER
 from tests.console_parts import cylinder
@@ -49,32 +55,32 @@ class Bench:
         end_s = self.now_s + seconds
         while self.now_s < end_s:
             self.now_s += TICK_S
-            self.operator.advance(self.now_s, looking=True)
-        self.operator.tell(self.now_s)
+            self.operator.advance(self.now_s, has_viewers=True)
+        self.operator.refresh_tables(self.now_s)
 
     async def change_scene(self, name: str, value: float) -> None:
         """Move one of the scene's sliders, and wait until the new object is known."""
-        self.operator.heed("slide", name, value)
+        self.operator.handle_request("slide", name, value)
         self.run(2.0 * SETTLE_S)
         await self.know_object()
 
     async def know_object(self) -> None:
-        task = self.operator.desk.scenes._making_aim
+        task = self.operator.controller.scenes._picker_task
         assert task is not None
         await task
 
     def depth_m(self) -> float:
         """How deep the finger is in the cylinder's side, along its path."""
         tips = [one.positions_world_m[0] for one in self.sent if isinstance(one, FingerPath)]
-        solid = self.operator.desk.scenes.scene.object
+        solid = self.operator.controller.scenes.scene.object
         away = (tips[-1] - solid.world_from_object.position_m)[1:]
         return float(solid.geometry.radius_m - np.linalg.norm(away))  # type: ignore[union-attr]  # a cylinder
 
     def assert_agreement(self) -> None:
-        intent = self.operator.desk.finger.intent
+        intent = self.operator.controller.finger.intent
         assert self.touch._depth.value == pytest.approx(1e3 * intent.depth_m, abs=0.05)
         shown = self.touch._across.value, self.touch._up.value
-        wanted = 1e3 * np.array(self.operator.desk.finger.position_m)
+        wanted = 1e3 * np.array(self.operator.controller.finger.position_m)
         assert shown == pytest.approx(wanted, abs=0.51)
         assert self.touch._lift.label == (LOWER if intent.lifted else LIFT)
 
@@ -84,21 +90,23 @@ async def bench(tmp_path: Path) -> AsyncIterator[Bench]:
     (tmp_path / "plan.json").write_text(
         json.dumps({"scene": json.loads(cylinder().model_dump_json())})
     )
-    files = Files(tmp_path / "plan.json", tmp_path, tmp_path / "bags", tmp_path / "kept.json")
+    files = ConsoleFiles(
+        tmp_path / "plan.json", tmp_path, tmp_path / "bags", tmp_path / "kept.json"
+    )
     files.bags.mkdir()
     sent: list[Message] = []
-    server = start_server("127.0.0.1", 0, Guard("127.0.0.1", None), "test")
-    finger = Finger(sent.append, speed_m_per_s=0.15)
+    server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "test")
+    finger = FingerController(sent.append, speed_m_per_s=0.15)
     facts = GraphFacts(recorders=("tape",), records_on_request=True, solvers=("body",))
-    desk = Desk(sent.append, files, finger, pytest.fail, facts)
-    newest = Newest(lambda topic, error: pytest.fail(str(error)))
+    controller = ConsoleController(sent.append, files, finger, pytest.fail, facts)
+    newest = LatestMessages(lambda topic, error: pytest.fail(str(error)))
     operator = Operator(
-        server, newest, desk, pytest.fail, name="page", with_finger=True, with_eye=False
+        server, newest, controller, pytest.fail, name="page", with_finger=True, with_eye=False
     )
     bench = Bench(operator, files.bags, sent)
     await bench.know_object()
     yield bench
-    await desk.scenes.close()
+    await controller.scenes.close()
     server.stop()
 
 
@@ -108,30 +116,30 @@ async def test_the_push_slider_means_what_it_shows(bench: Bench) -> None:
     assert bench.touch._lift.label == LOWER
     for name, value in (("young_modulus_pa", 9e3), ("stretch_ratio", 1.04), ("size_ratio", 1.1)):
         bench.touch._depth.value = 18.0
-        bench.operator.heed("push", 0.018)
+        bench.operator.handle_request("push", 0.018)
         bench.run()
         assert bench.depth_m() == pytest.approx(0.018, abs=3e-4)
         await bench.change_scene(name, value)
         bench.touch._depth.value = 8.0
-        bench.operator.heed("push", 0.008)
+        bench.operator.handle_request("push", 0.008)
         bench.run()
         assert bench.depth_m() == pytest.approx(0.008, abs=3e-4)
         bench.assert_agreement()
 
 
 async def test_lifted_the_finger_comes_down_where_the_sliders_are(bench: Bench) -> None:
-    bench.operator.heed("touch", EYE, np.array([0.02, 0.01, 0.0]) - EYE)
+    bench.operator.handle_request("touch", EYE, np.array([0.02, 0.01, 0.0]) - EYE)
     bench.run()
     bench.assert_agreement()
     assert bench.touch._across.value == 20.0
-    bench.operator.heed("lift")
+    bench.operator.handle_request("lift")
     bench.touch._across.value, bench.touch._up.value = -10.0, 0.0
-    bench.operator.heed("place", -0.010, 0.0)
+    bench.operator.handle_request("place", -0.010, 0.0)
     bench.run()
     assert bench.depth_m() < -0.02
     bench.assert_agreement()
     bench.touch._depth.value = 6.0
-    bench.operator.heed("push", 0.006)
+    bench.operator.handle_request("push", 0.006)
     bench.run()
     assert bench.depth_m() == pytest.approx(0.006, abs=3e-4)
     assert bench.sent[-1].positions_world_m[0, 0] == pytest.approx(-0.010)  # type: ignore[attr-defined]  # a path
@@ -139,9 +147,9 @@ async def test_lifted_the_finger_comes_down_where_the_sliders_are(bench: Bench) 
 
 
 async def test_after_a_refused_command_the_page_shows_what_holds(bench: Bench) -> None:
-    bench.operator.heed("push", 0.006)
+    bench.operator.handle_request("push", 0.006)
     bench.touch._depth.value = 30.0
-    bench.operator.heed("push", float("nan"))
+    bench.operator.handle_request("push", float("nan"))
     bench.assert_agreement()
     assert bench.touch._depth.value == 6.0
 
@@ -151,10 +159,10 @@ async def test_the_bag_that_was_recorded_is_chosen(bench: Bench) -> None:
     old.write_bytes(b"")
     bench.run(1.0)
     assert bench.bag.value == "old.mcap"
-    bench.operator.heed("record")
+    bench.operator.handle_request("record")
     assert bench.sent[-1] == Recording(running=True)
     bench.run(10.0)
-    bench.operator.heed("record")
+    bench.operator.handle_request("record")
     assert bench.bag.value == "old.mcap", "the recorder has not made its bag yet"
     (bench.bags / "new.mcap").write_bytes(b"")
     os.utime(old)
@@ -174,19 +182,19 @@ async def test_own_display_messages_are_known_by_their_writer(
     bench: Bench, writer: str, restored: bool
 ) -> None:
     """A label says nothing: another writer may use the console's words."""
-    look = bench.operator.desk.look
+    eye_view = bench.operator.controller.eye_view
     others = display("console 1")
-    bench.operator.hear(others, Header(1, 1, 1, "clock", writer, 1), 0.0)
-    look.wanted = True
+    bench.operator.on_message(others, Header(1, 1, 1, "clock", writer, 1), 0.0)
+    eye_view.wanted = True
     bench.run(0.5)
-    assert look.state is LookState.DRAWING
+    assert eye_view.state is EyeViewState.DRAWING
     bench.run(2.0 * MAX_DRAWING_S)
     assert (bench.sent[-1] is others) == restored
 
 
 async def test_notes_come_from_the_nodes_of_the_plan_whatever_their_names(bench: Bench) -> None:
     for name, note in (("tape", "records to a.mcap"), ("body", "meshes, 3 s left")):
-        bench.operator.hear(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
+        bench.operator.on_message(status(name, note), Header(1, 1, 1, "clock", name, 1), 0.0)
     bench.run(0.5)
     assert "records to a.mcap" in bench.operator._page.record._words._shown
     assert "meshes, 3 s left" in bench.operator._page._state._shown

@@ -231,7 +231,7 @@ async def end_recording(page: Page, heard: Heard) -> None:
     await expect(page.get_by_role("combobox", name="Bag")).to_have_value("a.mcap")
     await page.get_by_role("button", name="Show the bag").click()
     await expect(page.get_by_role("alert").last).to_contain_text(
-        "nothing in it that the page shows"
+        "has no topic that the page shows"
     )
 
 

@@ -18,8 +18,8 @@ from flexsheet.messages.types import (
     EStop,
     Fingertip,
 )
-from flexsheet.nodes.console.desk import Replay
-from flexsheet.nodes.console.replay import Timeline, bags_in
+from flexsheet.nodes.console.controller import Replay
+from flexsheet.nodes.console.replay import Timeline, list_bags
 from tests.console_parts import cylinder
 from tests.fingertips import fingertip
 
@@ -58,17 +58,17 @@ def test_a_bag_is_shown_as_it_was_at_any_moment(bag: Path) -> None:
     assert timeline.bookmarks == [(pytest.approx(4.0), "touch")]
     for seconds, height in ((0.05, 0.0), (10.0, 1e-2), (3.14, 3.1e-3), (0.0, 0.0)):
         timeline.seconds = seconds
-        entry = timeline.newest("fingertip", Fingertip)
+        entry = timeline.latest("fingertip", Fingertip)
         assert entry is not None
         assert entry[0].position_world_m[2] == pytest.approx(height)
-    assert timeline.newest("arm_left", ArmState) is None
-    one, again = timeline.newest("scene", Scene), timeline.newest("scene", Scene)
+    assert timeline.latest("arm_left", ArmState) is None
+    one, again = timeline.latest("scene", Scene), timeline.latest("scene", Scene)
     assert one is not None
     assert again is not None
     assert one[0] is again[0], "the scene is not drawn anew at each frame"
     timeline.seconds = -1.0
-    assert timeline.newest("fingertip", Fingertip) is None
-    assert bags_in(bag.parent.parent) == ["sub/a.mcap"]
+    assert timeline.latest("fingertip", Fingertip) is None
+    assert list_bags(bag.parent.parent) == ["sub/a.mcap"]
 
 
 def test_bags_that_cannot_be_shown_say_why(tmp_path: Path, bag: Path) -> None:
@@ -80,7 +80,7 @@ def test_bags_that_cannot_be_shown_say_why(tmp_path: Path, bag: Path) -> None:
     with BagWriter(tmp_path / "stop.mcap") as writer:
         message = EStop(engaged=True, reason="")
         writer.write(TOPICS["estop"], message, Header(1, 1, 1, "c", "w", 1), 1)
-    with pytest.raises(BagError, match="nothing in it"):
+    with pytest.raises(BagError, match="has no topic that"):
         Timeline(tmp_path / "stop.mcap")
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(bag.read_bytes()[:-300])

@@ -18,9 +18,14 @@ from flexsheet.messages.types import (
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.limiter import check_sheet
 from flexsheet.nodes.console import scenes
-from flexsheet.nodes.console.aim import Aim
-from flexsheet.nodes.console.desk import SETTLE_S, Desk, Files, SceneDesk
-from flexsheet.nodes.console.finger import Finger, FingerIntent
+from flexsheet.nodes.console.controller import (
+    SETTLE_S,
+    ConsoleController,
+    ConsoleFiles,
+    SceneController,
+)
+from flexsheet.nodes.console.finger import FingerController, FingerIntent
+from flexsheet.nodes.console.picking import SurfacePicker
 from tests.console_parts import ROOT, cylinder
 from tests.plans import scene_with
 
@@ -45,13 +50,13 @@ SOLIDS: list[dict[str, Any]] = [
 @pytest.mark.parametrize("geometry", SOLIDS, ids=lambda one: str(one["shape"]))
 def test_a_larger_object_keeps_its_front(geometry: dict[str, Any]) -> None:
     first = scene_with(geometry, (0.0, 0.0, -0.05), (0.2, 0.0, 0.0))
-    grown = scenes.edited(first, young_modulus_pa=9e3, stretch_ratio=1.05, size_ratio=1.3)
+    grown = scenes.edit_scene(first, young_modulus_pa=9e3, stretch_ratio=1.05, size_ratio=1.3)
     assert grown.object.material.young_modulus_pa == 9e3
     assert grown.sheet.min_stretch_ratio == 1.05
 
     def front(scene: Scene) -> float:
-        shape = Aim(scene)
-        seen = shape.under_ray(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, -1.0]), 0.0)
+        shape = SurfacePicker(scene)
+        seen = shape.pick(np.array([0.0, 0.0, 0.5]), np.array([0.0, 0.0, -1.0]), 0.0)
         return float(seen[2])
 
     if geometry["shape"] in ("sphere", "plane"):
@@ -73,7 +78,7 @@ def test_a_larger_object_keeps_its_front(geometry: dict[str, Any]) -> None:
 def test_values_that_make_no_scene_are_refused(scene: Scene, name: str, value: float) -> None:
     good = {"young_modulus_pa": 4e3, "stretch_ratio": 1.02, "size_ratio": 1.0}
     with pytest.raises(scenes.SceneChoiceError):
-        scenes.edited(scene, **good | {name: value})
+        scenes.edit_scene(scene, **good | {name: value})
 
 
 @pytest.mark.parametrize("path", sorted(SCENES.glob("*.yaml")), ids=lambda path: path.stem)
@@ -81,7 +86,9 @@ def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
     """At more than 8 % the arms of the demo stood still, and the scene's own limit was raised."""
     scene = load_scene(path)
     limit = scenes.max_stretch_ratio(scene)
-    tight = scenes.edited(scene, young_modulus_pa=4e3, stretch_ratio=limit, size_ratio=1.0).sheet
+    tight = scenes.edit_scene(
+        scene, young_modulus_pa=4e3, stretch_ratio=limit, size_ratio=1.0
+    ).sheet
     assert tight.max_stretch_ratio == scene.sheet.max_stretch_ratio
     assert tight.min_stretch_ratio == limit <= tight.max_stretch_ratio
     left, right = np.eye(4), np.eye(4)
@@ -93,20 +100,20 @@ def test_the_tension_ends_where_the_arms_would_stop(path: Path) -> None:
 async def test_scenes_are_sent_once_a_slider_rests(scene: Scene, tmp_path: Path) -> None:
     (tmp_path / "other.json").write_text(scene.model_dump_json())
     sent: list[Message] = []
-    desk = SceneDesk(sent.append, tmp_path, scene)
-    desk.slide(10.0, young_modulus_pa=5e3)
-    desk.slide(10.3, young_modulus_pa=6e3)
-    assert not desk.settle(10.3 + 0.9 * SETTLE_S)
-    assert desk.settle(10.3 + SETTLE_S)
-    assert not desk.settle(20.0)
+    controller = SceneController(sent.append, tmp_path, scene)
+    controller.slide(10.0, young_modulus_pa=5e3)
+    controller.slide(10.3, young_modulus_pa=6e3)
+    assert not controller.apply_sliders(10.3 + 0.9 * SETTLE_S)
+    assert controller.apply_sliders(10.3 + SETTLE_S)
+    assert not controller.apply_sliders(20.0)
     assert [one.object.material.young_modulus_pa for one in sent if isinstance(one, Scene)] == [6e3]
-    desk.choose("other")
-    assert desk.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
+    controller.choose("other")
+    assert controller.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
     with pytest.raises(scenes.SceneChoiceError, match='no scene "none"; there are: other'):
-        desk.choose("none")
-    desk.slide(30.0, size_ratio=-1.0)
+        controller.choose("none")
+    controller.slide(30.0, size_ratio=-1.0)
     with pytest.raises(scenes.SceneChoiceError):
-        desk.settle(31.0)
+        controller.apply_sliders(31.0)
     assert len(sent) == 2
 
 
@@ -115,23 +122,27 @@ def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_
     other = scene.model_copy(update={"name": "other"})
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "other.json").write_text(other.model_dump_json())
-    files = Files(tmp_path / "plan.json", tmp_path / "scenes", tmp_path, tmp_path / "console.json")
+    files = ConsoleFiles(
+        tmp_path / "plan.json", tmp_path / "scenes", tmp_path, tmp_path / "console.json"
+    )
     warnings: list[str] = []
 
-    def desk() -> tuple[Desk, list[Message]]:
+    def controller() -> tuple[ConsoleController, list[Message]]:
         sent: list[Message] = []
-        made = Desk(sent.append, files, Finger(sent.append, speed_m_per_s=0.1), warnings.append)
+        made = ConsoleController(
+            sent.append, files, FingerController(sent.append, speed_m_per_s=0.1), warnings.append
+        )
         made.begin()
         return made, sent
 
-    first, sent = desk()
+    first, sent = controller()
     assert [one.name for one in sent if isinstance(one, Scene)] == [scene.name]
     first.scenes.choose("other")
     first.scenes.slide(1.0, young_modulus_pa=9e3)
-    first.scenes.settle(2.0)
+    first.scenes.apply_sliders(2.0)
     first.finger.push(0.009)
     first.record(True)
-    again, sent = desk()
+    again, sent = controller()
     assert again.finger.intent == FingerIntent(depth_m=0.009, lifted=False)
     assert again.scenes.sliders == first.scenes.sliders
     taken_up, recording = sent
@@ -140,12 +151,12 @@ def test_a_console_that_is_started_again_goes_on_where_it_was(scene: Scene, tmp_
     assert recording == Recording(running=True)
     again.record(False)
     again.scenes.choose("other")
-    third, sent = desk()
+    third, sent = controller()
     assert [type(message) for message in sent] == [Scene], "nothing is being recorded"
     assert third.scenes.sliders.young_modulus_pa == scene.object.material.young_modulus_pa
     assert warnings == []
-    files.kept.write_text("{")
-    (begun,) = desk()[1]
+    files.state.write_text("{")
+    (begun,) = controller()[1]
     assert isinstance(begun, Scene)
     assert begun.name == scene.name
-    assert "cannot be taken up again" in warnings[0]
+    assert "is no valid state" in warnings[0]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from flexsheet.messages.types import ArmState, PortStatus, Status
-from flexsheet.nodes.console import banner, dress, panels
+from flexsheet.nodes.console import banner, html_head, panels
 from flexsheet.nodes.console.banner import BannerState, GraphState
-from flexsheet.nodes.console.desk import LookState
+from flexsheet.nodes.console.controller import EyeViewState
 from flexsheet.nodes.console.graph_tab import max_latency_ms
 from flexsheet.nodes.console.history import SERIES, WINDOW_S, History, widen_isolated
 from flexsheet.nodes.console.page import STOP_COLOR
@@ -21,7 +21,7 @@ from tests.colours import luminance
 from tests.console_parts import Shelf
 from tests.fingertips import fingertip
 
-PAGE_STYLE = (dress.HERE / "page.css").read_text()
+PAGE_STYLE = (html_head.HERE / "page.css").read_text()
 
 
 def port(topic: str, **changes: Any) -> PortStatus:
@@ -164,7 +164,7 @@ def test_only_arms_that_wait_for_a_word_are_said_to(auto: bool) -> None:
 
 def test_under_the_banner_stands_why_nothing_happens() -> None:
     idle = {"left": arm_state("left", mode="idle", reason="not told <yet>")}
-    assert "The left arm says: not told &lt;yet&gt;." in rendered(arms=idle)
+    assert "The left arm reports: not told &lt;yet&gt;." in rendered(arms=idle)
     assert "9 s left" in rendered(solver_note="precomputing the soft body: 9 s left")
     replay = rendered(scene="sphere", replay="a.mcap")
     assert "REPLAY" in replay
@@ -193,7 +193,7 @@ def test_words_of_the_tabs() -> None:
     told = panels.finger(fingertip(np.array([-0.012, 0.003, -0.0041])))
     assert "12 mm left and 3 mm above the screen" in told
     assert "4 mm behind" in told
-    resting: dict[str, Any] = {"state": LookState.RESTING, "waited_s": 1.0, "ago_s": None}
+    resting: dict[str, Any] = {"state": EyeViewState.RESTING, "waited_s": 1.0, "ago_s": None}
     assert "twin_eye" in panels.eye(wanted=True, possible=False, **resting)
     assert "Tick" in panels.eye(wanted=False, possible=True, **resting)
     assert "no recorder" in panels.recorder(None, ())
@@ -246,14 +246,14 @@ def test_latencies_are_from_the_exposure_on() -> None:
         arm_right=arm_state("right"),
     )
     for second in range(40):
-        history.take(float(second), shelf)
+        history.add(float(second), shelf)
     times, *series = history.columns()
     assert (times[0], times[-1]) == (-WINDOW_S, 0.0)
     last = dict(zip(SERIES, (one[-1] for one in series), strict=True))
     assert last["finger found"] == pytest.approx(3.0)
     assert last["arm commanded"] == pytest.approx(8.0)
     assert np.isnan(last["frame drawn"])
-    told = history.newest_and_worst()
+    told = history.latest_and_max()
     assert told["finger found"] == pytest.approx((3.0, 3.0))
     legend = panels.latency_table(told)
     assert ">8<" in legend

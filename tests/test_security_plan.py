@@ -27,7 +27,8 @@ from flexsheet.messages.security import new_key_pair, write_secret
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Arming, EStop
 from flexsheet.nodes import node_class
-from flexsheet.nodes.console.desk import Desk, Files, Finger, ReleaseError
+from flexsheet.nodes.console.controller import ConsoleController, ConsoleFiles, ReleaseError
+from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
 from flexsheet.nodes.node import Node, NodeParameters, Output, parameters_of
 from flexsheet.nodes.runner import Links
@@ -223,16 +224,16 @@ def test_a_console_that_may_not_reset_says_who_may(folder: Path, may: bool | Non
     plan = lab(folder, may_reset_estop=may)
     (folder / "plan.json").write_text(plan.model_dump_json())
     sent: list[Message] = []
-    files = Files(folder / "plan.json", folder, folder, folder / "console.json")
+    files = ConsoleFiles(folder / "plan.json", folder, folder, folder / "console.json")
     facts = GraphFacts.from_plan(files.plan, "console")
-    finger = Finger(sent.append, speed_m_per_s=0.1)
-    desk = Desk(sent.append, files, finger, print, facts)
-    desk.stop("pressed at the console")
+    finger = FingerController(sent.append, speed_m_per_s=0.1)
+    console = ConsoleController(sent.append, files, finger, print, facts)
+    console.stop("pressed at the console")
     if may:
-        desk.release()
+        console.release()
         assert sent[-1] == EStop(engaged=False, reason="reset at the console")
     else:
-        with pytest.raises(ReleaseError, match="do it on main, or let it: may_reset_estop"):
-            desk.release()
+        with pytest.raises(ReleaseError, match="use main, or set may_reset_estop"):
+            console.release()
         assert sent == [EStop(engaged=True, reason="pressed at the console")]
-        assert desk.stopped == "pressed at the console"
+        assert console.stopped == "pressed at the console"

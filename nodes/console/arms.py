@@ -1,8 +1,8 @@
-"""What the arms look like: their links as boxes and tubes, and where those are.
+"""Describe the drawn arms: boxes per link, and the poses of the links.
 
-The lengths are the RV-1A's own (base to shoulder, upper arm, elbow, forearm, flange); thicknesses
-are drawn, not measured.  A link's frame is where its joint turns; at zero every frame is parallel
-to the base.
+The lengths are those of the RV-1A: base to shoulder, upper arm, elbow, forearm, flange. The
+thicknesses are drawn, not measured. The origin of a link's frame lies on its joint axis. With all
+joints at zero every frame is parallel to the base.
 """
 
 from __future__ import annotations
@@ -24,12 +24,14 @@ JOINTS = (
     ((0.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
     ((0.0, 0.0, 0.072), (0.0, 0.0, 1.0)),
 )
-"""Where each joint is in the frame of the link before it (m), and the axis it turns about."""
+"""Position of each joint in the frame of the link before it (m), and its axis."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A box of a link: its size and middle (m) in the link's frame; link 0 is the base."""
+    """Describe a box of a link: its size and centre (m) in the frame of the link; link 0 is the
+    base.
+    """
 
     link: int
     size_m: tuple[float, float, float]
@@ -51,45 +53,45 @@ PIECES = (
 )
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
-"""Of a box, (8, 3): x is bit 4 of the index, y bit 2, z bit 1."""
+"""Corners of a box, (8, 3): x is bit 4 of the index, y bit 2, z bit 1."""
 
 CLAMP_SIZE_M = (0.012, 1.04, 0.012)
-"""Of the bar that holds the sheet: across, along the edge as a share of it, through."""
+"""Size of the bar that holds the sheet: across, along the edge (over its length), through."""
 
 
 def link_poses(world_from_base: Floats, joints_rad: Floats) -> Floats:
-    """world_from_link (7, 4, 4) of the base and the six links, the last one the flange."""
+    """Compute world_from_link (7, 4, 4) of the base and the six links; the last is the flange."""
     poses = [world_from_base]
     for (offset_m, axis), angle_rad in zip(JOINTS, joints_rad.tolist(), strict=True):
-        turn = rotation_from_vector(angle_rad * np.array(axis))
-        poses.append(poses[-1] @ transform(turn, offset_m))
+        rotation = rotation_from_vector(angle_rad * np.array(axis))
+        poses.append(poses[-1] @ transform(rotation, offset_m))
     return np.stack(poses)
 
 
 def rounded_box(
     size_m: tuple[float, float, float], middle_m: tuple[float, float, float], bevel: float = 0.18
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """A box with bevelled edges: vertices (24, 3) and triangles (44, 3), counter-clockwise outside.
+    """Make a box with bevelled edges: vertices (24, 3), counter-clockwise triangles (44, 3).
 
-    bevel: share of the least half side that is cut off.
+    bevel: fraction of the smallest half side that is cut off.
     """
     half = 0.5 * np.array(size_m)
     cut = bevel * half.min()
-    # Three vertices at each corner, each on one of its faces: index 8 * axis + corner.
+    # Each corner has three vertices, one per face: index 8 * axis + corner.
     vertices = np.concatenate(
         [CORNERS * (half - cut * (1.0 - np.eye(3)[axis])) for axis in range(3)]
     )
-    return vertices + np.array(middle_m), _wound_outwards(vertices, _box_triangles())
+    return vertices + np.array(middle_m), _orient_outwards(vertices, _box_triangles())
 
 
 def _box_triangles() -> NDArray[np.int32]:
-    """Vertices (44, 3) of the triangles: of the corners, of the edges' strips, of the faces."""
+    """Return the vertices (44, 3) of the triangles of corners, edge strips and faces."""
     corner = np.arange(8)
     triangles = [np.stack([corner, 8 + corner, 16 + corner], axis=1)]
     for axis in range(3):
         bit = 4 >> axis
         low = corner[corner & bit == 0]
-        # The edges along this axis join the faces of the other two; its own faces are their ends.
+        # Edges along this axis join the faces of the other two axes.
         first, second = (8 * other for other in range(3) if other != axis)
         near, far = low, low | bit
         triangles += [
@@ -102,8 +104,8 @@ def _box_triangles() -> NDArray[np.int32]:
     return np.concatenate(triangles).astype(np.int32)
 
 
-def _wound_outwards(vertices: Floats, triangles: NDArray[np.int32]) -> NDArray[np.int32]:
-    """The same triangles of a convex body about the origin, counter-clockwise from outside."""
+def _orient_outwards(vertices: Floats, triangles: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Return the triangles of a convex body about the origin, counter-clockwise from outside."""
     a, b, c = (vertices[triangles[:, i]] for i in range(3))
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), a + b + c) < 0.0
     triangles[inward] = triangles[inward][:, ::-1]

@@ -1,4 +1,4 @@
-"""The banner over everything else: how the arms are, what to do about it, and what is shown."""
+"""Render the banner: the state of the arms, what to do about it, and what is shown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flexsheet.nodes.console.panels import MODES, words
 
 
 class BannerState(IntEnum):
-    """What the banner shows, the most urgent last."""
+    """Name the states of the banner, the most urgent last."""
 
     READY = 0
     WAITING = 1
@@ -36,11 +36,11 @@ STILL_STOPPED = "the arms are still stopped"
 
 @dataclass(frozen=True, slots=True)
 class GraphState:
-    """What the banner is made of.
+    """Hold the inputs of the banner.
 
-    arms: by side.  estop_reason: None without an e-stop.  overload: the sentence that says by how
-    much the computer is overloaded, empty: it is not.  solver_note: of the soft body's solver while
-    it has not answered for this scene yet.  replay: name of the bag that is shown.
+    arms: by side. estop_reason: None without an e-stop. overload: sentence about an overloaded
+    computer, else empty. solver_note: note of the soft body's solver while it has not answered for
+    this scene. replay: name of the shown bag.
     """
 
     scene: str
@@ -53,14 +53,14 @@ class GraphState:
 
     @property
     def stopped(self) -> str | None:
-        """The reason of an e-stop that holds, as far as the console knows it."""
+        """Return the reason of an engaged e-stop, as far as the console knows it."""
         if self.estop_reason is None and any(arm.mode == "estop" for arm in self.arms.values()):
             return STILL_STOPPED
         return self.estop_reason
 
     @property
     def banner(self) -> BannerState:
-        """The most urgent state that holds."""
+        """Return the most urgent present state."""
         if self.stopped is not None:
             return BannerState.ESTOP
         if any(map(is_faulty, self.arms.values())):
@@ -73,7 +73,7 @@ class GraphState:
 
     @property
     def resettable(self) -> bool:
-        """Whether there is something that a reset clears."""
+        """Return whether a reset would clear something."""
         return self.stopped is not None or any(arm.faults for arm in self.arms.values())
 
 
@@ -88,15 +88,15 @@ def render(state: GraphState) -> str:
     sentences = [state.overload, _remedy(state, shown), _explain(state, shown)]
     forces = [arm.edge_force_n for arm in state.arms.values() if arm.edge_force_n is not None]
     if forces:
-        sentences.append(f"The sheet pulls with {max(forces):.1f} N.")
+        sentences.append(f"The edge force is {max(forces):.1f} N.")
     if state.solver_note:
         sentences.append(f"No object is shown yet, its solver reports: {state.solver_note}.")
     scene = f"<b>{escape(state.scene)}</b>"
     source = f"Scene {scene}, live."
     if state.replay is not None:
         source = (
-            f"<b>REPLAY</b> of {escape(state.replay)}, scene {scene}: the 3D view shows what was, "
-            "this window what is."
+            f"<b>REPLAY</b> of {escape(state.replay)}, scene {scene}: the 3D view shows the bag, "
+            "this window the running graph."
         )
     text = " ".join([source, *(escape(one) for one in sentences if one)])
     return (
@@ -113,7 +113,7 @@ def _title(state: GraphState, shown: BannerState) -> str:
             return f"E-STOP is engaged: {state.stopped}"
         case BannerState.FAULT:
             faults = "; ".join(_describe(side, arm) for side, arm in state.arms.items())
-            # First, since it is the probable cause of the faults.
+            # The probable cause of the faults comes first.
             return f"The computer is busy. {faults}" if state.overload else faults
         case BannerState.BUSY:
             return "The computer is busy"
@@ -132,18 +132,18 @@ def _describe(side: str, arm: ArmState) -> str:
 
 
 def _remedy(state: GraphState, shown: BannerState) -> str:
-    """What a person can do; empty where nothing is to be done."""
+    """Return what a person can do; empty if there is nothing to do."""
     arms = state.arms.values()
     if shown is BannerState.ESTOP:
         return f"Release the stop once the arms rest; {_after_reset(state)}."
     if shown is BannerState.FAULT:
         if any(arm.path_blocked and not arm.faults for arm in arms):
             return (
-                "Lower Tension or Size, choose another scene, or move the finger: "
-                "then the arms look for a path again."
+                "Lower Tension or Size, choose another scene, or move the finger; "
+                "the arms then search for a path again."
             )
         if all(arm.mode == "disconnected" for arm in arms if is_faulty(arm)):
-            return "Check the power and the cable of the arm; it is connected again by itself."
+            return "Check the power and the cable of the arm; it reconnects automatically."
         return f"Remove the cause, then press Reset the fault; {_after_reset(state)}."
     if shown is BannerState.WAITING and any(_awaits_person(arm) for arm in arms):
         return "The arms stay where they are until: flexsheet arms enable."
@@ -166,7 +166,7 @@ def _explain(state: GraphState, shown: BannerState) -> str:
         return ""
     for side, arm in state.arms.items():
         if arm.mode != "follow" and not is_faulty(arm) and arm.reason:
-            return f"The {side} arm says: {arm.reason}."
+            return f"The {side} arm reports: {arm.reason}."
     sheet = state.sheet
     if sheet is None or not state.arms:
         return ""
@@ -176,4 +176,8 @@ def _explain(state: GraphState, shown: BannerState) -> str:
         case "approach":
             return "The sheet waits in front of the finger."
         case _:
-            return f"The sheet holds: {sheet.reason}." if sheet.reason else "The sheet holds."
+            return (
+                f"The sheet holds its pose: {sheet.reason}."
+                if sheet.reason
+                else "The sheet holds its pose."
+            )

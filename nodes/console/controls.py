@@ -1,7 +1,7 @@
-"""What all of the page's tabs do with viser's controls.
+"""Wrap viser's controls for all tabs.
 
-Every callback runs on viser's own threads; it only hands on what was asked, by name, to the node.
-Of viser's handles only what its stubs do not tell (that values can be set) is used: they are Any.
+Every callback runs on viser's own threads and only passes a request to the node. viser's stubs do
+not declare that values can be set, so handles have the type Any.
 """
 
 from __future__ import annotations
@@ -9,19 +9,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-Ask = Callable[..., None]
-"""ask(name, *values): what the viewer wants; may be called from any thread."""
+Request = Callable[..., None]
+"""request(name, *values): pass a request of a viewer to the node, from any thread."""
 
 
-def handing(ask: Ask, name: str, *values: Any) -> Callable[[Any], None]:
-    """A callback that asks for this."""
-    return lambda event: ask(name, *values)
+def make_callback(request: Request, name: str, *values: Any) -> Callable[[Any], None]:
+    """Return a callback that makes this request."""
+    return lambda event: request(name, *values)
 
 
 def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
-    """Call with the value that a viewer has set; not with what the page is told to show.
+    """Call `changed` with each value that a viewer sets, not with values set by the page.
 
-    As a coroutine it runs on viser's loop, so that the values come in the order of the changes.
+    The callback is a coroutine on viser's loop, so that the values arrive in the order of the
+    changes.
     """
 
     async def on_update(event: Any) -> None:
@@ -32,13 +33,13 @@ def on_value(handle: Any, changed: Callable[[Any], None]) -> None:
 
 
 def show_value(handle: Any, value: Any) -> None:
-    """Set a control's value where it shows another one."""
+    """Set the value of a control if it differs."""
     if handle.value != value:
         handle.value = value
 
 
 class Html:
-    """A piece of HTML on the page, sent only where it has changed."""
+    """Show a piece of HTML on the page; send it only when it has changed."""
 
     def __init__(self, gui: Any, html: str = "") -> None:
         self._handle, self._shown = gui.add_html(html), html

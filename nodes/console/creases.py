@@ -1,4 +1,4 @@
-"""Meshes with sharp edges, for a viewer that shades every vertex by one normal."""
+"""Split meshes at sharp edges, for a viewer that shades every vertex by one normal."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Floats = NDArray[np.float64]
 Triangles = NDArray[np.int32]
 
 CREASE_RAD = 0.7
-"""An edge whose two triangles turn by more is sharp."""
+"""Minimum angle between the normals of two triangles at a sharp edge."""
 
 
 def split_creases(vertices: Floats, triangles: Triangles) -> tuple[NDArray[np.int64], Triangles]:

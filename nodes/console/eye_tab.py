@@ -1,4 +1,4 @@
-"""The tab that looks through the user's eye."""
+"""Show the tab with the images of the user's eye."""
 
 from __future__ import annotations
 
@@ -8,44 +8,44 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.types import Correction
-from flexsheet.nodes.console.controls import Ask, Html, on_value
+from flexsheet.nodes.console.controls import Html, Request, on_value
 
 CORRECTIONS = ("two_pass", "four_triangles", "one_plane", "none")
-PICTURES = (
-    ("seen", "What the eye sees of the sheet"),
-    ("expected", "What it ought to see"),
-    ("frame", "What the projector is given"),
+IMAGES = (
+    ("seen", "Seen by the eye"),
+    ("expected", "Expected by the eye"),
+    ("frame", "Projector image"),
 )
 
 
 class EyeTab:
-    """Pictures, each shown once there is one."""
+    """Show each image once it exists."""
 
-    def __init__(self, gui: Any, ask: Ask) -> None:
-        self._look = gui.add_checkbox(
-            "Take pictures", False, hint="One every six seconds: each costs the graph some work"
+    def __init__(self, gui: Any, request: Request) -> None:
+        self._enabled = gui.add_checkbox(
+            "Render images", False, hint="One every six seconds: each costs the graph some work"
         )
         self._correction = gui.add_dropdown(
             "Correction",
             CORRECTIONS,
-            hint="For the tilt and the dent of the sheet, from the best to none at all",
+            hint="Corrects the tilt and the deflection of the sheet; the best one first",
         )
-        on_value(self._look, lambda on: ask("look", on))
-        on_value(self._correction, lambda name: ask("correct", name))
-        self._words = Html(gui)
+        on_value(self._enabled, lambda on: request("eye_view", on))
+        on_value(self._correction, lambda name: request("correct", name))
+        self._text = Html(gui)
         blank = np.full((3, 4, 3), 235, dtype=np.uint8)
-        self._pictures = {
+        self._images = {
             name: gui.add_image(blank, label=label, jpeg_quality=85, visible=False)
-            for name, label in PICTURES
+            for name, label in IMAGES
         }
 
     def show_correction(self, correction: Correction) -> None:
-        """The one that the scene chose, or a viewer."""
+        """Show the correction that the scene or a viewer chose."""
         self._correction.value = correction
 
-    def show_words(self, html: str) -> None:
-        self._words.show(html)
+    def show_text(self, html: str) -> None:
+        self._text.show(html)
 
-    def show_picture(self, name: str, image: NDArray[np.uint8]) -> None:
-        self._pictures[name].image = image
-        self._pictures[name].visible = True
+    def show_image(self, name: str, image: NDArray[np.uint8]) -> None:
+        self._images[name].image = image
+        self._images[name].visible = True

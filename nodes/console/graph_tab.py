@@ -1,4 +1,4 @@
-"""The tab that tells how the graph is: a strip chart of the latencies, and tables."""
+"""Show the tab with the state of the graph: a strip chart of latencies, and tables."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ Floats = NDArray[np.float64]
 
 
 class GraphTab:
-    """A chart whose lines differ by colour and by dashes, and the tables under it."""
+    """Show a chart whose lines differ by colour and by dashes, and the tables under it."""
 
     def __init__(self, gui: Any) -> None:
         gui.add_html(
-            '<p class="fs-words"><b>Latency, ms</b>, over the last half minute, s; which line is '
-            "which is told below</p>"
+            '<p class="fs-words"><b>Latency, ms</b>, over the last half minute, s; the table '
+            "below names the lines</p>"
         )
         lines = tuple(
             {"label": name, "stroke": line.color, "width": 2, "dash": line.dash, "spanGaps": False}
@@ -39,7 +39,7 @@ class GraphTab:
 
     def show(self, tables: str, columns: tuple[Floats, ...]) -> None:
         self._tables.show(tables)
-        # Set here, as uPlot finds no range where one of the series has no value at all.
+        # uPlot finds no range if one of the series has no value.
         scales = _scales(max_latency_ms(columns))
         if self._chart.scales != scales:
             self._chart.scales = scales
@@ -54,7 +54,7 @@ def _scales(top_ms: float) -> dict[str, Any]:
 
 
 def max_latency_ms(columns: tuple[Floats, ...]) -> float:
-    """Return the end of the chart's scale: the next of 1, 2, 5, 10, ... ms above all values."""
+    """Return the upper end of the chart's scale: the next of 1, 2, 5, 10, ... ms."""
     values = np.concatenate(columns[1:])
     largest = float(values[np.isfinite(values)].max(initial=1.0))
     decade = 10.0 ** np.floor(np.log10(largest))

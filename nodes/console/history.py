@@ -1,4 +1,4 @@
-"""What the strip charts show: the last half minute of a few latencies."""
+"""Sample the latencies of the last half minute, for the strip chart."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.messages.types import ArmState, Fingertip, Frame, SheetTarget, SoftBody
-from flexsheet.nodes.console.newest import Source
+from flexsheet.nodes.console.latest_messages import MessageSource
 
 Floats = NDArray[np.float64]
 
@@ -18,19 +18,19 @@ SERIES = ("finger found", "sheet placed", "body answered", "arm commanded", "fra
 
 
 class History:
-    """Samples of the latencies, each in ms from the exposure that it goes back to."""
+    """Store samples of the latencies, each in ms since its exposure."""
 
     def __init__(self) -> None:
         self._samples: deque[tuple[float, tuple[float, ...]]] = deque()
 
-    def take(self, now_s: float, source: Source) -> None:
-        """Add a sample of now; what is older than the window is dropped."""
+    def add(self, now_s: float, source: MessageSource) -> None:
+        """Add a sample; samples older than the window are dropped."""
         self._samples.append((now_s, latencies_ms(source)))
         while self._samples and self._samples[0][0] < now_s - WINDOW_S:
             self._samples.popleft()
 
     def columns(self) -> tuple[Floats, ...]:
-        """Seconds before the newest sample (all <= 0), then each series (ms; NaN: nothing)."""
+        """Return seconds before the latest sample (<= 0), then each series in ms; NaN: no value."""
         if not self._samples:
             return (np.zeros(1), *(np.full(1, np.nan) for _ in SERIES))
         newest_s = self._samples[-1][0]
@@ -38,8 +38,8 @@ class History:
         values = np.array([values for _, values in self._samples])
         return (times, *values.T)
 
-    def newest_and_worst(self) -> dict[str, tuple[float, float]]:
-        """The last sample (ms) and the greatest by series; NaN where nothing has come."""
+    def latest_and_max(self) -> dict[str, tuple[float, float]]:
+        """Return the latest sample (ms) and the maximum by series; NaN without a value."""
         found = {}
         for name, values in zip(SERIES, self.columns()[1:], strict=True):
             known = values[np.isfinite(values)]
@@ -48,8 +48,11 @@ class History:
 
 
 def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
-    """Return the columns so that a line is drawn of each value: one without a neighbour is repeated
-    at the sample beside it, and a single sample half a second earlier."""
+    """Return the columns so that a line is drawn for every value.
+
+    A value without a neighbour is repeated at the sample beside it. A single sample is repeated
+    half a second earlier.
+    """
     times, *series = columns
     if len(times) == 1:
         times = np.array([times[0] - SAMPLE_S, times[0]])
@@ -65,10 +68,10 @@ def widen_isolated(columns: tuple[Floats, ...]) -> tuple[Floats, ...]:
     return (times, *widened)
 
 
-def latencies_ms(source: Source) -> tuple[float, ...]:
-    """How long after its exposure (ms) each step's newest message was sent; NaN: none was.
+def latencies_ms(source: MessageSource) -> tuple[float, ...]:
+    """Return the time (ms) from the exposure to the publication of the latest message of each step.
 
-    For the arm: when the command was written that goes back to the exposure.
+    NaN without a message. For the arms: the time at which the command of that exposure was written.
     """
     found = []
     for name, kind in (
@@ -76,17 +79,17 @@ def latencies_ms(source: Source) -> tuple[float, ...]:
         ("sheet_target", SheetTarget),
         ("soft_body", SoftBody),
     ):
-        entry = source.newest(name, kind)
+        entry = source.latest(name, kind)
         found.append(
             float("nan") if entry is None else 1e-6 * (entry[1].publish_ns - entry[1].source_ns)
         )
-    arms = [source.newest(name, ArmState) for name in ("arm_left", "arm_right")]
+    arms = [source.latest(name, ArmState) for name in ("arm_left", "arm_right")]
     sent = [
         1e-6 * (arm[0].command_sent_ns - arm[0].target_source_ns)
         for arm in arms
         if arm is not None and arm[0].target_source_ns and arm[0].command_sent_ns
     ]
     found.append(max(sent, default=float("nan")))
-    frame = source.newest("frame", Frame)
+    frame = source.latest("frame", Frame)
     late = float("nan") if frame is None else 1e-6 * (frame[1].publish_ns - frame[1].source_ns)
     return (*found, late)

@@ -1,4 +1,4 @@
-"""A page in the browser: the whole apparatus in 3D, how the graph is, and a hand on it."""
+"""Serve a page in the browser that shows the whole apparatus and controls it."""
 
 from __future__ import annotations
 
@@ -16,36 +16,43 @@ from flexsheet.messages.topics import Delivery, Topic
 from flexsheet.messages.types import Bookmark, Display, EStop, FingerPath, Recording, Skin
 from flexsheet.messages.wire import WireError
 from flexsheet.nodes import NodeRole
-from flexsheet.nodes.console.desk import Desk, Files
-from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.access_control import AccessControl, read_token, start_server
+from flexsheet.nodes.console.controller import ConsoleController, ConsoleFiles
+from flexsheet.nodes.console.finger import FingerController
 from flexsheet.nodes.console.graph_facts import GraphFacts
-from flexsheet.nodes.console.guard import Guard, read_token, start_server
-from flexsheet.nodes.console.newest import Newest
+from flexsheet.nodes.console.latest_messages import LatestMessages
 from flexsheet.nodes.console.operator import Operator
 from flexsheet.nodes.node import Node, NodeParameters, Output, further_port, periodic
 from flexsheet.nodes.parameter_marks import ListenPort
 
-SHOWN = {
+TOPICS_READ = {
     *("fingertip", "sheet_target", "arm_left", "arm_right", "skin", "soft_body"),
     *("frame", "twin/eye", "status", "host", "estop", "display"),
 }
-"""Topics that it reads, as far as the graph has them."""
+"""Topics that the console reads if the graph has them."""
 
 
 class ConsoleParameters(NodeParameters):
-    """Where the page is, and how often it changes while somebody looks."""
+    """Hold the address of the page, its update rates and its files."""
 
     address: str = Field(default="127.0.0.1", description="IP address that the page is served at")
-    page_port: ListenPort = Field(default=8080, description="0: any that is free")
-    token_file: Path | None = Field(
-        default=None, description="who looks must know what is in it; needed beyond loopback"
+    page_port: ListenPort = Field(
+        default=8080, description="TCP port of the page; 0: any free port"
     )
-    rate_hz: Positive = Field(default=25.0, description="of the 3D view")
-    tables_hz: Positive = Field(default=2.0, description="of tables and charts")
-    control_finger: bool = Field(default=True, description="the mouse moves the twin's finger")
-    finger_speed_m_per_s: Positive = 0.15
-    bags: Path = Field(default=Path("runs"), description="folder whose bags can be replayed")
-    plan: Path = Field(default=Path("@run/plan.json"), description="holds the first scene")
+    token_file: Path | None = Field(
+        default=None,
+        description="file with the token that viewers need; required unless on loopback",
+    )
+    rate_hz: Positive = Field(default=25.0, description="update rate of the 3D view")
+    tables_hz: Positive = Field(default=2.0, description="update rate of tables and charts")
+    control_finger: bool = Field(default=True, description="let viewers move the simulated finger")
+    finger_speed_m_per_s: Positive = Field(
+        default=0.15, description="maximum speed of the simulated finger"
+    )
+    bags: Path = Field(default=Path("runs"), description="folder with the bags to replay")
+    plan: Path = Field(
+        default=Path("@run/plan.json"), description="plan of the run, with the first scene"
+    )
     scenes: Path = Field(default=Path("@run/scenes"), description="scenes to choose from")
     state_file: Path = Field(
         default=Path("@run/console-kept.json"),
@@ -58,20 +65,20 @@ class ConsoleParameters(NodeParameters):
         try:
             return str(ip_address(address))
         except ValueError:
-            raise ValueError(f'"{address}" is no IP address; as in 127.0.0.1') from None
+            raise ValueError(f'"{address}" is no IP address; use one such as 127.0.0.1') from None
 
     @model_validator(mode="after")
-    def _is_guarded(self) -> Self:
+    def _has_access_control(self) -> Self:
         if self.token_file is None and not ip_address(self.address).is_loopback:
             raise ValueError(
-                f"address {self.address} is beyond loopback: name a token_file, "
-                "or take 127.0.0.1 and come through ssh -L"
+                f"address {self.address} is not loopback: set token_file, "
+                "or use 127.0.0.1 with ssh -L"
             )
         return self
 
 
 class Console(Node):
-    """Serves the page.  It takes what it draws at its own rate, and works only while one looks."""
+    """Serve the page. It reads messages at its own rates, and only while there are viewers."""
 
     takes_frames: ClassVar[bool] = True
     opens_devices: ClassVar[bool] = True
@@ -86,77 +93,77 @@ class Console(Node):
 
     @classmethod
     def replay_refusal(cls, parameters: Any) -> str:
-        return "it serves a page; only its outputs are in the bag, not what people did there"
+        return "it serves a page, and the requests of its viewers are not in the bag"
 
     @classmethod
     def further_inputs(
         cls, parameters: ConsoleParameters, written: Sequence[Topic]
     ) -> Sequence[str]:
-        return [topic.name for topic in written if topic.name in SHOWN]
+        return [topic.name for topic in written if topic.name in TOPICS_READ]
 
     async def setup(self) -> None:
         given = self.parameters
         token = None if given.token_file is None else read_token(given.token_file)
-        guard = Guard(given.address, token)
+        access = AccessControl(given.address, token)
         self._loop = asyncio.get_running_loop()
-        self._newest = Newest(self._refused)
-        self._server = start_server(given.address, given.page_port, guard, "flexsheet")
+        self._latest = LatestMessages(self._refused)
+        self._server = start_server(given.address, given.page_port, access, "flexsheet")
         self.url = f"http://{given.address}:{self._server.get_port()}/"
-        finger = Finger(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
-        files = Files(given.plan, given.scenes, given.bags, given.state_file)
+        finger = FingerController(self._publish, speed_m_per_s=given.finger_speed_m_per_s)
+        files = ConsoleFiles(given.plan, given.scenes, given.bags, given.state_file)
         facts = GraphFacts.from_plan(given.plan, self.name)
-        desk = Desk(self._publish, files, finger, self.log.warning, facts)
+        controller = ConsoleController(self._publish, files, finger, self.log.warning, facts)
         self.operator = Operator(
             self._server,
-            self._newest,
-            desk,
-            self._ask,
+            self._latest,
+            controller,
+            self._request,
             name=self.name,
             with_finger=given.control_finger,
             with_eye=further_port("twin/eye") in self.inputs,
         )
-        desk.begin()
-        self.note = f"{self.url}, nobody looks"
+        controller.begin()
+        self.note = f"{self.url}, viewers: 0"
 
     async def close(self) -> None:
-        await self.operator.desk.scenes.close()
+        await self.operator.controller.scenes.close()
         await asyncio.to_thread(self._server.stop)
 
     def deliver(self, port: str, message: Any, header: Header) -> None:
-        """Keep frames of what is drawn until they are drawn; what must all be read is read now."""
+        """Store frames until they are drawn; decode at once where every message counts."""
         source = self.inputs[port]
         source.counts.count(header, self.clock.now_ns())
-        superseded = self._newest.put(source.topic.name, message)
+        superseded = self._latest.put(source.topic.name, message)
         if source.topic.delivery is Delivery.LATEST:
             source.counts.dropped += superseded
         elif source.topic.message is not Skin and (
-            opened := self._newest.newest(source.topic.name, source.topic.message)
+            opened := self._latest.latest(source.topic.name, source.topic.message)
         ):
-            self._guarded(self.operator.hear, opened[0], header, self.clock.now_ns() * 1e-9)
+            self._call(self.operator.on_message, opened[0], header, self.clock.now_ns() * 1e-9)
 
     @periodic("rate_hz")
     def draw(self) -> None:
-        """The 3D view, and what moves by itself."""
+        """Update the 3D view and everything that moves."""
         now_s = self.clock.now_ns() * 1e-9
-        looking = len(self._server.get_clients())
-        self.note = f"{self.url}, {looking or 'nobody'} look{'' if looking > 1 else 's'}"
-        self._guarded(self.operator.advance, now_s, looking > 0)
+        viewers = len(self._server.get_clients())
+        self.note = f"{self.url}, viewers: {viewers}"
+        self._call(self.operator.advance, now_s, viewers > 0)
 
     @periodic("tables_hz")
-    def tell(self) -> None:
-        """Tables and charts."""
+    def refresh_tables(self) -> None:
+        """Update tables and charts."""
         if self._server.get_clients():
-            self._guarded(self.operator.tell, self.clock.now_ns() * 1e-9)
+            self._call(self.operator.refresh_tables, self.clock.now_ns() * 1e-9)
 
     def _publish(self, message: Message) -> None:
         kind = type(message)
         next(out for out in self.outputs.values() if out.topic.message is kind).publish(message)
 
-    def _ask(self, what: str, *values: Any) -> None:
-        """Hand on what a viewer wants, from any thread."""
-        self._loop.call_soon_threadsafe(self._guarded, self.operator.heed, what, *values)
+    def _request(self, name: str, *values: Any) -> None:
+        """Pass a request of a viewer to the loop, from any thread."""
+        self._loop.call_soon_threadsafe(self._call, self.operator.handle_request, name, *values)
 
-    def _guarded(self, function: Any, *values: Any) -> None:
+    def _call(self, function: Any, *values: Any) -> None:
         try:
             function(*values)
         except Exception as error:

@@ -1,18 +1,18 @@
-// What viser's page leaves out: names of its controls, keys where it has none, the browser's choice
-// of dark, and a word when the connection is lost.  It runs before viser's own script.
+// Add to viser's page: names of its controls, missing keys, the browser's dark mode, and a message
+// when the connection is lost.  It runs before viser's own script.
 (() => {
   "use strict";
 
   const STOP = "E-STOP";
   const LOST =
-    "No connection to the console. What is shown is old, and the e-stop of this page does nothing: " +
-    "use the arms' own.";
+    "No connection to the console. The page is out of date, and its e-stop does nothing: " +
+    "use the e-stop of the arms.";
 
   const VIEW =
-    "3D view of arms, sheet, object and finger. Arrow keys turn it, W, A, S, D, Q, E move it; the " +
+    "3D view of arms, sheet, object and finger. Arrow keys rotate it, W, A, S, D, Q, E move it; the " +
     "sliders under Touch move the finger.";
 
-  // viser is dark where its address says so, not where the browser does.
+  // viser takes dark mode from its address only.
   const asked = new URLSearchParams(location.search);
   const wantsDark = matchMedia("(prefers-color-scheme: dark)").matches;
   if (wantsDark && !asked.has("darkMode") && !asked.has("token")) {
@@ -23,7 +23,7 @@
   const stopButton = () =>
     [...document.querySelectorAll("#root button")].find((one) => one.textContent.startsWith(STOP));
 
-  // viser heeds no hotkey while a text box has the focus; the e-stop must always be heeded.
+  // viser ignores hotkeys while a text box has the focus; the e-stop must always work.
   addEventListener(
     "keydown",
     (event) => {
@@ -33,7 +33,7 @@
     true,
   );
 
-  // Arrows that move a slider or go on to the next tab must not turn the 3D view too.
+  // Arrow keys that move a slider or change the tab must not rotate the 3D view.
   document.addEventListener("keydown", (event) => {
     if (event.key.startsWith("Arrow") && event.target.closest("[role=slider], [role=tab]"))
       event.stopPropagation();
@@ -60,7 +60,7 @@
     maximize: "Show larger",
   };
 
-  function mend() {
+  function nameControls() {
     for (const label of document.querySelectorAll("label[for]"))
       for (const control of controlsOf(label)) name(control, label.textContent);
     for (const [icon, text] of Object.entries(ICONS))
@@ -91,7 +91,7 @@
     heading.click();
   });
 
-  // viser takes the mouse from its panels while it has no connection.
+  // viser disables the mouse on its panels while it has no connection.
   const lost = document.createElement("p");
   lost.id = "fs-lost";
   lost.className = "fs-banner fs-ground-bad";
@@ -124,7 +124,7 @@
       due = true;
       setTimeout(() => {
         due = false;
-        mend();
+        nameControls();
       }, 100);
     }).observe(document.body, { childList: true, subtree: true });
   });

@@ -1,4 +1,4 @@
-"""The page's panels: what can be pressed, moved and read beside the 3D view."""
+"""Build the panels of the page: controls and texts beside the 3D view."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import viser
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.console import banner, panels
 from flexsheet.nodes.console.banner import GraphState
-from flexsheet.nodes.console.controls import Ask, Html, handing
-from flexsheet.nodes.console.desk import Desk
+from flexsheet.nodes.console.controller import ConsoleController
+from flexsheet.nodes.console.controls import Html, Request, make_callback
 from flexsheet.nodes.console.eye_tab import EyeTab
 from flexsheet.nodes.console.graph_tab import GraphTab
 from flexsheet.nodes.console.record_tab import RecordTab
+from flexsheet.nodes.console.scene_view import SceneView
 from flexsheet.nodes.console.touch_tab import TouchTab
-from flexsheet.nodes.console.view import View
 
 BRAND = (14, 92, 132)
 STOP_COLOR = (185, 28, 28)
@@ -24,16 +24,21 @@ MAIN_WIDTH, STOP_WIDTH = 380, 320
 
 
 class Page:
-    """All panels; the node tells it what to show."""
+    """Hold all panels; the operator sets what they show."""
 
     def __init__(
-        self, server: viser.ViserServer, ask: Ask, *, with_finger: bool, others_may: tuple[str, ...]
+        self,
+        server: viser.ViserServer,
+        request: Request,
+        *,
+        with_finger: bool,
+        others_may: tuple[str, ...],
     ) -> None:
-        """others_may: hosts that may reset an e-stop where the console's may not; empty: it may."""
+        """Build the panels. others_may: hosts that may reset an e-stop; empty: the console may."""
         self._gui: Any = server.gui
-        self._ask, self._others_may = ask, others_may
-        self.view = View(server)
-        self.view.on_touch(lambda *ray: ask("touch", *ray), lambda: None)
+        self._request, self._others_may = request, others_may
+        self.view = SceneView(server)
+        self.view.on_touch(lambda *ray: request("touch", *ray), lambda: None)
         self._gui.configure_theme(
             dark_mode=False, show_logo=False, show_share_button=False, brand_color=BRAND
         )
@@ -43,16 +48,16 @@ class Page:
         self._problem = Html(self._gui)
         tabs = self._gui.add_tab_group()
         with tabs.add_tab("Touch", viser.Icon.HAND_FINGER):
-            self.touch = TouchTab(self._gui, ask, self.view, with_finger=with_finger)
+            self.touch = TouchTab(self._gui, request, self.view, with_finger=with_finger)
         with tabs.add_tab("Graph", viser.Icon.TOPOLOGY_STAR):
             self.graph = GraphTab(self._gui)
         with tabs.add_tab("Eye", viser.Icon.EYE):
-            self.eye = EyeTab(self._gui, ask)
+            self.eye = EyeTab(self._gui, request)
         with tabs.add_tab("Record", viser.Icon.PLAYER_RECORD):
-            self.record = RecordTab(self._gui, ask)
+            self.record = RecordTab(self._gui, request)
 
     def _add_stop(self) -> None:
-        """In a window of its own, so that no tab and no scrolling takes it away."""
+        """Add the e-stop in its own window, which no tab and no scrolling hides."""
         panel = self._gui.add_panel()
         with panel.add_tab("Stop", viser.Icon.HAND_STOP):
             stop = self._gui.add_button(
@@ -62,28 +67,30 @@ class Page:
             self._release = self._gui.add_button(
                 RELEASE, disabled=True, hint="The arms must be at rest"
             )
-        # At the bottom: viser's own notices come at the top.
+        # viser shows its own notices at the top.
         panel.float(x=14, y=-14, width=STOP_WIDTH)
-        # On a telephone viser would fold it.
+        # viser folds panels on small screens.
         panel.expand()
-        stop.on_click(handing(self._ask, "stop", "pressed at the console"))
-        self._release.on_click(handing(self._ask, "release"))
+        stop.on_click(make_callback(self._request, "stop", "pressed at the console"))
+        self._release.on_click(make_callback(self._request, "release"))
         command = self._gui.add_command("E-stop: stop both arms", hotkey="escape")
-        command.on_trigger(handing(self._ask, "stop", "Escape at the console"))
+        command.on_trigger(make_callback(self._request, "stop", "Escape at the console"))
 
-    def show_scene(self, scene: Scene, desk: Desk) -> None:
-        """A scene that the graph now works with, or that a bag holds."""
+    def show_scene(self, scene: Scene, controller: ConsoleController) -> None:
+        """Show a scene of the graph or of a bag."""
         self.view.set_scene(scene)
-        self.touch.show_scene(scene, desk.scenes.base, desk.scenes.names, desk.scenes.sliders)
-        self.eye.show_correction(desk.look.correction)
+        self.touch.show_scene(
+            scene, controller.scenes.base, controller.scenes.names, controller.scenes.sliders
+        )
+        self.eye.show_correction(controller.eye_view.correction)
 
     def show_problem(self, text: str) -> None:
         self._problem.show(panels.problem(text))
 
     def show_state(self, state: GraphState) -> None:
-        """The banner, and whether there is an e-stop to release or a fault to reset."""
+        """Show the banner, and whether there is an e-stop to release or a fault to reset."""
         self._state.show(banner.render(state))
-        # Always there, so that nothing moves under the pointer.
+        # Always visible, so that nothing moves under the pointer.
         self._release.disabled = not state.resettable
         label = RESET if state.stopped is None else RELEASE
         if self._others_may:

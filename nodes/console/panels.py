@@ -1,6 +1,6 @@
-"""The page's words and tables, as HTML that a screen reader can read; colours never stand alone.
+"""Make the texts and tables of the page, as HTML for screen readers too.
 
-The classes are those of page.css.
+Every colour comes with a symbol. The classes are those of page.css.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from math import isnan
 
 from flexsheet.messages.topics import TOPICS
 from flexsheet.messages.types import Fingertip, PortStatus, Status
-from flexsheet.nodes.console.desk import LookState
+from flexsheet.nodes.console.controller import EyeViewState
 
 GOOD, WARN, BAD = ("fs-good", "●"), ("fs-warn", "▲"), ("fs-bad", "✕")
-SLOW_SHARE = 0.5
-"""Of the least rate that the table of topics expects: below it a topic is called slow."""
+SLOW_RATIO = 0.5
+"""A topic below this fraction of its minimum rate in the table of topics is slow."""
 
-STALE_S = 3.0
-"""A node that has not said how it is for so long is called silent."""
+MAX_STATUS_AGE_S = 3.0
+"""A node without a status message for this time is silent."""
 
 MODES = {
     "starting": "starting",
@@ -32,12 +32,12 @@ MODES = {
     "relax": "relaxing the sheet",
     "estop": "stopped",
 }
-"""What an arm is, in words."""
+"""Texts of the modes of an arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """How a series is drawn: its colour, readable on light and dark, and its dashes (px)."""
+    """Hold the style of a series: a colour for light and dark pages, and dashes (px)."""
 
     color: str
     dash: tuple[int, ...] = ()
@@ -59,7 +59,7 @@ def _mark(kind: tuple[str, str], text: str) -> str:
 def _table(
     caption: str, head: Iterable[str], rows: Iterable[Iterable[str]], *, numbers: Iterable[int] = ()
 ) -> str:
-    """numbers: which columns are flushed right."""
+    """Make a table. numbers: indices of right-aligned columns."""
     flushed = dict.fromkeys(numbers, ' class="fs-number"')
     heads = "".join(
         f'<th scope="col"{flushed.get(i, "")}>{escape(one)}</th>' for i, one in enumerate(head)
@@ -82,9 +82,9 @@ def words(html: str) -> str:
 
 
 def latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
-    """The chart's legend, with numbers.
+    """Make the legend of the chart, with numbers.
 
-    latencies: by series, the newest and the worst (ms); NaN where nothing has come.
+    latencies: by series, the latest and the maximum (ms); NaN: no value.
     """
     rows = []
     for line, (name, (newest, worst)) in zip(LINES, latencies.items(), strict=True):
@@ -93,20 +93,20 @@ def latency_table(latencies: Mapping[str, tuple[float, float]]) -> str:
             '<svg width="34" height="8" aria-hidden="true"><line x1="0" y1="4" x2="30" y2="4" '
             f'stroke="{line.color}" stroke-width="2.5"{dashes}/></svg>'
         )
-        told = ["–" if isnan(value) else f"{value:.0f}" for value in (newest, worst)]
-        rows.append((f"{drawn} {escape(name)}", *told))
+        texts = ["–" if isnan(value) else f"{value:.0f}" for value in (newest, worst)]
+        rows.append((f"{drawn} {escape(name)}", *texts))
     head = ("from the exposure until", "now, ms", "worst, ms")
-    return _table("Latency in numbers", head, rows, numbers=(1, 2))
+    return _table("Latencies", head, rows, numbers=(1, 2))
 
 
 def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
-    """Each node with its state, its share of a core, and its last error or note.
+    """Make a table of the nodes: state, processor load, last error or note.
 
-    statuses: by node, its newest status and how long ago (s) that was.
+    statuses: by node, its latest status and the age of that (s).
     """
     rows = []
     for name, (status, age_s) in sorted(statuses.items()):
-        if age_s > STALE_S:
+        if age_s > MAX_STATUS_AGE_S:
             state = _mark(BAD, f"silent for {age_s:.0f} s")
         elif status.state == "degraded":
             state = _mark(BAD, "degraded")
@@ -114,12 +114,12 @@ def nodes_table(statuses: Mapping[str, tuple[Status, float]]) -> str:
             state = _mark(GOOD, "running")
         else:
             state = _mark(WARN, status.state)
-        said = escape(status.note)
+        text = escape(status.note)
         if status.errors:
             count = f"{status.errors} error{'s' if status.errors > 1 else ''}"
-            said += f"<br>{_mark(BAD, f'{count}: {status.last_error}')}"
-        rows.append((escape(name), state, f"{100 * status.cpu_ratio:.0f}", said))
-    return _table("Nodes", ("node", "state", "CPU, %", "says"), rows, numbers=(2,))
+            text += f"<br>{_mark(BAD, f'{count}: {status.last_error}')}"
+        rows.append((escape(name), state, f"{100 * status.cpu_ratio:.0f}", text))
+    return _table("Nodes", ("node", "state", "CPU, %", "note"), rows, numbers=(2,))
 
 
 def topics_table(
@@ -133,7 +133,7 @@ def topics_table(
     written: dict[str, list[PortStatus]] = {}
     read: dict[str, list[PortStatus]] = {}
     for node, (status, age_s) in statuses.items():
-        if age_s > STALE_S:
+        if age_s > MAX_STATUS_AGE_S:
             continue
         for port in status.outputs:
             written.setdefault(port.topic, []).append(port)
@@ -156,7 +156,7 @@ def topics_table(
             state = _mark(GOOD, "on\N{NO-BREAK SPACE}change")
         elif rate_hz == 0.0:
             state = _mark(WARN, "silent")
-        elif rate_hz < SLOW_SHARE * topic.rate_hz[0]:
+        elif rate_hz < SLOW_RATIO * topic.rate_hz[0]:
             state = _mark(WARN, "slow")
         else:
             state = _mark(GOOD, "flows")
@@ -164,19 +164,19 @@ def topics_table(
         rows.append((escape(name), state, rate, oldest, str(dropped), str(lost)))
     head = ("topic", "state", "Hz", "age, ms", "skipped", "lost")
     return _table("Topics", head, rows, numbers=(2, 3, 4, 5)) + words(
-        "Age: of the message that the slowest reader has, from its exposure. Skipped: a newer one "
-        "was there already. Lost: on the way. Both since the start."
+        "Age: time since the exposure, of the oldest message among the readers. Skipped: replaced "
+        "by a newer message before it was read. Lost: in transit. Both since the start."
     )
 
 
 def finger(fingertip: Fingertip | None) -> str:
-    """Where the fingertip is, or why that is not known; always of the same height."""
+    """Describe the position of the fingertip, or why it is unknown; the height is constant."""
     return f'<div class="fs-finger">{words(_finger(fingertip))}</div>'
 
 
 def _finger(fingertip: Fingertip | None) -> str:
     if fingertip is None:
-        return "No fingertip has come yet."
+        return "No fingertip has been received."
     if not fingertip.valid:
         return _mark(WARN, f"not tracked: {fingertip.reason.replace('_', ' ')}")
     x, y, z = (round(1e3 * metres) for metres in fingertip.position_world_m.tolist())
@@ -188,29 +188,29 @@ def _finger(fingertip: Fingertip | None) -> str:
 
 
 def eye(
-    *, possible: bool, wanted: bool, state: LookState, waited_s: float, ago_s: float | None
+    *, possible: bool, wanted: bool, state: EyeViewState, waited_s: float, ago_s: float | None
 ) -> str:
-    """Return what the eye's pictures wait for.
+    """Describe what the images of the eye wait for.
 
-    waited_s: since `state` began.  ago_s: since the newest picture; None: there is none.
+    waited_s: since `state` began. ago_s: since the latest image; None: there is none.
     """
     if not possible:
-        return words("Nothing in this graph looks at the sheet; the twin's eye (twin_eye) would.")
+        return words("This graph has no simulated eye (a node of type twin_eye).")
     if not wanted:
         return words("Tick the box to see what the user's eye sees.")
-    taken = "" if ago_s is None else f" The last picture came {ago_s:.0f} s ago."
+    last = "" if ago_s is None else f" The last image came {ago_s:.0f} s ago."
     match state:
-        case LookState.DRAWING:
-            return words(f"Waits for the renderer to draw a frame: {waited_s:.0f} s.{taken}")
-        case LookState.TRACING:
+        case EyeViewState.DRAWING:
+            return words(f"Waits for the renderer to draw a frame: {waited_s:.0f} s.{last}")
+        case EyeViewState.TRACING:
             return words(
-                "Waits for the simulated eye to trace the picture, which takes a second of a "
-                f"processor and longer on a busy computer: {waited_s:.0f} s.{taken}"
+                "Waits for the simulated eye to trace the image, which takes one second of "
+                f"processor time, and longer on a busy computer: {waited_s:.0f} s.{last}"
             )
-        case LookState.RESTING if ago_s is None:
-            return words("Waits for its turn: no frame or no picture came in time.")
-        case LookState.RESTING:
-            return words(f"Taken {ago_s:.0f} s ago, the next one follows within six seconds.")
+        case EyeViewState.RESTING if ago_s is None:
+            return words("Waits for the next request: no frame or no image came in time.")
+        case EyeViewState.RESTING:
+            return words(f"Rendered {ago_s:.0f} s ago; the next image follows within six seconds.")
 
 
 def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
@@ -222,8 +222,8 @@ def recorder(note: str | None, bookmarks: tuple[str, ...]) -> str:
 
 
 def problem(text: str) -> str:
-    """An error of what was asked for, or nothing."""
+    """Show the error of a request; an empty text removes it."""
     if not text:
         return ""
-    said = escape(text[:1].upper() + text[1:])
-    return f'<div role="alert" class="fs-banner fs-ground-bad fs-problem">{said}</div>'
+    sentence = escape(text[:1].upper() + text[1:])
+    return f'<div role="alert" class="fs-banner fs-ground-bad fs-problem">{sentence}</div>'

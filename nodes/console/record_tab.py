@@ -7,21 +7,21 @@ from typing import Any
 
 import viser
 
-from flexsheet.nodes.console.controls import Ask, Html, handing, on_value, show_value
-from flexsheet.nodes.console.desk import Replay
+from flexsheet.nodes.console.controller import Replay
+from flexsheet.nodes.console.controls import Html, Request, make_callback, on_value, show_value
 
 PLAY_RATES = ("0.1", "0.25", "0.5", "1", "2", "4")
 NO_BAG = "(no bag)"
 NO_BOOKMARK = "-"
 RECORDING_COLOR = (146, 64, 14)
-"""Not the e-stop's."""
+"""Differs from the colour of the e-stop."""
 
 
 class RecordTab:
-    """Its timeline is there while a bag is shown."""
+    """Show the controls of recording and replay; the timeline is visible while a bag is shown."""
 
-    def __init__(self, gui: Any, ask: Ask) -> None:
-        self._ask = ask
+    def __init__(self, gui: Any, request: Request) -> None:
+        self._request = request
         self._seconds_by_option: dict[str, float] = {}
         with gui.add_folder("Record"):
             self._record = gui.add_button("Start recording", icon=viser.Icon.PLAYER_RECORD)
@@ -29,7 +29,7 @@ class RecordTab:
             bookmark = gui.add_button("Add a bookmark (M)", hint="Key: M")
             self._words = Html(gui)
         with gui.add_folder("Replay"):
-            self._bag = gui.add_dropdown("Bag", (NO_BAG,), hint="The newest first")
+            self._bag = gui.add_dropdown("Bag", (NO_BAG,), hint="Newest first")
             opened = gui.add_button("Show the bag")
             self._play = gui.add_button("Play", visible=False)
             self._time = gui.add_slider("Time, s", 0.0, 1.0, 0.05, 0.0, visible=False)
@@ -38,32 +38,32 @@ class RecordTab:
             )
             self._bookmarks = gui.add_dropdown("Go to", (NO_BOOKMARK,), visible=False)
             self._live = gui.add_button("Back to the running graph", visible=False)
-        self._record.on_click(handing(ask, "record"))
-        bookmark.on_click(lambda _: ask("bookmark", self._label.value))
-        opened.on_click(lambda _: ask("open_bag", self._bag.value))
-        self._play.on_click(handing(ask, "play"))
-        self._live.on_click(handing(ask, "leave"))
-        on_value(self._time, lambda seconds: ask("seek", seconds))
-        on_value(self._rate, lambda rate: ask("replay_rate", float(rate)))
+        self._record.on_click(make_callback(request, "record"))
+        bookmark.on_click(lambda _: request("bookmark", self._label.value))
+        opened.on_click(lambda _: request("open_bag", self._bag.value))
+        self._play.on_click(make_callback(request, "play"))
+        self._live.on_click(make_callback(request, "leave"))
+        on_value(self._time, lambda seconds: request("seek", seconds))
+        on_value(self._rate, lambda rate: request("replay_rate", float(rate)))
         on_value(self._bookmarks, self._go_to_bookmark)
         command = gui.add_command("Add a bookmark", hotkey="M")
-        command.on_trigger(lambda _: ask("bookmark", self._label.value))
+        command.on_trigger(lambda _: request("bookmark", self._label.value))
 
     def _go_to_bookmark(self, option: str) -> None:
         seconds = self._seconds_by_option.get(option)
         if seconds is not None:
-            self._ask("seek", seconds)
-            # So that the same can be chosen again.
+            self._request("seek", seconds)
+            # The same bookmark can then be chosen again.
             self._bookmarks.value = NO_BOOKMARK
 
     def show_state(self, html: str, *, recording: bool) -> None:
-        """What the recorder does."""
+        """Show what the recorder does."""
         self._words.show(html)
         self._record.label = "Stop recording" if recording else "Start recording"
         self._record.color = RECORDING_COLOR if recording else None
 
     def show_bags(self, names: Sequence[str], made: str | None = None) -> None:
-        """List the bags.  made: one to choose, as it has just been recorded."""
+        """List the bags. made: a bag to choose, since it was just recorded."""
         options = tuple(names) or (NO_BAG,)
         if self._bag.options != options:
             self._bag.options = options
@@ -71,7 +71,7 @@ class RecordTab:
             show_value(self._bag, made)
 
     def show_replay(self, replay: Replay, *, opened: bool = False) -> None:
-        """The timeline's place; `opened`: it is another bag's, or none any more."""
+        """Show the position of the timeline; `opened`: another bag is shown, or none."""
         timeline = replay.timeline
         if opened:
             for handle in (self._play, self._time, self._rate, self._bookmarks, self._live):

@@ -12,17 +12,17 @@ from mcap.records import Message as Record
 from flexsheet.messages.bag import BagError, BagReader, Chunk
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.types import Bookmark
-from flexsheet.nodes.console.newest import checked
+from flexsheet.nodes.console.latest_messages import check_type
 
 M = TypeVar("M", bound=Message)
 
-CHUNKS_KEPT = 6
+MAX_CHUNKS = 6
 
 
 class Timeline:
-    """A bag and a place in it; `seconds` counts from its beginning.
+    """Read a bag at a position; `seconds` counts from its beginning.
 
-    Raises BagError for a file that is no bag, or holds nothing that the page could show.
+    Raises BagError for a file that is not a bag, or contains nothing that the page shows.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,28 +32,30 @@ class Timeline:
         self.duration_s, self._start_ns = summary.duration_s, summary.start_ns
         self._readable = {one.name for one in summary.topics if one.readable and one.count}
         if not self._readable & {"arm_left", "arm_right", "fingertip", "soft_body"}:
-            raise BagError(f"{path}: nothing in it that the page shows; it holds no arms, finger")
+            raise BagError(
+                f"{path}: has no topic that the page shows, such as arm_left or fingertip"
+            )
         self._channels = {one.topic: one.id for one in self._reader.channels.values()}
-        self._places = {name: self._times(name) for name in self._readable}
+        self._positions = {name: self._times(name) for name in self._readable}
         self._chunks: OrderedDict[int, dict[tuple[int, int], Record]] = OrderedDict()
         self._opened: dict[str, tuple[int, tuple[Message, Header]]] = {}
         self.bookmarks = self._find_bookmarks()
         self.seconds = 0.0
 
-    def newest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """See `flexsheet.nodes.console.newest.Source`; at `seconds`."""
-        times, _ = self._places.get(name, ([], []))
+    def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
+        """Return the latest message up to `seconds`; see `latest_messages.MessageSource`."""
+        times, _ = self._positions.get(name, ([], []))
         i = bisect_right(times, self._start_ns + round(self.seconds * 1e9)) - 1
         if i < 0:
             return None
-        held = self._opened.get(name)
-        if held is None or held[0] != i:
-            held = (i, self._open(name, i))
-            self._opened[name] = held
-        return checked(held[1], kind)
+        cached = self._opened.get(name)
+        if cached is None or cached[0] != i:
+            cached = (i, self._open(name, i))
+            self._opened[name] = cached
+        return check_type(cached[1], kind)
 
     def _times(self, name: str) -> tuple[list[int], list[Chunk]]:
-        """Log times of a topic's messages in order, and the chunk of each."""
+        """Return the log times of the messages of a topic in order, and the chunk of each."""
         entries = [
             (time_ns, chunk.offset, chunk)
             for chunk in self._reader.chunks
@@ -63,41 +65,41 @@ class Timeline:
         return [entry[0] for entry in entries], [entry[2] for entry in entries]
 
     def _open(self, name: str, i: int) -> tuple[Message, Header]:
-        times, chunks = self._places[name]
+        times, chunks = self._positions[name]
         record = self._records(chunks[i]).get((self._channels[name], times[i]))
         if record is None:
             raise BagError(f'{self.path}: topic "{name}": no message where its index says')
         return self._reader.open_record(self._reader.channels[self._channels[name]], record)
 
     def _records(self, chunk: Chunk) -> dict[tuple[int, int], Record]:
-        """Messages of a chunk by channel and log time; the last few chunks are kept."""
-        held = self._chunks.get(chunk.offset)
-        if held is None:
+        """Return the messages of a chunk by channel and log time; the last chunks are cached."""
+        cached = self._chunks.get(chunk.offset)
+        if cached is None:
             with self.path.open("rb") as file:
                 records = self._reader.read_chunk(file, chunk)
-            held = {
+            cached = {
                 (record.channel_id, record.log_time): record
                 for record in records
                 if isinstance(record, Record)
             }
-            self._chunks[chunk.offset] = held
-            if len(self._chunks) > CHUNKS_KEPT:
+            self._chunks[chunk.offset] = cached
+            if len(self._chunks) > MAX_CHUNKS:
                 self._chunks.popitem(last=False)
         self._chunks.move_to_end(chunk.offset)
-        return held
+        return cached
 
     def _find_bookmarks(self) -> list[tuple[float, str]]:
         """Return (seconds, label) of the bookmarks."""
         found = []
-        for i, time_ns in enumerate(self._places.get("bookmark", ([], []))[0]):
+        for i, time_ns in enumerate(self._positions.get("bookmark", ([], []))[0]):
             message, _ = self._open("bookmark", i)
             if isinstance(message, Bookmark):
                 found.append(((time_ns - self._start_ns) * 1e-9, message.label))
         return found
 
 
-def bags_in(folder: Path) -> list[str]:
-    """Names of the bags in a folder, the newest first."""
+def list_bags(folder: Path) -> list[str]:
+    """List the bags in a folder, the newest first."""
     found = [path for path in folder.glob("**/*.mcap") if path.is_file()]
     found.sort(key=lambda path: path.stat().st_mtime, reverse=True)
     return [str(path.relative_to(folder)) for path in found]

@@ -1,4 +1,4 @@
-"""Scenes to choose from, and what the page's sliders make of one."""
+"""Load the scenes of a run, and change one by the sliders of the page."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
 
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
-"""Of the slider."""
+"""Minimum and step of the slider."""
 
 
 class SceneChoiceError(FlexsheetError, ValueError):
-    """A scene that cannot be shown; the sentence says why."""
+    """Report a scene that cannot be used, and why."""
 
     code = "scene-choice"
     remedy = "Choose a scene with the devices of the running one."
 
 
 def first_scene(plan_file: Path) -> Scene:
-    """The scene of the run's plan; SceneChoiceError where it has none."""
+    """Return the scene of the run's plan; SceneChoiceError without one."""
     values = json.loads(plan_file.read_text())["scene"]
     if values is None:
-        raise SceneChoiceError('the launch file names no scene: give it a "scene" for the console')
+        raise SceneChoiceError('the launch file names no scene; the console needs its key "scene"')
     return Scene.model_validate(values)
 
 
@@ -43,25 +43,25 @@ def scene_names(folder: Path) -> list[str]:
 
 
 def load(folder: Path, name: str) -> Scene:
-    """A scene of the run's folder by its name; SceneChoiceError says which there are."""
+    """Load a scene of the run's folder by its name; SceneChoiceError lists the scenes."""
     names = scene_names(folder)
     if name not in names:
         raise SceneChoiceError(f'there is no scene "{name}"; there are: {", ".join(names)}')
     return Scene.model_validate_json((folder / f"{name}.json").read_text())
 
 
-def edited(
+def edit_scene(
     scene: Scene, *, young_modulus_pa: float, stretch_ratio: float, size_ratio: float
 ) -> Scene:
-    """The scene with another stiffness, least stretch of the sheet, and size of its object.
+    """Change the stiffness, the minimum stretch of the sheet and the size of the object.
 
-    The object grows away from the user: its foremost point stays where it is.  SceneChoiceError
-    for values that make no scene.
+    The object grows away from the user: its front stays where it is. SceneChoiceError for invalid
+    values.
     """
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
     try:
-        geometry = scaled(solid.geometry, size_ratio)
+        geometry = scale_geometry(solid.geometry, size_ratio)
         pose = solid.world_from_object
         rotation = rotation_from_rpy(pose.rpy_rad)
         back_m = front_m(solid.geometry, rotation) * (size_ratio - 1.0)
@@ -74,9 +74,8 @@ def edited(
         limit = max_stretch_ratio(scene)
         if stretch_ratio > limit + STRETCH_STEP:
             raise SceneChoiceError(
-                f"tension: {100 * (stretch_ratio - 1):.1f} % is more than the arms of this scene "
-                f"hold, {100 * (limit - 1):.1f} % (max_stretch_ratio and max_edge_force_n of its "
-                "sheet)"
+                f"tension: {100 * (stretch_ratio - 1):.1f} % is above {100 * (limit - 1):.1f} %, "
+                "the limit of this scene (max_stretch_ratio and max_edge_force_n of its sheet)"
             )
         values["sheet"] = _with(sheet, min_stretch_ratio=min(stretch_ratio, limit))
         return Scene(**values)
@@ -87,7 +86,7 @@ def edited(
 
 
 def max_stretch_ratio(scene: Scene) -> float:
-    """Return the largest least stretch that the arms hold: by the scene's length and its force."""
+    """Return the upper end of the slider: by the scene's limits of length and of force."""
     sheet = scene.sheet
     strongest = stretch_for_edge_force(
         sheet.max_edge_force_n,
@@ -96,21 +95,21 @@ def max_stretch_ratio(scene: Scene) -> float:
         thickness_m=sheet.thickness_m,
     )
     limit = min(sheet.max_stretch_ratio, strongest)
-    # Rounded down to the slider's step.  What the scene itself asks for can be shown in any case.
+    # Rounded down to the slider's step, but never below the stretch of the scene itself.
     steps = np.floor((limit - 1.0) / STRETCH_STEP + 1e-6)
     return max(1.0 + float(steps) * STRETCH_STEP, sheet.min_stretch_ratio, MIN_STRETCH_RATIO)
 
 
 def _with(part: Any, **changes: Any) -> Any:
-    """A copy of a message's part with some fields changed, checked as if it had just come."""
+    """Copy a part of a message with some fields changed, and validate it."""
     fields = {name: getattr(part, name) for name in type(part).model_fields}
     return type(part)(**fields | changes)
 
 
-def scaled(geometry: Geometry, ratio: float) -> Geometry:
-    """The same shape, larger by `ratio` about its origin; a plane stays as it is."""
+def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
+    """Scale a shape about its origin; a plane is unchanged."""
     if not (np.isfinite(ratio) and ratio > 0.0):
-        raise SceneChoiceError(f"size: {ratio} times as large is no size")
+        raise SceneChoiceError(f"size: factor {ratio} is not a positive number")
     changes: dict[str, Any]
     match geometry:
         case Cylinder():
@@ -135,9 +134,10 @@ def scaled(geometry: Geometry, ratio: float) -> Geometry:
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """How far a shape reaches towards the user (world z) from its origin, turned as (3, 3) says.
+    """Return the extent (m) of a shape towards the user (world z) from its origin.
 
-    Of a cylinder the side counts, not the ends: they are not touched.
+    world_from_object: rotation (3, 3). A cylinder is measured at its side: its ends are not
+    touched.
     """
     towards = world_from_object[2]
     match geometry:

@@ -1,7 +1,7 @@
-"""The sheet as the page draws it: ruled between its edges, dented by the finger.
+"""Compute the sheet as the page draws it: ruled between its edges, deflected by the finger.
 
-The dent is that of a soap film, good to look at; what the sheet truly does is the business of
-`flexsheet.nodes.models.sheet`.
+The deflection is that of a soap film, for display only. See `flexsheet.nodes.models.sheet` for the
+mechanics of the sheet.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ Floats = NDArray[np.float64]
 Indices = NDArray[np.int32]
 
 COLUMNS, ROWS = 41, 41
-LEAST_EDGE_DISTANCE_M = 0.05
+MIN_EDGE_DISTANCE_M = 0.05
 NEAR = 6
-"""Cells along each side around a vertex that are searched for where a ray goes through."""
+"""Number of cells along each side around a vertex that are searched for a hit of a ray."""
 
 MIRRORED = 2
-"""Images of the finger in each free edge."""
+"""Number of images of the finger in each free edge."""
 
 
 def sheet_points(
@@ -34,16 +34,16 @@ def sheet_points(
     fingertip: Floats | None,
     finger_radius_m: float,
 ) -> Floats | None:
-    """Vertices (ROWS * COLUMNS, 3) in the world, rows from bottom to top, columns left to right.
+    """Compute vertices (ROWS * COLUMNS, 3) in the world: rows upwards, columns to the right.
 
-    fingertip: (3,), or None.  None where the edges are too near to one another to hold a sheet.
+    fingertip: (3,), or None. Returns None if the edges are too close to each other.
     """
     left, right = world_from_left_edge, world_from_right_edge
     width_m = float(np.linalg.norm(right[:3, 3] - left[:3, 3]))
-    if not width_m >= LEAST_EDGE_DISTANCE_M:
+    if not width_m >= MIN_EDGE_DISTANCE_M:
         return None
     left_bottom, right_bottom, right_top, left_top = corners(left, right, height_m)
-    across, up = _shares()
+    across, up = _fractions()
     flat = (1.0 - across) * ((1.0 - up) * left_bottom + up * left_top) + across * (
         (1.0 - up) * right_bottom + up * right_top
     )
@@ -52,19 +52,20 @@ def sheet_points(
         x, y, z = apply(inverse(world_from_sheet), fingertip).tolist()
         if z < 0.0 and abs(x) < 0.49 * width_m and abs(y) < 0.5 * height_m:
             grid = (across[:, 0] - 0.5) * width_m, (up[:, 0] - 0.5) * height_m
-            dent = film(*grid, (x, y), (width_m, height_m), finger_radius_m)
-            flat = flat + z * dent[:, None] * world_from_sheet[:3, 2]
+            deflection = film(*grid, (x, y), (width_m, height_m), finger_radius_m)
+            flat = flat + z * deflection[:, None] * world_from_sheet[:3, 2]
     return np.asarray(flat)
 
 
 def film(
     x: Floats, y: Floats, finger: tuple[float, float], size_m: tuple[float, float], radius_m: float
 ) -> Floats:
-    """Share (n,) of the finger's depth at places x, y (n,) of a film held at x = +-width / 2.
+    """Compute the deflection (n,), over the depth of the finger, of a film clamped at x = +-width /
+    2.
 
-    The film solves Laplace's equation with a point force in an infinite strip (the conformal map of
-    the strip gives its Green's function in closed form); free edges at y = +-height / 2 are made by
-    mirroring the finger in them.  Within `radius_m` of the finger it is as deep as the finger.
+    x, y: (n,). The film solves Laplace's equation with a point force in an infinite strip. The
+    conformal map of the strip gives its Green's function in closed form. Free edges at y = +-height
+    / 2 are made by mirroring the finger. Within `radius_m` of the finger the deflection is 1.
     """
     width_m, height_m = size_m
     finger_x, finger_y = finger
@@ -80,22 +81,22 @@ def film(
 
 
 def _strip(x: Floats, y: Floats, source_x: float) -> Floats:
-    """Green's function of Laplace in |x| < pi / 2, source at (source_x, 0), but for a factor."""
+    """Compute Green's function of Laplace in |x| < pi / 2, up to a factor, for (source_x, 0)."""
     high = np.cosh(np.minimum(np.abs(y), 30.0))
     near = np.maximum(high - np.cos(x - source_x), 1e-12)
     return np.asarray(np.log(np.maximum(high + np.cos(x + source_x), near) / near))
 
 
 @lru_cache(maxsize=1)
-def _shares() -> tuple[Floats, Floats]:
-    """How far along the width and the height (n, 1) each vertex is, 0 to 1."""
+def _fractions() -> tuple[Floats, Floats]:
+    """Return the fractions (n, 1) of width and height of each vertex, 0 to 1."""
     up, across = np.meshgrid(np.linspace(0, 1, ROWS), np.linspace(0, 1, COLUMNS), indexing="ij")
     return across.reshape(-1, 1), up.reshape(-1, 1)
 
 
 @lru_cache(maxsize=1)
 def sheet_triangles() -> Indices:
-    """(2 * (ROWS - 1) * (COLUMNS - 1), 3), counter-clockwise for the user."""
+    """Return triangles (2 * (ROWS - 1) * (COLUMNS - 1), 3), counter-clockwise for the user."""
     index = np.arange(ROWS * COLUMNS, dtype=np.int32).reshape(ROWS, COLUMNS)
     a, b, c, d = index[:-1, :-1], index[:-1, 1:], index[1:, 1:], index[1:, :-1]
     lower, upper = np.stack([a, b, c], axis=-1), np.stack([a, c, d], axis=-1)
@@ -103,10 +104,10 @@ def sheet_triangles() -> Indices:
 
 
 def hit_by_ray(points: Floats, origin: Floats, towards: Floats) -> Floats:
-    """Where rays from `origin` (3,) towards `towards` (n, 3) meet the sheet's mesh; NaN: nowhere.
+    """Compute where rays from `origin` (3,) towards `towards` (n, 3) meet the sheet; NaN: nowhere.
 
-    points: of `sheet_points`.  Moeller and Trumbore (1997) with the triangles around the vertex
-    that is nearest to the ray as seen from its origin.
+    points: of `sheet_points`. Method of Moeller and Trumbore (1997), on the triangles around the
+    vertex that is nearest to the ray as seen from its origin.
     """
     direction = towards - origin
     seen = points - origin
@@ -128,7 +129,7 @@ def hit_by_ray(points: Floats, origin: Floats, towards: Floats) -> Floats:
 
 
 def _around(vertices: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Indices (n, 2 * NEAR**2) of the triangles in the cells around vertices (n,)."""
+    """Return indices (n, 2 * NEAR**2) of the triangles in the cells around vertices (n,)."""
     rows, columns = np.divmod(vertices, COLUMNS)
     cells = np.arange(-NEAR // 2, NEAR - NEAR // 2)
     row = np.clip(rows[:, None, None] + cells[None, :, None], 0, ROWS - 2)

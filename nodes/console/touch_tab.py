@@ -1,4 +1,4 @@
-"""The tab to touch the object with, and to choose what it is and from where it is seen."""
+"""Show the tab that controls the finger, the scene and the view."""
 
 from __future__ import annotations
 
@@ -7,26 +7,26 @@ from functools import partial
 from typing import Any
 
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.console.controls import Ask, Html, handing, on_value, show_value
-from flexsheet.nodes.console.desk import Sliders
-from flexsheet.nodes.console.finger import Finger
+from flexsheet.nodes.console.controller import Sliders
+from flexsheet.nodes.console.controls import Html, Request, make_callback, on_value, show_value
+from flexsheet.nodes.console.finger import FingerController
+from flexsheet.nodes.console.scene_view import LAYERS, VIEWPOINTS, SceneView
 from flexsheet.nodes.console.scenes import MIN_STRETCH_RATIO, max_stretch_ratio
-from flexsheet.nodes.console.view import LAYERS, VIEWPOINTS, View
 
-REACH_MM = 80.0
-DEEPEST_MM = 50.0
+MAX_OFFSET_MM = 80.0
+MAX_DEPTH_MM = 50.0
 LIFT, LOWER = "Lift the finger (L)", "Put the finger down (L)"
 
 
 class TouchTab:
-    """Finger, scene and view."""
+    """Show the controls of finger, scene and view."""
 
-    def __init__(self, gui: Any, ask: Ask, view: View, *, with_finger: bool) -> None:
-        self._gui, self._ask, self._view = gui, ask, view
+    def __init__(self, gui: Any, request: Request, view: SceneView, *, with_finger: bool) -> None:
+        self._gui, self._request, self._view = gui, request, view
         self._with_finger = with_finger
         gui.add_markdown(
-            "**Drag on the sheet** to stroke the object. Drag beside it to turn the view, scroll "
-            "to come nearer."
+            "**Drag on the sheet** to stroke the object. Drag beside it to rotate the view, scroll "
+            "to zoom."
             if with_finger
             else "The finger is measured; it cannot be moved from here."
         )
@@ -36,33 +36,38 @@ class TouchTab:
             self._finger = Html(gui)
         with gui.add_folder("Object and sheet"):
             self._add_scene()
-        with gui.add_folder("View"):
+        with gui.add_folder("SceneView"):
             self._add_view()
 
     def _add_finger(self) -> None:
-        gui, ask = self._gui, self._ask
+        gui, request = self._gui, self._request
         self._depth = gui.add_slider(
-            "Push, mm", 0.0, DEEPEST_MM, 0.5, 4.0, hint="How deep the finger goes into the object"
+            "Push, mm", 0.0, MAX_DEPTH_MM, 0.5, 4.0, hint="Depth of the finger in the object"
         )
         self._across = gui.add_slider(
-            "Across, mm", -REACH_MM, REACH_MM, 1.0, 0.0, hint="To the right of the screen's middle"
+            "Across, mm",
+            -MAX_OFFSET_MM,
+            MAX_OFFSET_MM,
+            1.0,
+            0.0,
+            hint="To the right of the centre of the screen",
         )
         self._up = gui.add_slider(
-            "Up, mm", -REACH_MM, REACH_MM, 1.0, 0.0, hint="Above the screen's middle"
+            "Up, mm", -MAX_OFFSET_MM, MAX_OFFSET_MM, 1.0, 0.0, hint="Above the centre of the screen"
         )
         self._lift = gui.add_button(LOWER, hint="Onto the object, and off it. Key: L")
-        on_value(self._depth, lambda value: ask("push", 1e-3 * value))
+        on_value(self._depth, lambda value: request("push", 1e-3 * value))
         for slider in (self._across, self._up):
             on_value(
-                slider, lambda _: ask("place", 1e-3 * self._across.value, 1e-3 * self._up.value)
+                slider, lambda _: request("place", 1e-3 * self._across.value, 1e-3 * self._up.value)
             )
-        self._lift.on_click(handing(ask, "lift"))
+        self._lift.on_click(make_callback(request, "lift"))
         gui.add_command("Lift the finger, or put it down", hotkey="L").on_trigger(
-            handing(ask, "lift")
+            make_callback(request, "lift")
         )
 
     def _add_scene(self) -> None:
-        gui, ask = self._gui, self._ask
+        gui, request = self._gui, self._request
         self._scene = gui.add_dropdown("Scene", ("-",), hint="Object, sheet and their sizes")
         self._stiffness = gui.add_slider(
             "Stiffness, kPa", 0.5, 30.0, 0.1, 4.0, hint="Young's modulus of the object"
@@ -70,29 +75,28 @@ class TouchTab:
         self._tension = gui.add_slider(
             "Tension, %",
             *(_percent(MIN_STRETCH_RATIO), 8.0, 0.1, 2.0),
-            hint="How much longer than slack the sheet is drawn, at least; up to what the arms of "
-            "this scene hold",
+            hint="Minimum stretch of the sheet; the arms of this scene limit it",
         )
         self._size = gui.add_slider(
             "Size, %", 50, 150, 1, 100, hint="Of the object; its front stays where it is"
         )
-        on_value(self._scene, lambda name: ask("choose", name))
-        on_value(self._stiffness, lambda value: ask("slide", "young_modulus_pa", 1e3 * value))
-        on_value(self._tension, lambda value: ask("slide", "stretch_ratio", 1.0 + 0.01 * value))
-        on_value(self._size, lambda value: ask("slide", "size_ratio", 0.01 * value))
+        on_value(self._scene, lambda name: request("choose", name))
+        on_value(self._stiffness, lambda value: request("slide", "young_modulus_pa", 1e3 * value))
+        on_value(self._tension, lambda value: request("slide", "stretch_ratio", 1.0 + 0.01 * value))
+        on_value(self._size, lambda value: request("slide", "size_ratio", 0.01 * value))
 
     def _add_view(self) -> None:
         seen_from = self._gui.add_button_group(
-            "Seen from", tuple(VIEWPOINTS), hint="Turns your own view only"
+            "View from", tuple(VIEWPOINTS), hint="Changes your own view only"
         )
         seen_from.on_click(lambda event: self._view.look_from(event.client, event.target.value))
         with self._gui.add_folder("Show", expand_by_default=False):
             for layer in LAYERS:
                 box = self._gui.add_checkbox(layer, True)
-                on_value(box, partial(self._ask, "show_layer", layer))
+                on_value(box, partial(self._request, "show_layer", layer))
 
     def show_scene(self, scene: Scene, base: Scene, names: Sequence[str], sliders: Sliders) -> None:
-        """Show a scene that the graph now works with.  base: what the sliders change."""
+        """Show a scene of the graph. base: the scene that the sliders change."""
         if names:
             self._scene.options = tuple(names)
             if scene.name in names:
@@ -102,19 +106,19 @@ class TouchTab:
         self._tension.value = _percent(sliders.stretch_ratio)
         self._size.value = round(100.0 * sliders.size_ratio)
 
-    def show_intent(self, finger: Finger) -> None:
-        """Show all that is wanted of the finger."""
+    def show_intent(self, finger: FingerController) -> None:
+        """Show the requested position of the finger."""
         if self._with_finger:
-            show_value(self._depth, _within(1e3 * finger.intent.depth_m, 0.0, DEEPEST_MM, 1))
+            show_value(self._depth, _within(1e3 * finger.intent.depth_m, 0.0, MAX_DEPTH_MM, 1))
             self.show_position(finger)
             self.show_lifted(finger)
 
-    def show_position(self, finger: Finger) -> None:
-        """Show where the finger is wanted; beyond the sliders: at their nearest end."""
+    def show_position(self, finger: FingerController) -> None:
+        """Show the requested position; beyond the sliders: their nearest end."""
         for slider, value_m in zip((self._across, self._up), finger.position_m, strict=True):
-            show_value(slider, _within(1e3 * value_m, -REACH_MM, REACH_MM, 0))
+            show_value(slider, _within(1e3 * value_m, -MAX_OFFSET_MM, MAX_OFFSET_MM, 0))
 
-    def show_lifted(self, finger: Finger) -> None:
+    def show_lifted(self, finger: FingerController) -> None:
         """Offer to lift the finger, or to put it down."""
         label = LOWER if finger.intent.lifted else LIFT
         if self._lift.label != label:

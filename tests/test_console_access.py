@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
-from flexsheet.nodes.console.dress import dressed
-from flexsheet.nodes.console.guard import (
+from flexsheet.nodes.console.access_control import (
     COOKIE,
+    AccessControl,
     ConsoleError,
-    Guard,
     page_logger,
     read_token,
     start_server,
 )
+from flexsheet.nodes.console.html_head import inject_assets
 from flexsheet.nodes.console.node import ConsoleParameters
 from tests.waiting import DEADLINE_S
 
@@ -38,49 +38,49 @@ def asked(path: str = "/", host: str = "127.0.0.1:8080", **headers: str) -> Requ
     return Request(path, Headers({"Host": host, **named}))
 
 
-def status_of(guard: Guard, request: Request) -> int:
-    refused = guard.refusal(request)
+def status_of(access: AccessControl, request: Request) -> int:
+    refused = access.refusal(request)
     return 200 if refused is None else refused.status_code
 
 
 def test_on_loopback_only_the_computers_own_pages_may_ask() -> None:
-    guard = Guard("127.0.0.1", None)
-    assert status_of(guard, asked()) == 200
-    assert status_of(guard, asked(host="localhost:8080")) == 200
-    assert status_of(guard, asked(host="[::1]:8080")) == 200
-    assert status_of(guard, asked(Origin="http://127.0.0.1:8080", Upgrade="websocket")) == 200
-    assert status_of(guard, asked(Origin="http://evil.example", Upgrade="websocket")) == 403
-    assert status_of(guard, asked(Origin="null")) == 403
-    assert status_of(guard, asked(host="evil.example:8080")) == 403, "a name bound to loopback"
-    assert status_of(guard, asked(host="")) == 403
+    access = AccessControl("127.0.0.1", None)
+    assert status_of(access, asked()) == 200
+    assert status_of(access, asked(host="localhost:8080")) == 200
+    assert status_of(access, asked(host="[::1]:8080")) == 200
+    assert status_of(access, asked(Origin="http://127.0.0.1:8080", Upgrade="websocket")) == 200
+    assert status_of(access, asked(Origin="http://evil.example", Upgrade="websocket")) == 403
+    assert status_of(access, asked(Origin="null")) == 403
+    assert status_of(access, asked(host="evil.example:8080")) == 403, "a name bound to loopback"
+    assert status_of(access, asked(host="")) == 403
     for destination in ("iframe", "frame", "embed", "object"):
-        assert status_of(guard, asked(Sec_Fetch_Dest=destination)) == 403
-    assert status_of(guard, asked(Sec_Fetch_Dest="document")) == 200
-    assert status_of(guard, asked(host="[::1")) == 403
+        assert status_of(access, asked(Sec_Fetch_Dest=destination)) == 403
+    assert status_of(access, asked(Sec_Fetch_Dest="document")) == 200
+    assert status_of(access, asked(host="[::1")) == 403
 
 
 def test_with_a_token_who_does_not_know_it_is_sent_away() -> None:
-    guard = Guard("192.0.2.1", TOKEN)
+    access = AccessControl("192.0.2.1", TOKEN)
     host = "192.0.2.1:8080"
-    assert status_of(guard, asked(host=host)) == 401
-    assert status_of(guard, asked(f"/?token={TOKEN}x", host)) == 401
-    assert status_of(guard, asked("/?token=", host)) == 401
-    assert status_of(guard, asked("/?token=ü", host)) == 401
-    welcome = guard.refusal(asked(f"/?token={TOKEN}", host))
+    assert status_of(access, asked(host=host)) == 401
+    assert status_of(access, asked(f"/?token={TOKEN}x", host)) == 401
+    assert status_of(access, asked("/?token=", host)) == 401
+    assert status_of(access, asked("/?token=ü", host)) == 401
+    welcome = access.refusal(asked(f"/?token={TOKEN}", host))
     assert welcome is not None
     assert (welcome.status_code, welcome.headers["Location"]) == (303, "/")
     cookie = welcome.headers["Set-Cookie"].partition(";")[0]
     assert cookie == f"{COOKIE}={TOKEN}"
-    assert status_of(guard, asked(host=host, Cookie=cookie)) == 200
-    assert status_of(guard, asked(host=host, Cookie=f"{COOKIE}=guess")) == 401
-    assert status_of(guard, asked(host=host, Cookie='a=b=;;"==')) == 401
+    assert status_of(access, asked(host=host, Cookie=cookie)) == 200
+    assert status_of(access, asked(host=host, Cookie=f"{COOKIE}=guess")) == 401
+    assert status_of(access, asked(host=host, Cookie='a=b=;;"==')) == 401
     wrong = asked(host=host, Cookie=cookie, Origin="http://evil.example")
-    assert status_of(guard, wrong) == 403
+    assert status_of(access, wrong) == 403
 
 
 def test_beyond_loopback_there_is_no_page_without_a_token(tmp_path: Path) -> None:
-    with pytest.raises(ConsoleError, match="beyond loopback"):
-        Guard("192.0.2.1", None)
+    with pytest.raises(ConsoleError, match="not loopback"):
+        AccessControl("192.0.2.1", None)
     with pytest.raises(ValueError, match="token_file"):
         ConsoleParameters(address="192.0.2.1")
     with pytest.raises(ValueError, match="no IP address"):
@@ -109,7 +109,7 @@ def test_the_page_is_served_with_our_style_and_script(packed: bool) -> None:
         headers["Content-Encoding"] = "gzip" if packed else "identity"
         return Response(200, "OK", headers, body)
 
-    served = dressed(answer(b"<html><head><title>x</title></head><body></body></html>"))
+    served = inject_assets(answer(b"<html><head><title>x</title></head><body></body></html>"))
     assert served.headers.get_all("Content-Length") == [str(len(served.body))]
     page = gzip.decompress(served.body) if packed else bytes(served.body)
     head, _, rest = page.partition(b"</head>")
@@ -121,7 +121,7 @@ def test_the_page_is_served_with_our_style_and_script(packed: bool) -> None:
         answer(b"</head>", "image/png"),
         Response(401, "", Headers()),
     ):
-        assert bytes(dressed(other).body) == bytes(other.body)
+        assert bytes(inject_assets(other).body) == bytes(other.body)
 
 
 class LogLines(logging.Handler):
@@ -138,11 +138,11 @@ class LogLines(logging.Handler):
 
 @pytest.fixture(scope="module")
 def page_server() -> Iterator[tuple[int, LogLines]]:
-    """The port of a guarded page, and what its server logs."""
+    """The port of a checked_servers page, and what its server logs."""
     lines = LogLines()
     for logger in (page_logger(), logging.getLogger("websockets.server")):
         logger.addHandler(lines)
-    server = start_server("127.0.0.1", 0, Guard("127.0.0.1", None), "test")
+    server = start_server("127.0.0.1", 0, AccessControl("127.0.0.1", None), "test")
     yield server.get_port(), lines
     server.stop()
     for logger in (page_logger(), logging.getLogger("websockets.server")):

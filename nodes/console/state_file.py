@@ -1,4 +1,4 @@
-"""What a console that is started again takes up from the one before it in the same run."""
+"""Store the state with which a restarted console continues."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from flexsheet.nodes.console.finger import FingerIntent
 from flexsheet.nodes.console.scenes import SceneChoiceError
 
 
-class Kept(BaseModel):
-    """base: the scene that was chosen; sliders: what they made of it, None: they rest.
+class ConsoleState(BaseModel):
+    """Hold the state of the console.
 
-    recording: whether the recorder had been told to record.  finger: what was wanted of the finger,
-    None: nobody had moved it.
+    base: the chosen scene. sliders: their values, None: not moved. recording: whether recording was
+    requested. finger: the requested position of the finger, None: nobody has moved it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -27,19 +27,19 @@ class Kept(BaseModel):
     finger: FingerIntent | None = None
 
 
-def load_kept(path: Path) -> Kept | None:
-    """What was kept; None where nothing was.  SceneChoiceError for a file of something else."""
+def load_state(path: Path) -> ConsoleState | None:
+    """Read the state; None without a file. SceneChoiceError for an invalid file."""
     try:
-        return Kept.model_validate_json(path.read_bytes())
+        return ConsoleState.model_validate_json(path.read_bytes())
     except FileNotFoundError:
         return None
     except (OSError, ValidationError) as error:
         first = str(error).splitlines()[0]
         raise SceneChoiceError(
-            f"{path}: cannot be taken up again, so the first scene holds: {first}"
+            f"{path}: is no valid state, so the console starts with the first scene: {first}"
         ) from error
 
 
-def save_kept(path: Path, kept: Kept) -> None:
-    """Write it whole or not at all."""
+def save_state(path: Path, kept: ConsoleState) -> None:
+    """Write the state atomically."""
     write_file(path, kept.model_dump_json())

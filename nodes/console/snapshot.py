@@ -1,4 +1,4 @@
-"""What the page's 3D view shows at one moment, as arrays in the world frame."""
+"""Compute what the 3D view shows at one time, as arrays in the world frame."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.types import ArmState, Fingertip, Skin, SoftBody
 from flexsheet.nodes.console.arms import link_poses
-from flexsheet.nodes.console.newest import Source
+from flexsheet.nodes.console.latest_messages import MessageSource
 from flexsheet.nodes.console.sheet import hit_by_ray, sheet_points
 from flexsheet.nodes.models.rigid import transform_from_rpy
 
 Floats = NDArray[np.float64]
 
-RAY_PLACES = (-0.55, 0.0, 0.55)
-"""Of the points that rays are drawn for, over the object's half width and half height."""
+RAY_POSITIONS = (-0.55, 0.0, 0.55)
+"""Positions of the drawn rays, over the half width and half height of the object."""
 
 
-def transform_of(pose: Pose) -> Floats:
+def transform_from_pose(pose: Pose) -> Floats:
     return transform_from_rpy(pose.position_m, pose.rpy_rad)
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """One moment; what is not known is None.
+class SceneSnapshot:
+    """Hold what is drawn at one time; unknown values are None.
 
-    links: by side, world_from_link (7, 4, 4).  edges: by side, world_from_edge.  sheet: (n, 3), see
-    `sheet_points`.  skin: (n, 3) as deformed.  finger: (3,), finger_valid: whether it is tracked.
+    links: by side, world_from_link (7, 4, 4). edges: by side, world_from_edge. sheet: (n, 3), see
+    `sheet_points`. skin: (n, 3), deformed. finger: (3,). finger_valid: whether it is tracked.
     """
 
     links: dict[str, Floats]
@@ -41,15 +41,15 @@ class Picture:
     finger_valid: bool
 
 
-def picture_of(scene: Scene, source: Source) -> Picture:
-    """The newest of everything that is drawn."""
+def take_snapshot(scene: Scene, source: MessageSource) -> SceneSnapshot:
+    """Compute the snapshot of the latest messages."""
     links, edges = {}, {}
     for side, arm in (("left", scene.arms.left), ("right", scene.arms.right)):
-        state = source.newest(f"arm_{side}", ArmState)
+        state = source.latest(f"arm_{side}", ArmState)
         if state is not None:
-            links[side] = link_poses(transform_of(arm.world_from_base), state[0].joints_rad)
-            edges[side] = state[0].world_from_flange @ transform_of(arm.flange_from_edge)
-    finger = _message(source.newest("fingertip", Fingertip))
+            links[side] = link_poses(transform_from_pose(arm.world_from_base), state[0].joints_rad)
+            edges[side] = state[0].world_from_flange @ transform_from_pose(arm.flange_from_edge)
+    finger = _message(source.latest("fingertip", Fingertip))
     tip = None if finger is None else finger.position_world_m
     sheet = None
     if len(edges) == 2:
@@ -60,7 +60,7 @@ def picture_of(scene: Scene, source: Source) -> Picture:
             fingertip=tip if finger is not None and finger.valid else None,
             finger_radius_m=scene.finger.radius_m,
         )
-    return Picture(
+    return SceneSnapshot(
         links=links,
         edges=edges,
         sheet=sheet,
@@ -74,9 +74,9 @@ def _message(entry: tuple[Fingertip, Header] | None) -> Fingertip | None:
     return None if entry is None else entry[0]
 
 
-def _skin(source: Source) -> Floats | None:
-    """The skin as it is deformed; at rest while the solver says nothing of this one."""
-    skin, body = source.newest("skin", Skin), source.newest("soft_body", SoftBody)
+def _skin(source: MessageSource) -> Floats | None:
+    """Return the deformed skin; at rest while the solver has published nothing for it."""
+    skin, body = source.latest("skin", Skin), source.latest("soft_body", SoftBody)
     if skin is None:
         return None
     rest = skin[0].vertices_world_m
@@ -86,26 +86,26 @@ def _skin(source: Source) -> Floats | None:
 
 
 def ray_vertices(rest: Floats) -> NDArray[np.int64]:
-    """Indices (9,) of vertices of a skin that rays are drawn for: a grid on what faces the user."""
+    """Return indices (9,) of skin vertices for rays: a grid on the side that faces the user."""
     low, high = rest.min(axis=0), rest.max(axis=0)
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     chosen = []
-    for up in RAY_PLACES:
-        for across in RAY_PLACES:
-            place = middle[:2] + half[:2] * np.array([0.7 * across, up])
-            off = np.linalg.norm(rest[:, :2] - place, axis=1)
+    for up in RAY_POSITIONS:
+        for across in RAY_POSITIONS:
+            position = middle[:2] + half[:2] * np.array([0.7 * across, up])
+            off = np.linalg.norm(rest[:, :2] - position, axis=1)
             chosen.append(int(np.argmin(off - 0.3 * (rest[:, 2] - middle[2]))))
     return np.array(chosen)
 
 
 def rays(scene: Scene, sheet: Floats, points: Floats) -> tuple[Floats, Floats]:
-    """The light of some points of the object: to the eye, and from the projector.
+    """Compute the light rays of points (n, 3) of the deformed skin.
 
-    points: (n, 3) of the deformed skin.  Gives segments (m, 2, 3) eye to sheet, and as many from
-    the sheet to the projector; points whose ray misses the sheet have none.
+    Returns segments (m, 2, 3) from the eye to the sheet, and (m, 2, 3) from the sheet to the
+    projector. Points whose ray misses the sheet have none.
     """
     eye = scene.eyes.centre_world_m
-    projector = transform_of(scene.projector.world_from_projector)[:3, 3]
+    projector = transform_from_pose(scene.projector.world_from_projector)[:3, 3]
     hits = hit_by_ray(sheet, eye, points)
     hits = hits[np.isfinite(hits).all(axis=1)]
     to_eye = np.stack([np.broadcast_to(eye, hits.shape), hits], axis=1)

@@ -1,4 +1,4 @@
-"""What came last on each topic, opened only when somebody looks."""
+"""Store the latest message of each topic, and decode it on demand."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from flexsheet.messages.wire import WireError, decode
 M = TypeVar("M", bound=Message)
 
 
-class Source(Protocol):
-    """Where the page's picture comes from: the running graph, or a bag."""
+class MessageSource(Protocol):
+    """Provide the messages that the page shows: of the running graph, or of a bag."""
 
-    def newest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """The newest message of the topic with its header; None before the first."""
+    def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
+        """Return the latest message of the topic with its header; None before the first."""
         ...
 
 
-class Newest:
-    """The newest message of each topic as frames, and opened once it was asked for.
+class LatestMessages:
+    """Hold the latest message of each topic as frames, and decode it at the first access.
 
-    refused: told of a message whose bytes are not what they should be.
+    refused: called with the topic and the error of a message that cannot be decoded.
     """
 
     def __init__(self, refused: Callable[[Topic, WireError], None]) -> None:
@@ -32,13 +32,13 @@ class Newest:
         self._refused = refused
 
     def put(self, name: str, frames: Any) -> bool:
-        """Keep the frames; says whether they took the place of some that nobody looked at."""
+        """Store the frames; return whether they replaced frames that nobody read."""
         unseen = name in self._frames
         self._frames[name] = frames
         return unseen
 
-    def newest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
-        """See `Source`."""
+    def latest(self, name: str, kind: type[M]) -> tuple[M, Header] | None:
+        """See `MessageSource`."""
         frames = self._frames.pop(name, None)
         if frames is not None:
             topic = topic_named(name)
@@ -46,14 +46,14 @@ class Newest:
                 self._opened[name] = decode(frames, topic)
             except WireError as error:
                 self._refused(topic, error)
-        return checked(self._opened.get(name), kind)
+        return check_type(self._opened.get(name), kind)
 
 
-def checked(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
-    """The entry, known to be of that kind."""
+def check_type(entry: tuple[Message, Header] | None, kind: type[M]) -> tuple[M, Header] | None:
+    """Return the entry with the type `kind`; TypeError for another type."""
     if entry is None:
         return None
     message, header = entry
     if not isinstance(message, kind):
-        raise TypeError(f"{type(message).__name__} is no {kind.__name__}")
+        raise TypeError(f"{type(message).__name__} is not a {kind.__name__}")
     return message, header

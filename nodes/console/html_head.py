@@ -1,8 +1,8 @@
-"""viser's page with the console's own style and script in its head.
+"""Add the console's own style and script to the head of viser's page.
 
-viser serves one finished page, in which sliders have no names, folders cannot be opened by keys,
-labels are too light to read, and a lost connection is a red dot.  What our two files add is plain
-HTML beside it; a viser whose page has no head is served as it is.
+viser's page has sliders without names, folders that no key opens, labels with too little contrast,
+and a red dot for a lost connection. The two files of the console correct this. A page without a
+head is served unchanged.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ HERE = Path(__file__).resolve().parent
 HEAD_END = b"</head>"
 
 
-def dressed(response: Response) -> Response:
-    """The answer with our style and script, where it is an HTML page; else the same answer."""
+def inject_assets(response: Response) -> Response:
+    """Return the answer with the style and script if it is an HTML page; else the same answer."""
     kind = response.headers.get("Content-Type", "")
     if response.status_code != 200 or not kind.startswith("text/html"):
         return response

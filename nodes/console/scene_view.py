@@ -1,4 +1,4 @@
-"""The 3D view: what is drawn, in which colours, and how it is kept up to date."""
+"""Draw the 3D view, and update what has changed."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.console.arms import CLAMP_SIZE_M, PIECES, rounded_box
 from flexsheet.nodes.console.creases import split_creases
-from flexsheet.nodes.console.picture import Picture, ray_vertices, rays, transform_of
 from flexsheet.nodes.console.sheet import COLUMNS, ROWS, sheet_points, sheet_triangles
+from flexsheet.nodes.console.snapshot import SceneSnapshot, ray_vertices, rays, transform_from_pose
 from flexsheet.nodes.models.rigid import apply, quaternion_from_rotation, transform
 
 Floats = NDArray[np.float64]
@@ -32,18 +32,18 @@ EYE: Color = (250, 250, 250)
 
 GRID: Color = (176, 181, 189)
 GRID_SECTION: Color = (128, 135, 146)
-"""Seen on a light and on a dark page."""
+"""Both grid colours are visible on light and dark pages."""
 
 SHEET_LIFT_M, LINES_LIFT_M = 0.0006, 0.0009
-"""How far the sheet and its lines are drawn before where they are: a flat object lies in the same
-plane as the sheet that touches it, and the graphics card could not tell which is in front."""
+"""Distance by which the sheet and its lines are drawn nearer to the viewer. A flat object lies in
+the plane of the sheet, and equal depths would flicker."""
 
 LINES_EVERY = 5
 FINGER_LENGTH_M = 0.05
 FINGER_TILT_RAD = 0.6
 NAME_ABOVE_M = np.array([0.0, 0.05, 0.0])
 FLOOR_M = 0.02
-"""Below the arms' bases."""
+"""Distance of the floor below the bases of the arms."""
 
 LAYERS = ("Arms", "Sheet", "Object", "Finger", "Rays", "Devices", "Names")
 EYE_VIEW = "the eye"
@@ -52,26 +52,26 @@ VIEWPOINTS: dict[str, tuple[Any, Any] | None] = {
     "near": ((0.13, 0.1, 0.6), (0.0, 0.0, 0.0)),
     EYE_VIEW: None,
 }
-"""Where a view is from and what it looks at (world, m); None: from between the user's eyes."""
+"""Eye and target of each view (world, m); None: from between the user's eyes."""
 
 Drag = Callable[[Floats, Floats], None]
-"""Gets a ray (origin and direction, world) from the viewer's eye through the mouse."""
+"""Called with a ray (origin and direction, world) from the viewer's eye through the mouse."""
 
 
-class View:
-    """The 3D scene of all viewers; `draw` sends what has changed."""
+class SceneView:
+    """Hold the 3D scene of all viewers; `draw` sends what has changed."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, self._scene = server, server.scene
         self._shown = dict.fromkeys(LAYERS, True)
         self._layers: dict[str, list[Any]] = {}
         self._links: dict[str, list[Any]] = {}
-        self._placed: set[str] = set()
+        self._posed: set[str] = set()
         self._of_scene: Scene | None = None
         self._skin_shape: tuple[int, ...] | None = None
         self._finger_color = FINGER
         self._scene.set_up_direction("+y")
-        # Without a graphics card shadows would take most of a frame's time.
+        # Without a graphics card, shadows would take most of the time of a frame.
         self._scene.configure_default_lights(cast_shadow=False)
         first = next(iter(VIEWPOINTS.values()))
         assert first is not None  # which needs no scene
@@ -79,31 +79,31 @@ class View:
         server.initial_camera.fov = 0.75
 
     def look_from(self, client: viser.ClientHandle, name: str) -> None:
-        """Turn one viewer's view."""
+        """Change one viewer's view."""
         viewpoint, scene = VIEWPOINTS[name], self._of_scene
         if viewpoint is None:
             if scene is None:
                 return
             viewpoint = scene.eyes.centre_world_m, np.zeros(3)
-        place, towards = viewpoint
+        position, target = viewpoint
         with client.atomic():
             client.camera.up_direction = (0.0, 1.0, 0.0)
-            client.camera.position, client.camera.look_at = place, towards
+            client.camera.position, client.camera.look_at = position, target
 
     def show_layer(self, layer: str, shown: bool) -> None:
         self._shown[layer] = shown
         for handle in self._layers.get(layer, []):
             handle.visible = shown
         for side, frames in self._links.items():
-            # Where an arm is must be known before it is drawn.
+            # An arm is visible once its pose is known.
             for handle in frames:
-                handle.visible = self._shown["Arms"] and side in self._placed
+                handle.visible = self._shown["Arms"] and side in self._posed
 
     def set_scene(self, scene: Scene) -> None:
-        """Draw everything anew for a scene."""
+        """Draw everything again for a scene."""
         self._scene.reset()
         self._layers = {layer: [] for layer in LAYERS}
-        self._of_scene, self._skin_shape, self._placed = scene, None, set()
+        self._of_scene, self._skin_shape, self._posed = scene, None, set()
         self._add_floor(scene)
         self._links = {
             side: self._add_arm(side, scene.sheet.height_m) for side in ("left", "right")
@@ -120,7 +120,7 @@ class View:
         ]
 
     def set_skin(self, rest: Floats, triangles: NDArray[np.int32]) -> None:
-        """Draw the object with this skin from now on."""
+        """Draw the object with this skin."""
         self._skin_source, split = split_creases(rest, triangles)
         corners = _f32(rest[self._skin_source])
         self._object = self._add(
@@ -130,41 +130,41 @@ class View:
         self._make_touchable(self._object)
 
     def on_touch(self, touched: Drag, released: Callable[[], None]) -> None:
-        """Call these when the mouse presses or drags on the sheet or the object, and lets go."""
+        """Set the callbacks for a press or drag on sheet or object, and for the release."""
         self._touched, self._released = touched, released
 
-    def draw(self, picture: Picture) -> None:
-        """Move everything to where it is now."""
+    def draw(self, snapshot: SceneSnapshot) -> None:
+        """Update all poses and meshes."""
         scene = self._of_scene
         if scene is None:
             return
         with self._server.atomic():
-            for side, poses in picture.links.items():
-                if side not in self._placed:
-                    self._placed.add(side)
+            for side, poses in snapshot.links.items():
+                if side not in self._posed:
+                    self._posed.add(side)
                     self.show_layer("Arms", self._shown["Arms"])
                 for handle, pose in zip(self._links[side], poses, strict=False):
-                    _place(handle, pose)
-                _place(self._links[side][-1], picture.edges[side])
-            if picture.sheet is not None:
-                self._sheet.vertices = _f32(lift_sheet(picture.sheet, SHEET_LIFT_M))
-                lines = line_segments(lift_sheet(picture.sheet, LINES_LIFT_M))
+                    _set_pose(handle, pose)
+                _set_pose(self._links[side][-1], snapshot.edges[side])
+            if snapshot.sheet is not None:
+                self._sheet.vertices = _f32(lift_sheet(snapshot.sheet, SHEET_LIFT_M))
+                lines = line_segments(lift_sheet(snapshot.sheet, LINES_LIFT_M))
                 self._sheet_lines.points = _f32(lines)
-            if picture.skin is not None and picture.skin.shape == self._skin_shape:
-                self._object.vertices = _f32(picture.skin[self._skin_source])
-            if picture.finger is not None:
-                self._finger.position = picture.finger
-                color = FINGER if picture.finger_valid else FINGER_LOST
+            if snapshot.skin is not None and snapshot.skin.shape == self._skin_shape:
+                self._object.vertices = _f32(snapshot.skin[self._skin_source])
+            if snapshot.finger is not None:
+                self._finger.position = snapshot.finger
+                color = FINGER if snapshot.finger_valid else FINGER_LOST
                 if self._finger_color != color:
                     self._finger_color = self._finger.color = color
-            self._draw_rays(scene, picture)
+            self._draw_rays(scene, snapshot)
 
-    def _draw_rays(self, scene: Scene, picture: Picture) -> None:
-        if picture.sheet is None or picture.skin is None or not self._shown["Rays"]:
+    def _draw_rays(self, scene: Scene, snapshot: SceneSnapshot) -> None:
+        if snapshot.sheet is None or snapshot.skin is None or not self._shown["Rays"]:
             return
-        if picture.skin.shape != self._skin_shape:
+        if snapshot.skin.shape != self._skin_shape:
             return
-        found = rays(scene, picture.sheet, picture.skin[self._ray_vertices])
+        found = rays(scene, snapshot.sheet, snapshot.skin[self._ray_vertices])
         for handle, segments in zip(self._rays, found, strict=True):
             if len(segments):
                 handle.points = _f32(segments)
@@ -191,7 +191,7 @@ class View:
         )
 
     def _add_arm(self, side: str, height_m: float) -> list[Any]:
-        """Frames of the seven links, and at the end the clamp's, with their boxes."""
+        """Add frames of the seven links and of the clamp, with their boxes."""
         frames = [
             self._add("Arms", self._scene.add_frame(f"/{side}/{link}", show_axes=False))
             for link in range(7)
@@ -251,9 +251,9 @@ class View:
         self._finger_color = FINGER
 
     def _add_devices(self, scene: Scene) -> None:
-        """The stereo camera, the projector, and the user's eyes, as bodies with lenses."""
+        """Add the stereo camera, the projector and the user's eyes, with their lenses."""
         camera = scene.camera
-        left = transform_of(camera.world_from_left)
+        left = transform_from_pose(camera.world_from_left)
         baseline_m = -float(camera.right_from_left[0, 3])
         self._add_device(
             "/devices/camera",
@@ -264,7 +264,7 @@ class View:
         )
         self._add_device(
             "/devices/projector",
-            transform_of(scene.projector.world_from_projector),
+            transform_from_pose(scene.projector.world_from_projector),
             ((0.16, 0.07, 0.12), (0.0, 0.0, -0.065)),
             [(0.0, 0.0, -0.005)],
             0.02,
@@ -283,22 +283,24 @@ class View:
             )
 
     def _add_names(self, scene: Scene) -> None:
-        """What the bodies are, in words above them."""
+        """Add labels above the bodies."""
         camera, projector = scene.camera, scene.projector.world_from_projector
         baseline_m = -float(camera.right_from_left[0, 3])
-        middle = apply(transform_of(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0]))
-        places = {
+        middle = apply(
+            transform_from_pose(camera.world_from_left), np.array([0.5 * baseline_m, 0.0, 0.0])
+        )
+        positions = {
             "stereo camera": middle + NAME_ABOVE_M,
             "projector": np.asarray(projector.position_m) + NAME_ABOVE_M,
             "user's eyes": scene.eyes.centre_world_m + 0.4 * NAME_ABOVE_M,
             "left arm": np.asarray(scene.arms.left.world_from_base.position_m),
             "right arm": np.asarray(scene.arms.right.world_from_base.position_m),
         }
-        for i, (text, place) in enumerate(places.items()):
+        for i, (text, position) in enumerate(positions.items()):
             label = self._scene.add_label(
                 f"/names/{i}",
                 text,
-                position=place,
+                position=position,
                 font_screen_scale=0.9,
                 anchor="bottom-center",
                 depth_test=False,
@@ -317,7 +319,7 @@ class View:
         body = self._scene.add_mesh_simple(
             name, _f32(vertices), triangles, color=ARM_DARK, flat_shading=True
         )
-        _place(body, pose)
+        _set_pose(body, pose)
         self._add("Devices", body)
         for i, lens in enumerate(lenses):
             self._scene.add_icosphere(
@@ -330,7 +332,7 @@ class View:
         )
 
     def _make_touchable(self, handle: Any) -> None:
-        # Coroutines run on the server's own loop, in the order of the mouse's moves.
+        # Coroutines run on the server's own loop, in the order of the mouse events.
         async def dragged(event: Any) -> None:
             if event.phase == "end":
                 self._released()
@@ -347,7 +349,7 @@ class View:
 
 
 def lift_sheet(points: Floats, lift_m: float) -> Floats:
-    """Return the sheet's points (n, 3), moved towards the user along its mean normal."""
+    """Move the sheet's points (n, 3) towards the user along its mean normal."""
     first, last = points[0], points[-1]
     right, left = points[COLUMNS - 1], points[-COLUMNS]
     normal = np.cross(right - left, last - first)
@@ -355,7 +357,7 @@ def lift_sheet(points: Floats, lift_m: float) -> Floats:
 
 
 def line_segments(points: Floats) -> Floats:
-    """Segments (n, 2, 3) of every fifth row and column of the sheet's grid."""
+    """Return segments (n, 2, 3) of every fifth row and column of the sheet's grid."""
     grid = points.reshape(ROWS, COLUMNS, 3)
     rows, columns = grid[::LINES_EVERY], grid[:, ::LINES_EVERY].swapaxes(0, 1)
     lines = np.concatenate([rows, columns]) if ROWS == COLUMNS else rows
@@ -363,7 +365,7 @@ def line_segments(points: Floats) -> Floats:
 
 
 def finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
-    """A fingertip (n, 3) and its triangles, tip at the origin, pointing away from the user."""
+    """Make a fingertip (n, 3) and its triangles, tip at the origin, pointing away from the user."""
     rings, around = 8, 20
     tilt = np.linspace(0.0, 0.5 * np.pi, rings)
     radii = np.concatenate([radius_m * np.sin(tilt), [1.15 * radius_m]])
@@ -377,7 +379,7 @@ def finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
         ]
         + [np.array([[0.0, 0.0, FINGER_LENGTH_M + 0.4 * radius_m]])]
     )
-    # Leant back about the middle of the tip, as a finger comes from below.
+    # Tilted about the centre of the tip, since a finger comes from below.
     lean = np.array(
         [
             [1.0, 0.0, 0.0],
@@ -397,7 +399,7 @@ def finger_mesh(radius_m: float) -> tuple[Floats, NDArray[np.int32]]:
     return vertices, np.array(triangles, dtype=np.int32)
 
 
-def _place(handle: Any, pose: Floats) -> None:
+def _set_pose(handle: Any, pose: Floats) -> None:
     handle.position = pose[:3, 3]
     handle.wxyz = quaternion_from_rotation(pose[:3, :3])
 

@@ -17,9 +17,9 @@ from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import (
     FingerPath,
 )
-from flexsheet.nodes.console.aim import HOVER_M, Aim
-from flexsheet.nodes.console.desk import SceneDesk
-from flexsheet.nodes.console.finger import Finger, FingerIntent, Ray
+from flexsheet.nodes.console.controller import SceneController
+from flexsheet.nodes.console.finger import FingerController, FingerIntent, Ray
+from flexsheet.nodes.console.picking import HOVER_M, SurfacePicker
 from tests.console_parts import cylinder
 from tests.plans import scene_with
 from tests.waiting import DEADLINE_S
@@ -27,7 +27,7 @@ from tests.waiting import DEADLINE_S
 Floats = NDArray[np.float64]
 
 
-AIMS = [Aim(cylinder()), Aim(scene_with({"shape": "sphere", "radius_m": 0.04}))]
+AIMS = [SurfacePicker(cylinder()), SurfacePicker(scene_with({"shape": "sphere", "radius_m": 0.04}))]
 
 
 @pytest.fixture(scope="module")
@@ -36,28 +36,28 @@ def scene() -> Scene:
 
 
 def test_the_mouse_means_a_point_below_the_surface_or_beside_it(scene: Scene) -> None:
-    aim = Aim(scene)
+    picker = SurfacePicker(scene)
     eye, forward = np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, -2.0])
-    np.testing.assert_allclose(aim.under_ray(eye, forward, 0.0), [0.0, 0.0, 0.0], atol=2e-4)
-    np.testing.assert_allclose(aim.under_ray(eye, forward, 0.01), [0.0, 0.0, -0.01], atol=2e-4)
-    beside = aim.under_ray(eye, np.array([0.0, 0.3, -0.6]), 0.01)
+    np.testing.assert_allclose(picker.pick(eye, forward, 0.0), [0.0, 0.0, 0.0], atol=2e-4)
+    np.testing.assert_allclose(picker.pick(eye, forward, 0.01), [0.0, 0.0, -0.01], atol=2e-4)
+    beside = picker.pick(eye, np.array([0.0, 0.3, -0.6]), 0.01)
     assert beside[1] > 0.05
     assert (beside >= scene.finger.volume_min_m).all()
     assert (beside <= scene.finger.volume_max_m).all()
     grazing = np.array([0.0, 0.04, -0.6 - scene.object.geometry.radius_m])  # type: ignore[union-attr]  # a cylinder
     for towards in (forward, grazing):
-        hover = aim.under_ray(eye, towards, -HOVER_M)
+        hover = picker.pick(eye, towards, -HOVER_M)
         assert depth_m(scene, hover) == pytest.approx(-HOVER_M, abs=2e-4)
-    finger = Finger(lambda message: None, speed_m_per_s=0.1)
+    finger = FingerController(lambda message: None, speed_m_per_s=0.1)
     for bad in (np.zeros(3), np.array([np.nan, 0, 1])):
         with pytest.raises(ValueError, match="direction"):
             finger.touch(eye, bad)
 
 
 def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> None:
-    aim, sent = Aim(scene), []
-    finger = Finger(sent.append, speed_m_per_s=0.1)
-    finger.use(aim)
+    picker, sent = SurfacePicker(scene), []
+    finger = FingerController(sent.append, speed_m_per_s=0.1)
+    finger.use(picker)
     finger.push(0.003)
     finger.place(0.0, -0.04)
     for _ in range(60):
@@ -79,7 +79,7 @@ def test_the_finger_goes_round_the_object_and_not_through_it(scene: Scene) -> No
     assert all(isinstance(path, FingerPath) for path in sent)
 
 
-def moved(finger: Finger, sent: list[FingerPath]) -> Floats:
+def moved(finger: FingerController, sent: list[FingerPath]) -> Floats:
     """Where the finger (3,) is once it does not move any more; each step within its speed."""
     for _ in range(200):
         count = len(sent)
@@ -101,8 +101,8 @@ def depth_m(scene: Scene, point: Floats) -> float:
 def test_what_is_wanted_of_the_finger_outlives_scenes_and_lifting(scene: Scene) -> None:
     """The push was forgotten with each new scene, and by lifting the finger."""
     sent: list[FingerPath] = []
-    finger = Finger(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
-    finger.use(Aim(scene))
+    finger = FingerController(sent.append, speed_m_per_s=0.1)  # type: ignore[arg-type]  # it sends no other
+    finger.use(SurfacePicker(scene))
     finger.advance(0.05, None)
     assert not sent, "nobody has moved it yet"
     finger.push(0.018)
@@ -111,7 +111,7 @@ def test_what_is_wanted_of_the_finger_outlives_scenes_and_lifting(scene: Scene) 
     finger.use(None)
     finger.push(0.008)
     finger.advance(0.05, None)
-    finger.use(Aim(thinner))
+    finger.use(SurfacePicker(thinner))
     assert depth_m(thinner, moved(finger, sent)) == pytest.approx(0.008, abs=2e-4)
     finger.lift()
     assert depth_m(thinner, moved(finger, sent)) == pytest.approx(-HOVER_M, abs=2e-4)
@@ -142,15 +142,15 @@ commands = st.one_of(
 def test_the_finger_depends_on_what_is_wanted_and_not_on_how_it_came_about(
     steps: list[tuple[Any, ...]],
 ) -> None:
-    finger = Finger(lambda message: None, speed_m_per_s=1.0)
+    finger = FingerController(lambda message: None, speed_m_per_s=1.0)
     finger.use(AIMS[0])
-    aim, depth, position, lifted = AIMS[0], 0.004, (0.0, 0.0), True
+    picker, depth, position, lifted = AIMS[0], 0.004, (0.0, 0.0), True
     commanded = False
     for name, *values in steps:
         if name == "scene":
-            aim = AIMS[int(values[0])]
+            picker = AIMS[int(values[0])]
             finger.use(None)
-            finger.use(aim)
+            finger.use(picker)
             continue
         getattr(finger, name)(*values)
         commanded = True
@@ -163,17 +163,17 @@ def test_the_finger_depends_on_what_is_wanted_and_not_on_how_it_came_about(
     led = np.array([0.0, 0.0, 0.08])
     if commanded:
         ray = np.array([*position, 1.5]), np.array([0.0, 0.0, -1.0])
-        led = aim.under_ray(*ray, -HOVER_M if lifted else depth)
+        led = picker.pick(*ray, -HOVER_M if lifted else depth)
     finger.advance(1000.0, None)
     assert finger.position_m == position
-    np.testing.assert_allclose(finger._led, led)
+    np.testing.assert_allclose(finger._last_point, led)
 
 
 def test_a_finger_that_cannot_be_moved_says_why(scene: Scene) -> None:
-    finger = Finger(lambda message: None, speed_m_per_s=0.1)
-    finger.use(Aim(scene))
+    finger = FingerController(lambda message: None, speed_m_per_s=0.1)
+    finger.use(SurfacePicker(scene))
     for depth in (-0.001, np.nan, np.inf):
-        with pytest.raises(ValueError, match="no depth"):
+        with pytest.raises(ValueError, match="finite number"):
             finger.push(depth)
 
 
@@ -181,14 +181,14 @@ async def test_an_object_is_made_ready_to_point_at_beside_the_loop(
     scene: Scene, tmp_path: Path
 ) -> None:
     sent: list[Message] = []
-    desk = SceneDesk(sent.append, tmp_path, scene)
-    finger, failures = Finger(sent.append, speed_m_per_s=1.0), []
-    desk.make_aim(finger, failures.append)
+    controller = SceneController(sent.append, tmp_path, scene)
+    finger, failures = FingerController(sent.append, speed_m_per_s=1.0), []
+    controller.make_picker(finger, failures.append)
     finger.push(0.002)
     assert not finger.advance(1.0, None), "its shape is not known yet"
     async with asyncio.timeout(DEADLINE_S):
         while not finger.advance(1.0, None):  # noqa: ASYNC110  # it is told by a task
             await asyncio.sleep(0)
-    await desk.close()
+    await controller.close()
     assert sent
     assert not failures

@@ -12,7 +12,7 @@ from flexsheet.messages.types import (
     EStop,
 )
 from flexsheet.messages.wire import WireError
-from flexsheet.nodes.console.newest import Newest
+from flexsheet.nodes.console.latest_messages import LatestMessages
 from tests.console_parts import frames_of
 
 Floats = NDArray[np.float64]
@@ -20,16 +20,16 @@ Floats = NDArray[np.float64]
 
 def test_only_what_is_looked_at_is_opened() -> None:
     refused: list[tuple[Topic, WireError]] = []
-    newest = Newest(lambda topic, error: refused.append((topic, error)))
-    assert newest.newest("estop", EStop) is None
+    newest = LatestMessages(lambda topic, error: refused.append((topic, error)))
+    assert newest.latest("estop", EStop) is None
     assert not newest.put("estop", frames_of(EStop(engaged=True, reason="1"))[0])
     assert newest.put("estop", frames_of(EStop(engaged=True, reason="2"))[0]), "never looked at"
-    entry = newest.newest("estop", EStop)
+    entry = newest.latest("estop", EStop)
     assert entry is not None
     assert entry[0].reason == "2"
-    assert newest.newest("estop", EStop) is entry or newest.newest("estop", EStop) == entry
+    assert newest.latest("estop", EStop) is entry or newest.latest("estop", EStop) == entry
     newest.put("estop", [b"rubbish"])
-    assert newest.newest("estop", EStop) == entry, "what came before still stands"
+    assert newest.latest("estop", EStop) == entry, "what came before still stands"
     assert [topic.name for topic, _ in refused] == ["estop"]
     with pytest.raises(TypeError):
-        newest.newest("estop", Bookmark)
+        newest.latest("estop", Bookmark)

@@ -1,0 +1,400 @@
+"""Carry out the requests of viewers, on the node's own loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from dataclasses import asdict, astuple, dataclass, replace
+from enum import Enum, auto
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.base import Message
+from flexsheet.messages.errors import FlexsheetError
+from flexsheet.messages.methods import chosen
+from flexsheet.messages.scene import Scene
+from flexsheet.messages.types import Bookmark, Correction, Display, EStop, Frame, Recording, TwinEye
+from flexsheet.nodes.console import scenes
+from flexsheet.nodes.console.finger import FingerController
+from flexsheet.nodes.console.graph_facts import GraphFacts
+from flexsheet.nodes.console.picking import SurfacePicker
+from flexsheet.nodes.console.replay import Timeline, list_bags
+from flexsheet.nodes.console.state_file import ConsoleState, load_state, save_state
+
+Floats = NDArray[np.float64]
+Publish = Callable[[Message], None]
+
+SETTLE_S = 0.4
+"""Time that a slider must rest before the changed scene is published."""
+
+EYE_VIEW_PERIOD_S = 6.0
+PIXELS_EVERY = 3
+MAX_DRAWING_S = 5.0
+"""The renderer draws many frames in this time, or none."""
+
+CAPTURE_S = 1.0
+"""Time after a frame within which the simulated eye has all its inputs."""
+
+MAX_TRACING_S = 120.0
+"""Time after which an image is given up."""
+
+DEFAULT_BOOKMARK = "bookmark"
+MAX_LABELS = 64
+"""Number of requested labels whose late images are still shown."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sliders:
+    """Hold the values of the page's sliders."""
+
+    young_modulus_pa: float
+    stretch_ratio: float
+    size_ratio: float
+
+    @staticmethod
+    def from_scene(scene: Scene) -> Sliders:
+        return Sliders(
+            scene.object.material.young_modulus_pa,
+            max(scene.sheet.min_stretch_ratio, scenes.MIN_STRETCH_RATIO),
+            1.0,
+        )
+
+
+class SceneController:
+    """Control the scene that the graph uses: choose it, and change it by the sliders."""
+
+    def __init__(
+        self,
+        publish: Callable[[Scene], None],
+        folder: Path,
+        first: Scene,
+        sliders: Sliders | None = None,
+    ) -> None:
+        """Start with `first`. sliders: values of the last console; None: nobody has moved them."""
+        self._publish, self._folder = publish, folder
+        self.names = scenes.scene_names(folder)
+        self.base, self.moved = first, sliders is not None
+        self.sliders = sliders or Sliders.from_scene(first)
+        self.scene = self._edit_scene() if self.moved else first
+        self._due_s: float | None = None
+        self._picker_task: asyncio.Task[None] | None = None
+
+    def choose(self, name: str) -> None:
+        """Change to another of the run's scenes; SceneChoiceError."""
+        self.base, self.moved = scenes.load(self._folder, name), False
+        self.sliders = Sliders.from_scene(self.base)
+        self._send(self.base)
+
+    def slide(self, now_s: float, **changes: float) -> None:
+        """Store the value of a slider; `apply_sliders` publishes the scene once it rests."""
+        self.sliders = replace(self.sliders, **changes)
+        self._due_s = now_s + SETTLE_S
+
+    def apply_sliders(self, now_s: float) -> bool:
+        """Publish the changed scene if it is due, and return whether it was. SceneChoiceError."""
+        if self._due_s is None or now_s < self._due_s:
+            return False
+        self._due_s = None
+        scene, self.moved = self._edit_scene(), True
+        self._send(scene)
+        return True
+
+    def _edit_scene(self) -> Scene:
+        return scenes.edit_scene(self.base, **asdict(self.sliders))
+
+    def _send(self, scene: Scene) -> None:
+        self.scene = scene
+        self._publish(scene)
+
+    def publish_current(self) -> None:
+        """Publish the scene in use again."""
+        self._publish(self.scene)
+
+    def make_picker(self, finger: FingerController, failed: Callable[[str], None]) -> None:
+        """Make the picker of the present object in a thread, and give it to the finger."""
+        if self._picker_task is not None:
+            self._picker_task.cancel()
+        finger.use(None)
+        self._picker_task = asyncio.create_task(self._make_picker(self.scene, finger, failed))
+
+    async def _make_picker(
+        self, scene: Scene, finger: FingerController, failed: Callable[[str], None]
+    ) -> None:
+        try:
+            finger.use(await asyncio.to_thread(SurfacePicker, scene))
+        except ValueError as error:
+            failed(f"the finger cannot be moved over this object: {error}")
+
+    async def close(self) -> None:
+        if self._picker_task is not None:
+            self._picker_task.cancel()
+            await asyncio.gather(self._picker_task, return_exceptions=True)
+
+
+class EyeViewState(Enum):
+    """Name what the next image of the user's eye waits for."""
+
+    RESTING = auto()
+    DRAWING = auto()
+    TRACING = auto()
+
+
+class EyeViewRequester:
+    """Request images of the user's eye: frames with pixels, which the simulated eye traces.
+
+    Tracing takes one second of processor time, and much longer on a busy computer. No other image
+    is requested meanwhile. The display settings of another writer are restored as soon as the eye
+    has its inputs. Without such settings, the correction of the scene or of the console is
+    restored.
+    """
+
+    def __init__(self, publish: Publish, scene: Scene) -> None:
+        self._publish = publish
+        self.wanted = False
+        self.picked: Correction | Literal["auto"] = "auto"
+        self.state = EyeViewState.RESTING
+        self._by_scene = scene.methods.correction
+        self._owns_display = self._borrowed = False
+        self._number = 0
+        self._labels: deque[str] = deque(maxlen=MAX_LABELS)
+        self._since_s, self._next_s = 0.0, 0.0
+        self._others_display: Display | None = None
+
+    @property
+    def label(self) -> str:
+        """Label of the newest request."""
+        return f"console {self._number}"
+
+    @property
+    def correction(self) -> Correction:
+        """Return the correction that was chosen at the console, else that of the scene."""
+        return chosen(self.picked, self._by_scene, "two_pass")
+
+    def waited_s(self, now_s: float) -> float:
+        """Return how long the present state has lasted."""
+        return now_s - self._since_s
+
+    def on_scene(self, scene: Scene) -> None:
+        """Use the correction of a scene.
+
+        A renderer that has received a display message ignores the correction of later scenes. If
+        that message was the console's, the console publishes the new correction.
+        """
+        self._by_scene = scene.methods.correction
+        if self._owns_display and not self._borrowed:
+            self._restore_display()
+
+    def on_others_display(self, display: Display) -> None:
+        """Store the display message of another writer, to restore it later."""
+        self._others_display, self._owns_display = display, False
+
+    def advance(self, now_s: float) -> None:
+        """Request the next image if it is due, and give up one that takes too long."""
+        waited_s = self.waited_s(now_s)
+        match self.state:
+            case EyeViewState.RESTING:
+                if self.wanted and now_s >= self._next_s:
+                    self._request(now_s)
+            case EyeViewState.DRAWING:
+                if waited_s > MAX_DRAWING_S:
+                    self._rest(now_s)
+            case EyeViewState.TRACING:
+                if self._borrowed and waited_s > CAPTURE_S:
+                    self._restore_display()
+                if waited_s > MAX_TRACING_S:
+                    self._rest(now_s)
+
+    def _request(self, now_s: float) -> None:
+        self._number += 1
+        self._labels.append(self.label)
+        self._enter(EyeViewState.DRAWING, now_s)
+        self._borrowed = True
+        self._publish(
+            Display(
+                correction=self.correction,
+                stereo="mono",
+                marks=False,
+                pixels_every=PIXELS_EVERY,
+                label=self.label,
+            )
+        )
+
+    def request_now(self) -> None:
+        """Request the next image without waiting for the period."""
+        self._next_s = 0.0
+
+    def on_frame(self, frame: Frame, now_s: float) -> None:
+        """Note the first frame with the requested pixels; the eye traces it."""
+        if self.state is EyeViewState.DRAWING and frame.label == self.label and frame.pixels:
+            self._enter(EyeViewState.TRACING, now_s)
+
+    def on_image(self, eye: TwinEye, now_s: float) -> bool:
+        """Note an image, and return whether this console requested it, however late."""
+        if eye.label == self.label and self.state is not EyeViewState.RESTING:
+            self._rest(now_s)
+        return eye.label in self._labels
+
+    def _enter(self, state: EyeViewState, now_s: float) -> None:
+        self.state, self._since_s = state, now_s
+
+    def _rest(self, now_s: float) -> None:
+        self._enter(EyeViewState.RESTING, now_s)
+        self._next_s = now_s + EYE_VIEW_PERIOD_S
+        if self._borrowed:
+            self._restore_display()
+
+    def _restore_display(self) -> None:
+        self._borrowed, self._owns_display = False, self._others_display is None
+        own = Display(correction=self.correction, stereo="side_by_side", label="console rests")
+        self._publish(self._others_display or own)
+
+
+class Replay:
+    """Show a bag in place of the running graph; none of its messages is published."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.timeline: Timeline | None = None
+        self.playing = False
+        self.rate = 1.0
+
+    def bags(self) -> list[str]:
+        return list_bags(self._folder)
+
+    def open(self, name: str) -> None:
+        """Show a bag of the folder from its beginning; BagError."""
+        self.timeline = Timeline(self._folder / name)
+        self.playing = True
+
+    def leave(self) -> None:
+        """Return to the running graph."""
+        self.timeline, self.playing = None, False
+
+    def seek(self, seconds: float) -> None:
+        """Go to a position of the bag (s), clipped to its duration."""
+        if self.timeline is not None:
+            self.timeline.seconds = float(np.clip(seconds, 0.0, self.timeline.duration_s))
+
+    def play_or_pause(self) -> None:
+        """Pause, or play from the present position; at the end, from the beginning."""
+        if self.timeline is not None and self.timeline.seconds >= self.timeline.duration_s:
+            self.seek(0.0)
+        self.playing = not self.playing
+
+    def advance(self, duration_s: float) -> None:
+        """Play on by this time (s); stop at the end."""
+        if self.timeline is None or not self.playing:
+            return
+        self.seek(self.timeline.seconds + self.rate * duration_s)
+        if self.timeline.seconds >= self.timeline.duration_s:
+            self.playing = False
+
+
+@dataclass(frozen=True, slots=True)
+class ConsoleFiles:
+    """Name the files of a console: the run's plan and scenes, the bags, and its state."""
+
+    plan: Path
+    scenes: Path
+    bags: Path
+    state: Path
+
+
+class ReleaseError(FlexsheetError, ValueError):
+    """Report that this console's host may not reset an e-stop, and which hosts may."""
+
+    code = "release"
+    remedy = (
+        "Reset the e-stop on a host that the text names, or set `hosts.NAME.may_reset_estop` for "
+        "this host in the launch file on all hosts."
+    )
+
+
+class ConsoleController:
+    """Combine the controllers, and publish e-stops, recordings and bookmarks.
+
+    A restarted console continues with the scene, the sliders and the recording of its run. warn:
+    called with the reason if it cannot.
+    """
+
+    def __init__(
+        self,
+        publish: Publish,
+        files: ConsoleFiles,
+        finger: FingerController,
+        warn: Callable[[str], None],
+        facts: GraphFacts | None = None,
+    ) -> None:
+        self._files, self.facts = files, facts or GraphFacts()
+        state = load_first_state(files, warn)
+        self.recording, sliders = state.recording, state.sliders
+        given = None if sliders is None else Sliders(*sliders)
+        self.scenes = SceneController(self._send_scene, files.scenes, state.base, given)
+        self.finger = finger
+        if state.finger is not None:
+            finger.restore(state.finger)
+        self.eye_view = EyeViewRequester(publish, self.scenes.scene)
+        self.replay = Replay(files.bags)
+        self._publish = publish
+        self.stopped: str | None = None
+
+    def begin(self) -> None:
+        """Publish the latched messages again: they are lost when their publisher exits."""
+        self.scenes.publish_current()
+        if self.recording:
+            self._publish(Recording(running=True))
+
+    def stop(self, reason: str) -> None:
+        self.stopped = reason
+        self._publish(EStop(engaged=True, reason=reason))
+
+    def release(self) -> None:
+        """Reset the e-stop; ReleaseError if the graph would ignore the reset."""
+        if others := self.facts.others_may_reset:
+            raise ReleaseError(
+                f"this console's host may not reset an e-stop; use {' or '.join(others)}, or "
+                "set may_reset_estop of this host in the launch file"
+            )
+        self.stopped = None
+        self._publish(EStop(engaged=False, reason="reset at the console"))
+
+    def record(self, running: bool) -> None:
+        self.recording = running
+        self._publish(Recording(running=running))
+        self.save_state()
+
+    def add_bookmark(self, label: str) -> str:
+        """Publish a bookmark, and return its label."""
+        label = label.strip() or DEFAULT_BOOKMARK
+        self._publish(Bookmark(label=label))
+        return label
+
+    def _send_scene(self, scene: Scene) -> None:
+        self._publish(scene)
+        self.eye_view.on_scene(scene)
+        self.save_state()
+
+    def save_state(self) -> None:
+        """Store what a restarted console continues with."""
+        scenes = self.scenes
+        state = ConsoleState(
+            base=scenes.base,
+            sliders=astuple(scenes.sliders) if scenes.moved else None,
+            recording=self.recording,
+            finger=self.finger.intent if self.finger.commanded else None,
+        )
+        save_state(self._files.state, state)
+
+
+def load_first_state(files: ConsoleFiles, warn: Callable[[str], None]) -> ConsoleState:
+    """Return the state of the console before this one, else the first scene alone."""
+    try:
+        state = load_state(files.state)
+    except scenes.SceneChoiceError as error:
+        warn(str(error))
+        state = None
+    return state or ConsoleState(base=scenes.first_scene(files.plan))

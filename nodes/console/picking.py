@@ -1,0 +1,88 @@
+"""Compute the fingertip position that a mouse ray means, and the path to it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flexsheet.messages.scene import Scene
+from flexsheet.nodes.models.rigid import apply, inverse, transform_from_rpy
+from flexsheet.nodes.models.shapes import Shape, make_shape
+
+Floats = NDArray[np.float64]
+
+MAX_RAY_M = 3.0
+SURFACE_TOLERANCE_M = 1e-4
+MAX_STEPS = 64
+MIN_STEP_RATIO = 0.01
+"""Fraction of a full step; a shorter step around an object starts at its centre and leads nowhere.
+"""
+
+HOVER_M = 0.03
+"""Height of a lifted finger above the object."""
+
+
+class SurfacePicker:
+    """Pick points of a scene's object. Building one for a mesh takes a second."""
+
+    def __init__(self, scene: Scene) -> None:
+        pose = scene.object.world_from_object
+        self._world_from_object = transform_from_rpy(pose.position_m, pose.rpy_rad)
+        self._object_from_world = inverse(self._world_from_object)
+        self._shape: Shape = make_shape(dict(scene.object.geometry))
+        self._low, self._high = scene.finger.volume_min_m, scene.finger.volume_max_m
+
+    def pick(self, origin: Floats, direction: Floats, depth_m: float) -> Floats:
+        """Return the fingertip (3,) that a ray from the viewer's eye means.
+
+        If the ray meets the object: the point `depth_m` below its surface, along the normal;
+        negative: above. If it misses the object: the point of the ray nearest to it, at least at
+        that height. direction (3,) is not zero.
+        """
+        direction = direction / np.linalg.norm(direction)
+        travelled, nearest_m, nearest = 0.0, np.inf, origin
+        for _ in range(MAX_STEPS):
+            point = origin + travelled * direction
+            away_m = float(self._shape.signed_distance(apply(self._object_from_world, point)))
+            if away_m < nearest_m:
+                nearest_m, nearest = away_m, point
+            if away_m < SURFACE_TOLERANCE_M:
+                return self.offset_point(point, depth_m)
+            travelled += away_m
+            if travelled > MAX_RAY_M:
+                break
+        return (
+            self.offset_point(nearest, depth_m) if nearest_m < -depth_m else self._within(nearest)
+        )
+
+    def offset_point(self, near: Floats, depth_m: float) -> Floats:
+        """Return the point `depth_m` below the surface point nearest to `near`; negative: above."""
+        found = self._shape.closest(apply(self._object_from_world, near))
+        inside = found.point - depth_m * found.normal
+        return self._within(apply(self._world_from_object, inside))
+
+    def step(self, finger: Floats, target: Floats, *, depth_m: float, max_step_m: float) -> Floats:
+        """Return the next point (3,) from the finger towards the target, at most `max_step_m` away.
+
+        The step goes no deeper into the object than `depth_m`, or than the finger is already. If a
+        path around the object makes no progress, the step is straight.
+        """
+        across = target - finger
+        distance = float(np.linalg.norm(across))
+        if distance <= max_step_m:
+            return target
+        straight = finger + across * (max_step_m / distance)
+        deepest_m = max(depth_m, self._depth_m(finger))
+        if self._depth_m(straight) <= deepest_m + SURFACE_TOLERANCE_M:
+            return straight
+        across = self.offset_point(straight, deepest_m) - finger
+        around_m = float(np.linalg.norm(across))
+        if around_m < MIN_STEP_RATIO * max_step_m:
+            return straight
+        return finger + across * min(1.0, max_step_m / around_m)
+
+    def _depth_m(self, point: Floats) -> float:
+        return -float(self._shape.signed_distance(apply(self._object_from_world, point)))
+
+    def _within(self, point: Floats) -> Floats:
+        return np.clip(point, self._low, self._high)
