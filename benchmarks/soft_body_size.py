@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.methods.charts import ROOT
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.methods.svg import COLOURS, drawn_for_pages, save_svg
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.running.code_state import git_state

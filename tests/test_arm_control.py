@@ -21,10 +21,9 @@ from flexsheet.messages.types import ArmState, EStop, Side
 from flexsheet.nodes.arm_bridge.control import ArmControl, Command, OtherArm, Patience
 from flexsheet.nodes.arm_bridge.geometry import ArmGeometry
 from flexsheet.nodes.arm_bridge.goal import Goal, goal_ahead, pace
-from flexsheet.nodes.arm_bridge.kinematics import KINEMATICS, STEPS, forward, next_joints
+from flexsheet.nodes.arm_bridge.kinematics import STEPS, forward, next_joints
 from flexsheet.nodes.arm_bridge.node import ArmBridge, ArmBridgeParameters
 from flexsheet.nodes.arm_bridge.standstill import STANDSTILL_COUNT
-from flexsheet.nodes.methods import measure
 from flexsheet.nodes.models.motion import SheetMotion
 from flexsheet.nodes.models.rigid import transform_from_rpy, vector_from_rotation
 from flexsheet.nodes.models.sheet import edge_poses
@@ -446,13 +445,6 @@ async def test_without_a_scene_the_node_waits() -> None:
     assert node.note == "waits for a scene"
     assert not any(isinstance(message, ArmState) for message in sent)
     await node.close()
-
-
-def test_every_method_of_the_family_is_within_tolerance_in_its_range() -> None:
-    points = [measure(trial, repeats=1) for trial in KINEMATICS.trials(SCENE)]
-    assert {point.method for point in points} == set(KINEMATICS.methods)
-    for point in points:
-        assert not point.in_range or point.error <= KINEMATICS.tolerance(SCENE)
 
 
 def test_a_bridge_steps_by_what_its_way_is_checked_with_and_by_nothing_else() -> None:

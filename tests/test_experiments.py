@@ -22,14 +22,13 @@ from flexsheet.launch.methods.charts import (
     UnknownFamilyError,
     chart_result,
     family_named,
-    finite,
     measure_family,
     write_chart,
 )
+from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.methods.svg import INK
 from flexsheet.messages.methods import (
     Correction,
-    KinematicsMethod,
     MarkerMethod,
     SheetForceMethod,
     SheetShapeMethod,
@@ -228,7 +227,6 @@ CHOICES = {
     "marker": MarkerMethod,
     "triangulation": TriangulationMethod,
     "tracking": TrackingMethod,
-    "kinematics": KinematicsMethod,
     "sheet-force": SheetForceMethod,
     "sheet-shape": SheetShapeMethod,
     "correction": Correction,
@@ -291,4 +289,4 @@ def test_the_front_holds_what_nothing_beats_and_ignores_what_is_out_of_range() -
 
 
 def test_json_never_holds_nan() -> None:
-    assert finite({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
+    assert replace_non_finite({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}

@@ -17,8 +17,8 @@ from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
-from flexsheet.nodes.triangulator import families
-from flexsheet.nodes.triangulator.families import MARKER, DrawnDisc, centre_bound_px, noisy
+from flexsheet.nodes.triangulator import benchmarks
+from flexsheet.nodes.triangulator.benchmarks import MARKER, DrawnDisc, centre_bound_px, noisy
 from flexsheet.nodes.triangulator.marker import (
     MARKER_METHODS,
     Blob,
@@ -288,7 +288,7 @@ def test_mark_methods_are_judged_with_the_noise_that_the_node_tells_them(
         believed.append(noise)
         return []
 
-    monkeypatch.setattr(families, "MARKER_METHODS", {"moments": spy})
+    monkeypatch.setattr(benchmarks, "MARKER_METHODS", {"moments": spy})
     loud = {"read_noise_levels": 4.0, "photons_per_level": 10.0}
     camera = scene.camera.model_copy(update=loud)
     trial = next(iter(MARKER.trials(scene.model_copy(update={"camera": camera}))))

@@ -16,7 +16,7 @@ from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.commands.tune import NOT_MET
 from flexsheet.launch.methods import tune
-from flexsheet.launch.methods.machine import busy_words
+from flexsheet.launch.methods.results import describe_load
 from flexsheet.launch.methods.tune import (
     Tunable,
     choose,
@@ -31,11 +31,10 @@ from flexsheet.messages.base import Header
 from flexsheet.messages.clock import VirtualClock
 from flexsheet.messages.methods import Methods, SoftBodyChoice
 from flexsheet.messages.scene import Scene
-from flexsheet.nodes.arm_bridge.kinematics import KINEMATICS
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from flexsheet.nodes.methods import Case, Family, Point, Trial
 from flexsheet.nodes.planner.force_table import law_by
-from flexsheet.nodes.triangulator.families import TRIANGULATION
+from flexsheet.nodes.triangulator.benchmarks import TRIANGULATION
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 
@@ -185,13 +184,13 @@ def test_a_miss_is_said_with_how_far_it_misses() -> None:
 
 def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     there = {
-        "flexsheet.launch.methods.families:QUICK_SHAPE": family(
+        "flexsheet.launch.methods.benchmarks:QUICK_SHAPE": family(
             "sheet-shape", ["four_triangles", "reduced_order"]
         ),
-        "flexsheet.launch.methods.families:QUICK_CORRECTION": family(
+        "flexsheet.launch.methods.benchmarks:QUICK_CORRECTION": family(
             "correction", ["one_plane", "two_pass_triangles"]
         ),
-        "flexsheet.launch.methods.families:CORRECTION": family("correction", ["two_pass"]),
+        "flexsheet.launch.methods.benchmarks:CORRECTION": family("correction", ["two_pass"]),
     }
     monkeypatch.setattr(tune, "family_at", there.__getitem__)
     errors = {"four_triangles": 0.2, "reduced_order": 0.1, "one_plane": 9.0}
@@ -374,14 +373,14 @@ def run(*arguments: object) -> Any:
 
 def test_a_real_family_is_tuned_by_the_command(tmp_path: Path) -> None:
     out = tmp_path / "tuned.yaml"
-    command = [SCENES / "light-touch.yaml", "--family", "kinematics", "--output", out, "--json"]
+    command = [SCENES / "light-touch.yaml", "--family", "triangulation", "--output", out, "--json"]
     outcome = run(*command)
     assert outcome.exit_code == 0, outcome.output
     result = json.loads(outcome.stdout)
     assert result["met"]
     (only,) = result["families"]
-    assert only["chosen"].startswith("closed_form")
-    assert load_scene(out).methods.kinematics == only["setting"]
+    assert only["chosen"] == "dlt"
+    assert load_scene(out).methods.triangulation == only["setting"]
 
 
 def test_a_miss_has_an_exit_code_of_its_own(
@@ -400,7 +399,7 @@ def test_an_unknown_family_is_named_with_the_nearest() -> None:
     assert isinstance(outcome.exception, CommandError)
     assert 'did you mean "correction"?' in str(outcome.exception)
     assert "no node takes a choice" in str(
-        run(SCENES / "sphere.yaml", "--family", "rolling").exception
+        run(SCENES / "sphere.yaml", "--family", "kinematics").exception
     )
 
 
@@ -408,7 +407,7 @@ def test_every_choice_that_can_be_made_is_one_that_a_scene_can_say() -> None:
     for tunable in tune.TUNABLES:
         for setting in tunable.settings.values():
             assert Methods.model_validate({tunable.key: setting})
-    assert {one.key for one in tune.TUNABLES} == set(Methods.model_fields)
+    assert {one.key for one in tune.TUNABLES} == set(Methods.model_fields) - {"kinematics"}
 
 
 def test_families_ask_for_the_scenes_own_cases_only() -> None:
@@ -423,8 +422,6 @@ def test_families_ask_for_the_scenes_own_cases_only() -> None:
     asked_for = [trial for trial in TRIANGULATION.trials(wider) if trial.in_scene]
     assert {trial.case["baseline_mm"] for trial in asked_for} == {130.0}
     assert all(trial.in_range for trial in asked_for)
-    tilts = [trial.case for trial in KINEMATICS.trials(SCENE) if trial.in_scene]
-    assert all("tilt_deg" in case for case in tilts)
 
 
 @pytest.mark.parametrize(("name", "missed"), [("light-touch", False), ("demanding", True)])
@@ -489,4 +486,4 @@ def test_a_busy_machine_is_told_of(
 ) -> None:
     monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
     monkeypatch.setattr("os.cpu_count", lambda: 8)
-    assert (busy_words() is not None) == busy
+    assert (describe_load() is not None) == busy

@@ -8,8 +8,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from flexsheet.messages import reference as messages_page
-from website import commands_page, errors_page, parameters_page, registers_page
+from website import commands_page, errors_page, messages_page, parameters_page, registers_page
 from website.graph import PICTURES, svg
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"

@@ -21,7 +21,7 @@ from flexsheet.launch.commands.output import (
     progress_words,
     words,
 )
-from flexsheet.launch.methods.finite import finite
+from flexsheet.launch.methods.results import replace_non_finite
 
 app = typer.Typer(add_completion=False)
 
@@ -32,7 +32,7 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
     epilog=examples(
         "flexsheet chart tracking",
         "flexsheet chart triangulation --cases",
-        "flexsheet chart kinematics --scene lab.yaml --json",
+        "flexsheet chart triangulation --scene lab.yaml --json",
         "flexsheet chart --output docs/charts --redraw",
     )
 )
@@ -69,7 +69,7 @@ def chart(
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts
-    from flexsheet.launch.methods.machine import busy_words
+    from flexsheet.launch.methods.results import describe_load
     from flexsheet.launch.plans.plan import load_scene
 
     if redraw:
@@ -87,14 +87,14 @@ def chart(
         families = [charts.family_named(name) for name in ([family] if family else charts.FAMILIES)]
     except charts.UnknownFamilyError as error:
         raise CommandError(str(error), BAD_INPUT) from None
-    if busy := busy_words():
+    if busy := describe_load():
         words.print(busy, style="yellow")
     results = []
     for each in families:
         with progress_words() as progress:
             told = partial(_told, progress, each.name)
             points = charts.measure_family(each, scene, progress=told)
-        result = finite(charts.chart_result(each, scene, points))
+        result = replace_non_finite(charts.chart_result(each, scene, points))
         picture, _ = charts.write_chart(result, output)
         words.print(f"chart: {picture}")
         results.append(result)

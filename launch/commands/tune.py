@@ -74,7 +74,7 @@ def tune(
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune
-    from flexsheet.launch.methods.machine import busy_words, machine_name
+    from flexsheet.launch.methods.results import describe_load, machine_name
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
@@ -85,7 +85,7 @@ def tune(
     target = None if dry_run else output or scene_file
     if target is not None:
         tune.check_target(scene_file, target)  # what follows takes minutes
-    if busy := busy_words():
+    if busy := describe_load():
         words.print(busy, style="yellow")
     with progress_words() as progress:
         choices = tune.tune(scene, tunables, margin=margin, progress=progress)

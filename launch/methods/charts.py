@@ -14,8 +14,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from flexsheet.launch.methods.finite import finite
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name, replace_non_finite
 from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
 from flexsheet.launch.running.code_state import git_state
 from flexsheet.messages.errors import FlexsheetError
@@ -28,16 +27,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FAMILIES: dict[str, str] = {
-    "marker": "flexsheet.nodes.triangulator.families:MARKER",
-    "triangulation": "flexsheet.nodes.triangulator.families:TRIANGULATION",
-    "tracking": "flexsheet.launch.methods.families:TRACKING",
-    "kinematics": "flexsheet.nodes.arm_bridge.kinematics:KINEMATICS",
+    "marker": "flexsheet.nodes.triangulator.benchmarks:MARKER",
+    "triangulation": "flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",
+    "tracking": "flexsheet.launch.methods.benchmarks:TRACKING",
     "soft-body": "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY",
-    "correction": "flexsheet.launch.methods.families:CORRECTION",
-    "sheet-force": "flexsheet.launch.methods.families:SHEET_FORCE",
-    "sheet-shape": "flexsheet.launch.methods.families:SHEET_SHAPE",
-    "mesh-normal": "flexsheet.nodes.planner.families:MESH_NORMAL",
-    "rolling": "flexsheet.nodes.planner.families:ROLLING",
+    "correction": "flexsheet.launch.methods.benchmarks:CORRECTION",
+    "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
+    "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
 """Families by their name on the command line; each node's folder describes its own."""
 
@@ -279,7 +275,7 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
     folder.mkdir(parents=True, exist_ok=True)
     picture, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
     draw_chart(result, picture)
-    write_file(numbers, json.dumps(finite(result), indent=1) + "\n")
+    write_file(numbers, json.dumps(replace_non_finite(result), indent=1) + "\n")
     return picture, numbers
 
 

@@ -24,7 +24,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
 from flexsheet.launch.methods.charts import duration, family_at, git_commit, measure_family
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.errors import FlexsheetError
@@ -78,33 +78,27 @@ TUNABLES = (
     Tunable(
         "marker",
         "marker",
-        ("flexsheet.nodes.triangulator.families:MARKER",),
+        ("flexsheet.nodes.triangulator.benchmarks:MARKER",),
         _by_name("moments", "weighted_centroid", "subpixel_fit"),
     ),
     Tunable(
         "triangulation",
         "triangulation",
-        ("flexsheet.nodes.triangulator.families:TRIANGULATION",),
+        ("flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",),
         _by_name("dlt"),
     ),
     Tunable(
         "tracking",
         "tracking",
-        ("flexsheet.launch.methods.families:TRACKING",),
+        ("flexsheet.launch.methods.benchmarks:TRACKING",),
         _by_name("none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"),
-    ),
-    Tunable(
-        "kinematics",
-        "kinematics",
-        ("flexsheet.nodes.arm_bridge.kinematics:KINEMATICS",),
-        _by_name("closed_form_continuous"),
     ),
     Tunable(
         "sheet-force",
         "sheet_force",
         (
-            "flexsheet.launch.methods.families:SHEET_LAWS",
-            "flexsheet.launch.methods.families:SHEET_FORCE",
+            "flexsheet.launch.methods.benchmarks:SHEET_LAWS",
+            "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
         ),
         _by_name("linear", "scaled", "table"),
     ),
@@ -112,8 +106,8 @@ TUNABLES = (
         "sheet-shape",
         "sheet_shape",
         (
-            "flexsheet.launch.methods.families:QUICK_SHAPE",
-            "flexsheet.launch.methods.families:SHEET_SHAPE",
+            "flexsheet.launch.methods.benchmarks:QUICK_SHAPE",
+            "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
         ),
         _by_name("four_triangles", "reduced_order"),
     ),
@@ -121,8 +115,8 @@ TUNABLES = (
         "correction",
         "correction",
         (
-            "flexsheet.launch.methods.families:QUICK_CORRECTION",
-            "flexsheet.launch.methods.families:CORRECTION",
+            "flexsheet.launch.methods.benchmarks:QUICK_CORRECTION",
+            "flexsheet.launch.methods.benchmarks:CORRECTION",
         ),
         _by_name("none", "one_plane", "four_triangles", "two_pass"),
     ),

@@ -9,9 +9,8 @@ J2, J3, J5 about y; shoulder 300 mm up, upper arm 250 mm, elbow shift 90 mm back
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from math import acos, atan2, copysign, cos, degrees, hypot, inf, pi, remainder, sin
 from typing import Literal, NamedTuple, get_args
 
@@ -20,17 +19,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.methods import KinematicsMethod
-from flexsheet.messages.scene import Scene
-from flexsheet.nodes.methods import Family, Trial
-from flexsheet.nodes.models.rigid import (
-    apply,
-    inverse,
-    rotation_from_vector,
-    transform,
-    transform_from_rpy,
-    vector_from_rotation,
-)
-from flexsheet.nodes.models.sheet import edge_poses, flange_pose
 
 Floats = NDArray[np.float64]
 JointsFor = Callable[[Floats, Floats], Floats]
@@ -427,19 +415,6 @@ def singularities(joints_rad: ArrayLike) -> Singularities:
     return Singularities(np.abs(_out(joints)), np.abs(elbow), np.abs(wrist))
 
 
-def manipulability(joints_rad: ArrayLike) -> Floats:
-    """|det J| (m^3) of joints (..., 6): 0 at a singularity (Yoshikawa, IJRR 4(2), 1985).
-
-    With a spherical wrist the determinant is that of the arm times that of the wrist; here it is
-    upper arm x (elbow to wrist) x |sin(J3 - straight)| x |wrist centre to J1's axis| x |sin J5|.
-    """
-    joints = np.asarray(joints_rad, dtype=np.float64)
-    elbow = np.sin(joints[..., 2] - ELBOW_ANGLE_RAD)
-    return np.asarray(
-        UPPER_ARM_M * _ELBOW_TO_WRIST_M * np.abs(elbow * _out(joints) * np.sin(joints[..., 4]))
-    )
-
-
 def _out(joints: Floats) -> Floats:
     """How far (m) the wrist centre lies before the axes of J1; negative behind it."""
     q2, q23 = joints[..., 1], joints[..., 1] + joints[..., 2]
@@ -470,131 +445,10 @@ def jacobian(joints_rad: ArrayLike) -> Floats:
     return np.vstack([np.cross(axes, flange[:3, 3:] - centres, axis=0), axes])
 
 
-def damped_least_squares(
-    base_from_flange: Floats,
-    present_rad: ArrayLike,
-    *,
-    iterations: int = 20,
-    damping: float = 1e-3,
-    tolerance: float = 1e-9,
-) -> Floats:
-    """Joints (6,) near `present_rad` for a flange pose, by Levenberg's damped steps.
-
-    Needs a start from which the pose can be reached without a change of branch; knows no joint
-    ranges; stops at `tolerance` (m and rad) or after `iterations`, whatever is left then
-    (Wampler 1986).
-    """
-    joints = np.array(present_rad, dtype=np.float64)
-    for _ in range(iterations):
-        pose = forward(joints)
-        error = np.concatenate(
-            [
-                base_from_flange[:3, 3] - pose[:3, 3],
-                vector_from_rotation(base_from_flange[:3, :3] @ pose[:3, :3].T),
-            ]
-        )
-        if float(np.abs(error).max()) < tolerance:
-            break
-        slope = jacobian(joints)
-        joints += slope.T @ np.linalg.solve(slope @ slope.T + damping**2 * np.eye(6), error)
-    return joints
-
-
-CHART_LEAP_RAD = 0.35
-"""Joints that would go further than this in one step stop the bridge: out of a method's range."""
-
 CENTRE_RAD = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
 """The arm reaching forward, far from all singularities and ranges."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Edge:
-    """A clamped edge's middle and ends (3, 3) m, seen from the flange: what errors are taken of."""
-
-    points: Floats
-
-    def error_mm(self, wanted: Floats, joints_rad: Floats) -> float:
-        """How far a point of the edge is off, at most."""
-        off = apply(forward(joints_rad), self.points) - apply(wanted, self.points)
-        return 1e3 * float(np.linalg.norm(off, axis=1).max())
-
-
-def _trials(scene: Scene) -> Iterable[Trial]:
-    """Steps of the left arm: tilts over the working range, and past the wrist's singularity.
-
-    tilt: the sheet turns by 0.03 rad.  past: the flange's axis passes that of the forearm at a
-    distance, in a step of 0.02 rad that begins 0.01 rad before the nearest point.
-    """
-    arm = scene.arms.left
-    base_from_world = inverse(
-        transform_from_rpy(arm.world_from_base.position_m, arm.world_from_base.rpy_rad)
-    )
-    flange_from_edge = transform_from_rpy(
-        arm.flange_from_edge.position_m, arm.flange_from_edge.rpy_rad
-    )
-    half = 0.5 * scene.sheet.height_m
-    edge = _Edge(apply(flange_from_edge, np.array([[0.0, -half, 0.0], [0, 0, 0], [0, half, 0]])))
-
-    def flange(tilt_rad: float) -> Floats:
-        world_from_sheet = transform_from_rpy(np.zeros(3), [tilt_rad, 0.0, 0.0])
-        left, _ = edge_poses(world_from_sheet, scene.sheet.width_m)
-        return base_from_world @ flange_pose(left, flange_from_edge)
-
-    start = CENTRE_RAD
-    for share in (0.0, 0.5, 1.0):
-        tilt_rad = share * scene.working_range.tilt_rad
-        start = inverse_kinematics(flange(tilt_rad - 0.03), start)
-        tilt_deg = round(degrees(tilt_rad), 1)
-        yield from _step_trials({"tilt_deg": tilt_deg}, start, flange(tilt_rad), edge)
-    for past_deg in (0.1, 1.0, 8.0):
-        distance = float(np.radians(past_deg))
-        start = CENTRE_RAD.copy()
-        start[3:] = atan2(-distance, 0.01), -hypot(distance, 0.01), 0.0
-        pose = forward(start)
-        axis = _arm_rotation(start[0], start[1] + start[2])[:, 1]
-        wrist = pose[:3, 3] - FLANGE_M * pose[:3, 2]
-        turned = rotation_from_vector(0.02 * axis) @ pose[:3, :3]
-        wanted = transform(turned, wrist + FLANGE_M * turned[:, 2])
-        for trial in _step_trials({"past_singularity_deg": past_deg}, start, wanted, edge):
-            yield replace(trial, in_scene=False)
-
-
-def _step_trials(
-    case: dict[str, float | int | str], start: Floats, wanted: Floats, edge: _Edge
-) -> Iterable[Trial]:
-    near = float(singularities(start).wrist_rad) < WRIST_NEAR_RAD
-    for method, solve in _METHODS.items():
-        leap = float(np.abs(solve(wanted, start) - start).max())
-        gives_way = near and solve is next_joints
-        yield Trial(
-            method=method,
-            case=case,
-            run=partial(solve, wanted, start),
-            error=partial(edge.error_mm, wanted),
-            in_range=leap <= CHART_LEAP_RAD and not gives_way,
-            size={"leap_deg": round(degrees(leap), 2)},
-        )
-
 
 STEPS: Mapping[KinematicsMethod, JointsFor] = {
     "closed_form_continuous": next_joints,
 }
-"""What a bridge may step by: the branch that its way was checked on.  Of the others of the family,
-which are there to compare, one leaves that branch past a singularity and the rest know no ranges.
-"""
-
-_METHODS: dict[str, JointsFor] = {
-    "closed_form": inverse_kinematics,
-    "closed_form_continuous": next_joints,
-    "damped_least_squares_2": partial(damped_least_squares, iterations=2),
-    "damped_least_squares_20": partial(damped_least_squares, iterations=20),
-}
-
-KINEMATICS = Family(
-    name="kinematics",
-    unit="mm",
-    reference="forward kinematics",
-    methods=tuple(_METHODS),
-    trials=_trials,
-    tolerance=lambda scene: 1e3 * scene.tolerances.sheet_position_m,
-)
+"""Methods of a bridge by name; its path is checked on the branch of the same method."""
