@@ -23,7 +23,7 @@ from flexsheet.launch.experiments.compliance import (
     read_bag,
 )
 from flexsheet.launch.experiments.pictures import draw_compliance
-from flexsheet.launch.experiments.stroke import Track
+from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
@@ -48,10 +48,10 @@ def held(press: Press, depth_m: float, retreat_m: float) -> Recorded:
         pose = arm.flange_from_edge
         clamp = transform_from_rpy(pose.position_m, pose.rpy_rad)
         flange = transform(axes, middle + side * half) @ inverse(clamp)
-        rows.append(Track(TIMES, np.tile(flange.ravel(), (2, 1))))
+        rows.append(SampledMotion(TIMES, np.tile(flange.ravel(), (2, 1))))
     return Recorded(
         scene=SCENE,
-        finger=Track(TIMES, np.tile(tip, (2, 1))),
+        finger=SampledMotion(TIMES, np.tile(tip, (2, 1))),
         windows_ns={},
         edges=(rows[0], rows[1]),
         curve_times_ns=[0],

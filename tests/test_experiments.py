@@ -52,20 +52,22 @@ def points_at(angles: np.ndarray, distance: float) -> np.ndarray:
     return AXIS + distance * direction
 
 
-def edges_tangent_at(angles: np.ndarray, *, lifted_m: float = 0.0) -> tuple[stroke.Track, ...]:
+def edges_tangent_at(
+    angles: np.ndarray, *, lifted_m: float = 0.0
+) -> tuple[stroke.SampledMotion, ...]:
     """Edges of a sheet that is tangent to the cylinder at `angles`, moved out along its normal."""
     contact = points_at(angles, RADIUS + lifted_m)
     along = np.column_stack([np.zeros_like(angles), np.cos(angles), -np.sin(angles)])
     normal = np.column_stack([np.zeros_like(angles), np.sin(angles), np.cos(angles)])
     half_width = np.array([0.125, 0.0, 0.0])
     return tuple(
-        stroke.Track(TIMES, np.hstack([contact + side * half_width, along, normal]))
+        stroke.SampledMotion(TIMES, np.hstack([contact + side * half_width, along, normal]))
         for side in (-1, 1)
     )
 
 
-def finger_at(angles: np.ndarray, depth_m: float = 0.0) -> stroke.Track:
-    return stroke.Track(TIMES, points_at(angles, RADIUS - depth_m))
+def finger_at(angles: np.ndarray, depth_m: float = 0.0) -> stroke.SampledMotion:
+    return stroke.SampledMotion(TIMES, points_at(angles, RADIUS - depth_m))
 
 
 @given(
@@ -88,7 +90,7 @@ def test_a_known_lag_and_lift_come_out(lag_rad: float, lifted_m: float, depth_m:
 
 def test_times_keep_their_digits_on_a_machine_that_is_long_up() -> None:
     start_ns = 300 * 24 * 3600 * 1_000_000_000
-    samples = stroke.Track(
+    samples = stroke.SampledMotion(
         start_ns + np.array([0, 1_000_000], dtype=np.int64), np.array([[0.0], [1.0]])
     )
     middle = samples.at(np.array([start_ns + 500_000], dtype=np.int64))
@@ -109,12 +111,12 @@ def test_the_stroke_path_is_the_papers() -> None:
 
 def test_a_track_needs_samples() -> None:
     with pytest.raises(ExperimentError, match="1 samples of fingertip"):
-        stroke.track([(0, np.zeros(3))], "fingertip")
+        stroke.make_motion([(0, np.zeros(3))], "fingertip")
 
 
 def test_a_missing_stroke_is_named_with_what_there_is() -> None:
-    empty = stroke.Track(TIMES[:2], np.zeros((2, 3)))
-    recording = stroke.Recording(
+    empty = stroke.SampledMotion(TIMES[:2], np.zeros((2, 3)))
+    recording = stroke.StrokeRecording(
         scene=SCENE,
         fingertip=empty,
         measured=empty,
@@ -157,7 +159,7 @@ def test_rows_have_the_papers_sizes_and_a_missing_picture_is_named() -> None:
         for correction in image.CORRECTIONS
         for label in [series.label(10, correction)]
     }
-    rows = image.rows(pictures, series)
+    rows = image.make_rows(pictures, series)
     assert [row["method"] for row in rows] == list(image.CORRECTIONS)
     assert rows[0]["depth_mm"] == 10
     assert rows[0]["delta_h_mm"] == pytest.approx(0.0, abs=1e-6)
@@ -165,7 +167,7 @@ def test_rows_have_the_papers_sizes_and_a_missing_picture_is_named() -> None:
     assert rows[0]["mean_mm"] == pytest.approx(5.0, abs=0.1)
     pictures.popitem()
     with pytest.raises(ExperimentError, match="no picture"):
-        image.rows(pictures, series)
+        image.make_rows(pictures, series)
 
 
 def make_family() -> Family:

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from ruamel.yaml import YAML
 
-from flexsheet.launch.objects.meshes import MOST_BYTES, read_mesh
+from flexsheet.launch.objects.meshes import MAX_BYTES, read_mesh
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_plan, load_scene
 from flexsheet.messages.base import Header
@@ -188,7 +188,7 @@ def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(MeshError, match=r"read from \.obj and \.stl"):
         read_mesh(tmp_path / "a.ply", 0.001, None)
     with (tmp_path / "huge.stl").open("wb") as file:
-        file.truncate(MOST_BYTES + 1)
+        file.truncate(MAX_BYTES + 1)
     with pytest.raises(MeshError, match="at most 64 are read"):
         read_mesh(tmp_path / "huge.stl", 0.001, None)
 

@@ -20,8 +20,8 @@ from flexsheet.launch.methods.results import describe_load
 from flexsheet.launch.methods.tune import (
     Tunable,
     choose,
+    evaluate_methods,
     tunables_named,
-    verdicts,
     write_choices,
     written,
 )
@@ -57,8 +57,8 @@ def point(method: str, error: float, *, depth: int = 1, **more: Any) -> Point:
     return Point(method, case, case, median_s=took, p99_s=took, error=error, **told)
 
 
-def chosen_of(points: Sequence[Point], *, margin: float = 0.2) -> tune.Verdict:
-    return choose(verdicts(points, SETTINGS, tolerance=1.0, margin=margin))
+def chosen_of(points: Sequence[Point], *, margin: float = 0.2) -> tune.MethodEvaluation:
+    return choose(evaluate_methods(points, SETTINGS, tolerance=1.0, margin=margin))
 
 
 def test_the_cheapest_that_is_good_enough_everywhere_is_chosen() -> None:
@@ -158,7 +158,7 @@ def test_what_takes_minutes_is_asked_only_where_nothing_else_does(
 
 
 def choice_of(points: Sequence[Point], key: str = "marker") -> tune.Choice:
-    judged = verdicts(points, SETTINGS, tolerance=1.0)
+    judged = evaluate_methods(points, SETTINGS, tolerance=1.0)
     return tune.Choice("made-up", key, "mm", 1.0, choose(judged), tuple(judged))
 
 
@@ -249,7 +249,7 @@ def test_choices_on_one_line_are_unfolded() -> None:
 
 def scene_choice() -> tune.Choice:
     settings: dict[str, tune.Setting] = {"cheap": {"method": "linear", "skin_spacing_m": 0.006}}
-    judged = verdicts([point("cheap", 0.1)], settings, tolerance=1.0)
+    judged = evaluate_methods([point("cheap", 0.1)], settings, tolerance=1.0)
     return tune.Choice("soft-body", "soft_body", "mm", 1.0, judged[0], tuple(judged))
 
 

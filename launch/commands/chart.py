@@ -73,7 +73,7 @@ def chart(
     from flexsheet.launch.plans.plan import load_scene
 
     if redraw:
-        results = charts.kept_charts(output)
+        results = charts.read_charts(output)
         if not results:
             raise CommandError(f"--output {output}: holds no charts to draw anew", BAD_INPUT)
         for result in results:
@@ -110,7 +110,7 @@ def _told(progress: Callable[[str], None], family: str, text: str) -> None:
 
 
 def _print_methods(result: dict[str, Any]) -> None:
-    from flexsheet.launch.methods.charts import duration, methods_of
+    from flexsheet.launch.methods.charts import duration, summarize_methods
 
     rows = [
         (
@@ -120,7 +120,7 @@ def _print_methods(result: dict[str, Any]) -> None:
             f"{one['inside']} of {one['cases']}",
             "front" if one["front"] else "",
         )
-        for one in methods_of(result["points"])
+        for one in summarize_methods(result["points"])
     ]
     print_table(("method", "median", f"error, {result['unit']}", "cases in range", ""), rows)
 

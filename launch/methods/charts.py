@@ -38,7 +38,7 @@ FAMILIES: dict[str, str] = {
 """Families by their name on the command line; each node's folder describes its own."""
 
 REPEATS = 30
-TOLD_EVERY_S = 1.0
+PROGRESS_PERIOD_S = 1.0
 ROOT = Path(__file__).resolve().parents[2]
 OVERVIEW = "README.md"
 TITLE_WIDTH = 95
@@ -57,10 +57,10 @@ def family_named(name: str) -> Family:
         near = get_close_matches(name, FAMILIES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(FAMILIES)}"
         raise UnknownFamilyError(f'unknown family "{name}"{hint}')
-    return family_at(FAMILIES[name])
+    return load_family(FAMILIES[name])
 
 
-def family_at(place: str) -> Family:
+def load_family(place: str) -> Family:
     """The family that `module:NAME` describes."""
     module_name, _, attribute = place.partition(":")
     family = getattr(import_module(module_name), attribute)
@@ -92,7 +92,7 @@ def measure_family(
     points: list[Point] = []
     last_s = -math.inf
     for trial in filter(wanted, family.trials(scene)):
-        if time.monotonic() - last_s >= TOLD_EVERY_S:
+        if time.monotonic() - last_s >= PROGRESS_PERIOD_S:
             last_s = time.monotonic()
             progress(f"measuring {trial.method}, {len(points)} done")
         points.append(measure(trial, repeats=repeats))
@@ -100,14 +100,14 @@ def measure_family(
 
 
 def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Return a function that reports (done, total) with the time left, every `TOLD_EVERY_S`."""
+    """Return a function that reports (done, total) with the time left, at intervals."""
     eta, last_s = EtaEstimator(), -math.inf
 
     def report(done: int, total: int) -> None:
         nonlocal last_s
         now_s = time.monotonic()
         left = f": {eta.text(done, total, now_s)}" if total else ""
-        if now_s - last_s >= TOLD_EVERY_S:
+        if now_s - last_s >= PROGRESS_PERIOD_S:
             last_s = now_s
             progress(f"{what} {done} of {total}{left}")
 
@@ -154,7 +154,7 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
             unused.remove()
         _draw_time(first, result)
         for axes, name in zip(others, ["error", *also], strict=False):
-            _draw_along(axes, result, name)
+            _draw_sweep(axes, result, name)
         save_svg(figure, path)
 
 
@@ -166,7 +166,9 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
     for index, method in enumerate(methods):
         mine = [point for point in result["points"] if point["method"] == method]
         for in_range, marker in ((True, "o"), (False, "x")):
-            shown = [point for point in mine if point["in_range"] == in_range and _judged(point)]
+            shown = [
+                point for point in mine if point["in_range"] == in_range and _has_reference(point)
+            ]
             if shown:
                 front = "" if method not in result["front"] else ", on the front"
                 axes.plot(
@@ -181,7 +183,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
         usable = [
             point
             for point in result["points"]
-            if point["in_range"] and point["case"] == case and _judged(point)
+            if point["in_range"] and point["case"] == case and _has_reference(point)
         ]
         steps = sorted((point["median_s"] * 1e6, max(point["error"], least)) for point in usable)
         best = [
@@ -202,7 +204,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
     axes.legend(fontsize=8)
 
 
-def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
+def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
     """One figure over the case, a line for each method, hollow out of its range; grey: what the
     reference itself does not know."""
     along, points = result["sweep_key"], result["points"]
@@ -230,7 +232,7 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
         shown = [
             (point["case"][along], value(point), point["in_range"])
             for point in points
-            if point["method"] == method and _number(value(point))
+            if point["method"] == method and _is_finite(value(point))
         ]
         if not shown:
             continue
@@ -252,13 +254,13 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     axes.legend(fontsize=8)
 
 
-def _number(value: float | None) -> bool:
+def _is_finite(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
 
-def _judged(point: dict[str, Any]) -> bool:
+def _has_reference(point: dict[str, Any]) -> bool:
     """Whether there was a reference to judge a point by."""
-    return _number(point["error"])
+    return _is_finite(point["error"])
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -279,13 +281,13 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
     return picture, numbers
 
 
-def kept_charts(folder: Path) -> list[dict[str, Any]]:
+def read_charts(folder: Path) -> list[dict[str, Any]]:
     """The charts whose numbers lie in the folder, in the order of the table of families."""
     kept = [folder / f"{name}.json" for name in FAMILIES]
-    return [_as_today(json.loads(path.read_text())) for path in kept if path.exists()]
+    return [_add_missing_keys(json.loads(path.read_text())) for path in kept if path.exists()]
 
 
-def _as_today(result: dict[str, Any]) -> dict[str, Any]:
+def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
     """Numbers of earlier code, with what they did not have yet."""
     points = [
         {"extra_metrics": {}, "reference_uncertainty": {}, **point} for point in result["points"]
@@ -308,7 +310,7 @@ def _overview_lines(folder: Path) -> Iterator[str]:
         "good for; the front has those that no other method beats in both. The numbers of each "
         "picture stand beside it as JSON.\n"
     )
-    for result in kept_charts(folder):
+    for result in read_charts(folder):
         name, unit = result["family"], result["unit"]
         commit = (result.get("code") or {}).get("commit") or "unknown"
         yield f"## {name}\n"
@@ -320,7 +322,7 @@ def _overview_lines(folder: Path) -> Iterator[str]:
         yield f"![{name}: time against error of each method]({name}.svg)\n"
         yield f"| method | time, median | largest error in range, {unit} | cases in range | front |"
         yield "|---|---|---|---|---|"
-        yield from map(_overview_row, methods_of(result["points"]))
+        yield from map(_overview_row, summarize_methods(result["points"]))
         yield ""
         # benchmarks of the same methods leave theirs as FAMILY-WHAT
         for more in sorted(folder.glob(f"{name}-*.svg")):
@@ -328,13 +330,13 @@ def _overview_lines(folder: Path) -> Iterator[str]:
                 yield f"![{more.stem}]({more.name})\n\n[Numbers]({more.stem}.json).\n"
 
 
-def methods_of(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Per method: the slowest median, the largest error and the count of its cases in range."""
     rows = []
-    front = pareto_front([Point(**point) for point in points if _judged(point)])
+    front = pareto_front([Point(**point) for point in points if _has_reference(point)])
     for method in dict.fromkeys(point["method"] for point in points):
         mine = [point for point in points if point["method"] == method]
-        inside = [point for point in mine if point["in_range"] and _judged(point)]
+        inside = [point for point in mine if point["in_range"] and _has_reference(point)]
         rows.append(
             {
                 "method": method,

@@ -57,7 +57,7 @@ def drawn_for_pages() -> Iterator[None]:
         yield
 
 
-def svg_of(figure: Figure) -> str:
+def render_svg(figure: Figure) -> str:
     """The figure as SVG; its ground is transparent, its ink is light where the page is dark."""
     drawn = StringIO()
     figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
@@ -66,5 +66,5 @@ def svg_of(figure: Figure) -> str:
 
 
 def save_svg(figure: Figure, path: Path) -> None:
-    """Write `svg_of` the figure."""
-    write_file(path, svg_of(figure))
+    """Write `render_svg` the figure."""
+    write_file(path, render_svg(figure))

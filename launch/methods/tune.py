@@ -23,7 +23,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
-from flexsheet.launch.methods.charts import duration, family_at, git_commit, measure_family
+from flexsheet.launch.methods.charts import duration, git_commit, load_family, measure_family
 from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.launch.plans.plan import load_scene
@@ -156,7 +156,7 @@ def tunables_named(names: Sequence[str]) -> list[Tunable]:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class MethodEvaluation:
     """One method over a scene's working range.
 
     median_s: of a call, in the middle of the cases.  slowest_s: of the slowest case.  error: the
@@ -192,8 +192,8 @@ class Choice:
     key: str
     unit: str
     tolerance: float
-    chosen: Verdict
-    judged: tuple[Verdict, ...]
+    chosen: MethodEvaluation
+    judged: tuple[MethodEvaluation, ...]
 
     @property
     def met(self) -> bool:
@@ -215,13 +215,13 @@ class Choice:
         cheaper = [other for other in self.judged if other.median_s * TIE_RATIO < one.median_s]
         rest = "nothing is cheaper"
         if cheaper:
-            nearest = min(cheaper, key=_miss)
+            nearest = min(cheaper, key=_miss_key)
             rest = f"{nearest.method} is cheaper ({duration(nearest.median_s)}), but "
             rest += self._shortfall(nearest)
         left = f"{one.method} ({took}) leaves {_figure(one.error)} of {allowed} allowed"
         return f"{self.family}: {left}; {rest}"
 
-    def _shortfall(self, one: Verdict) -> str:
+    def _shortfall(self, one: MethodEvaluation) -> str:
         """Why a method does not do."""
         parts = []
         if one.wrong:
@@ -261,13 +261,13 @@ def _case(case: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def verdicts(
+def evaluate_methods(
     points: Sequence[Point],
     settings: Mapping[str, Setting],
     *,
     tolerance: float,
     margin: float = MARGIN,
-) -> list[Verdict]:
+) -> list[MethodEvaluation]:
     """How each method of `settings` does over the cases that the scene asks for."""
     allowed, found = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
@@ -279,7 +279,7 @@ def verdicts(
         worst = max(sure, key=lambda point: point.error, default=mine[0])
         times = sorted(point.median_s for point in mine)
         found.append(
-            Verdict(
+            MethodEvaluation(
                 method=method,
                 setting=setting,
                 median_s=times[len(times) // 2],
@@ -294,17 +294,17 @@ def verdicts(
     return found
 
 
-def choose(judged: Sequence[Verdict]) -> Verdict:
+def choose(judged: Sequence[MethodEvaluation]) -> MethodEvaluation:
     """The cheapest that meets the tolerance everywhere, else the nearest miss."""
     enough = [one for one in judged if one.meets]
     if not enough:
-        return min(judged, key=_miss)
+        return min(judged, key=_miss_key)
     quickest = min(one.median_s for one in enough)
     same = [one for one in enough if one.median_s <= TIE_RATIO * quickest]
     return min(same, key=lambda one: (one.error, one.median_s))
 
 
-def _miss(one: Verdict) -> tuple[int, int, float, float]:
+def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
     """By how much a method misses.
 
     What it is not meant for comes first: there it gives no answer that could be near.
@@ -327,23 +327,25 @@ def tune(
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
     for number, tunable in enumerate(tunables, start=1):
-        told = partial(_told, progress, f"{tunable.name} ({number} of {len(tunables)})")
+        told = partial(_report, progress, f"{tunable.name} ({number} of {len(tunables)})")
         settings = dict(tunable.settings)
         if tunable.name == "correction":
             settings.pop("two_pass")
             settings[TWO_PASS_ONTO[shape]] = "two_pass"
-        choice = _tuned(scene, tunable, settings, margin=margin, measured=measured, progress=told)
+        choice = _tune_family(
+            scene, tunable, settings, margin=margin, measured=measured, progress=told
+        )
         if tunable.name == "sheet-shape":
             shape = choice.chosen.method
         choices.append(choice)
     return choices
 
 
-def _told(progress: Callable[[str], None], where: str, text: str) -> None:
+def _report(progress: Callable[[str], None], where: str, text: str) -> None:
     progress(f"{where}: {text}")
 
 
-def _tuned(
+def _tune_family(
     scene: Scene,
     tunable: Tunable,
     settings: Mapping[str, Setting],
@@ -352,9 +354,9 @@ def _tuned(
     measured: Measure | None,
     progress: Callable[[str], None],
 ) -> Choice:
-    judged: list[Verdict] = []
+    judged: list[MethodEvaluation] = []
     for place in tunable.families:
-        family = family_at(place)
+        family = load_family(place)
         known = {one.method for one in judged}
         left = {
             name: setting
@@ -371,7 +373,7 @@ def _tuned(
             points = measure_family(
                 family, scene, repeats=REPEATS, progress=progress, wanted=wanted
             )
-        judged += verdicts(points, left, tolerance=family.tolerance(scene), margin=margin)
+        judged += evaluate_methods(points, left, tolerance=family.tolerance(scene), margin=margin)
         if any(one.meets for one in judged):
             break
     tolerance = family.tolerance(scene)
@@ -512,14 +514,14 @@ def check_target(source: Path, target: Path) -> None:
     try:
         if target.is_dir():
             raise IsADirectoryError(errno.EISDIR, "it is a folder")
-        draft = _draft_of(target.resolve())
+        draft = _draft_path(target.resolve())
         draft.touch()
         draft.unlink()
     except OSError as error:
-        raise _unwritable(target, error) from error
+        raise _write_problem(target, error) from error
 
 
-def _unwritable(target: Path, error: OSError) -> BadInputError:
+def _write_problem(target: Path, error: OSError) -> BadInputError:
     if error.errno in DISK_ERRORS:
         return BadInputError([Problem(str(write_error(target, error)), (), "nothing is changed")])
     what = f"cannot be written: {error.strerror or error}"
@@ -531,7 +533,7 @@ def _read(source: Path) -> str:
     return source.read_bytes().decode("utf-8")  # read_text would change how lines end
 
 
-def _draft_of(target: Path) -> Path:
+def _draft_path(target: Path) -> Path:
     return target.with_name(f".{target.stem}.{os.getpid()}.yaml")
 
 
@@ -551,10 +553,10 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
     before = load_scene(source)
     # In the target's folder, as a scene names its mesh from there.
     place = target.resolve()
-    draft = _draft_of(place)
+    draft = _draft_path(place)
     try:
         draft.write_bytes(text.encode())
-        after = _loaded(draft, source)
+        after = _load_draft(draft, source)
         same = {"methods": before.methods}
         if after.model_copy(update=same).model_dump_json() != before.model_dump_json():
             problem = Problem(str(source), (METHODS,), "cannot be put in without a change", "")
@@ -562,12 +564,12 @@ def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None
         shutil.copymode(place if place.exists() else source, draft)
         draft.replace(place)
     except OSError as error:
-        raise _unwritable(target, error) from error
+        raise _write_problem(target, error) from error
     finally:
         draft.unlink(missing_ok=True)
 
 
-def _loaded(draft: Path, source: Path) -> Scene:
+def _load_draft(draft: Path, source: Path) -> Scene:
     """The scene of the draft; what is wrong with it is said of the source."""
     try:
         return load_scene(draft)

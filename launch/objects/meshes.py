@@ -36,13 +36,13 @@ MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in SHAPES if name != "mesh"), MESH_FILE)
 """What a scene file may say; a mesh's arrays are no matter for YAML."""
 SUFFIXES = (".obj", ".stl")
-MOST_BYTES = 64 << 20
-SMALLEST_M, LARGEST_M = 0.005, 1.0
+MAX_BYTES = 64 << 20
+MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
 """Objects that a hand can be shown; what is outside has its unit wrong."""
-LARGEST_UNITS = 1e9
+MAX_COORDINATE = 1e9
 """Of a coordinate in the file, whatever its unit: beyond it numbers of the mesh run over."""
 
-MOST_CUTTING = 0.01
+MAX_CUTTING_RATIO = 0.01
 """Pairs of triangles that cut through one another, over all triangles: more is no flaw of a rim but
 another object.  Fewer are bridged by the smooth surface."""
 
@@ -98,16 +98,16 @@ def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> 
     was done.  Refused is what `check_mesh` refuses of the rest, holes among them: a closed surface
     cannot be guessed.
     """
-    vertices, triangles, repairs = _repaired(_read(path), metres_per_unit)
+    vertices, triangles, repairs = _repair(_read(path), metres_per_unit)
     extent_m = float(np.ptp(vertices, axis=0).max())
-    if not SMALLEST_M <= extent_m <= LARGEST_M:
+    if not MIN_EXTENT_M <= extent_m <= MAX_EXTENT_M:
         raise MeshError(
             f"the object would be {extent_m:.3g} m wide; is metres_per_unit {metres_per_unit:g} "
             "right? (0.001 for millimetres, 0.01 for centimetres)"
         )
     check_mesh(vertices, triangles)
     cutting = count_intersections(vertices, triangles)
-    if cutting > MOST_CUTTING * len(triangles):
+    if cutting > MAX_CUTTING_RATIO * len(triangles):
         raise MeshError(
             f"the surface cuts through itself: {cutting} pairs of triangles; untangle it"
         )
@@ -137,8 +137,8 @@ def _read(path: Path) -> Any:
         size = path.stat().st_size
     except OSError as error:
         raise MeshError(f"cannot be read at {path}: {error.strerror}; check the path") from error
-    if size > MOST_BYTES:
-        raise MeshError(f"has {size >> 20} MiB, at most {MOST_BYTES >> 20} are read; decimate it")
+    if size > MAX_BYTES:
+        raise MeshError(f"has {size >> 20} MiB, at most {MAX_BYTES >> 20} are read; decimate it")
     # Late, because only scenes with a mesh need it.
     import trimesh
 
@@ -157,13 +157,13 @@ def _refuse_odd(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
     """Arrays that are no mesh, which the library lets through; MeshError."""
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
         raise MeshError("its faces are no triangles of points in space")
-    if not (np.abs(vertices) < LARGEST_UNITS).all():
-        raise MeshError(f"a vertex is NaN or infinite, or further away than {LARGEST_UNITS:g}")
+    if not (np.abs(vertices) < MAX_COORDINATE).all():
+        raise MeshError(f"a vertex is NaN or infinite, or further away than {MAX_COORDINATE:g}")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise MeshError("a triangle names a vertex that is not there")
 
 
-def _repaired(
+def _repair(
     mesh: Any, metres_per_unit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
     """Vertices (v, 3) m, triangles (t, 3) and what was repaired; MeshError for nothing at all."""

@@ -22,7 +22,7 @@ from flexsheet.messages.errors import FlexsheetError
 APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
-MOST_PX = 2048
+MAX_SIDE_PX = 2048
 """A side's; the projector has fewer."""
 
 
@@ -65,7 +65,9 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
     if picture is None:
         raise TextureError("is damaged, or no picture")
-    if max(picture.shape) > MOST_PX:
+    if max(picture.shape) > MAX_SIDE_PX:
         height, width = picture.shape[:2]
-        raise TextureError(f"has {width}x{height} pixels, at most {MOST_PX} to a side; shrink it")
+        raise TextureError(
+            f"has {width}x{height} pixels, at most {MAX_SIDE_PX} to a side; shrink it"
+        )
     return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
