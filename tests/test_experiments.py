@@ -132,7 +132,7 @@ def test_a_missing_stroke_is_named_with_what_there_is() -> None:
 
 
 def test_size_errors_are_absolute_differences_in_mm() -> None:
-    picture = image.Picture(
+    picture = image.EyeImage(
         "case", "none", 0.001, np.full((2, 2, 3), 10, np.uint8), np.full((2, 2, 3), 12, np.uint8)
     )
     errors = image.size_errors_mm(picture, lambda pixels, scale: (float(pixels[0, 0, 0]) * scale,))
@@ -155,7 +155,7 @@ def test_rows_have_the_papers_sizes_and_a_missing_picture_is_named() -> None:
     wider[150:250, 95:305] = 255
     series = replace(image.PUSH, values=(10,))
     pictures = {
-        label: image.Picture(label, correction, 0.001, wider, white)
+        label: image.EyeImage(label, correction, 0.001, wider, white)
         for correction in image.CORRECTIONS
         for label in [series.label(10, correction)]
     }
@@ -166,7 +166,7 @@ def test_rows_have_the_papers_sizes_and_a_missing_picture_is_named() -> None:
     assert rows[0]["delta_w_mm"] == pytest.approx(10.0, abs=0.1)
     assert rows[0]["mean_mm"] == pytest.approx(5.0, abs=0.1)
     pictures.popitem()
-    with pytest.raises(ExperimentError, match="no picture"):
+    with pytest.raises(ExperimentError, match="no image"):
         image.make_rows(pictures, series)
 
 

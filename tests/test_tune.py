@@ -21,9 +21,9 @@ from flexsheet.launch.methods.tune import (
     Tunable,
     choose,
     evaluate_methods,
+    insert_choices,
     tunables_named,
     write_choices,
-    written,
 )
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
@@ -128,7 +128,7 @@ def family(name: str, methods: Sequence[str]) -> Family:
 def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Families "quick" and "slow" in place of a node's own; which were measured is told."""
     there = {"quick": family("made-up", ["cheap"]), "slow": family("made-up", ["cheap", "dear"])}
-    monkeypatch.setattr(tune, "family_at", there.__getitem__)
+    monkeypatch.setattr(tune, "load_family", there.__getitem__)
     return []
 
 
@@ -192,7 +192,7 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
         ),
         "flexsheet.launch.methods.benchmarks:CORRECTION": family("correction", ["two_pass"]),
     }
-    monkeypatch.setattr(tune, "family_at", there.__getitem__)
+    monkeypatch.setattr(tune, "load_family", there.__getitem__)
     errors = {"four_triangles": 0.2, "reduced_order": 0.1, "one_plane": 9.0}
 
     def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
@@ -210,7 +210,7 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
 
 
 def put(text: str, *choices: tune.Choice) -> str:
-    return written(text, choices, today="2026-01-02", machine="a machine", commit="0" * 40)
+    return insert_choices(text, choices, today="2026-01-02", machine="a machine", commit="0" * 40)
 
 
 GOOD, BAD = choice_of([point("cheap", 0.1)]), choice_of([point("cheap", 2.0)], "tracking")
@@ -260,7 +260,7 @@ def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert source.read_text() == (SCENES / "sphere.yaml").read_text()
     wanted = SoftBodyChoice(method="linear", skin_spacing_m=0.006)
     assert load_scene(tmp_path / "copy.yaml").methods == Methods(soft_body=wanted)
-    with pytest.raises(BadInputError, match="a folder that is there"):
+    with pytest.raises(BadInputError, match="in an existing, writable folder"):
         write_choices(source, tmp_path / "no folder" / "copy.yaml", [scene_choice()])
     with pytest.raises(BadInputError, match="marker") as refused:  # no method's name
         write_choices(source, source, [GOOD])
@@ -307,10 +307,10 @@ def test_files_are_named_from_where_a_scene_goes(tmp_path: Path, quote: str) -> 
         f"a: 1\nobject:\n  geometry: {{file: {quote}o.obj{quote}, x: 1}}  # o.obj\n"
         f"  appearance:\n    image_file: {quote}../p.png{quote}\n"
     )
-    found = tune.moved(text, tmp_path / "here" / "a.yaml", tmp_path / "there" / "b.yaml")
+    found = tune.relocate_paths(text, tmp_path / "here" / "a.yaml", tmp_path / "there" / "b.yaml")
     wanted = text.replace(f"{quote}../p.png{quote}", '"../p.png"', 1)
     assert found == wanted.replace(f"{quote}o.obj{quote}", '"../here/o.obj"', 1)
-    assert tune.moved(text, tmp_path / "a.yaml", tmp_path / "b.yaml") == text
+    assert tune.relocate_paths(text, tmp_path / "a.yaml", tmp_path / "b.yaml") == text
 
 
 def test_a_copy_elsewhere_is_the_same_scene(tmp_path: Path) -> None:
@@ -342,7 +342,7 @@ def test_a_files_name_that_cannot_be_put_in_is_refused(tmp_path: Path) -> None:
     text = (SCENES / "palpation.yaml").read_text()
     source.write_text(text.replace("organ.obj", r'"orga\x6e.obj"'))
     (tmp_path / "far").mkdir()
-    with pytest.raises(BadInputError, match=r"geometry\.file: names .organ\.obj.*whole path"):
+    with pytest.raises(BadInputError, match=r"geometry\.file: names .organ\.obj.*absolute path"):
         tune.check_target(source, tmp_path / "far" / "copy.yaml")
 
 
@@ -364,7 +364,7 @@ def test_where_nothing_can_be_written_nothing_is_measured(
     monkeypatch.setattr(tune, "tune", lambda *_, **__: pytest.fail("measured"))
     outcome = run(SCENES / "sphere.yaml", "--output", tmp_path / where)
     assert isinstance(outcome.exception, BadInputError)
-    assert "give --output FILE, in a folder that is there" in str(outcome.exception)
+    assert "give --output FILE in in an existing, writable folder" in str(outcome.exception)
 
 
 def run(*arguments: object) -> Any:

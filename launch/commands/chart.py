@@ -1,4 +1,4 @@
-"""`flexsheet chart`: speed against accuracy of a method family."""
+"""`flexsheet chart`: compare speed and accuracy of methods."""
 
 from __future__ import annotations
 
@@ -52,20 +52,21 @@ def chart(
         ),
     ] = SCENE_FILE,
     output: Annotated[
-        Path, typer.Option("--output", metavar="FOLDER", help="For pictures and numbers.")
+        Path, typer.Option("--output", metavar="FOLDER", help="Folder for figures and numbers.")
     ] = Path("runs/charts"),
     redraw: Annotated[
-        bool, typer.Option("--redraw", help="Measure nothing: draw the numbers in --output anew.")
+        bool,
+        typer.Option("--redraw", help="Redraw the stored numbers in --output."),
     ] = False,
     cases: Annotated[
-        bool, typer.Option("--cases", help="Print every case, and not each method alone.")
+        bool, typer.Option("--cases", help="Print every case instead of one row per method.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Chart speed against accuracy of a family's methods, on this machine and one scene.
+    """Measure and draw speed and accuracy of a family's methods, on this machine and one scene.
 
-    Printed is for each method its slowest median and its largest error over the cases that it says
-    it is good for; the front has those that no other method beats in both.
+    Prints the maximum median time and the maximum error of each method over the cases in its range.
+    The front has the methods that no other method dominates in both.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts
@@ -75,7 +76,7 @@ def chart(
     if redraw:
         results = charts.read_charts(output)
         if not results:
-            raise CommandError(f"--output {output}: holds no charts to draw anew", BAD_INPUT)
+            raise CommandError(f"--output {output}: has no charts to redraw", BAD_INPUT)
         for result in results:
             charts.write_chart(result, output)
         words.print(f"charts: {charts.write_overview(output)}")
@@ -92,8 +93,8 @@ def chart(
     results = []
     for each in families:
         with progress_words() as progress:
-            told = partial(_told, progress, each.name)
-            points = charts.measure_family(each, scene, progress=told)
+            report = partial(_report, progress, each.name)
+            points = charts.measure_family(each, scene, progress=report)
         result = replace_non_finite(charts.chart_result(each, scene, points))
         picture, _ = charts.write_chart(result, output)
         words.print(f"chart: {picture}")
@@ -105,7 +106,7 @@ def chart(
         print_json(results[0] if family else results)
 
 
-def _told(progress: Callable[[str], None], family: str, text: str) -> None:
+def _report(progress: Callable[[str], None], family: str, text: str) -> None:
     progress(f"{family}: {text}")
 
 

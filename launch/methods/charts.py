@@ -1,4 +1,4 @@
-"""Speed against accuracy: measures a method family on this machine and this scene, and draws it."""
+"""Measure speed and accuracy of a method family on this machine and a scene, and draw them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from flexsheet.launch.methods.results import machine_name, replace_non_finite
-from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
+from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
 from flexsheet.launch.running.code_state import git_state
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
@@ -35,7 +35,7 @@ FAMILIES: dict[str, str] = {
     "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
     "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
-"""Families by their name on the command line; each node's folder describes its own."""
+"""Families by their name on the command line, as `module:NAME`."""
 
 REPEATS = 30
 PROGRESS_PERIOD_S = 1.0
@@ -45,14 +45,14 @@ TITLE_WIDTH = 95
 
 
 class UnknownFamilyError(FlexsheetError, KeyError):
-    """A family name that is not in the table; the message suggests one that is."""
+    """Raised for an unknown family name; the text suggests the nearest one."""
 
     code = "unknown-family"
     remedy = "Choose one of the names in the text (`flexsheet chart --help`)."
 
 
 def family_named(name: str) -> Family:
-    """The family of that name; raises UnknownFamilyError with the nearest name."""
+    """Return the family of that name; raises UnknownFamilyError with the nearest name."""
     if name not in FAMILIES:
         near = get_close_matches(name, FAMILIES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(FAMILIES)}"
@@ -61,7 +61,7 @@ def family_named(name: str) -> Family:
 
 
 def load_family(place: str) -> Family:
-    """The family that `module:NAME` describes."""
+    """Import the family at `module:NAME`."""
     module_name, _, attribute = place.partition(":")
     family = getattr(import_module(module_name), attribute)
     assert isinstance(family, Family)
@@ -69,7 +69,7 @@ def load_family(place: str) -> Family:
 
 
 def git_commit() -> str | None:
-    """The commit of this code; None where nobody knows it."""
+    """Return the commit of this code, or None if unknown."""
     commit: str | None = json.loads(git_state(ROOT))["commit"]
     return commit
 
@@ -82,13 +82,11 @@ def measure_family(
     progress: Callable[[str], None] = lambda text: None,
     wanted: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure every trial of the family that is wanted; `progress` is told how many are measured,
-    and before, of what has to be worked out, how much is left.
+    """Measure all trials of the family that are wanted; report preparation and trials as progress.
 
-    A family closes what a trial needs when it is asked for a later one, so each is measured at
-    once.
+    Each trial is measured before the next is requested, since a family may then release its data.
     """
-    family.prepare(scene, _with_time_left("working out what it takes to judge:", progress))
+    family.prepare(scene, _with_time_left("computing the reference:", progress))
     points: list[Point] = []
     last_s = -math.inf
     for trial in filter(wanted, family.trials(scene)):
@@ -115,7 +113,7 @@ def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int
 
 
 def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
-    """What `chart FAMILY --json` prints."""
+    """Return the result that `chart FAMILY --json` prints."""
     return {
         "family": family.name,
         "unit": family.unit,
@@ -132,10 +130,10 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
 
 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
-    """Draw the result: log time across, error up; a line is the front of one case.
+    """Draw error over time, logarithmic; a line is the Pareto front of one case.
 
-    A family that says so gets its errors along the case, too, and further figures: with the
-    reference's own doubt, a band below which nothing can be told.
+    A family with a `sweep_key` also gets diagrams of errors and extra metrics over that key, with a
+    band of the reference's uncertainty.
     """
     from matplotlib.figure import Figure
 
@@ -145,7 +143,7 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
         else sorted({k for p in result["points"] for k in p["extra_metrics"]})
     )
     panels = 1 if result["sweep_key"] is None else 2 + len(also)
-    with drawn_for_pages():
+    with page_style():
         columns = min(panels, 2)
         rows = math.ceil(panels / columns)
         figure = Figure(figsize=(8, 5.5) if rows == 1 else (14, 5.5 * rows), layout="constrained")
@@ -159,10 +157,10 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
 
 
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
-    """Errors below a ten-thousandth of the scene's tolerance (dashed) are drawn there: they are
-    rounding, and would press all the rest into a corner."""
+    """Draw error over time; errors below 1e-4 of the tolerance (dashed) are rounding and drawn
+    there."""
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
-    least = 1e-4 * result["tolerance"]
+    min_error = 1e-4 * result["tolerance"]
     for index, method in enumerate(methods):
         mine = [point for point in result["points"] if point["method"] == method]
         for in_range, marker in ((True, "o"), (False, "x")):
@@ -173,7 +171,7 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
                 front = "" if method not in result["front"] else ", on the front"
                 axes.plot(
                     [point["median_s"] * 1e6 for point in shown],
-                    [max(point["error"], least) for point in shown],
+                    [max(point["error"], min_error) for point in shown],
                     marker,
                     color=COLOURS[index % len(COLOURS)],
                     alpha=0.7,
@@ -185,7 +183,9 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
             for point in result["points"]
             if point["in_range"] and point["case"] == case and _has_reference(point)
         ]
-        steps = sorted((point["median_s"] * 1e6, max(point["error"], least)) for point in usable)
+        steps = sorted(
+            (point["median_s"] * 1e6, max(point["error"], min_error)) for point in usable
+        )
         best = [
             step
             for i, step in enumerate(steps)
@@ -205,8 +205,8 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
 
 
 def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
-    """One figure over the case, a line for each method, hollow out of its range; grey: what the
-    reference itself does not know."""
+    """Draw a metric over the sweep key, a line for each method; markers out of range are hollow,
+    the reference's uncertainty is grey."""
     along, points = result["sweep_key"], result["points"]
 
     def value(point: dict[str, Any]) -> float | None:
@@ -225,7 +225,7 @@ def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
     if doubts:
         at, doubt = zip(*doubts, strict=True)
         low = [0.0 if name == "error" else -each for each in doubt]
-        label = "the reference's own doubt"
+        label = "uncertainty of the reference"
         axes.fill_between(at, low, doubt, color=INK, alpha=0.12, linewidth=0, label=label)
     methods = list(dict.fromkeys(point["method"] for point in points))
     for index, method in enumerate(methods):
@@ -259,12 +259,12 @@ def _is_finite(value: float | None) -> bool:
 
 
 def _has_reference(point: dict[str, Any]) -> bool:
-    """Whether there was a reference to judge a point by."""
+    """Return whether a reference gave the point's error."""
     return _is_finite(point["error"])
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The cases of points, each once, in their order."""
+    """Return the distinct cases of points in their order."""
     cases: list[dict[str, Any]] = []
     for point in points:
         if point["case"] not in cases:
@@ -273,7 +273,7 @@ def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
-    """Write the picture and the numbers of a chart; returns both paths."""
+    """Write figure and numbers of a chart; return both paths."""
     folder.mkdir(parents=True, exist_ok=True)
     picture, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
     draw_chart(result, picture)
@@ -282,13 +282,13 @@ def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
 
 
 def read_charts(folder: Path) -> list[dict[str, Any]]:
-    """The charts whose numbers lie in the folder, in the order of the table of families."""
+    """Read the charts of a folder, in the order of the table of families."""
     kept = [folder / f"{name}.json" for name in FAMILIES]
     return [_add_missing_keys(json.loads(path.read_text())) for path in kept if path.exists()]
 
 
 def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of earlier code, with what they did not have yet."""
+    """Add the keys that results of earlier versions lack."""
     points = [
         {"extra_metrics": {}, "reference_uncertainty": {}, **point} for point in result["points"]
     ]
@@ -296,7 +296,7 @@ def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_overview(folder: Path) -> Path:
-    """One page of all the charts that lie in the folder; returns its path."""
+    """Write one page of all charts in the folder; return its path."""
     path = folder / OVERVIEW
     write_file(path, "\n".join(_overview_lines(folder)) + "\n")
     return path
@@ -305,10 +305,10 @@ def write_overview(folder: Path) -> Path:
 def _overview_lines(folder: Path) -> Iterator[str]:
     yield "# Speed against accuracy\n"
     yield (
-        "Every method of every family, timed and judged on one machine and one scene by "
-        "`flexsheet chart --output docs/charts`. *In range* are the cases that a method says it is "
-        "good for; the front has those that no other method beats in both. The numbers of each "
-        "picture stand beside it as JSON.\n"
+        "Time and error of every method, measured on one machine and one scene by "
+        "`flexsheet chart --output docs/charts`. *In range* counts the cases in a method's stated "
+        "range. The front has the methods that no other method dominates in time and error. "
+        "The numbers of each figure are beside it as JSON.\n"
     )
     for result in read_charts(folder):
         name, unit = result["family"], result["unit"]
@@ -331,7 +331,7 @@ def _overview_lines(folder: Path) -> Iterator[str]:
 
 
 def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Per method: the slowest median, the largest error and the count of its cases in range."""
+    """Return each method's maximum median time, maximum error and number of cases in range."""
     rows = []
     front = pareto_front([Point(**point) for point in points if _has_reference(point)])
     for method in dict.fromkeys(point["method"] for point in points):
@@ -358,7 +358,7 @@ def _overview_row(row: dict[str, Any]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A duration for people: 12 µs, 3.4 ms, 1.2 s."""
+    """Format a duration for people: 12 µs, 3.4 ms, 1.2 s."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"

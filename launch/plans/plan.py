@@ -12,7 +12,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from flexsheet.launch.objects.meshes import scene_of
+from flexsheet.launch.objects.meshes import make_scene
 from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
@@ -132,7 +132,7 @@ def _load_scene(
         return None, None
     try:
         scene_document = read_document(path)
-        return scene_document, scene_of(scene_document)
+        return scene_document, make_scene(scene_document)
     except BadInputError as error:
         problems.extend(error.problems)
         return None, None
@@ -140,7 +140,7 @@ def _load_scene(
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file; raises BadInputError."""
-    return scene_of(read_document(path))
+    return make_scene(read_document(path))
 
 
 def _planned(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.series import Grid, Spread, States
 from flexsheet.launch.bags.report.session import Session
-from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, render_svg
+from flexsheet.launch.methods.svg import COLOURS, INK, page_style, render_svg
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def charts_of(session: Session) -> dict[str, Chart]:
         "force": forces,
     }
     found = {}
-    with drawn_for_pages():
+    with page_style():
         for name, make in makers.items():
             chart = make(session)
             if chart is not None:
