@@ -22,11 +22,11 @@ from scipy.optimize import least_squares
 
 from flexsheet.launch.calibration.bundle import fit_rig, linearize, pose_transform
 from flexsheet.launch.calibration.check import (
-    Rig,
+    StereoRig,
     calibrate_plain_opencv,
     find_plain_corners,
     measure_board,
-    triangulated,
+    triangulate_corners,
 )
 from flexsheet.launch.calibration.corners import BoardPair, CornerFinder, board_points, find_pairs
 from flexsheet.launch.calibration.selection import fit_pairs
@@ -39,7 +39,7 @@ from flexsheet.nodes.twin.rig import make_true_camera
 Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Finder = Callable[[Image, Board], Floats | None]
-Fitter = Callable[[Sequence[BoardPair], Floats, tuple[int, int]], Rig]
+Fitter = Callable[[Sequence[BoardPair], Floats, tuple[int, int]], StereoRig]
 SCENE = Path(__file__).resolve().parent.parent / "launch" / "scenes" / "cylinder.yaml"
 POSES, SEED = 20, 2
 GROUPS = 4
@@ -122,14 +122,14 @@ def judge_finders() -> None:
         )
 
 
-def joint(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> Rig:
-    return Rig.of(fit_pairs(pairs, points, size).rig)
+def joint(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> StereoRig:
+    return StereoRig.of(fit_pairs(pairs, points, size).rig)
 
 
 def robust(loss: str, scale_px: float) -> Fitter:
     """The joint fit with a loss that grows less than squarely beyond `scale_px`."""
 
-    def fit(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> Rig:
+    def fit(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> StereoRig:
         start = fit_pairs(pairs, points, size)
         unknown = np.concatenate([start.rig, start.poses.ravel()])
 
@@ -151,26 +151,28 @@ def robust(loss: str, scale_px: float) -> Fitter:
         found = least_squares(
             shifts, unknown, jac=slopes, loss=loss, f_scale=scale_px, x_scale="jac"
         )
-        return Rig.of(found.x[:22])
+        return StereoRig.of(found.x[:22])
 
     return fit
 
 
-def with_board_shape(pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]) -> Rig:
+def with_board_shape(
+    pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
+) -> StereoRig:
     """The joint fit in turn with the height of each corner over the board's plane."""
     fit = fit_pairs(pairs, points, size)
     shape = points.copy()
     for _ in range(6):
-        rig, heights = Rig.of(fit.rig), np.zeros(len(points))
+        rig, heights = StereoRig.of(fit.rig), np.zeros(len(points))
         for pair, pose in zip(pairs, fit.poses, strict=True):
             ids, left, right = pair.common()
-            seen = triangulated(rig, left, right)
+            seen = triangulate_corners(rig, left, right)
             heights[ids] += rigid.apply(rigid.inverse(pose_transform(pose)), seen)[:, 2]
         heights = heights / len(pairs)
         plane = np.column_stack([np.ones(len(points)), points[:, :2]])
         shape[:, 2] = heights - plane @ np.linalg.lstsq(plane, heights, rcond=None)[0]
         fit = fit_rig(pairs, shape, rig=fit.rig, poses=fit.poses)
-    return Rig.of(fit.rig)
+    return StereoRig.of(fit.rig)
 
 
 FITTERS: dict[str, Fitter] = {

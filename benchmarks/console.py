@@ -26,7 +26,7 @@ import viser
 import websockets
 from playwright.async_api import Page, WebSocket, async_playwright
 
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.runs import local_endpoints

@@ -32,7 +32,7 @@ from rich.table import Table
 from ruamel.yaml import YAML
 
 from flexsheet.launch.experiments.run import DEMO_FILE
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.supervisor import RunningGraph
 

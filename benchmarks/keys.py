@@ -28,7 +28,7 @@ import uvloop
 
 from benchmarks import messaging
 from benchmarks.messaging import NODES_USE, PAYLOADS, BusLine, Design, Sender, percentile_us
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.base import Header
 from flexsheet.messages.bus import Publisher, Source, Subscriber
 from flexsheet.messages.security import KeyRing, new_key_pair, write_ring, write_secret

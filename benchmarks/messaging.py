@@ -38,7 +38,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.base import Header, Message
 from flexsheet.messages.bus import Publisher, Subscriber
 from flexsheet.messages.topics import TOPICS, Topic

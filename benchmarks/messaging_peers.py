@@ -40,7 +40,7 @@ from rich.progress import Progress
 
 from benchmarks import keys, messaging, peers
 from benchmarks.messaging import FLOOR, NODES_USE, PAYLOADS, BusLine, Design, Line, Payload, Sender
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.messages.bus import Publisher
 from flexsheet.messages.security import KeyRing
 from flexsheet.messages.topics import Topic

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.planner_methods import ellipsoid_mesh
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Mesh, Pose, Scene
 from flexsheet.messages.types import SoftBody
 from flexsheet.nodes.models.rigid import angle_between
 from flexsheet.nodes.models.shapes import Shape, make_shape
-from flexsheet.nodes.planner.families import ellipsoid_mesh
 from flexsheet.nodes.planner.motion import Plan, Planned
 from flexsheet.nodes.planner.parameters import PlannerParameters
 from flexsheet.nodes.planner.sheet_force import law_for

@@ -50,7 +50,7 @@ from flexsheet.launch.experiments import image
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.gestures import gesture_path
 from flexsheet.launch.experiments.run import DEMO_FILE, new_folder
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.precompute import precompute_graph
 from flexsheet.launch.running.supervisor import NodeFailedError, RunningGraph

@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.methods.charts import ROOT
-from flexsheet.launch.methods.machine import machine_name
-from flexsheet.launch.methods.svg import COLOURS, drawn_for_pages, save_svg
+from flexsheet.launch.methods.results import machine_name
+from flexsheet.launch.methods.svg import COLOURS, page_style, save_svg
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.launch.running.code_state import git_state
 from flexsheet.messages.scene import Scene, cylinder_of
@@ -312,7 +312,7 @@ def main() -> None:
         arguments.output.mkdir(parents=True, exist_ok=True)
         numbers.write_text(json.dumps(measure_all(), indent=1) + "\n")
     kept = json.loads(numbers.read_text())
-    with drawn_for_pages():
+    with page_style():
         draw(points_of(kept[BY_SIZE]), points_of(kept[BY_CONTACT]), picture)
 
 

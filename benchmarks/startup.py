@@ -23,7 +23,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.plan import load_graph
 from flexsheet.launch.running.runs import ROOT_VARIABLE
 from flexsheet.launch.running.supervisor import RunningGraph

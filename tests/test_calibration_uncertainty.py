@@ -13,15 +13,15 @@ from ruamel.yaml import YAML
 from scipy.optimize import least_squares
 
 from flexsheet.launch.calibration import bundle
-from flexsheet.launch.calibration.check import Rig, triangulated
+from flexsheet.launch.calibration.check import StereoRig, triangulate_corners
 from flexsheet.launch.calibration.corners import (
     BoardPair,
+    BoardView,
     CornerFinder,
-    View,
     board_points,
     match_views,
 )
-from flexsheet.launch.calibration.selection import Selection, fit_pairs, fit_selection
+from flexsheet.launch.calibration.selection import PairSelection, fit_pairs, fit_selection
 from flexsheet.launch.calibration.stereo import state_uncertainty
 from flexsheet.launch.calibration.uncertainty import (
     jackknife_covariance,
@@ -93,7 +93,7 @@ def calibrated(
     for left_from_board in twin.poses(count):
         left, right = twin.pair(left_from_board)
         pairs.append(match_views(finder.find(left), finder.find(right), board, ("left", "right")))
-    selection = Selection(pairs, [str(number) for number in range(count)])
+    selection = PairSelection(pairs, [str(number) for number in range(count)])
     size, points = (camera.width_px, camera.height_px), board_points(board)
     fit = fit_selection(selection, points, size)
     assert len(selection.good) >= 0.75 * count
@@ -115,8 +115,8 @@ def noisy(*, seed: int, sigma_px: float, count: int = 12) -> list[BoardPair]:
     ids = np.arange(len(POINTS))
     return [
         BoardPair(
-            View(ids, left + random.normal(0.0, sigma_px, left.shape)),
-            View(ids, right + random.normal(0.0, sigma_px, right.shape)),
+            BoardView(ids, left + random.normal(0.0, sigma_px, left.shape)),
+            BoardView(ids, right + random.normal(0.0, sigma_px, right.shape)),
         )
         for left, right in exact_corners(count)
     ]
@@ -127,8 +127,8 @@ def test_slopes_of_corners_are_those_of_differences() -> None:
     pose = np.array([0.3, -0.4, 0.1, -0.05, -0.04, 0.45])
     (pair,) = noisy(seed=1, sigma_px=0.1, count=1)
     pair = BoardPair(
-        View(pair.left.ids[:40], pair.left.pixels[:40]),
-        View(pair.right.ids[9:], pair.right.pixels[9:]),
+        BoardView(pair.left.ids[:40], pair.left.pixels[:40]),
+        BoardView(pair.right.ids[9:], pair.right.pixels[9:]),
     )
     here = bundle.linearize(pair, POINTS, rig, pose)
     for slopes, base, of in (
@@ -232,8 +232,8 @@ def test_boards_that_bend_are_told_by_the_jackknife_alone() -> None:
         left, right = drawn(true, rigid.apply(pose, bent))
         pairs.append(
             BoardPair(
-                View(np.arange(len(left)), left + random.normal(0.0, 0.02, left.shape)),
-                View(np.arange(len(right)), right + random.normal(0.0, 0.02, right.shape)),
+                BoardView(np.arange(len(left)), left + random.normal(0.0, 0.02, left.shape)),
+                BoardView(np.arange(len(right)), right + random.normal(0.0, 0.02, right.shape)),
             )
         )
     fit = fit_pairs(pairs, POINTS, (640, 480))
@@ -254,7 +254,7 @@ def test_fingertips_err_as_the_calibrations_state() -> None:
     errors, stated = [], []
     for seed in range(6):
         fit, uncertainty = calibrated(camera, COARSE, seed=seed, count=12, distance_m=0.5)
-        errors.append(triangulated(Rig.of(fit.rig), left, right) - points)
+        errors.append(triangulate_corners(StereoRig.of(fit.rig), left, right) - points)
         stated.append((uncertainty.depth_std_m, uncertainty.lateral_std_m))
     variances = np.mean(np.square(errors), axis=(0, 1))
     depth_m, lateral_m = np.sqrt(np.mean(np.square(stated), axis=0))
@@ -270,7 +270,7 @@ def test_the_shipped_calibration_is_true_within_what_it_states() -> None:
     score = off @ np.linalg.solve(shipped.uncertainty.covariance, off)
     assert score < 22 + 3 * np.sqrt(2 * 22)
     points = view_of_work(true, (640, 480), shipped.uncertainty.working_distance_m)
-    errors = triangulated(Rig.of(measured), *drawn(true, points)) - points
+    errors = triangulate_corners(StereoRig.of(measured), *drawn(true, points)) - points
     assert np.sqrt(np.mean(errors[:, 2] ** 2)) < 2.5 * shipped.uncertainty.depth_std_m
     # And good enough to reach 0.3 mm near the sheet with what marks add.
     assert np.linalg.norm(errors, axis=1).max() < 2.5e-4

@@ -512,9 +512,11 @@ def test_calibrating_with_real_pictures(flexsheet: Command, tmp_path: Path) -> N
 
 def test_a_family_is_charted(flexsheet: Command, tmp_path: Path) -> None:
     """All of it, for the quickest family: measured, drawn, written, printed."""
-    said = flexsheet("chart", "rolling", "--output", tmp_path)
+    said = flexsheet("chart", "triangulation", "--output", tmp_path)
     assert said.code == 0
-    assert [line.split()[0] for line in said.out.splitlines()][:2] == ["method", "as_a_cylinder"]
-    assert {"rolling.svg", "rolling.json", "README.md"} == {one.name for one in tmp_path.iterdir()}
+    assert [line.split()[0] for line in said.out.splitlines()][:2] == ["method", "dlt"]
+    assert {one.name for one in tmp_path.iterdir()} == {
+        "triangulation.svg", "triangulation.json", "README.md"
+    }  # fmt: skip
     again = flexsheet("chart", "--redraw", "--output", tmp_path, "--json").json()
-    assert [one["family"] for one in again] == ["rolling"]
+    assert [one["family"] for one in again] == ["triangulation"]

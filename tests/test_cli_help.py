@@ -133,7 +133,7 @@ def test_looking_into_a_graph_loads_little() -> None:
     [
         ("flexsheet topic echo finger", "fingertip"),
         ("flexsheet node describe pla", "planner"),
-        ("flexsheet chart mar", "marker"),
+        ("flexsheet chart triang", "triangulation"),
         ("flexsheet bag ver", "verify"),
         ("flexsheet topic echo --on", "--once"),
         ("flexsheet bag verify tri", "triangulator"),

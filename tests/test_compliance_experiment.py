@@ -12,18 +12,18 @@ from numpy.typing import NDArray
 from flexsheet.launch.calibration.simulated_sheet import twin_force
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.compliance import (
-    DEPTH_SHARES,
+    DEPTH_RATIOS,
+    EVALUATED_S,
     HOLD_S,
-    JUDGED_S,
-    Felt,
-    Judge,
+    ComplianceRecording,
+    ForceReference,
+    PresentedForce,
     Press,
-    Recorded,
-    presses,
+    make_presses,
     read_bag,
 )
 from flexsheet.launch.experiments.pictures import draw_compliance
-from flexsheet.launch.experiments.stroke import Track
+from flexsheet.launch.experiments.stroke import SampledMotion
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.nodes.models.rigid import inverse, transform, transform_from_rpy
@@ -36,7 +36,7 @@ STRETCH = 1.06
 CURVE = np.array([[0.0, 0.0], [0.02, 1.0], [0.05, 2.5]])
 
 
-def held(press: Press, depth_m: float, retreat_m: float) -> Recorded:
+def held(press: Press, depth_m: float, retreat_m: float) -> ComplianceRecording:
     """The finger rests at a depth; the sheet stands so far behind the object's tangent plane."""
     tip = press.surface - depth_m * press.normal
     y_axis = np.cross(press.normal, [1.0, 0.0, 0.0])
@@ -48,10 +48,10 @@ def held(press: Press, depth_m: float, retreat_m: float) -> Recorded:
         pose = arm.flange_from_edge
         clamp = transform_from_rpy(pose.position_m, pose.rpy_rad)
         flange = transform(axes, middle + side * half) @ inverse(clamp)
-        rows.append(Track(TIMES, np.tile(flange.ravel(), (2, 1))))
-    return Recorded(
+        rows.append(SampledMotion(TIMES, np.tile(flange.ravel(), (2, 1))))
+    return ComplianceRecording(
         scene=SCENE,
-        finger=Track(TIMES, np.tile(tip, (2, 1))),
+        finger=SampledMotion(TIMES, np.tile(tip, (2, 1))),
         windows_ns={},
         edges=(rows[0], rows[1]),
         curve_times_ns=[0],
@@ -59,10 +59,10 @@ def held(press: Press, depth_m: float, retreat_m: float) -> Recorded:
     )
 
 
-@pytest.mark.parametrize("press", presses(SCENE)[::2], ids=lambda press: press.path.label)
+@pytest.mark.parametrize("press", make_presses(SCENE)[::2], ids=lambda press: press.path.label)
 @pytest.mark.parametrize(("depth_m", "retreat_m"), [(0.02, 0.0), (0.045, 0.02), (0.005, -0.002)])
 def test_the_twins_sheet_says_what_was_felt(press: Press, depth_m: float, retreat_m: float) -> None:
-    felt = Judge(held(press, depth_m, retreat_m)).felt(500_000_000, press)
+    felt = ForceReference(held(press, depth_m, retreat_m)).evaluate(500_000_000, press)
     assert felt.depth_m == pytest.approx(depth_m, abs=1e-9)
     assert felt.retreat_m == pytest.approx(retreat_m, abs=1e-9)
     assert felt.wanted_n == pytest.approx(50.0 * depth_m, rel=1e-6)
@@ -73,24 +73,26 @@ def test_the_twins_sheet_says_what_was_felt(press: Press, depth_m: float, retrea
 
 
 def test_a_finger_past_the_middle_is_as_deep_as_it_was_pushed() -> None:
-    press = presses(SCENE)[0]
+    press = make_presses(SCENE)[0]
     deep_m = 1.3 * SCENE.object.geometry.radius_m
-    assert Judge(held(press, deep_m, 0.02)).felt(0, press).depth_m == pytest.approx(deep_m)
+    assert ForceReference(held(press, deep_m, 0.02)).evaluate(0, press).depth_m == pytest.approx(
+        deep_m
+    )
 
 
 def test_errors_of_what_cannot_be_felt_count_as_of_the_least_felt() -> None:
-    assert Felt(0.01, 2.0, 2.2, 0.0).error_ratio == pytest.approx(0.1)
-    assert Felt(0.0001, 0.0, 0.5 * FELT_N, 0.0).error_ratio == pytest.approx(0.5)
+    assert PresentedForce(0.01, 2.0, 2.2, 0.0).error_ratio == pytest.approx(0.1)
+    assert PresentedForce(0.0001, 0.0, 0.5 * FELT_N, 0.0).error_ratio == pytest.approx(0.5)
 
 
 def test_every_place_is_pressed_at_every_depth_and_judged_at_rest() -> None:
-    *at_places, last = presses(SCENE)
+    *at_places, last = make_presses(SCENE)
     deepest_m = SCENE.working_range.push_depth_m
     for press in at_places:
         depths = [hold.depth_m for hold in press.holds]
-        assert depths == pytest.approx(deepest_m * np.array(DEPTH_SHARES))
+        assert depths == pytest.approx(deepest_m * np.array(DEPTH_RATIOS))
         for hold in press.holds:
-            assert hold.end_s - hold.begin_s == pytest.approx(JUDGED_S)
+            assert hold.end_s - hold.begin_s == pytest.approx(EVALUATED_S)
             times = np.array([hold.end_s - HOLD_S, hold.begin_s, hold.end_s])
             along = [
                 np.interp(times, press.path.times_s, press.path.positions_world_m[:, i])

@@ -17,7 +17,7 @@ from ruamel.yaml import YAML
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.types import FingertipReason
 from flexsheet.nodes.models import rigid
-from flexsheet.nodes.triangulator.families import DrawnDisc, noisy
+from flexsheet.nodes.triangulator.benchmarks import DrawnDisc, noisy
 from flexsheet.nodes.triangulator.fingertip import DetectorConfig, detect
 from flexsheet.nodes.triangulator.marker import MARKER_METHODS, BlobFilter
 from flexsheet.nodes.triangulator.subpixel import PixelNoise

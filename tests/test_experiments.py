@@ -22,10 +22,10 @@ from flexsheet.launch.methods.charts import (
     UnknownFamilyError,
     chart_result,
     family_named,
-    finite,
     measure_family,
     write_chart,
 )
+from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.launch.methods.svg import INK
 from flexsheet.messages.methods import (
     Correction,
@@ -52,20 +52,22 @@ def points_at(angles: np.ndarray, distance: float) -> np.ndarray:
     return AXIS + distance * direction
 
 
-def edges_tangent_at(angles: np.ndarray, *, lifted_m: float = 0.0) -> tuple[stroke.Track, ...]:
+def edges_tangent_at(
+    angles: np.ndarray, *, lifted_m: float = 0.0
+) -> tuple[stroke.SampledMotion, ...]:
     """Edges of a sheet that is tangent to the cylinder at `angles`, moved out along its normal."""
     contact = points_at(angles, RADIUS + lifted_m)
     along = np.column_stack([np.zeros_like(angles), np.cos(angles), -np.sin(angles)])
     normal = np.column_stack([np.zeros_like(angles), np.sin(angles), np.cos(angles)])
     half_width = np.array([0.125, 0.0, 0.0])
     return tuple(
-        stroke.Track(TIMES, np.hstack([contact + side * half_width, along, normal]))
+        stroke.SampledMotion(TIMES, np.hstack([contact + side * half_width, along, normal]))
         for side in (-1, 1)
     )
 
 
-def finger_at(angles: np.ndarray, depth_m: float = 0.0) -> stroke.Track:
-    return stroke.Track(TIMES, points_at(angles, RADIUS - depth_m))
+def finger_at(angles: np.ndarray, depth_m: float = 0.0) -> stroke.SampledMotion:
+    return stroke.SampledMotion(TIMES, points_at(angles, RADIUS - depth_m))
 
 
 @given(
@@ -88,7 +90,7 @@ def test_a_known_lag_and_lift_come_out(lag_rad: float, lifted_m: float, depth_m:
 
 def test_times_keep_their_digits_on_a_machine_that_is_long_up() -> None:
     start_ns = 300 * 24 * 3600 * 1_000_000_000
-    samples = stroke.Track(
+    samples = stroke.SampledMotion(
         start_ns + np.array([0, 1_000_000], dtype=np.int64), np.array([[0.0], [1.0]])
     )
     middle = samples.at(np.array([start_ns + 500_000], dtype=np.int64))
@@ -109,12 +111,12 @@ def test_the_stroke_path_is_the_papers() -> None:
 
 def test_a_track_needs_samples() -> None:
     with pytest.raises(ExperimentError, match="1 samples of fingertip"):
-        stroke.track([(0, np.zeros(3))], "fingertip")
+        stroke.make_motion([(0, np.zeros(3))], "fingertip")
 
 
 def test_a_missing_stroke_is_named_with_what_there_is() -> None:
-    empty = stroke.Track(TIMES[:2], np.zeros((2, 3)))
-    recording = stroke.Recording(
+    empty = stroke.SampledMotion(TIMES[:2], np.zeros((2, 3)))
+    recording = stroke.StrokeRecording(
         scene=SCENE,
         fingertip=empty,
         measured=empty,
@@ -130,7 +132,7 @@ def test_a_missing_stroke_is_named_with_what_there_is() -> None:
 
 
 def test_size_errors_are_absolute_differences_in_mm() -> None:
-    picture = image.Picture(
+    picture = image.EyeImage(
         "case", "none", 0.001, np.full((2, 2, 3), 10, np.uint8), np.full((2, 2, 3), 12, np.uint8)
     )
     errors = image.size_errors_mm(picture, lambda pixels, scale: (float(pixels[0, 0, 0]) * scale,))
@@ -153,19 +155,19 @@ def test_rows_have_the_papers_sizes_and_a_missing_picture_is_named() -> None:
     wider[150:250, 95:305] = 255
     series = replace(image.PUSH, values=(10,))
     pictures = {
-        label: image.Picture(label, correction, 0.001, wider, white)
+        label: image.EyeImage(label, correction, 0.001, wider, white)
         for correction in image.CORRECTIONS
         for label in [series.label(10, correction)]
     }
-    rows = image.rows(pictures, series)
+    rows = image.make_rows(pictures, series)
     assert [row["method"] for row in rows] == list(image.CORRECTIONS)
     assert rows[0]["depth_mm"] == 10
     assert rows[0]["delta_h_mm"] == pytest.approx(0.0, abs=1e-6)
     assert rows[0]["delta_w_mm"] == pytest.approx(10.0, abs=0.1)
     assert rows[0]["mean_mm"] == pytest.approx(5.0, abs=0.1)
     pictures.popitem()
-    with pytest.raises(ExperimentError, match="no picture"):
-        image.rows(pictures, series)
+    with pytest.raises(ExperimentError, match="no image"):
+        image.make_rows(pictures, series)
 
 
 def make_family() -> Family:
@@ -289,4 +291,4 @@ def test_the_front_holds_what_nothing_beats_and_ignores_what_is_out_of_range() -
 
 
 def test_json_never_holds_nan() -> None:
-    assert finite({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}
+    assert replace_non_finite({"a": [float("nan"), 1.0]}) == {"a": [None, 1.0]}

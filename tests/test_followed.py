@@ -21,7 +21,7 @@ from flexsheet.launch.bags.report.strokes import read_followed
 from flexsheet.launch.bags.report.write import result_of
 from flexsheet.launch.commands.experiment import print_followed
 from flexsheet.launch.experiments import ExperimentError, stroke
-from flexsheet.launch.experiments.demo import followed_on
+from flexsheet.launch.experiments.demo import read_followed_path
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.bag import BagWriter
 from flexsheet.messages.scene import Plane, Sphere
@@ -151,12 +151,12 @@ def test_the_report_says_the_same(tmp_path: Path) -> None:
 
 def test_the_demo_takes_its_own_path(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag = write_hand(tmp_path / "a.mcap")
-    row = followed_on(bag, LABEL)
+    row = read_followed_path(bag, LABEL)
     json.dumps(row, allow_nan=False)
     print_followed([row])
     assert LABEL in capsys.readouterr().out
     with pytest.raises(ExperimentError, match='no finger on a path "wave"; it has: hand'):
-        followed_on(bag, "wave")
+        read_followed_path(bag, "wave")
 
 
 @given(
@@ -195,13 +195,13 @@ def test_figures_do_not_depend_on_how_the_exposures_are_cut(chunks: list[int], s
 TIMES = np.arange(5, dtype=np.int64) * 10_000_000
 
 
-def sheet(centre: Floats, normal: Floats) -> tuple[stroke.Track, stroke.Track]:
+def sheet(centre: Floats, normal: Floats) -> tuple[stroke.SampledMotion, stroke.SampledMotion]:
     """Both edges of a sheet that stands still, 240 mm wide."""
     across = np.cross([0.0, 1.0, 0.0], normal)
     across /= np.linalg.norm(across)
     along = np.cross(normal, across)
     left, right = (
-        stroke.Track(
+        stroke.SampledMotion(
             TIMES, np.tile(np.concatenate([centre + half * across, along, normal]), (5, 1))
         )
         for half in (-0.12, 0.12)
@@ -225,7 +225,9 @@ def test_a_known_lag_and_lift_on_a_sphere(
     turn = rotation_from_vector(lag_rad * np.eye(3)["xy".index(axis)])
     front = np.array([0.0, 0.0, 1.0])
     normal = turn @ front
-    finger = stroke.Track(TIMES, np.tile(pose.position_m + (radius_m - depth_m) * front, (5, 1)))
+    finger = stroke.SampledMotion(
+        TIMES, np.tile(pose.position_m + (radius_m - depth_m) * front, (5, 1))
+    )
     edges = sheet(pose.position_m + (radius_m + lifted_m) * normal, normal)
     delta_d, delta_theta = stroke.sheet_errors(scene, finger, edges, TIMES)
     chord = 2.0 * np.sqrt(radius_m * (radius_m + lifted_m)) * np.sin(0.5 * lag_rad)
@@ -240,7 +242,7 @@ def test_a_flat_object_presents_the_foot_itself(turned_rad: float, lifted_m: flo
     solid = sessions.SCENE.object.model_copy(update={"geometry": plane})
     scene = sessions.SCENE.model_copy(update={"object": solid})
     normal = np.array([0.0, np.sin(turned_rad), np.cos(turned_rad)])
-    finger = stroke.Track(TIMES, np.tile(pose.position_m, (5, 1)))
+    finger = stroke.SampledMotion(TIMES, np.tile(pose.position_m, (5, 1)))
     edges = sheet(pose.position_m + lifted_m * normal, normal)
     delta_d, delta_theta = stroke.sheet_errors(scene, finger, edges, TIMES)
     np.testing.assert_allclose(delta_theta, abs(turned_rad), atol=1e-9)
@@ -256,7 +258,7 @@ def test_the_general_definition_is_the_papers_on_a_cylinder(
     finger = radius_m * np.array([[0.0, np.sin(angle_rad), np.cos(angle_rad)]])
     normal = np.array([[0.0, np.sin(angle_rad + lag_rad), np.cos(angle_rad + lag_rad)]])
     centre = 1.01 * radius_m * normal + [[0.05, 0.0, 0.0]]
-    found = stroke.presented_on_surface(shape.closest(finger), centre, normal)
+    found = stroke.project_presented_point(shape.closest(finger), centre, normal)
     np.testing.assert_allclose(found, 1.01 * radius_m * normal, atol=3e-6)
 
 
@@ -276,10 +278,10 @@ def test_a_sheet_that_lags_on_a_curved_object_is_off_by_the_chord(name: str) -> 
     times = np.arange(count, dtype=np.int64) * 10_000_000
     late = np.maximum(np.arange(count) - lag, 0)
     left, right = (
-        stroke.Track(times, np.hstack([points + half * across, along, normals])[late])
+        stroke.SampledMotion(times, np.hstack([points + half * across, along, normals])[late])
         for half in (-0.12, 0.12)
     )
-    finger = stroke.Track(times, points)
+    finger = stroke.SampledMotion(times, points)
     delta_d, _ = stroke.sheet_errors(scene, finger, (left, right), times, shape=shape)
     chord = np.linalg.norm(points - points[late], axis=1)
     np.testing.assert_allclose(delta_d[lag:], chord[lag:], rtol=0.1)

@@ -257,8 +257,11 @@ def test_tags_of_python_are_nothing_but_text(tmp_path: Path, tag: str) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n", "further"),
-        ("v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n", "NaN"),
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1e300\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n", "exceeds"),
+        (
+            "v 0 0 0\nv 1 0 0\nv 0 nan 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n",
+            "not finite",
+        ),
     ],
 )
 def test_an_impossible_mesh_is_refused_in_words(tmp_path: Path, text: str, said: str) -> None:

@@ -249,12 +249,12 @@ def test_every_gesture_of_the_demos_scene_is_labelled_by_its_name(name: str) -> 
 
 
 def test_names_are_chosen_once_each_and_checked() -> None:
-    assert gestures.chosen(None) == list(gestures.GESTURES)
-    assert gestures.chosen("tap, stop,tap") == ["tap", "stop"]
+    assert gestures.select_gestures(None) == list(gestures.GESTURES)
+    assert gestures.select_gestures("tap, stop,tap") == ["tap", "stop"]
     with pytest.raises(ExperimentError, match=r'no gesture "tapp"; did you mean "tap"\?'):
-        gestures.chosen("hold,tapp")
-    with pytest.raises(ExperimentError, match="no gesture is named; there are: stroke-10"):
-        gestures.chosen(" ,")
+        gestures.select_gestures("hold,tapp")
+    with pytest.raises(ExperimentError, match="no gesture is named; choose from: stroke-10"):
+        gestures.select_gestures(" ,")
 
 
 def test_a_finger_path_is_a_gesture_or_a_file(tmp_path: Path) -> None:

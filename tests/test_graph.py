@@ -161,7 +161,7 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
 
 
 @pytest.fixture(scope="module")
-def recording(session: Session) -> stroke.Recording:
+def recording(session: Session) -> stroke.StrokeRecording:
     return stroke.read_recording(session.bag)
 
 
@@ -237,7 +237,7 @@ def test_no_queue_builds_up_where_data_is_used(session: Session) -> None:
         assert np.median(newer) <= 2, reader
 
 
-def test_the_sheet_follows_the_finger(recording: stroke.Recording) -> None:
+def test_the_sheet_follows_the_finger(recording: stroke.StrokeRecording) -> None:
     errors = stroke.stroke_errors(recording, STROKE_S)
     assert errors.true_delta_d_m.mean() < 1.5e-3
     assert errors.true_delta_theta_rad.mean() < np.radians(2.0)

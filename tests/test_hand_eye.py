@@ -17,21 +17,21 @@ from scipy.stats import chi2
 
 from flexsheet.launch import cli
 from flexsheet.launch.calibration.arm_poses import (
-    STILL_S,
+    MIN_STILL_S,
     TABLE,
-    PlacesError,
-    PlaceTaker,
+    ArmPosesError,
+    PoseRecorder,
     add_row,
-    read_sightings,
-    read_table,
-    rig_of,
+    make_lens_rig,
+    read_detections,
+    read_pose_table,
     true_base,
 )
 from flexsheet.launch.calibration.hand_eye import (
     BaseFit,
+    BoardDetection,
+    CornerView,
     HandEyeError,
-    Sighting,
-    View,
     calibrate_base,
 )
 from flexsheet.launch.plans.plan import load_scene
@@ -59,14 +59,14 @@ ROOT = Path(__file__).resolve().parent.parent
 SCENE_FILE = ROOT / "launch" / "scenes" / "cylinder.yaml"
 OPTICS_FILE = ROOT / "launch" / "calibrations" / "twin-bumblebee.yaml"
 SCENE = load_scene(SCENE_FILE)
-RIG = rig_of(SCENE, None)
+RIG = make_lens_rig(SCENE, None)
 BOARD = Board(columns=7, rows=5, square_m=0.015)
 CORNERS = np.concatenate([np.mgrid[:7, :5].T.reshape(-1, 2) * 0.015, np.zeros((35, 1))], axis=1)
 READY = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
 SIZE = (SCENE.camera.width_px, SCENE.camera.height_px)
 
 
-def seen(left_from_board: Floats, noise: Floats) -> list[View]:
+def seen(left_from_board: Floats, noise: Floats) -> list[CornerView]:
     """The corners by the twin's own projection; noise (2, 35, 2) px."""
     views = []
     for lens, eye_from_left, off in zip(
@@ -76,7 +76,7 @@ def seen(left_from_board: Floats, noise: Floats) -> list[View]:
         strict=True,
     ):
         in_eye = apply(eye_from_left @ left_from_board, CORNERS)
-        views.append(View(CORNERS, pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:]) + off))
+        views.append(CornerView(CORNERS, pixels_of(lens, in_eye[:, :2] / in_eye[:, 2:]) + off))
     return views
 
 
@@ -101,26 +101,26 @@ class Workplace:
             inverse(self.base) @ board @ inverse(self.flange_from_board), READY
         )
 
-    def sighting(
+    def detection(
         self, name: str, joints: Floats, *, noise_px: float = 0.0, joint_noise_rad: float = 0.0
-    ) -> Sighting:
+    ) -> BoardDetection:
         true = joints + self.random.normal(0.0, 1.0, 6) * joint_noise_rad
         left_from_board = (
             inverse(RIG.world_from_left) @ self.base @ twin_forward(true) @ self.flange_from_board
         )
         left, right = seen(left_from_board, self.random.normal(0.0, 1.0, (2, 35, 2)) * noise_px)
-        return Sighting(name, joints, left, right)
+        return BoardDetection(name, joints, left, right)
 
-    def sightings(
+    def detections(
         self,
         count: int,
         *,
         noise_px: float = 0.0,
         joint_noise_rad: float = 0.0,
         turn_rad: Any = 0.3,
-    ) -> list[Sighting]:
+    ) -> list[BoardDetection]:
         """turn_rad: deviation of the turns, one for all three axes or for each."""
-        found: list[Sighting] = []
+        found: list[BoardDetection] = []
         while len(found) < count:
             turn = self.random.normal(0.0, 1.0, 3) * turn_rad
             try:
@@ -129,7 +129,7 @@ class Workplace:
                 continue
             name = f"place {len(found)}"
             found.append(
-                self.sighting(name, joints, noise_px=noise_px, joint_noise_rad=joint_noise_rad)
+                self.detection(name, joints, noise_px=noise_px, joint_noise_rad=joint_noise_rad)
             )
         return found
 
@@ -143,7 +143,7 @@ class Workplace:
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_without_noise_the_base_is_found_exactly(side: Side) -> None:
     place = Workplace(1, side)
-    fit = calibrate_base(place.sightings(10), RIG)
+    fit = calibrate_base(place.detections(10), RIG)
     assert place.error(fit) == pytest.approx(np.zeros(6), abs=1e-7)
     assert fit.flange_from_board == pytest.approx(place.flange_from_board, abs=1e-7)
     assert all(one.reason == "" for one in fit.residuals)
@@ -161,7 +161,7 @@ def test_the_errors_are_within_the_stated_uncertainty(
     for seed in range(6):
         place = Workplace(100 + seed)
         fit = calibrate_base(
-            place.sightings(15, noise_px=noise_px, joint_noise_rad=joint_noise_rad), RIG
+            place.detections(15, noise_px=noise_px, joint_noise_rad=joint_noise_rad), RIG
         )
         error = place.error(fit)
         squares.append(float(error @ np.linalg.solve(fit.covariance, error)))
@@ -174,19 +174,19 @@ def test_the_errors_are_within_the_stated_uncertainty(
 
 def test_the_arms_own_error_is_told_from_the_cameras() -> None:
     place = Workplace(7)
-    fit = calibrate_base(place.sightings(40, noise_px=0.05, joint_noise_rad=1e-3), RIG)
+    fit = calibrate_base(place.detections(40, noise_px=0.05, joint_noise_rad=1e-3), RIG)
     # Three wrist joints and what the others add: somewhat more than one joint's deviation.
     assert 0.8e-3 < fit.arm_sigma_rad < 2.5e-3
     assert 1e-4 < fit.arm_sigma_m < 1e-3
     assert fit.corner_sigma_px == pytest.approx(0.05, rel=0.1)
-    quiet = calibrate_base(Workplace(7).sightings(40, noise_px=0.05), RIG)
+    quiet = calibrate_base(Workplace(7).detections(40, noise_px=0.05), RIG)
     assert quiet.arm_sigma_rad < 1e-4
     assert quiet.std_at(np.zeros(3))[0] < 0.2 * fit.std_at(np.zeros(3))[0]
 
 
 def test_more_places_make_it_more_certain() -> None:
     few, many = (
-        calibrate_base(Workplace(3).sightings(n, noise_px=0.1, joint_noise_rad=5e-4), RIG)
+        calibrate_base(Workplace(3).detections(n, noise_px=0.1, joint_noise_rad=5e-4), RIG)
         for n in (8, 40)
     )
     assert many.std_at(np.zeros(3))[0] < 0.6 * few.std_at(np.zeros(3))[0]
@@ -195,12 +195,12 @@ def test_more_places_make_it_more_certain() -> None:
 @pytest.mark.parametrize("strays", [1, 3])
 def test_places_with_wrong_joints_are_left_out(strays: int) -> None:
     place = Workplace(5)
-    sightings = place.sightings(14, noise_px=0.1, joint_noise_rad=2e-4)
+    detections = place.detections(14, noise_px=0.1, joint_noise_rad=2e-4)
     for index in range(strays):
-        one = sightings[index]
+        one = detections[index]
         wrong = one.joints_rad + place.random.normal(0.0, 0.05, 6)
-        sightings[index] = Sighting(one.name, wrong, one.left, one.right)
-    fit = calibrate_base(sightings, RIG)
+        detections[index] = BoardDetection(one.name, wrong, one.left, one.right)
+    fit = calibrate_base(detections, RIG)
     left_out = [one.name for one in fit.residuals if one.reason]
     assert left_out == [f"place {index}" for index in range(strays)]
     error = place.error(fit)
@@ -210,62 +210,64 @@ def test_places_with_wrong_joints_are_left_out(strays: int) -> None:
 
 def test_a_board_read_from_its_other_end_is_left_out() -> None:
     place = Workplace(15)
-    sightings = place.sightings(10, noise_px=0.1)
-    one = sightings[3]
+    detections = place.detections(10, noise_px=0.1)
+    one = detections[3]
     left, right = (
-        View(view.points_board, view.pixels[::-1].copy()) for view in (one.left, one.right)
+        CornerView(view.points_board, view.pixels[::-1].copy()) for view in (one.left, one.right)
     )
-    sightings[3] = Sighting(one.name, one.joints_rad, left, right)
-    fit = calibrate_base(sightings, RIG)
+    detections[3] = BoardDetection(one.name, one.joints_rad, left, right)
+    fit = calibrate_base(detections, RIG)
     assert [each.name for each in fit.residuals if each.reason] == ["place 3"]
 
 
 def test_when_nothing_fits_together_it_says_so() -> None:
     place = Workplace(6)
-    sightings = place.sightings(12, noise_px=0.1)
+    detections = place.detections(12, noise_px=0.1)
     shuffled = [
-        Sighting(one.name, other.joints_rad, one.left, one.right) if index % 2 else one
+        BoardDetection(one.name, other.joints_rad, one.left, one.right) if index % 2 else one
         for index, (one, other) in enumerate(
-            zip(sightings, [*sightings[5:], *sightings[:5]], strict=True)
+            zip(detections, [*detections[5:], *detections[:5]], strict=True)
         )
     ]
-    with pytest.raises(HandEyeError, match=r"do not fit .*are the joints those"):
+    with pytest.raises(
+        HandEyeError, match=r"(contradict|do not agree) .*check that the joints are those"
+    ):
         calibrate_base(shuffled, RIG)
 
 
 @pytest.mark.parametrize(
     ("turn_rad", "words"),
     [
-        (0.0, "hardly turns between the places \\(0.0 degrees rms"),
-        (0.02, "hardly turns"),
-        ([0.0, 0.0, 0.4], "turns about one axis only"),
-        ([0.4, 0.0, 0.0], "turns about one axis only"),
-        ([0.4, 0.03, 0.03], "turns about one axis only"),
+        (0.0, "hardly rotates between the poses \\(0.0 degrees rms"),
+        (0.02, "hardly rotates"),
+        ([0.0, 0.0, 0.4], "rotates about one axis only"),
+        ([0.4, 0.0, 0.0], "rotates about one axis only"),
+        ([0.4, 0.03, 0.03], "rotates about one axis only"),
     ],
 )
 def test_motions_that_leave_it_open_are_refused(turn_rad: Any, words: str) -> None:
-    sightings = Workplace(8).sightings(12, noise_px=0.1, turn_rad=turn_rad)
+    detections = Workplace(8).detections(12, noise_px=0.1, turn_rad=turn_rad)
     with pytest.raises(HandEyeError, match=words):
-        calibrate_base(sightings, RIG)
+        calibrate_base(detections, RIG)
 
 
 def test_too_few_places_are_refused() -> None:
-    with pytest.raises(HandEyeError, match="5 places of the arm, at least 6"):
-        calibrate_base(Workplace(9).sightings(5), RIG)
+    with pytest.raises(HandEyeError, match="5 poses of the arm, at least 6"):
+        calibrate_base(Workplace(9).detections(5), RIG)
 
 
 @pytest.mark.parametrize("joints", [np.full(6, np.nan), np.zeros(5)])
 def test_joints_that_are_none_are_named(joints: Floats) -> None:
-    sightings = Workplace(9).sightings(6)
-    one = sightings[2]
-    sightings[2] = Sighting(one.name, joints, one.left, one.right)
+    detections = Workplace(9).detections(6)
+    one = detections[2]
+    detections[2] = BoardDetection(one.name, joints, one.left, one.right)
     with pytest.raises(HandEyeError, match="place 2: its joints"):
-        calibrate_base(sightings, RIG)
+        calibrate_base(detections, RIG)
 
 
 def test_the_same_places_give_the_same_result() -> None:
-    sightings = Workplace(4).sightings(8, noise_px=0.1, joint_noise_rad=2e-4)
-    first, second = (calibrate_base(sightings, RIG) for _ in range(2))
+    detections = Workplace(4).detections(8, noise_px=0.1, joint_noise_rad=2e-4)
+    first, second = (calibrate_base(detections, RIG) for _ in range(2))
     assert (first.world_from_base == second.world_from_base).all()
     assert (first.covariance == second.covariance).all()
 
@@ -283,13 +285,15 @@ def test_roll_pitch_yaw_of_straight_up_and_down(pitch: float) -> None:
     assert rotation_from_rpy(rpy_from_rotation(rotation)) == pytest.approx(rotation, abs=1e-9)
 
 
-def write_poses(folder: Path, sightings: list[Sighting], place: Workplace, unit: str) -> None:
+def write_poses(
+    folder: Path, detections: list[BoardDetection], place: Workplace, unit: str
+) -> None:
     """A table with the board's poses instead of pictures."""
     names = ("board_x_m", "board_y_m", "board_z_m", "board_rx_rad", "board_ry_rad", "board_rz_rad")
     with (folder / TABLE).open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*(f"j{n}_{unit}" for n in range(1, 7)), *names])
-        for one in sightings:
+        for one in detections:
             pose = (
                 inverse(RIG.world_from_left)
                 @ place.base
@@ -304,19 +308,19 @@ def write_poses(folder: Path, sightings: list[Sighting], place: Workplace, unit:
 @pytest.mark.parametrize("unit", ["deg", "rad"])
 def test_a_table_of_board_poses_will_do(tmp_path: Path, unit: str) -> None:
     place = Workplace(11)
-    write_poses(tmp_path, place.sightings(8), place, unit)
-    sightings, blind = read_sightings(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
+    write_poses(tmp_path, place.detections(8), place, unit)
+    detections, blind = read_detections(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
     assert blind == []
-    assert place.error(calibrate_base(sightings, RIG)) == pytest.approx(np.zeros(6), abs=1e-6)
+    assert place.error(calibrate_base(detections, RIG)) == pytest.approx(np.zeros(6), abs=1e-6)
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("", "columns none; it needs j1_deg"),
-        ("left,right,j1_deg\n", "it needs j1_deg to j6_deg"),
-        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "it needs the columns left and right"),
+        ("", "columns none; add j1_deg"),
+        ("left,right,j1_deg\n", "add j1_deg to j6_deg"),
+        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "add the columns left and right"),
         ("left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n", "holds no rows"),
         (
             "left,right,j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\na,b,0,0,x,0,0,0\n",
@@ -333,8 +337,8 @@ def test_a_table_of_board_poses_will_do(tmp_path: Path, unit: str) -> None:
 def test_a_bad_table_is_named_to_the_cell(tmp_path: Path, text: str | None, words: str) -> None:
     if text is not None:
         (tmp_path / TABLE).write_text(text)
-    with pytest.raises(PlacesError, match=words):
-        read_table(tmp_path)
+    with pytest.raises(ArmPosesError, match=words):
+        read_pose_table(tmp_path)
 
 
 def test_a_board_behind_the_camera_is_refused(tmp_path: Path) -> None:
@@ -342,21 +346,21 @@ def test_a_board_behind_the_camera_is_refused(tmp_path: Path) -> None:
     (tmp_path / TABLE).write_text(
         f"{header},board_rx_rad,board_ry_rad,board_rz_rad\n0,25,119,0,-54,0,0,0,-0.5,0,0,0\n"
     )
-    with pytest.raises(PlacesError, match="row 2: the board lies behind a camera"):
-        read_sightings(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
+    with pytest.raises(ArmPosesError, match="row 2: the board lies behind a camera"):
+        read_detections(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
 
 
 class Live:
-    """A PlaceTaker that is shown what the twin's camera sees, with a clock of its own."""
+    """A PoseRecorder that is shown what the twin's camera sees, with a clock of its own."""
 
     def __init__(self, folder: Path) -> None:
         self.place = Workplace(12)
-        self.taker = PlaceTaker(folder, BOARD, RIG)
+        self.taker = PoseRecorder(folder, BOARD, RIG)
         self.shown = TwinBoard(SCENE.camera, BOARD, seed=1)
         self.now_s = 0.0
 
-    def show(self, joints: Floats, *, wait_s: float = 2.0 * STILL_S) -> str:
-        self.taker.see_joints(joints, self.now_s)
+    def show(self, joints: Floats, *, wait_s: float = 2.0 * MIN_STILL_S) -> str:
+        self.taker.update_joints(joints, self.now_s)
         self.now_s += wait_s
         pose = (
             inverse(RIG.world_from_left)
@@ -364,25 +368,25 @@ class Live:
             @ twin_forward(joints)
             @ self.place.flange_from_board
         )
-        return self.taker.see_pictures(*self.shown.pair(pose), self.now_s)
+        return self.taker.update_images(*self.shown.pair(pose), self.now_s)
 
 
 def test_a_place_is_taken_when_the_arm_rests_somewhere_new(tmp_path: Path) -> None:
     live = Live(tmp_path)
     dark = np.zeros((480, 640), np.uint8)
-    assert live.taker.see_pictures(dark, dark, 0.0) == "no word from the arm yet"
+    assert live.taker.update_images(dark, dark, 0.0) == "no message from the arm yet"
     here = live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3))
     there = live.place.joints(np.array([-0.2, 0.1, 0.1]), np.full(3, 0.02))
     assert live.show(here, wait_s=0.1) == "the arm moves"
-    assert live.show(here).startswith("place 1 taken")
-    assert "seen from here already" in live.show(here)
-    assert live.show(there).startswith("place 2 taken")
-    live.taker.see_joints(there, live.now_s)
-    assert live.taker.see_pictures(dark, dark, live.now_s + 5.0).startswith("no chessboard")
-    sightings, blind = read_sightings(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
+    assert live.show(here).startswith("pose 1 recorded")
+    assert "a similar pose is recorded already" in live.show(here)
+    assert live.show(there).startswith("pose 2 recorded")
+    live.taker.update_joints(there, live.now_s)
+    assert live.taker.update_images(dark, dark, live.now_s + 5.0).startswith("no chessboard")
+    detections, blind = read_detections(tmp_path, BOARD, RIG, SIZE, lambda *_: None)
     assert blind == []
-    assert [one.name for one in sightings] == ["left01.png", "left02.png"]
-    assert sightings[1].joints_rad == pytest.approx(there, abs=1e-12)
+    assert [one.name for one in detections] == ["left01.png", "left02.png"]
+    assert detections[1].joints_rad == pytest.approx(there, abs=1e-12)
 
 
 def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *arguments: object
@@ -438,7 +442,7 @@ def test_one_arm_alone_from_a_folder(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     place = Workplace(13, "right")
-    write_poses(tmp_path, place.sightings(8), place, "deg")
+    write_poses(tmp_path, place.detections(8), place, "deg")
     code, out, err = run(
         capsys, monkeypatch,
         "calibrate", "arms", *COMMON, "--right-arm", tmp_path, "-o", tmp_path / "arms.yaml",
@@ -455,12 +459,12 @@ def test_bad_input_to_the_command_is_named(
     place = Workplace(14)
     poor = tmp_path / "poor"
     poor.mkdir()
-    write_poses(poor, place.sightings(8, turn_rad=[0.0, 0.0, 0.4]), place, "rad")
+    write_poses(poor, place.detections(8, turn_rad=[0.0, 0.0, 0.4]), place, "rad")
     output = tmp_path / "arms.yaml"
     for arguments, words in (
         ([*COMMON, "-o", output], "give --left-arm, --right-arm or both; or else --twin"),
         ([*COMMON, "--left-arm", tmp_path / "none", "-o", output], "joints.csv: cannot be read"),
-        ([*COMMON, "--left-arm", poor, "-o", output], "turns about one axis only"),
+        ([*COMMON, "--left-arm", poor, "-o", output], "rotates about one axis only"),
         ([*COMMON, "--left-arm", poor, "-o", tmp_path / "no" / "x"], "does not exist"),
         (
             [*COMMON, "--left-arm", poor, "-o", output, "--write-scene", SCENE_FILE],
@@ -480,11 +484,11 @@ def test_bad_input_to_the_command_is_named(
 def test_pictures_of_another_size_or_without_a_board(tmp_path: Path) -> None:
     live = Live(tmp_path)
     live.show(live.place.joints(np.array([0.1, 0.2, 0.0]), np.zeros(3)))
-    with pytest.raises(PlacesError, match="pictures of 640x480 px"):
-        read_sightings(tmp_path, BOARD, RIG, (800, 600), lambda *_: None)
+    with pytest.raises(ArmPosesError, match="pictures of 640x480 px"):
+        read_detections(tmp_path, BOARD, RIG, (800, 600), lambda *_: None)
     add_row(tmp_path, ["left01.png", "left01.png"], READY)
     other = Board(columns=9, rows=6, square_m=0.015)
-    _, blind = read_sightings(tmp_path, other, RIG, SIZE, lambda *_: None)
+    _, blind = read_detections(tmp_path, other, RIG, SIZE, lambda *_: None)
     assert [name for name, _ in blind] == ["left01.png", "left01.png"]
     assert "9x6" in blind[0][1]
 

@@ -177,11 +177,11 @@ def test_a_scene_file_names_its_image(tmp_path: Path) -> None:
     ("appearance", "told"),
     [
         ("texture: image, image_file: gone.png", 'image_file.*"gone.png".*No such file'),
-        ("texture: image, image_file: skin.tif", r"read from \.png"),
+        ("texture: image, image_file: skin.tif", r"convert it to \.png"),
         ("texture: image, image_file: bad.png", "damaged"),
         ("texture: image, image_file: huge.png", "2050x1 pixels, at most 2048"),
-        ("texture: grid, image_file: bad.png", "texture: image only"),
-        ("texture: image, image_file: 7", "no file's name"),
+        ("texture: grid, image_file: bad.png", "needs texture: image"),
+        ("texture: image, image_file: 7", "not a file name"),
         ("texture: image", "has no image"),
     ],
 )

@@ -17,8 +17,8 @@ from ruamel.yaml import YAML
 
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
-from flexsheet.nodes.triangulator import families
-from flexsheet.nodes.triangulator.families import MARKER, DrawnDisc, centre_bound_px, noisy
+from flexsheet.nodes.triangulator import benchmarks
+from flexsheet.nodes.triangulator.benchmarks import MARKER, DrawnDisc, centre_bound_px, noisy
 from flexsheet.nodes.triangulator.marker import (
     MARKER_METHODS,
     Blob,
@@ -263,7 +263,7 @@ def test_no_picture_breaks_the_search(seed: int) -> None:
 
 
 def test_the_mark_family_tells_the_methods_apart(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(families, "MARKER_IMAGES", 12)
+    monkeypatch.setattr(benchmarks, "MARKER_IMAGES", 12)
     scene = Scene.model_validate(YAML(typ="safe").load(SCENE_FILE.read_text()))
     points = [measure_trial(trial, repeats=1) for trial in MARKER.trials(scene)]
     worst = {
@@ -289,7 +289,7 @@ def test_mark_methods_are_judged_with_the_noise_that_the_node_tells_them(
         believed.append(noise)
         return []
 
-    monkeypatch.setattr(families, "MARKER_METHODS", {"moments": spy})
+    monkeypatch.setattr(benchmarks, "MARKER_METHODS", {"moments": spy})
     loud = {"read_noise_levels": 4.0, "photons_per_level": 10.0}
     camera = scene.camera.model_copy(update=loud)
     trial = next(iter(MARKER.trials(scene.model_copy(update={"camera": camera}))))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from flexsheet.messages.base import Header
-from flexsheet.messages.reference import reference
 from flexsheet.messages.topics import TOPICS
+from website.messages_page import reference
 
 
 def test_page_names_every_topic_type_and_field() -> None:

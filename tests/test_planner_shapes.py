@@ -18,6 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from benchmarks.planner_methods import ellipsoid_mesh
 from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.messages.scene import Mesh
 from flexsheet.nodes.models.rigid import angle_between
@@ -30,7 +31,6 @@ from flexsheet.nodes.models.shapes import (
 )
 from flexsheet.nodes.planner import encounter
 from flexsheet.nodes.planner.encounter import Encounter, Presentation, Reach, UnpresentableError
-from flexsheet.nodes.planner.families import ellipsoid_mesh
 from flexsheet.nodes.planner.motion import Planned
 from tests.plans import STEP_S, STILL, Desk, scene_with
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.organ import obj_text, organ_mesh
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.gestures import gesture_path
 from flexsheet.launch.health.layout import check_layout
-from flexsheet.launch.objects.organ import obj_text, organ_mesh
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.models.rigid import angle_between, apply, inverse, transform_from_rpy

@@ -18,7 +18,7 @@ from flexsheet.launch.calibration.sheet_fit import (
     fit_sheet_model,
     tabulate_pushes,
 )
-from flexsheet.launch.calibration.sheet_rows import read_rows, twin_rows
+from flexsheet.launch.calibration.sheet_rows import read_rows, simulate_rows
 from flexsheet.launch.calibration.simulated_sheet import twin_force
 from flexsheet.launch.cli import app
 from flexsheet.launch.commands.calibrate_sheet import fitted
@@ -209,8 +209,8 @@ def test_rows_are_read_with_their_lines(tmp_path: Path) -> None:
         ("stretch_ratio,depth_mm,force_n\n1.02,5", "rows.csv:2: 2 values for 3 columns"),
         ("stretch_ratio,depth_mm,force_n\n1.02,five,1", 'rows.csv:2: depth_mm: "five"'),
         ("stretch_ratio,depth_mm,force_n\n1.02,,1", 'depth_mm: "" is not a number'),
-        ("stretch_ratio,depth_mm,force_n\n1.02,nan,1", "depth_mm: nan is not above 0"),
-        ("stretch_ratio,depth_mm,force_n\n1.02,-5,1", "-5 is not above 0"),
+        ("stretch_ratio,depth_mm,force_n\n1.02,nan,1", "depth_mm: nan is not positive"),
+        ("stretch_ratio,depth_mm,force_n\n1.02,-5,1", "-5 is not positive"),
         ("stretch_ratio,depth_mm,force_n\n2.5e2,5,1", "stretch_ratio: 2.5e2 is not near 1"),
         ("stretch_ratio,depth_mm,force_n\n1.02,5000,1", "lengths are in mm"),
         ("stretch_ratio,depth_mm,force_n,y_mm\n1.02,5,1,130", "y_mm: 130 is not on the sheet"),
@@ -238,7 +238,7 @@ def twin_calibration() -> SheetCalibration:
     small = SCENE.model_copy(
         update={"working_range": SCENE.working_range.model_copy(update={"push_depth_m": 0.02})}
     )
-    rows = twin_rows(small, places=False, noise_n=0.003, seed=2)
+    rows = simulate_rows(small, places=False, noise_n=0.003, seed=2)
     return fitted(
         small, rows, list(range(len(rows))), source="twin", with_mooney=False, with_table=True
     )

@@ -17,7 +17,7 @@ from flexsheet.messages.calibration_file import CalibrationMismatchError
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import measure as measure_trial
 from flexsheet.nodes.models import camera, rigid
-from flexsheet.nodes.triangulator.families import TRIANGULATION
+from flexsheet.nodes.triangulator.benchmarks import TRIANGULATION
 from flexsheet.nodes.triangulator.triangulation import (
     TRIANGULATION_METHODS,
     ClosestApproach,

@@ -16,14 +16,14 @@ from flexsheet.launch.cli import app
 from flexsheet.launch.commands.output import CommandError
 from flexsheet.launch.commands.tune import NOT_MET
 from flexsheet.launch.methods import tune
-from flexsheet.launch.methods.machine import busy_words
+from flexsheet.launch.methods.results import describe_load
 from flexsheet.launch.methods.tune import (
     Tunable,
     choose,
+    evaluate_methods,
+    insert_choices,
     tunables_named,
-    verdicts,
     write_choices,
-    written,
 )
 from flexsheet.launch.plans.documents import BadInputError
 from flexsheet.launch.plans.plan import load_scene
@@ -34,7 +34,7 @@ from flexsheet.messages.scene import Scene
 from flexsheet.nodes.fem_solver.soft_body_factory import SoftBodyFactory, choose_method
 from flexsheet.nodes.methods import Case, Family, Point, Trial
 from flexsheet.nodes.planner.force_table import law_by
-from flexsheet.nodes.triangulator.families import TRIANGULATION
+from flexsheet.nodes.triangulator.benchmarks import TRIANGULATION
 from flexsheet.nodes.triangulator.node import Triangulator
 from flexsheet.nodes.triangulator.parameters import TriangulatorParameters
 
@@ -57,8 +57,8 @@ def point(method: str, error: float, *, depth: int = 1, **more: Any) -> Point:
     return Point(method, case, case, median_s=took, p99_s=took, error=error, **told)
 
 
-def chosen_of(points: Sequence[Point], *, margin: float = 0.2) -> tune.Verdict:
-    return choose(verdicts(points, SETTINGS, tolerance=1.0, margin=margin))
+def chosen_of(points: Sequence[Point], *, margin: float = 0.2) -> tune.MethodEvaluation:
+    return choose(evaluate_methods(points, SETTINGS, tolerance=1.0, margin=margin))
 
 
 def test_the_cheapest_that_is_good_enough_everywhere_is_chosen() -> None:
@@ -128,7 +128,7 @@ def family(name: str, methods: Sequence[str]) -> Family:
 def stand_ins(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Families "quick" and "slow" in place of a node's own; which were measured is told."""
     there = {"quick": family("made-up", ["cheap"]), "slow": family("made-up", ["cheap", "dear"])}
-    monkeypatch.setattr(tune, "family_at", there.__getitem__)
+    monkeypatch.setattr(tune, "load_family", there.__getitem__)
     return []
 
 
@@ -158,7 +158,7 @@ def test_what_takes_minutes_is_asked_only_where_nothing_else_does(
 
 
 def choice_of(points: Sequence[Point], key: str = "marker") -> tune.Choice:
-    judged = verdicts(points, SETTINGS, tolerance=1.0)
+    judged = evaluate_methods(points, SETTINGS, tolerance=1.0)
     return tune.Choice("made-up", key, "mm", 1.0, choose(judged), tuple(judged))
 
 
@@ -184,15 +184,15 @@ def test_a_miss_is_said_with_how_far_it_misses() -> None:
 
 def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
     there = {
-        "flexsheet.launch.methods.families:QUICK_SHAPE": family(
+        "flexsheet.launch.methods.benchmarks:QUICK_SHAPE": family(
             "sheet-shape", ["four_triangles", "reduced_order"]
         ),
-        "flexsheet.launch.methods.families:QUICK_CORRECTION": family(
+        "flexsheet.launch.methods.benchmarks:QUICK_CORRECTION": family(
             "correction", ["one_plane", "two_pass_triangles"]
         ),
-        "flexsheet.launch.methods.families:CORRECTION": family("correction", ["two_pass"]),
+        "flexsheet.launch.methods.benchmarks:CORRECTION": family("correction", ["two_pass"]),
     }
-    monkeypatch.setattr(tune, "family_at", there.__getitem__)
+    monkeypatch.setattr(tune, "load_family", there.__getitem__)
     errors = {"four_triangles": 0.2, "reduced_order": 0.1, "one_plane": 9.0}
 
     def measured(asked: Family, scene: Scene, wanted: object) -> Sequence[Point]:
@@ -210,7 +210,7 @@ def test_two_passes_go_onto_the_shape_that_was_chosen(monkeypatch: pytest.Monkey
 
 
 def put(text: str, *choices: tune.Choice) -> str:
-    return written(text, choices, today="2026-01-02", machine="a machine", commit="0" * 40)
+    return insert_choices(text, choices, today="2026-01-02", machine="a machine", commit="0" * 40)
 
 
 GOOD, BAD = choice_of([point("cheap", 0.1)]), choice_of([point("cheap", 2.0)], "tracking")
@@ -249,7 +249,7 @@ def test_choices_on_one_line_are_unfolded() -> None:
 
 def scene_choice() -> tune.Choice:
     settings: dict[str, tune.Setting] = {"cheap": {"method": "linear", "skin_spacing_m": 0.006}}
-    judged = verdicts([point("cheap", 0.1)], settings, tolerance=1.0)
+    judged = evaluate_methods([point("cheap", 0.1)], settings, tolerance=1.0)
     return tune.Choice("soft-body", "soft_body", "mm", 1.0, judged[0], tuple(judged))
 
 
@@ -260,7 +260,7 @@ def test_a_scene_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert source.read_text() == (SCENES / "sphere.yaml").read_text()
     wanted = SoftBodyChoice(method="linear", skin_spacing_m=0.006)
     assert load_scene(tmp_path / "copy.yaml").methods == Methods(soft_body=wanted)
-    with pytest.raises(BadInputError, match="a folder that is there"):
+    with pytest.raises(BadInputError, match="in an existing, writable folder"):
         write_choices(source, tmp_path / "no folder" / "copy.yaml", [scene_choice()])
     with pytest.raises(BadInputError, match="marker") as refused:  # no method's name
         write_choices(source, source, [GOOD])
@@ -307,10 +307,10 @@ def test_files_are_named_from_where_a_scene_goes(tmp_path: Path, quote: str) -> 
         f"a: 1\nobject:\n  geometry: {{file: {quote}o.obj{quote}, x: 1}}  # o.obj\n"
         f"  appearance:\n    image_file: {quote}../p.png{quote}\n"
     )
-    found = tune.moved(text, tmp_path / "here" / "a.yaml", tmp_path / "there" / "b.yaml")
+    found = tune.relocate_paths(text, tmp_path / "here" / "a.yaml", tmp_path / "there" / "b.yaml")
     wanted = text.replace(f"{quote}../p.png{quote}", '"../p.png"', 1)
     assert found == wanted.replace(f"{quote}o.obj{quote}", '"../here/o.obj"', 1)
-    assert tune.moved(text, tmp_path / "a.yaml", tmp_path / "b.yaml") == text
+    assert tune.relocate_paths(text, tmp_path / "a.yaml", tmp_path / "b.yaml") == text
 
 
 def test_a_copy_elsewhere_is_the_same_scene(tmp_path: Path) -> None:
@@ -342,7 +342,7 @@ def test_a_files_name_that_cannot_be_put_in_is_refused(tmp_path: Path) -> None:
     text = (SCENES / "palpation.yaml").read_text()
     source.write_text(text.replace("organ.obj", r'"orga\x6e.obj"'))
     (tmp_path / "far").mkdir()
-    with pytest.raises(BadInputError, match=r"geometry\.file: names .organ\.obj.*whole path"):
+    with pytest.raises(BadInputError, match=r"geometry\.file: names .organ\.obj.*absolute path"):
         tune.check_target(source, tmp_path / "far" / "copy.yaml")
 
 
@@ -364,7 +364,7 @@ def test_where_nothing_can_be_written_nothing_is_measured(
     monkeypatch.setattr(tune, "tune", lambda *_, **__: pytest.fail("measured"))
     outcome = run(SCENES / "sphere.yaml", "--output", tmp_path / where)
     assert isinstance(outcome.exception, BadInputError)
-    assert "give --output FILE, in a folder that is there" in str(outcome.exception)
+    assert "give --output FILE in in an existing, writable folder" in str(outcome.exception)
 
 
 def run(*arguments: object) -> Any:
@@ -399,7 +399,7 @@ def test_an_unknown_family_is_named_with_the_nearest() -> None:
     assert isinstance(outcome.exception, CommandError)
     assert 'did you mean "correction"?' in str(outcome.exception)
     assert "no node takes a choice" in str(
-        run(SCENES / "sphere.yaml", "--family", "rolling").exception
+        run(SCENES / "sphere.yaml", "--family", "kinematics").exception
     )
 
 
@@ -407,7 +407,7 @@ def test_every_choice_that_can_be_made_is_one_that_a_scene_can_say() -> None:
     for tunable in tune.TUNABLES:
         for setting in tunable.settings.values():
             assert Methods.model_validate({tunable.key: setting})
-    assert {one.key for one in tune.TUNABLES} == set(Methods.model_fields)
+    assert {one.key for one in tune.TUNABLES} == set(Methods.model_fields) - {"kinematics"}
 
 
 def test_families_ask_for_the_scenes_own_cases_only() -> None:
@@ -486,4 +486,4 @@ def test_a_busy_machine_is_told_of(
 ) -> None:
     monkeypatch.setattr("os.getloadavg", lambda: (load, 0.0, 0.0))
     monkeypatch.setattr("os.cpu_count", lambda: 8)
-    assert (busy_words() is not None) == busy
+    assert (describe_load() is not None) == busy

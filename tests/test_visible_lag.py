@@ -33,10 +33,10 @@ def axes(times_s: Floats) -> tuple[Floats, Floats, Floats]:
     return RADIUS * normal - [0, 0, RADIUS], np.column_stack([zero, np.cos(a), -np.sin(a)]), normal
 
 
-def edge(times_s: Floats, x_m: float) -> stroke.Track:
+def edge(times_s: Floats, x_m: float) -> stroke.SampledMotion:
     centre, y, z = axes(times_s)
     rows = np.hstack([centre + np.array([x_m, 0.0, 0.0]), y, z])
-    return stroke.Track(np.asarray(times_s * 1e9, np.int64), rows)
+    return stroke.SampledMotion(np.asarray(times_s * 1e9, np.int64), rows)
 
 
 def frame(light_s: float, mark_lag_s: float, sheet_lag_s: float, dent_lag_s: float) -> Frame:
@@ -62,11 +62,11 @@ def frame(light_s: float, mark_lag_s: float, sheet_lag_s: float, dent_lag_s: flo
     )
 
 
-def recording(pictures: stroke.Pictures) -> stroke.Recording:
+def recording(pictures: stroke.DrawnFrames) -> stroke.StrokeRecording:
     times = np.arange(0.0, 13.0, 1 / 120)
-    finger = stroke.Track(np.asarray(times * 1e9, np.int64), axes(times)[0])
+    finger = stroke.SampledMotion(np.asarray(times * 1e9, np.int64), axes(times)[0])
     edges = edge(times, -0.125), edge(times, 0.125)
-    return stroke.Recording(
+    return stroke.StrokeRecording(
         scene=SCENE,
         fingertip=finger,
         measured=finger,
@@ -82,7 +82,7 @@ def recording(pictures: stroke.Pictures) -> stroke.Recording:
 
 @pytest.mark.parametrize("lag_s", [-0.007, 0.0, 0.012])
 def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
-    pictures = stroke.Pictures([], [], [])
+    pictures = stroke.DrawnFrames([], [], [])
     for light_s in np.arange(0.1, 12.0, 1 / 15):
         pictures.take(frame(float(light_s), lag_s, 2.0 * lag_s, 0.02))
     told = stroke.visible_lag_ms(recording(pictures), SECONDS)
@@ -92,10 +92,10 @@ def test_the_lag_of_mark_sheet_and_dent_is_told(lag_s: float) -> None:
 
 
 def test_too_few_pictures_tell_no_lag() -> None:
-    pictures = stroke.Pictures([], [], [])
+    pictures = stroke.DrawnFrames([], [], [])
     pictures.take(frame(3.0, 0.0, 0.0, 0.0))
     pictures.take(frame(3.1, 0.0, 0.0, 0.0).model_copy(update={"light_ns": 0}))
     told = stroke.visible_lag_ms(recording(pictures), SECONDS)
     assert told == {"fingertip": None, "sheet": None, "object": 0.0}
-    empty = stroke.visible_lag_ms(recording(stroke.Pictures([], [], [])), SECONDS)
+    empty = stroke.visible_lag_ms(recording(stroke.DrawnFrames([], [], [])), SECONDS)
     assert empty["object"] is None

@@ -8,8 +8,14 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from flexsheet.messages import reference as messages_page
-from website import arm_states_page, commands_page, errors_page, parameters_page, registers_page
+from website import (
+    arm_states_page,
+    commands_page,
+    errors_page,
+    messages_page,
+    parameters_page,
+    registers_page,
+)
 from website.graph import PICTURES, svg
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"

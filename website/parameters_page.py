@@ -7,9 +7,10 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from flexsheet.messages.reference import field_type, parts_of, type_section
+from flexsheet.messages.field_types import field_type
 from flexsheet.nodes import NODES, node_class
 from flexsheet.nodes.node import parameters_of
+from website.messages_page import parts_of, type_section
 
 ROOT = Path(__file__).resolve().parent.parent
 UNITS = {

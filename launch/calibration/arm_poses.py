@@ -1,10 +1,10 @@
-"""Places of an arm with a board on its flange: the folders that `flexsheet calibrate arms` reads.
+"""Read, record and simulate poses of an arm with a board on its flange.
 
-A folder holds `joints.csv` and the pictures that it names.  A row is a place where the arm stood
-still: the six joints (`j1_deg` ... `j6_deg`, or `j1_rad` ...), and either the two pictures (`left`,
-`right`: file names in the folder) or where the board was seen by other means, in the left camera's
-frame (`board_x_m`, `board_y_m`, `board_z_m`, `board_rx_rad`, `board_ry_rad`, `board_rz_rad`: its
-first corner, and its turn as a rotation vector).
+A folder for `flexsheet calibrate arms` holds `joints.csv` and the images that it names.  A row is a
+pose at rest: the six joints (`j1_deg` ... `j6_deg`, or `j1_rad` ...), and either two images
+(`left`, `right`: file names in the folder) or the board's pose in the left camera's frame
+(`board_x_m`, `board_y_m`, `board_z_m`: its first corner; `board_rx_rad`, `board_ry_rad`,
+`board_rz_rad`: a rotation vector).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from flexsheet.launch.calibration.corners import (
     find_pairs,
     match_views,
 )
-from flexsheet.launch.calibration.hand_eye import Lens, Rig, Sighting, View
+from flexsheet.launch.calibration.hand_eye import BoardDetection, CameraLens, CornerView, LensRig
 from flexsheet.messages.calibration import Board, StereoCalibration
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
@@ -63,28 +63,28 @@ BOARD_COLUMNS = (
     "board_rz_rad",
 )
 
-STILL_RAD, STILL_S = 0.0005, 0.7
-"""Joints that have stayed within the first for the second are at rest."""
+MAX_STILL_RAD, MIN_STILL_S = 0.0005, 0.7
+"""Joints are at rest if they stayed within the angle for the time."""
 
-OTHER_TURN_RAD, OTHER_M = 0.05, 0.01
-"""A place is another one if the board is turned, or moved, by so much from all before."""
+MIN_NEW_ROTATION_RAD, MIN_NEW_SHIFT_M = 0.05, 0.01
+"""A pose is new if the board is rotated or translated at least this much from all others."""
 
 TWIN_BASE_M, TWIN_BASE_RAD, TWIN_JOINT_RAD = 0.005, 0.01, 2e-4
-"""How far the twin's bases stand off the scene's, and its joints off what they say (deviations)."""
+"""Standard deviations of the simulated bases from the scene's, and of the joint errors."""
 
 
-class PlacesError(FlexsheetError, ValueError):
-    """A folder of places that cannot be used; the message names file, row and column."""
+class ArmPosesError(FlexsheetError, ValueError):
+    """Raised for a folder of arm poses that cannot be used; the text names file, row and column."""
 
     code = "arm-poses"
     remedy = "Correct the row of joints.csv that the text names, or measure that pose again."
 
 
-def rig_of(scene: Scene, calibration: StereoCalibration | None) -> Rig:
-    """The stereo camera where the scene has it, with the calibration's optics or the scene's."""
+def make_lens_rig(scene: Scene, calibration: StereoCalibration | None) -> LensRig:
+    """Make the stereo rig at the scene's pose, with the calibration's optics or the scene's."""
     measured = scene.camera if calibration is None else calibration
     place = scene.camera.world_from_left
-    return Rig(
+    return LensRig(
         _lens(measured.left),
         _lens(measured.right),
         measured.right_from_left,
@@ -92,15 +92,15 @@ def rig_of(scene: Scene, calibration: StereoCalibration | None) -> Rig:
     )
 
 
-def _lens(lens: SceneLens) -> Lens:
-    return Lens(
+def _lens(lens: SceneLens) -> CameraLens:
+    return CameraLens(
         camera_matrix(lens.fx_px, lens.fy_px, lens.cx_px, lens.cy_px), np.array(lens.distortion)
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A line of the table: joints (6,) rad, and pictures or the board's pose (4, 4)."""
+    """Hold a row of the table: joints (6,) rad, and images or the board's pose (4, 4)."""
 
     name: str
     joints_rad: Floats
@@ -108,8 +108,8 @@ class Row:
     left_from_board: Floats | None
 
 
-def read_table(folder: Path) -> list[Row]:
-    """The rows of a folder's table; PlacesError says which cell is wrong."""
+def read_pose_table(folder: Path) -> list[Row]:
+    """Return the rows of a folder's table; ArmPosesError names the wrong cell."""
     path = folder / TABLE
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -117,21 +117,25 @@ def read_table(folder: Path) -> list[Row]:
             columns = tuple(reader.fieldnames or ())
             lines = list(reader)
     except OSError as error:
-        raise PlacesError(f"{path}: cannot be read: {error.strerror}; see docs/arms.md") from error
+        raise ArmPosesError(
+            f"{path}: cannot be read: {error.strerror}; see docs/arms.md"
+        ) from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise PlacesError(f"{path}: not a table of comma-separated values: {error}") from error
+        raise ArmPosesError(
+            f"{path}: is not CSV: {error}; save it as comma-separated values"
+        ) from error
     unit = next(
         (one for one in ("deg", "rad") if all(f"{j}_{one}" in columns for j in JOINTS)), None
     )
     if unit is None:
-        raise PlacesError(
-            f"{path}: columns {', '.join(columns) or 'none'}; it needs j1_deg to j6_deg, or j1_rad "
-            "to j6_rad"
+        raise ArmPosesError(
+            f"{path}: columns {', '.join(columns) or 'none'}; add j1_deg to j6_deg, or j1_rad to "
+            "j6_rad"
         )
     by_pose = all(name in columns for name in BOARD_COLUMNS)
     if not by_pose and not {"left", "right"} <= set(columns):
-        raise PlacesError(
-            f"{path}: it needs the columns left and right (pictures), or {', '.join(BOARD_COLUMNS)}"
+        raise ArmPosesError(
+            f"{path}: add the columns left and right (images), or {', '.join(BOARD_COLUMNS)}"
         )
     rows = []
     for number, line in enumerate(lines, start=2):
@@ -145,7 +149,7 @@ def read_table(folder: Path) -> list[Row]:
             pictures = (folder / (line["left"] or ""), folder / (line["right"] or ""))
             rows.append(Row(line["left"] or f"row {number}", joints_rad, pictures, None))
     if not rows:
-        raise PlacesError(f"{path}: holds no rows; one for each place of the arm")
+        raise ArmPosesError(f"{path}: holds no rows; add one for each pose of the arm")
     return rows
 
 
@@ -160,28 +164,28 @@ def _numbers(
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
-            raise PlacesError(f"{path}: row {number}, column {column}: {text!r} is not a number")
+            raise ArmPosesError(f"{path}: row {number}, column {column}: {text!r} is not a number")
         values.append(value)
     return np.array(values)
 
 
-def read_sightings(
-    folder: Path, board: Board, rig: Rig, size: tuple[int, int], progress: Progress
-) -> tuple[list[Sighting], list[tuple[str, str]]]:
-    """A folder's places with what was seen there; and which show nothing, with the reasons.
+def read_detections(
+    folder: Path, board: Board, rig: LensRig, size: tuple[int, int], progress: Progress
+) -> tuple[list[BoardDetection], list[tuple[str, str]]]:
+    """Return a folder's detections, and the names of poses without one with the reasons.
 
-    size: (width, height) px that the pictures must have.  PlacesError, CalibrationError.
+    size: required (width, height) px of the images.  Raises ArmPosesError and CalibrationError.
     """
-    rows = read_table(folder)
+    rows = read_pose_table(folder)
     if rows[0].pictures is None:
-        return [_drawn(row, board, rig) for row in rows], []
+        return [_project_board(row, board, rig) for row in rows], []
     pictures = [row.pictures for row in rows if row.pictures is not None]
     pairs, found_size = find_pairs(
         [left for left, _ in pictures], [right for _, right in pictures], board, progress
     )
     if found_size != size:
-        raise PlacesError(
-            f"{folder}: pictures of {found_size[0]}x{found_size[1]} px, the camera's calibration "
+        raise ArmPosesError(
+            f"{folder}: images of {found_size[0]}x{found_size[1]} px, the camera's calibration "
             f"is for {size[0]}x{size[1]}: take them at that size"
         )
     seen, blind = [], []
@@ -189,40 +193,40 @@ def read_sightings(
         if isinstance(pair, str):
             blind.append((row.name, pair))
         else:
-            seen.append(_sighting(row.name, row.joints_rad, pair, board))
+            seen.append(_make_detection(row.name, row.joints_rad, pair, board))
     return seen, blind
 
 
-def _sighting(name: str, joints_rad: Floats, pair: BoardPair, board: Board) -> Sighting:
+def _make_detection(name: str, joints_rad: Floats, pair: BoardPair, board: Board) -> BoardDetection:
     points = board_points(board)
-    return Sighting(
+    return BoardDetection(
         name,
         joints_rad,
-        View(points[pair.left.ids], pair.left.pixels),
-        View(points[pair.right.ids], pair.right.pixels),
+        CornerView(points[pair.left.ids], pair.left.pixels),
+        CornerView(points[pair.right.ids], pair.right.pixels),
     )
 
 
-def _drawn(row: Row, board: Board, rig: Rig) -> Sighting:
-    """A place known by the board's pose, as pictures without noise would show it."""
+def _project_board(row: Row, board: Board, rig: LensRig) -> BoardDetection:
+    """Project the board of a row with a board pose into both images, without noise."""
     assert row.left_from_board is not None
     points = board_points(board)
     views = []
     for lens, eye_from_left in ((rig.left, np.eye(4)), (rig.right, rig.right_from_left)):
         in_eye = apply(eye_from_left @ row.left_from_board, points)
         if in_eye[:, 2].min() <= 0.0:
-            raise PlacesError(f"{row.name}: the board lies behind a camera; check its pose")
-        views.append(View(points, project(in_eye, lens.matrix, lens.distortion)))
-    return Sighting(row.name, row.joints_rad, views[0], views[1])
+            raise ArmPosesError(f"{row.name}: the board lies behind a camera; check its pose")
+        views.append(CornerView(points, project(in_eye, lens.matrix, lens.distortion)))
+    return BoardDetection(row.name, row.joints_rad, views[0], views[1])
 
 
-class PlaceTaker:
-    """Takes a place into a folder whenever the arm rests and the board is seen somewhere new.
+class PoseRecorder:
+    """Record a pose into a folder whenever the arm rests and the board has a new pose.
 
-    Fed with what comes on the topics, in the order of the times (s, of one clock).
+    Joints and images must be given in the order of their times (s, of one clock).
     """
 
-    def __init__(self, folder: Path, board: Board, rig: Rig) -> None:
+    def __init__(self, folder: Path, board: Board, rig: LensRig) -> None:
         self.taken = 0
         self._folder, self._board, self._rig = folder, board, rig
         self._finder = CornerFinder(board, quick=True)
@@ -230,18 +234,18 @@ class PlaceTaker:
         self._still_since_s = math.inf
         self._poses: list[Floats] = []
 
-    def see_joints(self, joints_rad: Floats, time_s: float) -> None:
-        """The arm's measured joints (6,)."""
-        moved = self._joints is None or np.abs(joints_rad - self._joints).max() > STILL_RAD
+    def update_joints(self, joints_rad: Floats, time_s: float) -> None:
+        """Add measured joints (6,) rad."""
+        moved = self._joints is None or np.abs(joints_rad - self._joints).max() > MAX_STILL_RAD
         if moved:
             self._joints, self._still_since_s = joints_rad, time_s
 
-    def see_pictures(self, left: Image, right: Image, exposed_s: float) -> str:
-        """A pair of pictures (h, w); returns what to do, or that it was taken."""
+    def update_images(self, left: Image, right: Image, exposed_s: float) -> str:
+        """Add an image pair (h, w) each; return a hint for the operator."""
         joints = self._joints
         if joints is None:
-            return "no word from the arm yet"
-        if exposed_s - self._still_since_s < STILL_S:
+            return "no message from the arm yet"
+        if exposed_s - self._still_since_s < MIN_STILL_S:
             return "the arm moves"
         pair = match_views(
             self._finder.find(left), self._finder.find(right), self._board, ("left", "right")
@@ -249,14 +253,14 @@ class PlaceTaker:
         if isinstance(pair, str):
             return pair
         pose = self._pose(pair)
-        if any(_alike(pose, other) for other in self._poses):
-            return "the board was seen from here already; turn and move the flange"
+        if any(_is_same_pose(pose, other) for other in self._poses):
+            return "a similar pose is recorded already; rotate and move the flange"
         self._write(left, right, joints)
         self._poses.append(pose)
-        return f"place {self.taken} taken; turn and move the flange"
+        return f"pose {self.taken} recorded; rotate and move the flange"
 
     def _pose(self, pair: BoardPair) -> Floats:
-        """left_from_board (4, 4), from the left picture: to tell places apart."""
+        """Return left_from_board (4, 4) from the left image, to compare poses."""
         points = board_points(self._board)[pair.left.ids]
         lens = self._rig.left
         _, turn, shift = cv2.solvePnP(points, pair.left.pixels, lens.matrix, lens.distortion)
@@ -274,7 +278,7 @@ class PlaceTaker:
 
 
 def add_row(folder: Path, names: list[str], joints_rad: Floats) -> None:
-    """Add a place to a folder's table, which is begun where there is none."""
+    """Append a pose to a folder's table; create the table if needed."""
     path = folder / TABLE
     begun = path.exists()
     with path.open("a", newline="", encoding="utf-8") as file:
@@ -284,13 +288,16 @@ def add_row(folder: Path, names: list[str], joints_rad: Floats) -> None:
         writer.writerow([*names, *(repr(float(angle)) for angle in joints_rad)])
 
 
-def _alike(pose: Floats, other: Floats) -> bool:
+def _is_same_pose(pose: Floats, other: Floats) -> bool:
     turn = float(np.linalg.norm(vector_from_rotation(pose[:3, :3].T @ other[:3, :3])))
-    return turn < OTHER_TURN_RAD and float(np.linalg.norm(pose[:3, 3] - other[:3, 3])) < OTHER_M
+    return (
+        turn < MIN_NEW_ROTATION_RAD
+        and float(np.linalg.norm(pose[:3, 3] - other[:3, 3])) < MIN_NEW_SHIFT_M
+    )
 
 
 def true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
-    """world_from_base (4, 4) of the twin's arm, which stands somewhat off the scene's."""
+    """Return world_from_base (4, 4) of the simulated arm, which differs from the scene's."""
     place: Pose = getattr(scene.arms, side).world_from_base
     given = transform_from_rpy(place.position_m, place.rpy_rad)
     random = np.random.default_rng([seed, side == "left"])
@@ -298,13 +305,13 @@ def true_base(scene: Scene, side: Side, *, seed: int) -> Floats:
     return transform(turn @ given[:3, :3], given[:3, 3] + random.normal(0.0, TWIN_BASE_M, 3))
 
 
-def twin_places(
+def simulate_poses(
     scene: Scene, board: Board, side: Side, folder: Path, *, places: int, seed: int
 ) -> Iterator[int]:
-    """Write what the twin's camera sees of a board on the twin's arm; yields after each place.
+    """Write images of a board on the simulated arm to a folder; yield the count after each pose.
 
-    Joints that do not give their true place by TWIN_JOINT_RAD each, pictures with blur and noise.
-    BoardError for a board that cannot be drawn.
+    The joints have errors of TWIN_JOINT_RAD each, the images blur and noise.  Raises BoardError for
+    a board that cannot be drawn.
     """
     random = np.random.default_rng([seed, side == "left", 1])
     camera = make_true_camera(scene.camera)
@@ -314,7 +321,7 @@ def twin_places(
     world_from_left = transform_from_rpy(place.position_m, place.rpy_rad)
     middle = 0.5 * board.square_m * np.array([board.columns - 1.0, board.rows - 1.0, 0.0])
     ready = np.radians([0.0, 25.0, 119.0, 0.0, -54.0, 0.0])
-    # The board looks at the camera while the arm reaches forward, 60 mm before the flange.
+    # The board is 60 mm before the flange and faces the camera while the arm reaches forward.
     flange = base @ twin_forward(ready)
     held = flange[:3, 3] + 0.06 * flange[:3, 2]
     facing = transform(world_from_left[:3, :3], held - world_from_left[:3, :3] @ middle)
@@ -329,14 +336,14 @@ def twin_places(
                 inverse(base) @ board_pose @ inverse(flange_from_board), ready
             )
         except ValueError:
-            continue  # out of the arm's reach; another place is tried
+            continue  # out of reach: draw another pose
         true_joints = np.clip(
             joints + random.normal(0.0, TWIN_JOINT_RAD, 6), RANGE_RAD[:, 0], RANGE_RAD[:, 1]
         )
         left_from_board = (
             inverse(world_from_left) @ base @ twin_forward(true_joints) @ flange_from_board
         )
-        if not _in_both(shown, left_from_board):
+        if not _is_in_both_views(shown, left_from_board):
             continue
         done += 1
         names = [f"{one}{done:02}.png" for one in ("left", "right")]
@@ -346,8 +353,8 @@ def twin_places(
         yield done
 
 
-def _in_both(shown: TwinBoard, left_from_board: Floats) -> bool:
-    """Whether all corners are well inside both pictures."""
+def _is_in_both_views(shown: TwinBoard, left_from_board: Floats) -> bool:
+    """Return whether all corners are well inside both images."""
     size = np.array([shown.camera.width_px, shown.camera.height_px])
     views = shown.corners(left_from_board)
     return all(((view > 40.0) & (view < size - 40.0)).all() for view in views)

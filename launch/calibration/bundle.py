@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flexsheet.launch.calibration.corners import BoardPair, View
+from flexsheet.launch.calibration.corners import BoardPair, BoardView
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.nodes.models import rigid
 
@@ -242,7 +242,7 @@ def _by_view(present: Linearized, pair: BoardPair) -> tuple[Floats, Floats]:
     return shifts[:split], shifts[split:]
 
 
-def board_pose(view: View, board: Floats, lens: Floats) -> Floats:
+def board_pose(view: BoardView, board: Floats, lens: Floats) -> Floats:
     """Estimate the pose (6,) of the board in a camera's frame from one view."""
     points = board[view.ids]
     _, rotation, position = cv2.solvePnP(points, view.pixels, *lens_arrays(lens))

@@ -156,8 +156,8 @@ class Capture:
     def _distance(self, pose: Floats) -> str:
         middle = pose_transform(pose) @ [*self._middle, 1.0]
         diagonal_m = self.board.square_m * np.hypot(self.board.columns + 1, self.board.rows + 1)
-        share = self._lens[0] * diagonal_m / middle[2] / np.hypot(*self._size)
-        return "near" if share > NEAR else "far" if share < FAR else "middle"
+        fraction = self._lens[0] * diagonal_m / middle[2] / np.hypot(*self._size)
+        return "near" if fraction > NEAR else "far" if fraction < FAR else "middle"
 
     def advice(self, before: str) -> str:
         """Return what to do with the board next, after the words `before`."""

@@ -24,24 +24,24 @@ from flexsheet.launch.calibration.bundle import (
 )
 from flexsheet.launch.calibration.corners import (
     BoardPair,
+    BoardView,
     CalibrationError,
     Progress,
-    View,
     board_points,
-    digest_of,
+    compute_digest,
     find_pairs,
     ignore_progress,
     read_gray,
     same_order,
 )
-from flexsheet.launch.calibration.selection import MIN_PAIRS, Selection, fit_selection
+from flexsheet.launch.calibration.selection import MIN_PAIRS, PairSelection, fit_selection
 from flexsheet.messages.calibration import Board, StereoCalibration
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
+class StereoRig:
     """Hold a rig in OpenCV's form: matrices (3, 3), distortions (5,), a transform (4, 4)."""
 
     matrices: tuple[Floats, Floats]
@@ -49,20 +49,20 @@ class Rig:
     right_from_left: Floats
 
     @staticmethod
-    def of(numbers: Floats) -> Rig:
+    def of(numbers: Floats) -> StereoRig:
         """Make it from the 22 numbers of a fit."""
         left, right = lens_arrays(numbers[LEFT]), lens_arrays(numbers[RIGHT])
-        return Rig((left[0], right[0]), (left[1], right[1]), pose_transform(numbers[STAND]))
+        return StereoRig((left[0], right[0]), (left[1], right[1]), pose_transform(numbers[STAND]))
 
     @staticmethod
-    def calibrated(calibration: StereoCalibration) -> Rig:
+    def calibrated(calibration: StereoCalibration) -> StereoRig:
         """Make it from a calibration file."""
         left, right = (
             np.array([[lens.fx_px, 0.0, lens.cx_px], [0.0, lens.fy_px, lens.cy_px], [0, 0, 1.0]])
             for lens in (calibration.left, calibration.right)
         )
         distortions = np.array(calibration.left.distortion), np.array(calibration.right.distortion)
-        return Rig((left, right), distortions, calibration.right_from_left)
+        return StereoRig((left, right), distortions, calibration.right_from_left)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ class BoardMeasurement:
     distance_m: float
 
 
-def triangulated(rig: Rig, left: Floats, right: Floats) -> Floats:
+def triangulate_corners(rig: StereoRig, left: Floats, right: Floats) -> Floats:
     """Triangulate pixels (n, 2) into points (n, 3) in the left camera's frame, m: undistorted,
     linear."""
     normalized = [
@@ -101,10 +101,10 @@ def rigid_fit_residuals(points: Floats, model: Floats) -> Floats:
     return np.asarray(np.linalg.norm(reference @ (u @ handed @ vt) - centred, axis=1))
 
 
-def measure_board(rig: Rig, pair: BoardPair, board: Board) -> BoardMeasurement:
+def measure_board(rig: StereoRig, pair: BoardPair, board: Board) -> BoardMeasurement:
     """Measure the corners that both views of a pair show."""
     ids, left, right = pair.common()
-    points = triangulated(rig, left, right)
+    points = triangulate_corners(rig, left, right)
     place = {int(corner): number for number, corner in enumerate(ids)}
     squares, diagonals = [], []
     for corner, here in place.items():
@@ -128,7 +128,7 @@ def measure_board(rig: Rig, pair: BoardPair, board: Board) -> BoardMeasurement:
     )
 
 
-def _reprojection(rig: Rig, left: Floats, right: Floats, points: Floats) -> Floats:
+def _reprojection(rig: StereoRig, left: Floats, right: Floats, points: Floats) -> Floats:
     """Return distances (2n,) px between detected corners and projected points, left and right."""
     distances = []
     stands = (np.eye(4), rig.right_from_left)
@@ -158,7 +158,7 @@ def summary(boards: Sequence[BoardMeasurement]) -> dict[str, float | int | None]
     square_rms_mm: error of the distances of neighbouring corners.
     diagonal_rms_mm: error of both diagonals of the board.
     rigid_fit_rms_mm: error of the corners after a rigid fit of the board.
-    reprojection_rms_px: error of the triangulated corners.
+    reprojection_rms_px: error of the triangulate_corners corners.
     """
     return {
         "pairs": len(boards),
@@ -198,9 +198,9 @@ def check_stereo(
     again = [
         left.name
         for left, right in zip(left_paths, right_paths, strict=True)
-        if digest_of(left, right) in used
+        if compute_digest(left, right) in used
     ]
-    rig = Rig.calibrated(calibration)
+    rig = StereoRig.calibrated(calibration)
     return {
         **summary([measure_board(rig, pair, board) for pair in pairs]),
         "used_to_calibrate": again,
@@ -209,7 +209,7 @@ def check_stereo(
 
 def calibrate_plain_opencv(
     pairs: Sequence[BoardPair], points: Floats, size: tuple[int, int]
-) -> Rig:
+) -> StereoRig:
     """Calibrate with OpenCV as in its tutorials, for comparison: intrinsics first, then fixed.
 
     points: the board's corners (n, 3) m.
@@ -230,7 +230,7 @@ def calibrate_plain_opencv(
         size,
         flags=cv2.CALIB_FIX_INTRINSIC,
     )
-    return Rig(
+    return StereoRig(
         (floats(left_matrix), floats(right_matrix)),
         (floats(left_distortion).ravel()[:5], floats(right_distortion).ravel()[:5]),
         np.block([[rotation, position], [np.zeros((1, 3)), np.ones((1, 1))]]),
@@ -254,7 +254,9 @@ def find_plain_corners(left: Path, right: Path, board: Board) -> BoardPair | Non
         refined = cv2.cornerSubPix(image, corners.copy(), window, (-1, -1), criteria)
         views.append(refined.reshape(-1, 2).astype(np.float64))
     ids = np.arange(board.columns * board.rows)
-    return BoardPair(View(ids, views[0]), View(ids, same_order(views[0], views[1], board)))
+    return BoardPair(
+        BoardView(ids, views[0]), BoardView(ids, same_order(views[0], views[1], board))
+    )
 
 
 def cross_check(
@@ -294,8 +296,8 @@ def cross_check(
     for group in range(groups):
         out = numbers[group::groups]
         kept = [i for i in numbers if i not in out]
-        selection = Selection([whole[i] for i in kept], [left_paths[i].name for i in kept])
-        rig = Rig.of(fit_selection(selection, points, size).rig)
+        selection = PairSelection([whole[i] for i in kept], [left_paths[i].name for i in kept])
+        rig = StereoRig.of(fit_selection(selection, points, size).rig)
         ours.update({i: measure_board(rig, whole[i], board) for i in out})
         if plain:
             yardstick = calibrate_plain_opencv([plain[i] for i in kept if i in plain], points, size)

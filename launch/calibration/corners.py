@@ -58,7 +58,7 @@ class CalibrationError(FlexsheetError, ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class BoardView:
     """Hold the board's corners in one image: ids (n,), ascending, and pixels (n, 2)."""
 
     ids: Ids
@@ -69,8 +69,8 @@ class View:
 class BoardPair:
     """Hold one pose of the board in both images; of a ChArUco board each may show other corners."""
 
-    left: View
-    right: View
+    left: BoardView
+    right: BoardView
 
     def common(self) -> tuple[Ids, Floats, Floats]:
         """Return the corners that both views show: ids (n,), left and right pixels (n, 2)."""
@@ -144,13 +144,13 @@ class CornerFinder:
         if quick:
             self._flags |= cv2.CALIB_CB_FAST_CHECK
 
-    def find(self, image: Image) -> View | None:
+    def find(self, image: Image) -> BoardView | None:
         """Return subpixel corners of a grey image (h, w), or None where too few are visible."""
         if self._detector is not None:
             return self._charuco(image)
         return self._chessboard(image)
 
-    def _chessboard(self, image: Image) -> View | None:
+    def _chessboard(self, image: Image) -> BoardView | None:
         board = self.board
         found, corners = cv2.findChessboardCorners(
             image, (board.columns, board.rows), flags=self._flags
@@ -159,10 +159,12 @@ class CornerFinder:
             return None
         start = np.asarray(corners.reshape(-1, 2), dtype=np.float64)
         half_px = 0.4 * _nearest(start)
-        pixels = _refined(_larger(image), start, half_px, smoothing_px=CHESSBOARD_SMOOTHING_PX)
-        return View(np.arange(board.rows * board.columns), pixels)
+        pixels = _refine_corners(
+            _larger(image), start, half_px, smoothing_px=CHESSBOARD_SMOOTHING_PX
+        )
+        return BoardView(np.arange(board.rows * board.columns), pixels)
 
-    def _charuco(self, image: Image) -> View | None:
+    def _charuco(self, image: Image) -> BoardView | None:
         assert self._detector is not None
         assert self.board.marker_m is not None
         larger = _larger(image)
@@ -175,7 +177,7 @@ class CornerFinder:
         start = (in_larger + 0.5) / SCALE - 0.5
         rim = 0.5 * (1.0 - self.board.marker_m / self.board.square_m)
         half_px = min(0.4, 0.7 * rim) * _nearest(start)
-        pixels = _refined(larger, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)
+        pixels = _refine_corners(larger, start, half_px, smoothing_px=CHARUCO_SMOOTHING_PX)
         last = np.array([image.shape[1], image.shape[0]]) - 1.0
         clear = np.minimum(start, last - start).min(axis=1) > half_px + 2.0
         sound = clear & (np.linalg.norm(pixels - start, axis=1) < MAX_REFINEMENT_PX)
@@ -183,7 +185,7 @@ class CornerFinder:
         columns, rows = np.unique(ids % self.board.columns), np.unique(ids // self.board.columns)
         if len(ids) < MIN_CORNERS or min(len(columns), len(rows)) < 2:
             return None  # corners in one line do not determine a pose
-        return View(ids, pixels)
+        return BoardView(ids, pixels)
 
 
 def _nearest(pixels: Floats) -> Floats:
@@ -199,7 +201,9 @@ def _larger(image: Image) -> Image:
     return np.asarray(larger, dtype=np.uint8)
 
 
-def _refined(larger: Image, start: Floats, half_px: Floats, *, smoothing_px: float) -> Floats:
+def _refine_corners(
+    larger: Image, start: Floats, half_px: Floats, *, smoothing_px: float
+) -> Floats:
     """Refine corners (n, 2) px to the saddle points of their neighbourhoods, half_px (n,) to each
     side.
 
@@ -242,7 +246,7 @@ def same_order(left: Floats, right: Floats, board: Board) -> Floats:
 
 
 def match_views(
-    left: View | None, right: View | None, board: Board, names: tuple[str, str]
+    left: BoardView | None, right: BoardView | None, board: Board, names: tuple[str, str]
 ) -> BoardPair | str:
     """Match the board in a pair of views, or return why it cannot be used; names: of the images."""
     if left is None or right is None:
@@ -254,7 +258,7 @@ def match_views(
         if shared < MIN_CORNERS:
             return f"{shared} corners are in both views, at least {MIN_CORNERS} are needed"
         return pair
-    return BoardPair(left, View(right.ids, same_order(left.pixels, right.pixels, board)))
+    return BoardPair(left, BoardView(right.ids, same_order(left.pixels, right.pixels, board)))
 
 
 def read_gray(path: Path) -> Image:
@@ -265,7 +269,7 @@ def read_gray(path: Path) -> Image:
     return np.asarray(image, dtype=np.uint8)
 
 
-def digest_of(left: Path, right: Path) -> str:
+def compute_digest(left: Path, right: Path) -> str:
     """Return a digest that distinguishes a pair of files from others of the same names."""
     return hashlib.sha256(left.read_bytes() + right.read_bytes()).hexdigest()[:16]
 

@@ -1,19 +1,19 @@
-"""Where an arm's base stands in the world, from pictures of a board on its flange.
+"""Estimate the pose of an arm's base in the world from images of a board on its flange.
 
-Robot-world and hand-eye calibration: at each of several places of the arm
+Robot-world and hand-eye calibration: at each of several poses of the arm
 
     world_from_base base_from_flange(joints) flange_from_board = world_from_left left_from_board
 
 where the first and the third transform are unknown.  A closed form (Shah, Solving the
 robot-world/hand-eye calibration problem using the Kronecker product, J. Mechanisms Robotics 5(3),
-2013) gives a start; then all corners of all pictures are fitted at once.  An arm is not where its
-joints say by some tenths of a millimetre, and that error all corners of a pair share.  So each
-place has a small unknown motion of the flange of its own, of which only the size is unknown
-beforehand: a mixed model, with the sizes found by restricted maximum likelihood (Patterson and
-Thompson, Biometrika 58(3), 1971).  Without it each corner would count as a witness of its own, and
-the result would claim to be several times as certain as it is.
+2013) gives the start; then all corners of all images are fitted together.  The flange differs from
+the forward kinematics by some tenths of a millimetre, an error common to all corners of a pair.  So
+each pose has a small random motion of the flange.  In this mixed model, restricted maximum
+likelihood estimates the standard deviations (Patterson and Thompson, Biometrika 58(3), 1971).
+Without it, each corner would count as independent, and the stated uncertainty would be several
+times too small.
 
-Motions (6,) are a rotation vector (rad), then a shift (m).
+Motions (6,) are a rotation vector (rad), then a translation (m).
 """
 
 from __future__ import annotations
@@ -40,110 +40,110 @@ from flexsheet.nodes.models.rigid import (
 
 Floats = NDArray[np.float64]
 
-FEWEST = 6
-"""Places that are needed; 15 to 20 give a result worth having."""
+MIN_POSES = 6
+"""Minimum number of poses; 15 to 20 are recommended."""
 
-LEAST_TURN_RAD = float(np.radians(5.0))
-"""Root mean square turns of the flange about two axes, to tell the unknowns apart."""
+MIN_ROTATION_RAD = float(np.radians(5.0))
+"""Minimum RMS rotation of the flange about each of two axes; less leaves unknowns undetermined."""
 
-TRIES = 60
-SUBSET = 5
-"""Starts are also made from so many places chosen at random, lest one wrong place spoils all."""
+RANDOM_STARTS = 60
+SUBSET_POSES = 5
+"""Random subsets are tried as starts too, so that one wrong pose cannot spoil the start."""
 
 LENGTH_M = 0.3
-"""A turn of a radian counts as much as a shift by that."""
+"""Translation that weighs as much as a rotation of one radian."""
 
-ROUGH = 6.0
-"""A place that is off by so many times the median is left out of the first fit."""
+MAX_MEDIAN_RATIO = 6.0
+"""A pose with a larger error, over the median error, is excluded from the first fit."""
 
-STRAY, MEDIAN_CHI_SQUARE = 60.0, 5.348
-"""A place whose squared deviation is above that is left out (chi-square with six degrees of
-freedom, whose median scales it).  In 75 made-up sets of 15 places without a stray the largest was
-43: an arm's error is not quite the same everywhere."""
+MAX_CHI_SQUARE, MEDIAN_CHI_SQUARE = 60.0, 5.348
+"""A pose with a larger squared deviation is an outlier.  Deviations are chi-square with six degrees
+of freedom, scaled by the median.  The maximum in 75 simulated sets of 15 poses without an outlier
+was 43, since an arm's error varies over its workspace."""
 
 ROUNDING_PX, ROUNDING_RAD, ROUNDING_M = 1e-4, 1e-8, 1e-8
-LEAST_SCALE = 0.01
-"""Poses that agree to rounding have no spread to be measured by."""
+MIN_SCALE = 0.01
+"""Lower bound of the scale: poses that agree to rounding have no spread."""
 
-RETURNS = 5
+MAX_READMISSIONS = 5
 
-NO_ARM_M, NO_ARM_RAD = 0.01, 0.05
-"""No arm is so far off (deviations): the joints are then not those of the pictures."""
+MAX_PLAUSIBLE_ARM_M, MAX_PLAUSIBLE_ARM_RAD = 0.01, 0.05
+"""Larger standard deviations mean that the joints do not belong to the images."""
 
-STRAY_SHARE = 1.0 / 3.0
-"""If more places than that are left out, something else is wrong."""
+MAX_OUTLIER_RATIO = 1.0 / 3.0
+"""Maximum fraction of outliers; more point to another mistake."""
 
-SMALLEST_RAD, SMALLEST_M = 1e-6, 1e-6
-"""An arm is not taken for more exact than that."""
+MIN_ARM_RAD, MIN_ARM_M = 1e-6, 1e-6
+"""Lower bounds of the arm's standard deviations."""
 
-LARGEST_RAD, LARGEST_M = 0.1, 0.1
+MAX_ARM_RAD, MAX_ARM_M = 0.1, 0.1
 
 ADVICE = (
-    "are the joints those at the moment of the pictures, is the board fast on the flange, do the "
-    "stereo calibration and the board's square fit?"
+    "check that the joints are those at the exposure, that the board is fixed to the flange, and "
+    "that stereo calibration and board are the right ones"
 )
 
-SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
-"""First steps of the search for the deviations' logarithms."""
+INITIAL_SIMPLEX = np.array([[0.0, 0.0], [0.7, 0.0], [0.0, 0.7]])
+"""Initial simplex of the search over the logarithms of the deviations."""
 
-ROUNDS = 30
-SETTLED = 1e-10
-"""A step of all unknowns (rad, m) that ends the iteration."""
+MAX_ITERATIONS = 30
+CONVERGED_STEP = 1e-10
+"""A smaller step of all unknowns (rad, m) ends the iteration."""
 
-STARTED = 1e-6
-"""The same for what is only a start."""
+START_STEP = 1e-6
+"""The same for a start value."""
 
 
 class HandEyeError(FlexsheetError, ValueError):
-    """Places that do not fix where the base stands; the message says why and what to do."""
+    """Raised for poses that do not determine the base; the text gives the reason and a remedy."""
 
     code = "hand-eye"
     remedy = "Measure more poses, with the board rotated about at least two axes."
 
 
 @dataclass(frozen=True, slots=True)
-class Lens:
-    """Camera matrix (3, 3) px and Brown's distortion (5,)."""
+class CameraLens:
+    """Hold a camera matrix (3, 3) px and Brown's distortion (5,)."""
 
     matrix: Floats
     distortion: Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Rig:
-    """The stereo camera, and where it stands in the world; transforms (4, 4)."""
+class LensRig:
+    """Hold the optics and the pose of the stereo camera; transforms (4, 4)."""
 
-    left: Lens
-    right: Lens
+    left: CameraLens
+    right: CameraLens
     right_from_left: Floats
     world_from_left: Floats
 
 
 @dataclass(frozen=True, slots=True)
-class View:
-    """Corners of the board in one picture: where they are on the board (k, 3) m, and pixels."""
+class CornerView:
+    """Hold the corners in one image: positions on the board (k, 3) m, and pixels (k, 2)."""
 
     points_board: Floats
     pixels: Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Sighting:
-    """A place of the arm: its joints (6,) rad, and what both cameras saw of the board."""
+class BoardDetection:
+    """Hold one pose of the arm: its joints (6,) rad, and the board's corners in both images."""
 
     name: str
     joints_rad: Floats
-    left: View
-    right: View
+    left: CornerView
+    right: CornerView
 
 
 @dataclass(frozen=True, slots=True)
 class Residual:
-    """How a place fits.
+    """Hold the residual of one pose.
 
-    shift_m, turn_rad: how far the cameras see the flange from where the joints say it is.
-    rms_px: of the corners, drawn where the joints say.  reason: why it was left out; "" if it
-        was not.
+    shift_m, turn_rad: difference between the flange poses from the images and from the joints.
+    rms_px: of the corners, projected with the pose from the joints.  reason: why the pose is an
+        outlier; "" for an inlier.
     """
 
     name: str
@@ -155,16 +155,15 @@ class Residual:
 
 @dataclass(frozen=True, slots=True)
 class BaseFit:
-    """Where the base stands, how well that is known, and how the places fit.
+    """Hold the pose of the base, its uncertainty and the residuals.
 
-    covariance: (6, 6) of the motion that takes the found world_from_base to the true one: a turn
-        about the base's origin, in the world's axes, then a shift.  Raised by the square of
-        `jackknife_ratio` where that is above 1.
-    corner_sigma_px: of one coordinate of a corner.  arm_sigma_rad, arm_sigma_m: of one component of
-        the flange's error of place.
-    jackknife_ratio: what the result scatters when places are left out one by one, over what the fit
-        alone states (root mean square over the six).
-    leave_one_out: (n, 6) motions of the base when a used place is left out.
+    covariance: (6, 6) of the motion from the estimated world_from_base to the true one: a rotation
+        about the base's origin in the world's axes, then a translation.  Multiplied by the square
+        of `jackknife_ratio` if that is above 1.
+    corner_sigma_px: standard deviation of one coordinate of a corner.  arm_sigma_rad, arm_sigma_m:
+        of one component of the flange's pose error.
+    jackknife_ratio: standard deviations by the jackknife over those of the fit (RMS over the six).
+    leave_one_out: (n, 6) motions of the base when one inlier is left out.
     """
 
     world_from_base: Floats
@@ -178,9 +177,9 @@ class BaseFit:
     residuals: tuple[Residual, ...]
 
     def std_at(self, world_m: Floats) -> tuple[float, float]:
-        """How far a place in the world (3,) m, as this arm is sent there, may be off.
+        """Return the standard deviations of a commanded pose at a point in the world (3,) m.
 
-        Standard deviations: of the distance (m), and of the turn (rad), all three axes together.
+        The first is that of the distance (m), the second that of the rotation (rad), over all axes.
         """
         lever = np.hstack([-skew(world_m - self.world_from_base[:3, 3]), np.eye(3)])
         shift = float(np.sqrt(np.trace(lever @ self.covariance @ lever.T)))
@@ -189,27 +188,28 @@ class BaseFit:
 
 @dataclass(frozen=True, slots=True)
 class _Unknowns:
-    """What is sought, both (4, 4)."""
+    """Hold the unknown transforms, both (4, 4)."""
 
     world_from_base: Floats
     flange_from_board: Floats
 
-    def moved(self, step: Floats) -> _Unknowns:
-        """After motions (12,) of base and board, each a turn about its own origin and a shift."""
+    def apply_step(self, step: Floats) -> _Unknowns:
+        """Apply motions (12,) to base and board, each about its own origin."""
         return _Unknowns(
-            _moved(self.world_from_base, step[:6]), _moved(self.flange_from_board, step[6:])
+            _apply_motion(self.world_from_base, step[:6]),
+            _apply_motion(self.flange_from_board, step[6:]),
         )
 
 
 @dataclass(frozen=True, slots=True)
-class _Linear:
-    """One place, linearised about the present unknowns.
+class _LinearizedPose:
+    """Hold one pose, linearized about the present unknowns.
 
-    seen: (6,) motion of the flange, in its own frame, that draws the corners best.
-    spread: (6, 6), its covariance per px^2 of the corners.  by_unknowns: (6, 12), the flange's
-        motion for those of base and board.
-    inner_px2: what is left of the squared pixels (sum) after the motion that is seen.
-    count: coordinates.  rms_px: of the corners, without that motion.
+    seen: (6,) motion of the flange, in its own frame, that fits the corners best.
+    spread: (6, 6), its covariance per px^2 of the corners.  by_unknowns: (6, 12), the derivative of
+        the flange's motion by those of base and board.
+    inner_px2: sum of squared pixel residuals after the motion `seen`.
+    count: number of coordinates.  rms_px: of the corners, without that motion.
     """
 
     seen: Floats
@@ -220,94 +220,94 @@ class _Linear:
     rms_px: float
 
 
-def calibrate_base(sightings: Sequence[Sighting], rig: Rig, *, seed: int = 0) -> BaseFit:
-    """Where the arm's base stands; HandEyeError where the places do not say.
+def calibrate_base(detections: Sequence[BoardDetection], rig: LensRig, *, seed: int = 0) -> BaseFit:
+    """Estimate the pose of the arm's base; raise HandEyeError if the poses do not determine it.
 
-    seed: of the starts.  The stereo rig and its place in the world are taken as they are: what is
-    wrong there the result shares, and the fingertip, measured by the same rig, shares it too.
+    seed: of the random starts.  The stereo rig's pose and optics are taken as exact: their errors
+    enter the result, and equally the fingertip, which the same rig measures.
     """
-    _refuse_few(sightings)
-    flanges = [forward(one.joints_rad) for one in sightings]
-    _refuse_poor_turns(flanges)
-    boards = [_board_pose(one, rig) for one in sightings]
-    unknowns = _start(flanges, boards, rig, seed=seed)
-    used = _roughly_sound(_discrepancies(unknowns, flanges, boards, rig))
-    for attempt in range(2 * RETURNS):
-        _refuse_strays(sightings, used)
+    _check_count(detections)
+    flanges = [forward(one.joints_rad) for one in detections]
+    _check_rotations(flanges)
+    boards = [_board_pose(one, rig) for one in detections]
+    unknowns = _find_start(flanges, boards, rig, seed=seed)
+    used = _find_rough_inliers(_compute_discrepancies(unknowns, flanges, boards, rig))
+    for attempt in range(2 * MAX_READMISSIONS):
+        _check_outliers(detections, used)
         kept = np.flatnonzero(used).tolist()
-        _refuse_poor_turns([flanges[i] for i in kept])
-        unknowns, model = _fitted(
-            unknowns, [sightings[i] for i in kept], [flanges[i] for i in kept], rig
+        _check_rotations([flanges[i] for i in kept])
+        unknowns, model = _fit(
+            unknowns, [detections[i] for i in kept], [flanges[i] for i in kept], rig
         )
-        _refuse_absurd(model)
-        again = _sound(_linearised(unknowns, sightings, flanges, rig), model)
+        _check_plausible(model)
+        again = _find_inliers(_linearize(unknowns, detections, flanges, rig), model)
         if (again == used).all():
             break
-        # A place once left out may come back, but not for ever.
-        used = again if attempt < RETURNS else again & used
-    return _result(sightings, flanges, rig, unknowns=unknowns, model=model, used=used)
+        # A pose may be readmitted a few times only, so that the iteration ends.
+        used = again if attempt < MAX_READMISSIONS else again & used
+    return _make_result(detections, flanges, rig, unknowns=unknowns, model=model, used=used)
 
 
-def _refuse_few(sightings: Sequence[Sighting]) -> None:
-    if len(sightings) < FEWEST:
+def _check_count(detections: Sequence[BoardDetection]) -> None:
+    if len(detections) < MIN_POSES:
         raise HandEyeError(
-            f"{len(sightings)} places of the arm, at least {FEWEST} are needed; take 15 to 20"
+            f"{len(detections)} poses of the arm, at least {MIN_POSES} are needed; measure 15 to 20"
         )
-    for one in sightings:
+    for one in detections:
         if not np.isfinite(one.joints_rad).all() or one.joints_rad.shape != (6,):
-            raise HandEyeError(f"{one.name}: its joints are not six numbers; correct or remove it")
+            raise HandEyeError(f"{one.name}: needs six finite joints; correct or remove it")
 
 
-def _refuse_strays(sightings: Sequence[Sighting], used: NDArray[np.bool_]) -> None:
+def _check_outliers(detections: Sequence[BoardDetection], used: NDArray[np.bool_]) -> None:
     strays = int((~used).sum())
-    if strays > STRAY_SHARE * len(used):
-        names = ", ".join(one.name for one, good in zip(sightings, used, strict=True) if not good)
+    if strays > MAX_OUTLIER_RATIO * len(used):
+        names = ", ".join(one.name for one, good in zip(detections, used, strict=True) if not good)
         raise HandEyeError(
-            f"{strays} of {len(used)} places do not fit with the others ({names}): {ADVICE}"
+            f"{strays} of {len(used)} poses do not agree with the others ({names}): {ADVICE}"
         )
 
 
-def _refuse_absurd(model: _Model) -> None:
-    if model.arm_m > NO_ARM_M or model.arm_rad > NO_ARM_RAD:
+def _check_plausible(model: _NoiseModel) -> None:
+    if model.arm_m > MAX_PLAUSIBLE_ARM_M or model.arm_rad > MAX_PLAUSIBLE_ARM_RAD:
         raise HandEyeError(
-            f"the places do not fit together (the arm would be {1e3 * model.arm_m:.1f} mm and "
-            f"{np.degrees(model.arm_rad):.1f} degrees off its joints): {ADVICE}"
+            f"the poses contradict one another (the arm would differ from its joints by "
+            f"{1e3 * model.arm_m:.1f} mm and {np.degrees(model.arm_rad):.1f} degrees): {ADVICE}"
         )
 
 
-def _refuse_poor_turns(flanges: Sequence[Floats]) -> None:
-    """Turns about two axes are needed: about one alone, the shift along it stays open."""
+def _check_rotations(flanges: Sequence[Floats]) -> None:
+    """Check for rotations about two axes: one alone leaves the translation along it unknown."""
     mean = _mean_rotation([flange[:3, :3] for flange in flanges])
     turns = np.array([vector_from_rotation(mean.T @ flange[:3, :3]) for flange in flanges])
     values, axes = np.linalg.eigh(turns.T @ turns / len(turns))
     spread = np.sqrt(np.maximum(values, 0.0))
-    if spread[2] < LEAST_TURN_RAD:
+    if spread[2] < MIN_ROTATION_RAD:
         raise HandEyeError(
-            f"the flange hardly turns between the places ({np.degrees(spread[2]):.1f} degrees rms, "
-            f"at least {np.degrees(LEAST_TURN_RAD):.0f} about two axes): turn it by 20 to 40 "
-            "degrees, each way"
+            f"the flange hardly rotates between the poses ({np.degrees(spread[2]):.1f} degrees "
+            f"rms, at least {np.degrees(MIN_ROTATION_RAD):.0f} about two axes): rotate it by 20 to "
+            "40 degrees in both directions"
         )
-    if spread[1] < LEAST_TURN_RAD:
+    if spread[1] < MIN_ROTATION_RAD:
         x, y, z = axes[:, 2]
         raise HandEyeError(
-            f"the flange turns about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) of its own frame "
+            f"the flange rotates about one axis only, ({x:.2f}, {y:.2f}, {z:.2f}) of its own frame "
             f"(about others {np.degrees(spread[1]):.1f} degrees rms, at least "
-            f"{np.degrees(LEAST_TURN_RAD):.0f}): turn it about another too"
+            f"{np.degrees(MIN_ROTATION_RAD):.0f}): rotate it about another axis too"
         )
 
 
 def _mean_rotation(rotations: Sequence[Floats]) -> Floats:
-    """The rotation nearest to all (least squares of the matrices)."""
+    """Return the rotation nearest to all (least squares of the matrices)."""
     u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))
     return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u @ vt))]) @ vt)
 
 
-def _board_pose(sighting: Sighting, rig: Rig) -> Floats:
-    """left_from_board (4, 4) that draws the corners of both pictures best.
+def _board_pose(detection: BoardDetection, rig: LensRig) -> Floats:
+    """Fit left_from_board (4, 4) to the corners of both images.
 
-    A flat board has two poses that look nearly alike in one picture; the other picture decides.
+    A flat board has two similar poses in one image; the other image decides.
     """
-    left = sighting.left
+    left = detection.left
     count, turns, shifts, _ = cv2.solvePnPGeneric(
         left.points_board, left.pixels, rig.left.matrix, rig.left.distortion,
         flags=cv2.SOLVEPNP_IPPE,
@@ -318,28 +318,28 @@ def _board_pose(sighting: Sighting, rig: Rig) -> Floats:
             rotation_from_vector(np.asarray(turns[index], np.float64).ravel()),
             np.asarray(shifts[index], np.float64).ravel(),
         )
-        for _ in range(ROUNDS):
-            residuals, slopes = _pixels_by_motion(sighting, rig, pose, np.eye(4))
+        for _ in range(MAX_ITERATIONS):
+            residuals, slopes = _linearize_pixels(detection, rig, pose, np.eye(4))
             step = np.linalg.lstsq(slopes, residuals, rcond=None)[0]
             pose = pose @ transform(rotation_from_vector(step[:3]), step[3:])
-            if np.abs(step).max() < STARTED:
+            if np.abs(step).max() < START_STEP:
                 break
         cost = float(residuals @ residuals)
         if np.isfinite(cost) and cost < least:
             best, least = pose, cost
     if best is None:
-        raise HandEyeError(f"{sighting.name}: no pose of the board draws its corners; remove it")
+        raise HandEyeError(f"{detection.name}: no pose of the board fits its corners; remove it")
     return np.asarray(best)
 
 
-def _pixels_by_motion(
-    sighting: Sighting, rig: Rig, left_from_flange: Floats, flange_from_board: Floats
+def _linearize_pixels(
+    detection: BoardDetection, rig: LensRig, left_from_flange: Floats, flange_from_board: Floats
 ) -> tuple[Floats, Floats]:
-    """Seen minus drawn (m,) px, and the drawn pixels' slopes (m, 6) by a motion of the flange."""
+    """Return residuals (m,) px, and derivatives (m, 6) of the projections by a flange motion."""
     residuals, slopes = [], []
     for view, lens, eye_from_left in (
-        (sighting.left, rig.left, np.eye(4)),
-        (sighting.right, rig.right, rig.right_from_left),
+        (detection.left, rig.left, np.eye(4)),
+        (detection.right, rig.right, rig.right_from_left),
     ):
         on_flange = apply(flange_from_board, view.points_board)
         eye_from_flange = eye_from_left @ left_from_flange
@@ -364,19 +364,22 @@ def _pixels_by_motion(
     return np.concatenate(residuals), np.concatenate(slopes)
 
 
-def _start(
-    flanges: Sequence[Floats], boards: Sequence[Floats], rig: Rig, *, seed: int
+def _find_start(
+    flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig, *, seed: int
 ) -> _Unknowns:
-    """OpenCV's closed form from all places, or from those few with which most others agree."""
+    """Return the closed form from all poses, or from the subset that agrees with most others."""
     random = np.random.default_rng(seed)
     every = np.arange(len(flanges))
-    subsets = [every, *(random.choice(every, SUBSET, replace=False) for _ in range(TRIES))]
+    subsets = [
+        every,
+        *(random.choice(every, SUBSET_POSES, replace=False) for _ in range(RANDOM_STARTS)),
+    ]
     best, least = None, np.inf
     for chosen in subsets:
         found = _closed_form([flanges[i] for i in chosen], [boards[i] for i in chosen], rig)
         if found is None:
             continue
-        off = _discrepancies(found, flanges, boards, rig)
+        off = _compute_discrepancies(found, flanges, boards, rig)
         score = float(
             np.median(
                 np.linalg.norm(off[:, 3:], axis=1) + LENGTH_M * np.linalg.norm(off[:, :3], axis=1)
@@ -386,15 +389,17 @@ def _start(
             best, least = found, score
     if best is None:
         raise HandEyeError(
-            "no start was found from these places: turn the flange more, about two axes"
+            "no start was found from these poses: rotate the flange more, about two axes"
         )
     return best
 
 
-def _closed_form(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Rig) -> _Unknowns | None:
-    """Shah's solution of B F X = C, or None where these places have none.
+def _closed_form(
+    flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
+) -> _Unknowns | None:
+    """Return Shah's solution of B F X = C, or None if these poses have none.
 
-    With Y the transpose of X's rotation, C Y = B F for all places' rotations; hence the matrix
+    With Y the transpose of X's rotation, C Y = B F for all rotations; hence the matrix
     sum(kron(F, C)) takes the stacked columns of Y to those of B, n times as long, and both are its
     first singular vectors.  The shifts follow by linear least squares.
     """
@@ -405,8 +410,8 @@ def _closed_form(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Rig) 
     u, values, vt = np.linalg.svd(stacked)
     if values[0] - values[1] < 1e-9 * values[0]:
         return None
-    base = _rotation_of(u[:, 0])
-    board = _rotation_of(vt[0]).T
+    base = _rotation_from_stacked(u[:, 0])
+    board = _rotation_from_stacked(vt[0]).T
     # R_B (R_F t_X + t_F) + t_B = t_C
     rows = np.vstack([np.hstack([base @ f[:3, :3], np.eye(3)]) for f in flanges])
     sides = np.concatenate([c[:3, 3] - base @ f[:3, 3] for f, c in zip(flanges, seen, strict=True)])
@@ -416,16 +421,16 @@ def _closed_form(flanges: Sequence[Floats], boards: Sequence[Floats], rig: Rig) 
     return _Unknowns(transform(base, shifts[3:]), transform(board, shifts[:3]))
 
 
-def _rotation_of(stacked: Floats) -> Floats:
-    """The rotation whose columns, one below the other and times some number, are these nine."""
+def _rotation_from_stacked(stacked: Floats) -> Floats:
+    """Return the rotation whose stacked columns (9,) are these up to a factor."""
     matrix = stacked.reshape(3, 3).T
     return _mean_rotation([matrix if np.linalg.det(matrix) > 0.0 else -matrix])
 
 
-def _discrepancies(
-    unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: Rig
+def _compute_discrepancies(
+    unknowns: _Unknowns, flanges: Sequence[Floats], boards: Sequence[Floats], rig: LensRig
 ) -> Floats:
-    """Motions (n, 6) of the flange, in its frame, from where the joints say to where it is seen."""
+    """Return motions (n, 6) in the flange's frame from its pose by joints to that by images."""
     found = []
     for flange, board in zip(flanges, boards, strict=True):
         seen = rig.world_from_left @ board @ inverse(unknowns.flange_from_board)
@@ -434,79 +439,85 @@ def _discrepancies(
     return np.array(found)
 
 
-def _roughly_sound(discrepancies: Floats) -> NDArray[np.bool_]:
-    """Which places (n,) are off by no more than some times what most are: for a first fit."""
+def _find_rough_inliers(discrepancies: Floats) -> NDArray[np.bool_]:
+    """Return which poses (n,) have errors below a multiple of the median, for the first fit."""
     good = np.ones(len(discrepancies), dtype=bool)
-    for part, smallest in ((slice(0, 3), SMALLEST_RAD), (slice(3, 6), SMALLEST_M)):
+    for part, smallest in ((slice(0, 3), MIN_ARM_RAD), (slice(3, 6), MIN_ARM_M)):
         off = np.linalg.norm(discrepancies[:, part], axis=1)
-        good &= off <= ROUGH * max(float(np.median(off)), smallest)
+        good &= off <= MAX_MEDIAN_RATIO * max(float(np.median(off)), smallest)
     return good
 
 
 @dataclass(frozen=True, slots=True)
-class _Model:
-    """Deviations of a corner's coordinate (px) and of the flange's place (rad, m)."""
+class _NoiseModel:
+    """Hold the standard deviations of a corner's coordinate (px) and of the flange (rad, m)."""
 
     corner_px: float
     arm_rad: float
     arm_m: float
 
-    def weights(self, places: Sequence[_Linear]) -> Floats:
-        """Information (n, 6, 6) of what is seen of each flange, its own error included."""
+    def weights(self, places: Sequence[_LinearizedPose]) -> Floats:
+        """Return the information (n, 6, 6) of each measured flange motion, arm error included."""
         own = np.diag([self.arm_rad**2] * 3 + [self.arm_m**2] * 3)
         spreads = np.array([one.spread for one in places])
         return np.asarray(np.linalg.inv(self.corner_px**2 * spreads + own))
 
 
-def _sound(places: Sequence[_Linear], model: _Model) -> NDArray[np.bool_]:
-    """Which places (n,) are off by no more than chance allows, given how far most are off.
+def _find_inliers(places: Sequence[_LinearizedPose], model: _NoiseModel) -> NDArray[np.bool_]:
+    """Return which poses (n,) are inliers by the chi-square test, scaled by the median.
 
-    What is off by no more than rounding is sound, however exact the others are.
+    Deviations within rounding are inliers, however exact the others are.
     """
     seen = np.array([one.seen for one in places])
-    at_least = _Model(
+    at_least = _NoiseModel(
         max(model.corner_px, ROUNDING_PX),
         max(model.arm_rad, ROUNDING_RAD),
         max(model.arm_m, ROUNDING_M),
     )
     squares = np.einsum("nk,nkl,nl->n", seen, at_least.weights(places), seen)
-    scale = max(float(np.median(squares)) / MEDIAN_CHI_SQUARE, LEAST_SCALE)
-    return np.asarray(squares <= STRAY * scale)
+    scale = max(float(np.median(squares)) / MEDIAN_CHI_SQUARE, MIN_SCALE)
+    return np.asarray(squares <= MAX_CHI_SQUARE * scale)
 
 
-def _fitted(
-    unknowns: _Unknowns, sightings: Sequence[Sighting], flanges: Sequence[Floats], rig: Rig
-) -> tuple[_Unknowns, _Model]:
-    """The unknowns that fit best from a start, with the model's deviations; Gauss-Newton."""
-    model: _Model | None = None
-    for _ in range(ROUNDS):
-        places = _linearised(unknowns, sightings, flanges, rig)
-        model = _deviations(places, model)
-        matrix, side = _normal(places, model)
+def _fit(
+    unknowns: _Unknowns,
+    detections: Sequence[BoardDetection],
+    flanges: Sequence[Floats],
+    rig: LensRig,
+) -> tuple[_Unknowns, _NoiseModel]:
+    """Fit the unknowns and the standard deviations by Gauss-Newton steps."""
+    model: _NoiseModel | None = None
+    for _ in range(MAX_ITERATIONS):
+        places = _linearize(unknowns, detections, flanges, rig)
+        model = _estimate_deviations(places, model)
+        matrix, side = _normal_equations(places, model)
         try:
             step = np.asarray(np.linalg.solve(matrix, side), np.float64)
         except np.linalg.LinAlgError as error:
             raise HandEyeError(
-                "the places do not fix where the base stands: turn the flange more, about two axes"
+                "the poses do not determine the base: rotate the flange more, about two axes"
             ) from error
-        unknowns = unknowns.moved(step)
-        if np.abs(step).max() < SETTLED:
+        unknowns = unknowns.apply_step(step)
+        if np.abs(step).max() < CONVERGED_STEP:
             break
     assert model is not None
     return unknowns, model
 
 
-def _linearised(
-    unknowns: _Unknowns, sightings: Sequence[Sighting], flanges: Sequence[Floats], rig: Rig
-) -> list[_Linear]:
+def _linearize(
+    unknowns: _Unknowns,
+    detections: Sequence[BoardDetection],
+    flanges: Sequence[Floats],
+    rig: LensRig,
+) -> list[_LinearizedPose]:
     board = unknowns.flange_from_board
     by_board = np.block([[np.eye(3), np.zeros((3, 3))], [skew(board[:3, 3]), np.eye(3)]])
     left_from_world = inverse(rig.world_from_left)
     found = []
-    for sighting, flange in zip(sightings, flanges, strict=True):
+    for detection, flange in zip(detections, flanges, strict=True):
         world_from_flange = unknowns.world_from_base @ flange
-        residuals, slopes = _pixels_by_motion(
-            sighting, rig, left_from_world @ world_from_flange, board
+        residuals, slopes = _linearize_pixels(
+            detection, rig, left_from_world @ world_from_flange, board
         )
         information = slopes.T @ slopes
         seen = np.asarray(np.linalg.solve(information, slopes.T @ residuals), np.float64)
@@ -514,7 +525,7 @@ def _linearised(
         lever = world_from_flange[:3, 3] - unknowns.world_from_base[:3, 3]
         by_base = np.block([[back, np.zeros((3, 3))], [-back @ skew(lever), back]])
         found.append(
-            _Linear(
+            _LinearizedPose(
                 seen=seen,
                 spread=np.asarray(np.linalg.inv(information), np.float64),
                 by_unknowns=np.hstack([by_base, by_board]),
@@ -526,8 +537,10 @@ def _linearised(
     return found
 
 
-def _normal(places: Sequence[_Linear], model: _Model) -> tuple[Floats, Floats]:
-    """Normal equations (12, 12) and (12,) of a step of the unknowns."""
+def _normal_equations(
+    places: Sequence[_LinearizedPose], model: _NoiseModel
+) -> tuple[Floats, Floats]:
+    """Return the normal equations (12, 12) and (12,) of a step of the unknowns."""
     weights = model.weights(places)
     slopes = np.array([one.by_unknowns for one in places])
     seen = np.array([one.seen for one in places])
@@ -536,22 +549,24 @@ def _normal(places: Sequence[_Linear], model: _Model) -> tuple[Floats, Floats]:
     return matrix, side
 
 
-def _deviations(places: Sequence[_Linear], before: _Model | None) -> _Model:
-    """Corner noise from what each place's own motion leaves, the arm's by restricted likelihood."""
+def _estimate_deviations(
+    places: Sequence[_LinearizedPose], before: _NoiseModel | None
+) -> _NoiseModel:
+    """Estimate corner noise from the residuals within poses, the arm's error by REML."""
     freedom = sum(one.count - 6 for one in places)
     corner = float(np.sqrt(max(sum(one.inner_px2 for one in places), 0.0) / max(freedom, 1)))
     corner = max(corner, 1e-6)
     seen = np.array([one.seen for one in places])
     slopes = np.array([one.by_unknowns for one in places])
 
-    def unlikeliness(logs: Floats) -> float:
-        """-2 log of the restricted likelihood, but for a constant."""
+    def neg_log_likelihood(logs: Floats) -> float:
+        """Return -2 log of the restricted likelihood without its constant."""
         logs = np.clip(
             logs,
-            [np.log(SMALLEST_RAD), np.log(SMALLEST_M)],
-            [np.log(LARGEST_RAD), np.log(LARGEST_M)],
+            [np.log(MIN_ARM_RAD), np.log(MIN_ARM_M)],
+            [np.log(MAX_ARM_RAD), np.log(MAX_ARM_M)],
         )
-        weights = _Model(corner, *np.exp(logs).tolist()).weights(places)
+        weights = _NoiseModel(corner, *np.exp(logs).tolist()).weights(places)
         matrix = np.einsum("nki,nkl,nlj->ij", slopes, weights, slopes)
         side = np.einsum("nki,nkl,nl->i", slopes, weights, seen)
         left = seen - slopes @ np.linalg.lstsq(matrix, side, rcond=None)[0]
@@ -560,39 +575,39 @@ def _deviations(places: Sequence[_Linear], before: _Model | None) -> _Model:
         return squares + spread
 
     start = np.log([1e-4, 1e-4] if before is None else [before.arm_rad, before.arm_m])
-    options = {"xatol": 1e-3, "fatol": 1e-3, "initial_simplex": start + SIMPLEX}
-    best = minimize(unlikeliness, start, method="Nelder-Mead", options=options).x
+    options = {"xatol": 1e-3, "fatol": 1e-3, "initial_simplex": start + INITIAL_SIMPLEX}
+    best = minimize(neg_log_likelihood, start, method="Nelder-Mead", options=options).x
     arm_rad, arm_m = np.exp(best).tolist()
-    return _Model(
+    return _NoiseModel(
         corner,
-        min(max(arm_rad, SMALLEST_RAD), LARGEST_RAD),
-        min(max(arm_m, SMALLEST_M), LARGEST_M),
+        min(max(arm_rad, MIN_ARM_RAD), MAX_ARM_RAD),
+        min(max(arm_m, MIN_ARM_M), MAX_ARM_M),
     )
 
 
-def _moved(pose: Floats, motion: Floats) -> Floats:
-    """The pose turned about its own origin, and shifted; the motion's axes are the parent's."""
+def _apply_motion(pose: Floats, motion: Floats) -> Floats:
+    """Rotate a pose about its own origin and translate it; the motion is in the parent's axes."""
     turn = rotation_from_vector(motion[:3])
     return transform(turn @ pose[:3, :3], pose[:3, 3] + motion[3:])
 
 
-def _result(
-    sightings: Sequence[Sighting],
+def _make_result(
+    detections: Sequence[BoardDetection],
     flanges: Sequence[Floats],
-    rig: Rig,
+    rig: LensRig,
     *,
     unknowns: _Unknowns,
-    model: _Model,
+    model: _NoiseModel,
     used: NDArray[np.bool_],
 ) -> BaseFit:
-    every = _linearised(unknowns, sightings, flanges, rig)
+    every = _linearize(unknowns, detections, flanges, rig)
     places = [one for one, good in zip(every, used, strict=True) if good]
-    matrix, _ = _normal(places, model)
+    matrix, _ = _normal_equations(places, model)
     covariance = np.asarray(np.linalg.inv(matrix), np.float64)
     left_out = []
     for index in range(len(places)):
-        # At the optimum a place less is a step of the remaining normal equations.
-        without, side = _normal(places[:index] + places[index + 1 :], model)
+        # At the optimum, leaving out one pose is one step of the remaining normal equations.
+        without, side = _normal_equations(places[:index] + places[index + 1 :], model)
         left_out.append(np.linalg.solve(without, side)[:6])
     motions = np.array(left_out)
     count = len(motions)
@@ -611,12 +626,12 @@ def _result(
         leave_one_out=motions,
         residuals=tuple(
             Residual(
-                name=sighting.name,
+                name=detection.name,
                 shift_m=float(np.linalg.norm(one.seen[3:])),
                 turn_rad=float(np.linalg.norm(one.seen[:3])),
                 rms_px=one.rms_px,
-                reason="" if good else "does not fit with the others",
+                reason="" if good else "does not agree with the others",
             )
-            for sighting, one, good in zip(sightings, every, used, strict=True)
+            for detection, one, good in zip(detections, every, used, strict=True)
         ),
     )

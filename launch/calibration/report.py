@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flexsheet.launch.calibration.bundle import PARAMETERS, pose_transform
-from flexsheet.launch.calibration.check import Rig
+from flexsheet.launch.calibration.check import StereoRig
 from flexsheet.launch.calibration.corners import board_points, describe
 from flexsheet.launch.calibration.stereo import CalibrationResult
 from flexsheet.messages.files import write_file
@@ -45,7 +45,7 @@ def epipolar_distances(calibrated: CalibrationResult) -> tuple[Floats, Floats]:
 
     epipolar lines of the left ones, both undistorted and in the right camera's pixels.
     """
-    rig = Rig.of(calibrated.fit.rig)
+    rig = StereoRig.of(calibrated.fit.rig)
     rotation, position = rig.right_from_left[:3, :3], rig.right_from_left[:3, 3]
     essential = rigid.skew(position) @ rotation
     places, distances = [], []

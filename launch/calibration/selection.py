@@ -22,7 +22,7 @@ from flexsheet.launch.calibration.bundle import (
     pose_transform,
     pose_vector,
 )
-from flexsheet.launch.calibration.corners import BoardPair, CalibrationError, View
+from flexsheet.launch.calibration.corners import BoardPair, BoardView, CalibrationError
 from flexsheet.nodes.models import rigid
 
 Floats = NDArray[np.float64]
@@ -44,7 +44,7 @@ REPEAT_PX = 1.0
 """Two pairs whose corners differ by less show the board at one pose."""
 
 
-def single_lens(views: Sequence[View], points: Floats, size: tuple[int, int]) -> Floats:
+def single_lens(views: Sequence[BoardView], points: Floats, size: tuple[int, int]) -> Floats:
     """Fit one lens (8,) to its own views of the board, whose corners are `points` (n, 3) m."""
     _, matrix, distortion, *_ = cv2.calibrateCamera(
         [points[view.ids].astype(np.float32) for view in views],
@@ -114,9 +114,9 @@ def drop_outlier_corners(fit: RigFit, pairs: Sequence[BoardPair]) -> list[BoardP
     every = np.concatenate([view for views in distances for view in views])
     limit_px = CORNER_RATIO * float(np.median(every)) / 1.1774
 
-    def kept(view: View, off: Floats) -> View:
+    def kept(view: BoardView, off: Floats) -> BoardView:
         good = off <= limit_px
-        return View(view.ids[good], view.pixels[good])
+        return BoardView(view.ids[good], view.pixels[good])
 
     return [
         BoardPair(kept(pair.left, left), kept(pair.right, right))
@@ -155,7 +155,7 @@ def _apart(pair: BoardPair, other: BoardPair) -> float:
     return float(max(medians))
 
 
-class Selection:
+class PairSelection:
     """Hold which pairs remain, and why the others were dropped.
 
     good: the remaining pairs, by their number.
@@ -216,7 +216,7 @@ class Selection:
         return corner_count(whole) - corner_count(self.good[number])
 
 
-def fit_selection(selection: Selection, points: Floats, size: tuple[int, int]) -> RigFit:
+def fit_selection(selection: PairSelection, points: Floats, size: tuple[int, int]) -> RigFit:
     """Fit the rig to the trusted pairs and corners; the selection then lists what was dropped.
 
     Dropped are pairs that contradict the others grossly (`misfits`), single corners six standard

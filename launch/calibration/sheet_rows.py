@@ -1,4 +1,4 @@
-"""Measured pushes of a sheet: from a CSV file, whose mistakes are pointed at, or from the twin."""
+"""Read measured pushes of a sheet from a CSV file, or simulate them."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ STRETCH = ("edge_distance_mm", "stretch_ratio")
 OPTIONAL = ("x_mm", "y_mm", "edge_force_n", "finger_radius_mm")
 COLUMNS = (*STRETCH, *NEEDED, *OPTIONAL)
 
-MOST_PROBLEMS = 20
-"""More mistakes than these are counted, not listed."""
+MAX_PROBLEMS = 20
+"""Further problems are counted, not listed."""
 
-MOST_SHARE = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
-"""Largest plausible lengths over the sheet's width: beyond, the unit is probably another."""
+MAX_LENGTH_RATIO = {"edge_distance_mm": 2.0, "depth_mm": 0.6, "finger_radius_mm": 0.2}
+"""Maximum plausible lengths over the sheet's width; larger ones are probably in another unit."""
 
 
 def read_rows(
     path: Path, sheet: SheetSpec, finger_radius_m: float
 ) -> tuple[list[MeasuredPush], list[int]]:
-    """Pushes and their lines in the file; BadInputError names file, line and column.
+    """Return pushes and their line numbers; BadInputError names file, line and column.
 
     The first line names the columns: `depth_mm`, `force_n`, one of `edge_distance_mm` and
     `stretch_ratio` (over the scene's width), and, if measured, `x_mm`, `y_mm` (from the sheet's
-    centre), `edge_force_n` and `finger_radius_mm`.  Lines that are empty or begin with # are passed
-    over.
+    centre), `edge_force_n` and `finger_radius_mm`.  Empty lines and lines that begin with # are
+    skipped.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -72,12 +72,12 @@ def read_rows(
             pushes.append(_push(values, sheet, finger_radius_m))
             numbers.append(number)
     if problems:
-        shown = problems[:MOST_PROBLEMS]
-        if len(problems) > MOST_PROBLEMS:
-            shown.append(Problem(str(path), (), f"and {len(problems) - MOST_PROBLEMS} more"))
+        shown = problems[:MAX_PROBLEMS]
+        if len(problems) > MAX_PROBLEMS:
+            shown.append(Problem(str(path), (), f"and {len(problems) - MAX_PROBLEMS} more"))
         raise BadInputError(shown)
     if not pushes:
-        raise BadInputError([Problem(str(path), (), "has no rows", "give a push a line")])
+        raise BadInputError([Problem(str(path), (), "has no rows", "add one line for each push")])
     return pushes, numbers
 
 
@@ -108,10 +108,15 @@ def _check_header(where: str, names: list[str]) -> None:
 def _values(
     where: str, names: list[str], cells: list[str], sheet: SheetSpec, problems: list[Problem]
 ) -> dict[str, float]:
-    """The row's numbers; what is wrong with them goes to `problems`."""
+    """Return the row's numbers; append what is wrong with them to `problems`."""
     if len(cells) != len(names):
         problems.append(
-            Problem(where, (), f"{len(cells)} values for {len(names)} columns", "give one each")
+            Problem(
+                where,
+                (),
+                f"{len(cells)} values for {len(names)} columns",
+                "give one value for each column",
+            )
         )
         return {}
     values: dict[str, float] = {}
@@ -126,8 +131,8 @@ def _values(
             continue
         signed = name in ("x_mm", "y_mm", "force_n", "edge_force_n")
         if not math.isfinite(value) or (value <= 0.0 and not signed):
-            problems.append(Problem(where, (name,), f"{text} is not above 0 and finite"))
-        elif 1e-3 * value > MOST_SHARE.get(name, math.inf) * sheet.width_m:
+            problems.append(Problem(where, (name,), f"{text} is not positive and finite"))
+        elif 1e-3 * value > MAX_LENGTH_RATIO.get(name, math.inf) * sheet.width_m:
             problems.append(
                 Problem(where, (name,), f"{text} mm is too large for a sheet of "
                         f"{1e3 * sheet.width_m:g} mm", "lengths are in mm")
@@ -138,7 +143,7 @@ def _values(
             )
         else:
             values[name] = value
-    sides = (("x_mm", 0.5 * MOST_SHARE["edge_distance_mm"] * sheet.width_m),
+    sides = (("x_mm", 0.5 * MAX_LENGTH_RATIO["edge_distance_mm"] * sheet.width_m),
              ("y_mm", 0.5 * sheet.height_m))  # fmt: skip
     for name, half in sides:
         if abs(1e-3 * values.get(name, 0.0)) >= half:
@@ -163,10 +168,10 @@ def _push(values: dict[str, float], sheet: SheetSpec, finger_radius_m: float) ->
 TWIN_DEPTHS_M = (0.002, 0.004, 0.007, 0.012, 0.020, 0.030, 0.040, 0.050)
 TWIN_STRETCHES = 4
 TWIN_XS, TWIN_YS = (0.0, 0.13, 0.25), (0.0, 0.19, 0.36)
-"""Places: x over the width, y over the height."""
+"""Positions: x over the width, y over the height."""
 
 
-def twin_rows(
+def simulate_rows(
     scene: Scene,
     *,
     places: bool,
@@ -174,13 +179,13 @@ def twin_rows(
     seed: int,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[MeasuredPush]:
-    """Pushes of the twin's sheet over the scene's stretches and depths, with a gauge's noise.
+    """Simulate pushes over the scene's stretches and depths, with the noise of a force gauge.
 
-    places: over the sheet, not in its middle only.
+    places: push at positions over the whole sheet, not only at its centre.
     """
     rng = np.random.default_rng(seed)
     pushes: list[MeasuredPush] = []
-    asked = list(_twin_questions(scene, places))
+    asked = list(_simulated_cases(scene, places))
     for done, (stretch, depth, place) in enumerate(asked, start=1):
         force, pull = twin_push(scene.sheet, stretch, depth, place, scene.finger.radius_m)
         pushes.append(
@@ -197,7 +202,7 @@ def twin_rows(
     return pushes
 
 
-def _twin_questions(
+def _simulated_cases(
     scene: Scene, places: bool
 ) -> Iterator[tuple[float, float, tuple[float, float]]]:
     sheet = scene.sheet

@@ -1,4 +1,4 @@
-"""The twin's sheet on the bench: what it answers to a push, for calibration and judgement."""
+"""Simulate pushes of the sheet by the simulator's membrane, for calibration and reference."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Floats = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 JUST_TAUT_TENSION = 2e-6
-"""What the twin's rubber keeps of tension where it is slack, in shear moduli.  A hundredth of what
-it keeps in the graph, where the sheet may hang: with that a small push into a sheet that is just
-not taut would meet three times its force."""
+"""Residual tension of slack rubber, in shear moduli: a hundredth of that in the graph, where the
+sheet may hang.  With the larger one, a small push into a sheet that is just not taut would have
+three times its force."""
 
 
 def twin_push(
@@ -31,8 +31,10 @@ def twin_push(
     *,
     cells: int = CELLS,
 ) -> tuple[float, float]:
-    """Force along the sheet's normal and mean force on a clamp, N, of the scene's sheet pushed in
-    at a place (x, y from its centre)."""
+    """Return the force along the sheet's normal and the mean force on a clamp, N.
+
+    place_m: pushed position on the sheet (x, y from its centre).
+    """
     half = 0.5 * sheet.width_m * stretch_ratio
     pushed = solve(
         Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
@@ -54,14 +56,14 @@ def twin_force(
     place_m: tuple[float, float],
     finger_radius_m: float,
 ) -> float:
-    """The first of `twin_push`."""
+    """Return the normal force of `twin_push`, N."""
     return twin_push(sheet, stretch_ratio, depth_m, place_m, finger_radius_m)[0]
 
 
 def twin_points(
     scene: Scene, world_from_left_edge: Floats, world_from_right_edge: Floats, finger_tip: Floats
 ) -> Floats:
-    """Points (n, 3) of the twin's sheet in the world, between two edges and under a fingertip."""
+    """Return points (n, 3) m of the simulated sheet, clamped at two edges under a fingertip."""
     pushed = true_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     return pushed.positions.reshape(-1, 3)
 
@@ -72,7 +74,7 @@ def true_sheet(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> DeformedSheet:
-    """The twin's sheet between two edges (4, 4), under a fingertip (3,) or none."""
+    """Solve the simulated sheet between two edges (4, 4), under a fingertip (3,) or none."""
     sheet = scene.sheet
     return solve(
         Rubber(sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa),
@@ -89,9 +91,9 @@ def twin_errors(
     world_from_right_edge: Floats,
     finger_tip: Floats | None,
 ) -> Callable[[Image, Image], Floats]:
-    """Judges the projector's pictures of both patterns of places on the twin's sheet.
+    """Return a function that evaluates projector images of both coordinate ramps.
 
-    Returns a function to the errors (n,), m, at all points that the scene's eye sees.
+    It returns the errors (n,), m, at all points of the simulated sheet that the scene's eye sees.
     """
     sheet = true_sheet(scene, world_from_left_edge, world_from_right_edge, finger_tip)
     eye = scene.eyes.centre_world_m

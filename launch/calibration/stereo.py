@@ -28,16 +28,16 @@ from flexsheet.launch.calibration.corners import (
     BoardPair,
     Progress,
     board_points,
-    digest_of,
+    compute_digest,
     find_pairs,
     ignore_progress,
 )
-from flexsheet.launch.calibration.selection import Selection, fit_selection, not_determined
+from flexsheet.launch.calibration.selection import PairSelection, fit_selection, not_determined
 from flexsheet.launch.calibration.uncertainty import (
+    compute_right_from_left,
     jackknife_covariance,
     position_slopes,
     position_spread,
-    right_from_left_of,
     view_of_work,
 )
 from flexsheet.messages.calibration import Board, PairResidual, StereoCalibration, Uncertainty
@@ -81,7 +81,7 @@ def calibrate_stereo(
     they do not determine the rig.
     """
     found, size = find_pairs(left_paths, right_paths, board, progress)
-    selection = Selection(found, [path.name for path in left_paths])
+    selection = PairSelection(found, [path.name for path in left_paths])
     points = board_points(board)
     fit = fit_selection(selection, points, size)
     try:
@@ -111,7 +111,7 @@ def calibrate_stereo(
         height_px=size[1],
         left=make_lens(fit.rig[LEFT]),
         right=make_lens(fit.rig[RIGHT]),
-        right_from_left=right_from_left_of(fit.rig),
+        right_from_left=compute_right_from_left(fit.rig),
         board=board,
         reprojection_rms_px=fit.rms_px(),
         uncertainty=uncertainty,
@@ -124,7 +124,7 @@ def calibrate_stereo(
                 left_rms_px=float(residuals[i][0]) if i in residuals else None,
                 right_rms_px=float(residuals[i][1]) if i in residuals else None,
                 stray_corners=selection.stray_corners(i),
-                digest=digest_of(left_path, right_path),
+                digest=compute_digest(left_path, right_path),
             )
             for i, (left_path, right_path) in enumerate(zip(left_paths, right_paths, strict=True))
         ),

@@ -44,8 +44,8 @@ def view_of_work(
     """
     matrix, distortion = lens_arrays(rig[LEFT])
     width, height = size
-    shares = np.linspace(0.25, 0.75, across)
-    pixels = np.stack(np.meshgrid(shares * (width - 1), shares * (height - 1)), axis=-1)
+    fractions = np.linspace(0.25, 0.75, across)
+    pixels = np.stack(np.meshgrid(fractions * (width - 1), fractions * (height - 1)), axis=-1)
     slopes = cv2.undistortPoints(pixels.reshape(-1, 1, 2), matrix, distortion)[:, 0]
     points = distance_m * np.concatenate([slopes, np.ones((len(slopes), 1))], axis=1)
     seen, _ = cv2.projectPoints(points, rig[STAND][:3], rig[STAND][3:], *lens_arrays(rig[RIGHT]))
@@ -54,7 +54,7 @@ def view_of_work(
 
 
 def position_slopes(rig: Floats, points: Floats) -> Floats:
-    """Return the Jacobian (n, 3, 22) of triangulated positions (n, 3) by the rig's numbers.
+    """Return the Jacobian (n, 3, 22) of triangulate_corners positions (n, 3) by the rig's numbers.
 
     A fingertip's pixels p = f(x, rig) are given.  The point of least squared image error then obeys
     A dx + B drig = 0 in the least-squares sense, with A = df/dx and B = df/drig, hence dx/drig =
@@ -110,6 +110,6 @@ def jackknife_covariance(
     return np.asarray((groups - 1) / groups * scatter.T @ scatter)
 
 
-def right_from_left_of(rig: Floats) -> Floats:
+def compute_right_from_left(rig: Floats) -> Floats:
     """Return the transform (4, 4) between the cameras of a rig (22,)."""
     return rigid.transform(pose_transform(rig[STAND])[:3, :3], rig[STAND][3:])

@@ -36,8 +36,8 @@ from flexsheet.launch.commands.output import (
 from flexsheet.messages.files import write_file
 
 if TYPE_CHECKING:
-    from flexsheet.launch.calibration.arm_poses import PlaceTaker
-    from flexsheet.launch.calibration.hand_eye import BaseFit, Sighting
+    from flexsheet.launch.calibration.arm_poses import PoseRecorder
+    from flexsheet.launch.calibration.hand_eye import BaseFit, BoardDetection
     from flexsheet.messages.arms_calibration import ArmBase, ArmsCalibration
     from flexsheet.messages.calibration import Board, StereoCalibration
     from flexsheet.messages.scene import Scene
@@ -193,7 +193,7 @@ def capture(
     Move the arm by its teach pendant.  A place is taken when the arm rests and the board is seen
     somewhere new; Ctrl-C ends.
     """
-    from flexsheet.launch.calibration.arm_poses import PlaceTaker, rig_of
+    from flexsheet.launch.calibration.arm_poses import PoseRecorder, make_lens_rig
     from flexsheet.launch.plans.plan import load_scene
 
     if side not in SIDES:
@@ -206,7 +206,7 @@ def capture(
         raise CommandError(
             f"-o {output}: cannot be made: {error.strerror}; name a new folder", BAD_INPUT
         ) from error
-    taker = PlaceTaker(output, described, rig_of(scene, _optics(calibration, scene)))
+    taker = PoseRecorder(output, described, make_lens_rig(scene, _optics(calibration, scene)))
     size = (scene.camera.width_px, scene.camera.height_px)
     run_interruptible(_watch(f"arm_{side}", taker, size, places, run))
     if as_json:
@@ -216,7 +216,7 @@ def capture(
 
 
 async def _watch(
-    arm: str, taker: PlaceTaker, size: tuple[int, int], places: int, run: Path | None
+    arm: str, taker: PoseRecorder, size: tuple[int, int], places: int, run: Path | None
 ) -> int:
     import asyncio
     import time
@@ -232,7 +232,7 @@ async def _watch(
             pictures.put_nowait((pair, time.monotonic()))
 
     def on_arm(state: Any, _: Any) -> None:
-        taker.see_joints(state.joints_rad, time.monotonic())
+        taker.update_joints(state.joints_rad, time.monotonic())
 
     subscribers = [
         listener(TOPICS[name], run, handler)
@@ -247,7 +247,7 @@ async def _watch(
             if (pair.left.shape[1], pair.left.shape[0]) != size or any(pair.left_origin_px):
                 hint = "the camera sends parts of its pictures only; let it send them whole"
             else:
-                hint = await asyncio.to_thread(taker.see_pictures, pair.left, pair.right, time_s)
+                hint = await asyncio.to_thread(taker.update_images, pair.left, pair.right, time_s)
             if hint != said:
                 words.print(hint, markup=False)
             said = hint
@@ -284,14 +284,14 @@ def _made_up(
     scene: Scene, board: Board, side: Side, *, folder: Path, places: int, seed: int
 ) -> Path:
     """A folder with the twin's places."""
-    from flexsheet.launch.calibration.arm_poses import twin_places
+    from flexsheet.launch.calibration.arm_poses import simulate_poses
     from flexsheet.nodes.twin.board import BoardError
 
     mine = folder / side
     mine.mkdir()
     try:
         with _progress(f"the twin's {side} arm") as progress:
-            for done in twin_places(scene, board, side, mine, places=places, seed=seed):
+            for done in simulate_poses(scene, board, side, mine, places=places, seed=seed):
                 progress(done, places, f"the twin's {side} arm")
     except BoardError as error:
         raise CommandError(str(error), BAD_INPUT) from error
@@ -301,19 +301,19 @@ def _made_up(
 def _fit(
     folder: Path, board: Board, scene: Scene, optics: StereoCalibration | None, side: Side
 ) -> tuple[BaseFit, list[tuple[str, str]]]:
-    from flexsheet.launch.calibration.arm_poses import PlacesError, read_sightings, rig_of
+    from flexsheet.launch.calibration.arm_poses import ArmPosesError, make_lens_rig, read_detections
     from flexsheet.launch.calibration.corners import CalibrationError
     from flexsheet.launch.calibration.hand_eye import HandEyeError, calibrate_base
 
-    rig = rig_of(scene, optics)
+    rig = make_lens_rig(scene, optics)
     size = (scene.camera.width_px, scene.camera.height_px)
-    sightings: list[Sighting]
+    detections: list[BoardDetection]
     try:
         with _progress(f"{side} arm: looking for the board") as progress:
-            sightings, blind = read_sightings(folder, board, rig, size, progress)
+            detections, blind = read_detections(folder, board, rig, size, progress)
         with words.status(f"{side} arm: fitting"):
-            return calibrate_base(sightings, rig), blind
-    except (PlacesError, CalibrationError) as error:
+            return calibrate_base(detections, rig), blind
+    except (ArmPosesError, CalibrationError) as error:
         raise CommandError(str(error), BAD_INPUT) from error
     except HandEyeError as error:
         raise CommandError(f"{side} arm, {folder}: {error}", BAD_INPUT) from error

@@ -172,11 +172,11 @@ def fitted(
 def _twin_rows(scene: Scene, places: bool, noise_n: float, seed: int) -> list[MeasuredPush]:
     from rich.progress import Progress
 
-    from flexsheet.launch.calibration.sheet_rows import twin_rows
+    from flexsheet.launch.calibration.sheet_rows import simulate_rows
 
     with Progress(console=words.console, transient=True) as bar:
         task = bar.add_task("pushing the twin's sheet", total=None)
-        return twin_rows(
+        return simulate_rows(
             scene,
             places=places,
             noise_n=noise_n,

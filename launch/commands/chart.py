@@ -1,4 +1,4 @@
-"""`flexsheet chart`: speed against accuracy of a method family."""
+"""`flexsheet chart`: compare speed and accuracy of methods."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from flexsheet.launch.commands.output import (
     progress_words,
     words,
 )
-from flexsheet.launch.methods.finite import finite
+from flexsheet.launch.methods.results import replace_non_finite
 
 app = typer.Typer(add_completion=False)
 
@@ -32,7 +32,7 @@ SCENE_FILE = Path(__file__).resolve().parent.parent / "scenes" / "cylinder.yaml"
     epilog=examples(
         "flexsheet chart tracking",
         "flexsheet chart triangulation --cases",
-        "flexsheet chart marker --scene lab.yaml --json",
+        "flexsheet chart triangulation --scene lab.yaml --json",
         "flexsheet chart --output docs/charts --redraw",
     )
 )
@@ -52,30 +52,31 @@ def chart(
         ),
     ] = SCENE_FILE,
     output: Annotated[
-        Path, typer.Option("--output", metavar="FOLDER", help="For pictures and numbers.")
+        Path, typer.Option("--output", metavar="FOLDER", help="Folder for figures and numbers.")
     ] = Path("runs/charts"),
     redraw: Annotated[
-        bool, typer.Option("--redraw", help="Measure nothing: draw the numbers in --output anew.")
+        bool,
+        typer.Option("--redraw", help="Redraw the stored numbers in --output."),
     ] = False,
     cases: Annotated[
-        bool, typer.Option("--cases", help="Print every case, and not each method alone.")
+        bool, typer.Option("--cases", help="Print every case instead of one row per method.")
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Chart speed against accuracy of a family's methods, on this machine and one scene.
+    """Measure and draw speed and accuracy of a family's methods, on this machine and one scene.
 
-    Printed is for each method its slowest median and its largest error over the cases that it says
-    it is good for; the front has those that no other method beats in both.
+    Prints the maximum median time and the maximum error of each method over the cases in its range.
+    The front has the methods that no other method dominates in both.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts
-    from flexsheet.launch.methods.machine import busy_words
+    from flexsheet.launch.methods.results import describe_load
     from flexsheet.launch.plans.plan import load_scene
 
     if redraw:
-        results = charts.kept_charts(output)
+        results = charts.read_charts(output)
         if not results:
-            raise CommandError(f"--output {output}: holds no charts to draw anew", BAD_INPUT)
+            raise CommandError(f"--output {output}: has no charts to redraw", BAD_INPUT)
         for result in results:
             charts.write_chart(result, output)
         words.print(f"charts: {charts.write_overview(output)}")
@@ -87,14 +88,14 @@ def chart(
         families = [charts.family_named(name) for name in ([family] if family else charts.FAMILIES)]
     except charts.UnknownFamilyError as error:
         raise CommandError(str(error), BAD_INPUT) from None
-    if busy := busy_words():
+    if busy := describe_load():
         words.print(busy, style="yellow")
     results = []
     for each in families:
         with progress_words() as progress:
-            told = partial(_told, progress, each.name)
-            points = charts.measure_family(each, scene, progress=told)
-        result = finite(charts.chart_result(each, scene, points))
+            report = partial(_report, progress, each.name)
+            points = charts.measure_family(each, scene, progress=report)
+        result = replace_non_finite(charts.chart_result(each, scene, points))
         picture, _ = charts.write_chart(result, output)
         words.print(f"chart: {picture}")
         results.append(result)
@@ -105,12 +106,12 @@ def chart(
         print_json(results[0] if family else results)
 
 
-def _told(progress: Callable[[str], None], family: str, text: str) -> None:
+def _report(progress: Callable[[str], None], family: str, text: str) -> None:
     progress(f"{family}: {text}")
 
 
 def _print_methods(result: dict[str, Any]) -> None:
-    from flexsheet.launch.methods.charts import duration, methods_of
+    from flexsheet.launch.methods.charts import duration, summarize_methods
 
     rows = [
         (
@@ -120,7 +121,7 @@ def _print_methods(result: dict[str, Any]) -> None:
             f"{one['inside']} of {one['cases']}",
             "front" if one["front"] else "",
         )
-        for one in methods_of(result["points"])
+        for one in summarize_methods(result["points"])
     ]
     print_table(("method", "median", f"error, {result['unit']}", "cases in range", ""), rows)
 

@@ -219,7 +219,7 @@ def _photograph(
         )
         _record(launch_file, settings, bag, procedure, progress)
         pictures = image.read_pictures(bag)
-        rows = image.rows(pictures, series, with_maps=mapped)
+        rows = image.make_rows(pictures, series, with_maps=mapped)
         if map_file is not None:
             draw_error_maps(pictures, series, map_file)
     _print_rows(rows, bag, map_file, as_json=as_json)
@@ -257,7 +257,7 @@ def gestures(
     """How well a fingertip is tracked that strokes, taps, reaches, stops and turns."""
     from flexsheet.launch.experiments import gestures as experiment
 
-    wanted = experiment.chosen(names)
+    wanted = experiment.select_gestures(names)
     bag = result_folder(output, "gestures") / "gestures.mcap"
     with progress_words() as progress:
         procedure = experiment.gestures_procedure(wanted, progress)

@@ -102,7 +102,7 @@ def describe(
 
 
 def _parameter(name: str, field: Any) -> dict[str, Any]:
-    from flexsheet.messages.reference import field_type
+    from flexsheet.messages.field_types import field_type
 
     # As in docs/parameters.md, without the links.
     kind = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", field_type(field))

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from flexsheet.launch.methods.finite import finite
+from flexsheet.launch.methods.results import replace_non_finite
 from flexsheet.messages.errors import FlexsheetError
 
 if TYPE_CHECKING:
@@ -77,12 +77,12 @@ def examples_in(epilog: str | None) -> list[str]:
 
 def print_json(data: Any) -> None:
     """Print a JSON document on stdout; NaN and infinity become null."""
-    print(json.dumps(finite(data), indent=2, allow_nan=False))
+    print(json.dumps(replace_non_finite(data), indent=2, allow_nan=False))
 
 
 def print_json_line(data: Any) -> None:
     """Print a JSON document on one line of stdout, without buffering; see `print_json`."""
-    print(json.dumps(finite(data), allow_nan=False), flush=True)
+    print(json.dumps(replace_non_finite(data), allow_nan=False), flush=True)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -1,4 +1,4 @@
-"""`flexsheet tune`: the cheapest methods that are good enough for a scene."""
+"""`flexsheet tune`: choose the fastest sufficient methods for a scene."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from flexsheet.launch.methods.tune import Choice
 
 NOT_MET = 3
-"""Exit code: for some family no method is good enough, and the nearest miss was taken."""
+"""Exit code: a family has no sufficient method, and the nearest miss was chosen."""
 
 
 app = typer.Typer(add_completion=False)
@@ -49,32 +49,30 @@ def tune(
         typer.Option(
             "--family",
             metavar="NAME",
-            help="Only this one; may be given repeatedly.",
+            help="Tune only this family; can be repeated.",
             autocompletion=complete.tuned_families,
         ),
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("--output", metavar="FILE", help="Write a copy there, and leave SCENE alone."),
+        typer.Option("--output", metavar="FILE", help="Write a copy, and leave SCENE unchanged."),
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Write nothing.")] = False,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Do not write the scene.")] = False,
     margin: Annotated[
         float,
-        typer.Option(
-            min=0.0, max=0.9, help="Share of each tolerance that a method must leave over."
-        ),
+        typer.Option(min=0.0, max=0.9, help="Fraction of each tolerance that must remain."),
     ] = 0.2,
     as_json: JsonOption = False,
 ) -> None:
-    """Choose the cheapest methods that keep a scene's tolerances, and write them into the scene.
+    """Choose the fastest methods within a scene's tolerances, and write them into the scene.
 
-    Measures each family on this machine over the scene's working range: seconds to minutes each,
-    the first time.  Says why in a sentence per family.  Nodes whose parameters say `auto` take the
-    choice up.  Exit code 3: for some family no method is good enough; the nearest miss is taken.
+    Measures each family on this machine over the scene's working range, which takes seconds to
+    minutes the first time.  Prints the reason for each choice.  Nodes with the parameter value
+    `auto` use the choice.  Exit code 3: a family has no sufficient method.
     """
     logs_on_stderr()
     from flexsheet.launch.methods import charts, tune
-    from flexsheet.launch.methods.machine import busy_words, machine_name
+    from flexsheet.launch.methods.results import describe_load, machine_name
     from flexsheet.launch.plans.plan import load_scene
 
     scene = load_scene(scene_file)
@@ -84,8 +82,8 @@ def tune(
         raise CommandError(f"--family: {error}", BAD_INPUT) from None
     target = None if dry_run else output or scene_file
     if target is not None:
-        tune.check_target(scene_file, target)  # what follows takes minutes
-    if busy := busy_words():
+        tune.check_target(scene_file, target)  # before minutes of measuring
+    if busy := describe_load():
         words.print(busy, style="yellow")
     with progress_words() as progress:
         choices = tune.tune(scene, tunables, margin=margin, progress=progress)

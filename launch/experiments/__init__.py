@@ -1,4 +1,4 @@
-"""The paper's experiments, driven through the running graph and computed from the recorded bag."""
+"""Run the paper's experiments on a running graph and evaluate the recorded bags."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from flexsheet.messages.errors import FlexsheetError
 
 
 class ExperimentError(FlexsheetError, RuntimeError):
-    """An experiment that could not be done, or a bag that does not hold it; the text says why."""
+    """Raised for an experiment that failed, or a bag that does not hold its recording."""
 
     code = "experiment"
     remedy = "Run it on `launch/demo.yaml` first. A bag must be a recording of the same experiment."

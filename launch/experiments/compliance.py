@@ -1,9 +1,9 @@
-"""What a finger feels of the object: the twin's sheet as the arms held it, against the soft body.
+"""Compare the force that the simulated sheet presents with that of the soft body.
 
-The finger is pushed in at a few places, and held at several depths; then it goes in and out without
-a stop.  At each instant that is judged, the twin's membrane between the arms' true edges, pushed in
-by the true fingertip, says what force the finger met.  Wanted is the object's force at the finger's
-true depth, by the force curve that the soft body published there.
+The finger pushes at a few positions and rests at several depths; then it moves in and out without
+a stop.  At each evaluated instant, the simulator's membrane between the true edges, under the true
+fingertip, gives the presented force.  The desired force is that of the published force curve at the
+finger's true depth.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from scipy.interpolate import PchipInterpolator
 from flexsheet.launch.experiments import ExperimentError
 from flexsheet.launch.experiments.driver import Driver
 from flexsheet.launch.experiments.run import Procedure, Progress
-from flexsheet.launch.experiments.stroke import Track, track
+from flexsheet.launch.experiments.stroke import SampledMotion, make_motion
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
@@ -33,17 +33,17 @@ from flexsheet.nodes.twin.paths import map_to_surface
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
-PLACES_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
-"""Along the object, and around it from its front."""
+POSITIONS_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
+"""Along the object, and around it from its front, m."""
 
-DEPTH_SHARES = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
-"""Of the scene's push depth, at which the finger is held."""
+DEPTH_RATIOS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
+"""Depths at which the finger rests, over the scene's push depth."""
 
 HOVER_M = 0.03
 APPROACH_S = 1.2
 PUSH_M_PER_S = 0.05
-HOLD_S, JUDGED_S = 1.0, 0.3
-"""How long the finger is held at a depth, and the last part of it, in which the force is judged."""
+HOLD_S, EVALUATED_S = 1.0, 0.3
+"""Time at each depth, and its last part, in which the force is evaluated."""
 
 HELD_SAMPLES = 3
 MOVING_STEP_S = 0.06
@@ -51,7 +51,7 @@ MOVING_STEP_S = 0.06
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """The finger at a depth, from and until a time of its path (s)."""
+    """Hold an evaluated interval at a depth, in the path's time (s)."""
 
     depth_m: float
     begin_s: float
@@ -60,9 +60,9 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One path of the finger: at a place, with the depths at which it is held; none: in and out.
+    """Hold one path of the finger with its intervals at rest; empty for the moving press.
 
-    surface, normal: (3,) of the undeformed object at that place, in the world.
+    surface, normal: (3,) of the undeformed object at the pushed position, in the world.
     """
 
     path: FingerPath
@@ -71,38 +71,38 @@ class Press:
     holds: tuple[Hold, ...]
 
 
-def presses(scene: Scene) -> list[Press]:
-    """All that the finger does."""
-    depths = scene.working_range.push_depth_m * np.array(DEPTH_SHARES)
-    held = [_held(scene, along, around, depths) for along, around in PLACES_M]
-    return [*held, _in_and_out(scene, float(depths[-1]))]
+def make_presses(scene: Scene) -> list[Press]:
+    """Make all paths of the experiment."""
+    depths = scene.working_range.push_depth_m * np.array(DEPTH_RATIOS)
+    held = [_make_held_press(scene, along, around, depths) for along, around in POSITIONS_M]
+    return [*held, _make_moving_press(scene, float(depths[-1]))]
 
 
-def _held(scene: Scene, along_m: float, around_m: float, depths: Floats) -> Press:
+def _make_held_press(scene: Scene, along_m: float, around_m: float, depths: Floats) -> Press:
     times, heights, holds = [0.0, APPROACH_S], [HOVER_M, 0.0], []
     for depth in depths:
         begin_s = times[-1] + (depth + heights[-1]) / PUSH_M_PER_S
         times += [begin_s, begin_s + HOLD_S]
         heights += [-depth, -depth]
-        holds.append(Hold(float(depth), begin_s + HOLD_S - JUDGED_S, begin_s + HOLD_S))
+        holds.append(Hold(float(depth), begin_s + HOLD_S - EVALUATED_S, begin_s + HOLD_S))
     times.append(times[-1] + (HOVER_M - heights[-1]) / PUSH_M_PER_S)
     heights.append(HOVER_M)
     label = f"press at {1e3 * along_m:g}, {1e3 * around_m:g} mm"
     way = np.column_stack([times, heights])
-    return _press(scene, label, (along_m, around_m), way, tuple(holds))
+    return _make_press(scene, label, (along_m, around_m), way, tuple(holds))
 
 
-def _in_and_out(scene: Scene, deepest_m: float) -> Press:
+def _make_moving_press(scene: Scene, deepest_m: float) -> Press:
     way_s = deepest_m / PUSH_M_PER_S
     times = np.cumsum([0.0, APPROACH_S, way_s, way_s, APPROACH_S])
     heights = [HOVER_M, 0.0, -deepest_m, 0.0, HOVER_M]
-    return _press(scene, "in and out", PLACES_M[0], np.column_stack([times, heights]), ())
+    return _make_press(scene, "in and out", POSITIONS_M[0], np.column_stack([times, heights]), ())
 
 
-def _press(
+def _make_press(
     scene: Scene, label: str, place_m: tuple[float, float], way: Floats, holds: tuple[Hold, ...]
 ) -> Press:
-    """way: times (s) and heights over the surface (m), (n, 2)."""
+    """Make a press; way: times (s) and heights above the surface (m), (n, 2)."""
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
     path = FingerPath(
@@ -116,10 +116,10 @@ def _press(
 
 
 def compliance_procedure(progress: Progress) -> Procedure:
-    """Push at each place; then in and out."""
+    """Make a procedure that pushes at each position, then in and out."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
-        for press in presses(scene):
+        for press in make_presses(scene):
             progress(press.path.label)
             await driver.follow(press.path)
 
@@ -127,23 +127,23 @@ def compliance_procedure(progress: Progress) -> Procedure:
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """What the judgement reads from a bag.
+class ComplianceRecording:
+    """Hold a bag's data for the evaluation.
 
-    windows_ns: (begin, end) of each path, by label.  edges: (16,) rows, the clamped edges' poses.
-    curves: times (n,) and the object's force over depth, (m, 2) each.
+    windows_ns: (begin, end) of each path, by label.  edges: rows (16,), poses of the clamped edges.
+    curves: the object's force over depth, (m, 2) each, at `curve_times_ns`.
     """
 
     scene: Scene
-    finger: Track
+    finger: SampledMotion
     windows_ns: dict[str, tuple[int, int]]
-    edges: tuple[Track, Track]
+    edges: tuple[SampledMotion, SampledMotion]
     curve_times_ns: list[int]
     curves: list[Floats]
 
 
-def read_bag(bag: Path) -> Recorded:
-    """ExperimentError for a bag without what is needed."""
+def read_bag(bag: Path) -> ComplianceRecording:
+    """Read the data from a bag; ExperimentError if it lacks scene or force curve."""
     scene: Scene | None = None
     finger: list[tuple[int, Floats]] = []
     windows: dict[str, tuple[int, int]] = {}
@@ -166,21 +166,21 @@ def read_bag(bag: Path) -> Recorded:
             case _:
                 pass
     if scene is None or not curves:
-        raise ExperimentError(f"{bag}: no scene, or no soft body's force curve, was recorded")
+        raise ExperimentError(f"{bag}: has no scene or no force curve of a soft body; record both")
     curves.sort(key=lambda entry: entry[0])
-    return Recorded(
+    return ComplianceRecording(
         scene=scene,
-        finger=track(finger, "twin/finger"),
+        finger=make_motion(finger, "twin/finger"),
         windows_ns=windows,
-        edges=(track(flanges[0], "twin/arms"), track(flanges[1], "twin/arms")),
+        edges=(make_motion(flanges[0], "twin/arms"), make_motion(flanges[1], "twin/arms")),
         curve_times_ns=[time for time, _ in curves],
         curves=[curve for _, curve in curves],
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Felt:
-    """One instant: the finger's depth, what it met and should have met, and the sheet's retreat."""
+class PresentedForce:
+    """Hold one instant: finger depth, desired and presented force, and the sheet's depth."""
 
     depth_m: float
     wanted_n: float
@@ -189,14 +189,14 @@ class Felt:
 
     @property
     def error_ratio(self) -> float:
-        """Presented over wanted, less one; forces too small to be felt count as the least felt."""
+        """Return the relative error; desired forces below the JND floor count as that floor."""
         return (self.presented_n - self.wanted_n) / max(self.wanted_n, FELT_N)
 
 
-class Judge:
-    """Forces at instants of a recording, by the twin's membrane."""
+class ForceReference:
+    """Compute presented forces at instants of a recording by the simulator's membrane."""
 
-    def __init__(self, recorded: Recorded) -> None:
+    def __init__(self, recorded: ComplianceRecording) -> None:
         scene = recorded.scene
         self._recorded = recorded
         self._clamps = (
@@ -208,8 +208,8 @@ class Judge:
             sheet.width_m, sheet.height_m, sheet.thickness_m, sheet.young_modulus_pa
         )
 
-    def felt(self, at_ns: int, press: Press) -> Felt:
-        """Depths count from the place that is pressed: past a middle another one is as near."""
+    def evaluate(self, at_ns: int, press: Press) -> PresentedForce:
+        """Return the forces at an instant; depths count from the pressed position."""
         recorded, times = self._recorded, np.array([at_ns])
         tip = recorded.finger.at(times)[0]
         depth_m = float((press.surface - tip) @ press.normal)
@@ -225,7 +225,7 @@ class Judge:
             finger_radius_m=recorded.scene.finger.radius_m,
         )
         middle = 0.5 * (left[:3, 3] + right[:3, 3])
-        return Felt(
+        return PresentedForce(
             depth_m=depth_m,
             wanted_n=self._wanted_n(at_ns, depth_m),
             presented_n=float(pressed.finger_force_n @ press.normal),
@@ -244,23 +244,23 @@ def _transform(pose: Pose) -> Floats:
 
 
 def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
-    """The figures of `experiment compliance --json`; lengths in mm, forces in N, errors in %."""
+    """Return the figures of `experiment compliance --json` in mm, N and %."""
     recorded = read_bag(bag)
-    judge = Judge(recorded)
+    reference = ForceReference(recorded)
     held: list[dict[str, Any]] = []
-    moving: list[Felt] = []
-    for press in presses(recorded.scene):
+    moving: list[PresentedForce] = []
+    for press in make_presses(recorded.scene):
         label = press.path.label
         if label not in recorded.windows_ns:
             have = ", ".join(recorded.windows_ns) or "none"
             raise ExperimentError(f'the bag has no finger path "{label}"; it has: {have}')
-        progress(f"judging: {label}")
+        progress(f"evaluating: {label}")
         begin_ns, end_ns = recorded.windows_ns[label]
         for hold in press.holds:
             times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, HELD_SAMPLES) * 1e9)
-            held.append(_row(label, hold, [judge.felt(int(at), press) for at in times]))
+            held.append(_row(label, hold, [reference.evaluate(int(at), press) for at in times]))
         if not press.holds:
-            moving = list(_while_moving(judge, press, begin_ns, end_ns))
+            moving = list(_evaluate_moving(reference, press, begin_ns, end_ns))
     errors = np.array([row["error_percent"] for row in held])
     errors_moving = 100.0 * np.array([one.error_ratio for one in moving])
     return {
@@ -285,14 +285,16 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
     }
 
 
-def _while_moving(judge: Judge, press: Press, begin_ns: int, end_ns: int) -> Iterator[Felt]:
+def _evaluate_moving(
+    reference: ForceReference, press: Press, begin_ns: int, end_ns: int
+) -> Iterator[PresentedForce]:
     for at_ns in range(begin_ns, end_ns, round(MOVING_STEP_S * 1e9)):
-        felt = judge.felt(at_ns, press)
+        felt = reference.evaluate(at_ns, press)
         if max(felt.wanted_n, felt.presented_n) >= FELT_N:
             yield felt
 
 
-def _row(label: str, hold: Hold, felt: Sequence[Felt]) -> dict[str, Any]:
+def _row(label: str, hold: Hold, felt: Sequence[PresentedForce]) -> dict[str, Any]:
     return {
         "place": label.removeprefix("press "),
         "depth_mm": 1e3 * hold.depth_m,

@@ -1,4 +1,4 @@
-"""`flexsheet demo`: the whole system once on one machine, with a table and pictures at the end."""
+"""`flexsheet demo`: run the whole system on one machine, and draw tables and figures."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from flexsheet.launch.experiments import ExperimentError, image, stroke
 from flexsheet.launch.experiments.pictures import draw_eye_views, draw_latency, draw_stroke
 from flexsheet.launch.experiments.run import (
     Progress,
-    in_turn,
     picture_procedure,
     run_experiment,
+    run_in_sequence,
     settings_of_type,
     stroke_procedure,
 )
@@ -23,7 +23,7 @@ from flexsheet.messages.files import write_file
 from flexsheet.messages.types import Correction, FingerPath
 
 METRES_PER_PX = 0.0007
-"""The paper's; enough to look at, and four times as quick as what the experiments measure in."""
+"""The paper's resolution: sufficient for figures, four times as fast as the experiments' own."""
 
 SECONDS = (10.0, 30.0)
 TILT_DEG = -40
@@ -34,9 +34,9 @@ PUSH_CORRECTIONS: tuple[Correction, ...] = ("none", "four_triangles", "two_pass"
 
 @dataclass(frozen=True, slots=True)
 class DemoResult:
-    """What the demo leaves: folder and bag, the strokes' figures, the pictures.
+    """Hold the demo's results: folder, bag, figures of the strokes, images.
 
-    followed: how well the finger given by a path was followed; None without one.
+    followed: figures of following a given path; None without one.
     """
 
     folder: Path
@@ -54,9 +54,9 @@ def run_demo(
     *,
     path: FingerPath | None = None,
 ) -> DemoResult:
-    """Stroke in 10 s and in 30 s (or follow `path`), then picture a tilted and a pushed sheet."""
+    """Stroke in 10 s and in 30 s (or follow `path`), then image a tilted and a pushed sheet."""
     bag = folder / "demo.mcap"
-    procedure = in_turn(
+    procedure = run_in_sequence(
         stroke_procedure(SECONDS, progress, path=path),
         picture_procedure(image.TILT, [TILT_DEG], TILT_CORRECTIONS, progress, shading="soft"),
         picture_procedure(image.PUSH, [DEPTH_MM], PUSH_CORRECTIONS, progress, shading="soft"),
@@ -69,8 +69,8 @@ def run_demo(
     return summarize(bag, folder, strokes=(), path_label=path.label)
 
 
-def followed_on(bag: Path, label: str) -> dict[str, Any]:
-    """Return how well the finger was followed along the path with that label.
+def read_followed_path(bag: Path, label: str) -> dict[str, Any]:
+    """Return the figures of following the path with that label.
 
     Raises ExperimentError when the bag does not have it.
     """
@@ -93,10 +93,12 @@ def summarize(
         folder / "latency.png",
     )
     tilted = [
-        image.picture_of(photographs, image.TILT.label(TILT_DEG, name)) for name in TILT_CORRECTIONS
+        image.find_picture(photographs, image.TILT.label(TILT_DEG, name))
+        for name in TILT_CORRECTIONS
     ]
     pushed = [
-        image.picture_of(photographs, image.PUSH.label(DEPTH_MM, name)) for name in PUSH_CORRECTIONS
+        image.find_picture(photographs, image.PUSH.label(DEPTH_MM, name))
+        for name in PUSH_CORRECTIONS
     ]
     draw_eye_views(
         [(f"sheet tilted {TILT_DEG}°", tilted), (f"sheet pushed {DEPTH_MM} mm", pushed)], views
@@ -113,6 +115,6 @@ def summarize(
     write_file(folder / "stroke.json", json.dumps(results, indent=1) + "\n")
     followed = None
     if path_label is not None:
-        followed = followed_on(bag, path_label)
+        followed = read_followed_path(bag, path_label)
         write_file(folder / "followed.json", json.dumps(followed, indent=1) + "\n")
     return DemoResult(folder=folder, bag=bag, strokes=results, followed=followed, pictures=pictures)

@@ -1,8 +1,7 @@
-"""Drives a running graph as an experimenter would: moves the twin's finger, sets the display.
+"""Drive a running graph for an experiment: move the simulated finger, set the display.
 
-It is one more participant of the graph: it publishes as the writer "tools" and subscribes to what
-it waits for.  Every wait has a deadline, and an error that says what was waited for and how the
-nodes were.
+The driver publishes as the writer "tools" and subscribes to the topics that it waits for.  Every
+wait has a deadline; its error names the awaited condition and the nodes' notes.
 """
 
 from __future__ import annotations
@@ -37,20 +36,20 @@ from flexsheet.messages.types import (
 READ = ("twin/finger", "twin/eye", "sheet_target", "arm_left", "arm_right", "soft_body", "status")
 WRITTEN = ("twin/finger_path", "display")
 
-# The measured finger is never quite still, so neither is the sheet; these tell resting from going.
+# Noise of the measured finger moves the sheet; these limits distinguish rest from motion.
 SETTLED_POSITION_M = 1e-3
 SETTLED_SPEED_M_PER_S = 0.05
-SETTLED_TURN_RAD_PER_S = 0.8
+SETTLED_RATE_RAD_PER_S = 0.8
 SETTLED_MESSAGES = 100
 PIXELS_EVERY = 10
 WAIT_S = 20.0
-PICTURE_WAIT_S = 40.0
-BUSY = 3.0
-"""Load per core; the demo itself makes less."""
+IMAGE_WAIT_S = 40.0
+MAX_LOAD_PER_CORE = 3.0
+"""Load above which the computer is busy; the demo itself causes less."""
 
 
 class Driver:
-    """See the module's text; use as an async context manager."""
+    """Publish to and subscribe to a running graph; use as an async context manager."""
 
     def __init__(self, plan: ResolvedGraph, run: Run) -> None:
         self._plan, self._run = plan, run
@@ -120,7 +119,7 @@ class Driver:
         self._settled_since = self._settled_since + 1 if settled else 0
 
     async def wait_for(self, condition: Callable[[], bool], what: str, seconds: float) -> None:
-        """Wait until `condition` holds, asked at each message; ExperimentError after `seconds`."""
+        """Wait until `condition` holds, checked at each message, at most `seconds`."""
         if condition():
             return
         future: asyncio.Future[None] = asyncio.get_running_loop().create_future()
@@ -132,8 +131,8 @@ class Driver:
         except TimeoutError:
             notes = "".join(f"\n  {node}: {note}" for node, note in self._notes.items() if note)
             raise ExperimentError(
-                f"waited {seconds:g} s in vain for {what}{_busy()}; the nodes say:"
-                f"{notes or ' nothing'}"
+                f"waited {seconds:g} s without success for {what}{_describe_load()}; "
+                f"notes of the nodes:{notes or ' none'}"
             ) from None
         finally:
             self._waiters.remove(entry)
@@ -142,20 +141,20 @@ class Driver:
         return self._newest.get(topic)
 
     async def wait_until_up(self) -> None:
-        """Wait until the soft body answers and both arms follow."""
+        """Wait until the soft body is published and both arms follow."""
 
         def up() -> bool:
             arms = [self._newest.get(name) for name in ("arm_left", "arm_right")]
             following = all(isinstance(arm, ArmState) and arm.mode == "follow" for arm in arms)
             return following and "soft_body" in self._newest
 
-        await self.wait_for(up, "both arms to follow and the soft body to answer", 3 * WAIT_S)
+        await self.wait_for(up, "both arms to follow and the soft body to be published", 3 * WAIT_S)
 
     def move_finger(self, path: FingerPath) -> None:
         self._publish("twin/finger_path", path)
 
     async def follow(self, path: FingerPath) -> None:
-        """Send the finger along a path and wait until it is through."""
+        """Move the finger along a path and wait for its end."""
         self.move_finger(path)
 
         def done() -> bool:
@@ -171,7 +170,7 @@ class Driver:
         )
 
     async def wait_settled(self) -> None:
-        """Wait until the target rests and both arms are where they are told to be."""
+        """Wait until the target rests and both arms are at their commanded poses."""
         self._settled_since = 0
         await self.wait_for(
             lambda: self._settled_since >= SETTLED_MESSAGES, "the sheet to come to rest", WAIT_S
@@ -188,9 +187,9 @@ class Driver:
         *,
         pattern: Pattern = "object",
     ) -> TwinEye:
-        """Show the object with that correction, and wait for the eye's picture of it.
+        """Show the object with that correction, and wait for the eye's image of it.
 
-        Flat, its outline can be measured; soft, a person sees what it is.
+        Flat shading shows an outline to measure, soft shading a picture for people.
         """
         self.show(
             Display(
@@ -208,31 +207,31 @@ class Driver:
             eye = self._newest.get("twin/eye")
             return isinstance(eye, TwinEye) and eye.label == label
 
-        await self.wait_for(taken, f'the eye\'s picture of "{label}"', PICTURE_WAIT_S)
-        # What is not photographed need not be sent with its pixels.
+        await self.wait_for(taken, f'the eye\'s image of "{label}"', IMAGE_WAIT_S)
+        # Without a next image, frames need not carry their pixels.
         self.show(Display(correction=correction, stereo="side_by_side"))
         eye = self._newest["twin/eye"]
         assert isinstance(eye, TwinEye)
         return eye
 
 
-def _busy() -> str:
-    """Said where this computer has far more to do than it can: the likeliest cause of waiting."""
+def _describe_load() -> str:
+    """Return a hint if the computer is overloaded, the most likely cause of a time-out."""
     load, cores = os.getloadavg()[0], os.cpu_count() or 1
-    if load <= BUSY * cores:
+    if load <= MAX_LOAD_PER_CORE * cores:
         return ""
     return (
-        f"; this computer is busy (load {load:.0f} on {cores} cores): try again when it has less "
-        "to do"
+        f"; this computer is busy (load {load:.0f} on {cores} cores): end other programs and try "
+        "again"
     )
 
 
 def is_settled(arm: ArmState, target: SheetTarget) -> bool:
-    """Whether the arm is where it is told to be, and the target rests."""
+    """Return whether the arm is at its commanded pose and the target rests."""
     off = arm.world_from_flange[:3, 3] - arm.world_from_flange_commanded[:3, 3]
     return bool(
         arm.mode == "follow"
         and np.linalg.norm(off) < SETTLED_POSITION_M
         and np.linalg.norm(target.twist_world[:3]) < SETTLED_SPEED_M_PER_S
-        and np.linalg.norm(target.twist_world[3:]) < SETTLED_TURN_RAD_PER_S
+        and np.linalg.norm(target.twist_world[3:]) < SETTLED_RATE_RAD_PER_S
     )

@@ -1,4 +1,4 @@
-"""How well the fingertip is tracked through what people's fingers do, gesture by gesture."""
+"""Evaluate the tracking of the fingertip during gestures of the simulated finger."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ from flexsheet.nodes.twin.paths import recorded_path
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
-LEADS_S = (0.0, 0.02, 0.05)
-"""From the exposure: none, the way to the arm, and that with the arm's servo lag."""
+PREDICTION_HORIZONS_S = (0.0, 0.02, 0.05)
+"""From the exposure: none, the latency to the arm, and that with the arm's servo lag."""
 
 MAX_LAG_S = 0.08
-"""Below half the time of the quickest taps, so that no tap is taken for the one before."""
+"""Below half the period of the fastest taps, so that no tap is matched with its predecessor."""
 
-FEWEST = 10
+MIN_SAMPLES = 10
 GAP_PERIODS = 2.5
 SIGMAS = 3.0
 
@@ -46,19 +46,19 @@ GESTURES: dict[str, Callable[[Scene], FingerPath]] = {
     "stroke-30": partial(stroke.stroke_path, seconds=30.0),
     **twin_gestures.GESTURES,
 }
-"""All that the finger can do by name: the paper's target-following, and what people do besides."""
+"""Gestures by name: the paper's strokes, and models of human gestures."""
 
 
 def gesture_path(name: str, scene: Scene) -> FingerPath:
-    """The path of a gesture on the scene's object, labelled with its name."""
+    """Make the path of a gesture on the scene's object, labelled with its name."""
     try:
         return GESTURES[name](scene).model_copy(update={"label": name})
     except (FingerPathError, UnfitGeometryError) as error:
         raise ExperimentError(f'scene "{scene.name}": {error}') from None
 
 
-def chosen(names: str | None) -> list[str]:
-    """The gestures of a list with commas, each once; all without a list."""
+def select_gestures(names: str | None) -> list[str]:
+    """Return the gestures of a comma-separated list without repeats; None selects all."""
     if names is None:
         return list(GESTURES)
     wanted = list(dict.fromkeys(name.strip() for name in names.split(",") if name.strip()))
@@ -66,15 +66,15 @@ def chosen(names: str | None) -> list[str]:
         if name not in GESTURES:
             raise ExperimentError(f'no gesture "{name}"; {did_you_mean(name, list(GESTURES))}')
     if not wanted:
-        raise ExperimentError(f"no gesture is named; there are: {', '.join(GESTURES)}")
+        raise ExperimentError(f"no gesture is named; choose from: {', '.join(GESTURES)}")
     return wanted
 
 
 def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
-    """The path of a gesture, or of a recorded finger, in the launch file's scene."""
+    """Return the path of a gesture or of a recorded finger, in the launch file's scene."""
     scene = load_graph(launch_file).scene_message()
     if scene is None:
-        raise ExperimentError(f'{launch_file}: key "scene": the finger needs a scene; name one')
+        raise ExperimentError(f'{launch_file}: key "scene": the finger needs a scene; add one')
     if name_or_file in GESTURES:
         return gesture_path(name_or_file, scene)
     file = Path(name_or_file)
@@ -90,7 +90,7 @@ def finger_path(launch_file: Path, name_or_file: str) -> FingerPath:
 
 
 def gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
-    """Lead the finger through the gestures, one after another."""
+    """Make a procedure that performs the gestures in sequence."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for i, name in enumerate(names):
@@ -103,17 +103,17 @@ def gestures_procedure(names: Sequence[str], progress: Progress) -> Procedure:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The true finger at its exposures: times (n,) ns, positions and velocities (n, 3)."""
+    """Hold the true finger at the exposures: times (n,) ns, positions and velocities (n, 3)."""
 
     times_ns: Times
     positions: Floats
     velocities: Floats
 
     def at(self, times_ns: Times) -> Floats:
-        """Positions (m, 3) at other times, by cubic Hermite interpolation.
+        """Return positions (m, 3) at other times, by cubic Hermite interpolation.
 
-        At 60 Hz that is off by up to 45 um in the quickest taps, 13 um in slower ones, 8 um else.
-        NaN where frames were missed and before and after all exposures.
+        The error at 60 Hz is up to 45 um in the fastest taps, 13 um in slower ones, 8 um otherwise.
+        Positions are NaN between missed frames and outside all exposures.
         """
         zero = self.times_ns[0]
         seconds = (self.times_ns - zero) * 1e-9
@@ -129,9 +129,9 @@ class Truth:
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
-    """What a bag has of the finger: the truth, all fingertips in the order of their exposures, and
-    when each gesture was done, in ns of the same clock."""
+class GestureRecording:
+    """Hold a bag's true finger, its fingertips in the order of exposure, and the window of each
+    gesture, in ns of the same clock."""
 
     truth: Truth
     times_ns: Times
@@ -139,11 +139,11 @@ class Recorded:
     windows_ns: dict[str, tuple[int, int]]
 
 
-def read_gestures(bag: Path) -> Recorded:
-    """Collect true finger and fingertips from a bag.
+def read_gestures(bag: Path) -> GestureRecording:
+    """Read true finger and fingertips from a bag.
 
-    A gesture's window is the time on its path: neither the easing to its first point nor what
-    comes after its last, and so nothing of the graph's start.
+    A gesture's window is the time on its path, without the motion to its first point and the time
+    after its last.
     """
     truths: dict[int, TwinFinger] = {}
     tips: dict[int, Fingertip] = {}
@@ -155,7 +155,7 @@ def read_gestures(bag: Path) -> Recorded:
                 tips[header.source_ns] = message
             case _:
                 pass
-    if len(truths) < FEWEST:
+    if len(truths) < MIN_SAMPLES:
         raise ExperimentError(f"{bag}: {len(truths)} messages of twin/finger; a gesture needs more")
     on_path: dict[str, list[int]] = {}
     for at_ns in sorted(truths):
@@ -164,7 +164,7 @@ def read_gestures(bag: Path) -> Recorded:
             on_path.setdefault(finger.path_label, []).append(at_ns)
     times = sorted(truths)
     tip_times = sorted(tips)
-    return Recorded(
+    return GestureRecording(
         truth=Truth(
             np.array(times, dtype=np.int64),
             np.array([truths[time].position_world_m for time in times]),
@@ -203,7 +203,7 @@ def error_mm(errors: Floats) -> dict[str, float | None]:
     }
 
 
-def predicted(tips: Sequence[Fingertip], lead_s: float) -> Floats:
+def predict_positions(tips: Sequence[Fingertip], lead_s: float) -> Floats:
     """Where fingertips (n,) say that the finger is `lead_s` after their exposures (n, 3)."""
     if lead_s == 0.0:
         return _rows([tip.position_world_m for tip in tips])
@@ -217,7 +217,7 @@ def _rows(points: Sequence[Floats]) -> Floats:
     return np.array(points, dtype=np.float64).reshape(len(points), 3)
 
 
-def gesture_result(recorded: Recorded, name: str) -> dict[str, Any]:
+def gesture_result(recorded: GestureRecording, name: str) -> dict[str, Any]:
     """The figures of one gesture; lengths in mm, times in ms, None where there is nothing to tell.
 
     missing: exposures of which no fingertip came.  reasons: why fingertips that came were not
@@ -237,7 +237,7 @@ def gesture_result(recorded: Recorded, name: str) -> dict[str, Any]:
     usable = np.flatnonzero(valid & np.isfinite(truth).all(axis=1))
     good = [tips[i] for i in usable]
     true, times = truth[usable], recorded.times_ns[inside][usable]
-    errors = predicted(good, 0.0) - true
+    errors = predict_positions(good, 0.0) - true
     return {
         "gesture": name,
         "seconds": float((end_ns - begin_ns) * 1e-9),
@@ -249,12 +249,14 @@ def gesture_result(recorded: Recorded, name: str) -> dict[str, Any]:
         "error_mm": error_mm(errors),
         "measured_error_mm": error_mm(_rows([tip.measured_world_m for tip in good]) - true),
         "jump": _jump(errors, good),
-        "prediction": [_prediction(recorded.truth, times, good, lead) for lead in LEADS_S],
+        "prediction": [
+            _prediction(recorded.truth, times, good, lead) for lead in PREDICTION_HORIZONS_S
+        ],
     }
 
 
 def _jump(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
-    """The largest jump between consecutive fingertips (n,), and how many exceed SIGMAS."""
+    """Return the maximum jump between consecutive fingertips (n,), and how many exceed SIGMAS."""
     if len(tips) < 2:
         return {"max_sigmas": None, "max_mm": None, "beyond_3_sigmas": 0}
     sigmas = jump_sigmas(errors, np.array([tip.covariance[:3, :3] for tip in tips]))
@@ -268,13 +270,13 @@ def _jump(errors: Floats, tips: Sequence[Fingertip]) -> dict[str, Any]:
 def _prediction(
     truth: Truth, times_ns: Times, tips: Sequence[Fingertip], lead_s: float
 ) -> dict[str, Any]:
-    """Error and lag of what was predicted for `lead_s` after each exposure."""
+    """Return error and lag of the predictions for `lead_s` after each exposure."""
     ahead_ns = times_ns + round(lead_s * 1e9)
     true = truth.at(ahead_ns)
     known = np.isfinite(true).all(axis=1)
-    follower, leader, at_ns = predicted(tips, lead_s)[known], true[known], ahead_ns[known]
+    follower, leader, at_ns = predict_positions(tips, lead_s)[known], true[known], ahead_ns[known]
     lag = None
-    if len(at_ns) >= FEWEST and (at_ns[-1] - at_ns[0]) * 1e-9 > 4.0 * MAX_LAG_S:
+    if len(at_ns) >= MIN_SAMPLES and (at_ns[-1] - at_ns[0]) * 1e-9 > 4.0 * MAX_LAG_S:
         lag = lag_s((at_ns - at_ns[0]) * 1e-9, follower, leader, max_lag_s=MAX_LAG_S)
     return {
         "lead_ms": lead_s * 1e3,
@@ -284,9 +286,9 @@ def _prediction(
 
 
 def gestures_result(bag: Path, names: Sequence[str]) -> dict[str, Any]:
-    """The figures of `experiment gestures --json`, from its bag.
+    """Return the figures of `experiment gestures --json` from its bag.
 
-    followed: how well the sheet followed; None where the bag lacks arms or scene.
+    followed: errors of the sheet; None if the bag lacks arms or scene.
     """
     recorded = read_gestures(bag)
     followed = {run["path"]: run for run in read_followed(bag)}

@@ -1,7 +1,7 @@
-"""Section VI of the paper: the picture on an inclined sheet (Fig. 11) and a pushed one (Fig. 13).
+"""Section VI of the paper: the image on an inclined sheet (Fig. 11) and a pushed one (Fig. 13).
 
-Each case is a label: the renderer puts it into its frames, the twin's eye into its pictures, and
-the rows are computed from the pictures in the bag.
+Each case has a label, which the renderer puts into its frames and the simulated eye into its
+images.  The rows are computed from the images in the bag.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ REACH_S = 1.5
 def reach_path(
     scene: Scene, label: str, points: Sequence[tuple[float, float]], *, along_m: float = 0.0
 ) -> FingerPath:
-    """Go straight from point to point, each (angle around the cylinder, height above its side).
+    """Make a path through points, each (angle around the cylinder, height above its side).
 
-    along_m: from the cylinder's middle, along its axis.
+    along_m: position along the cylinder's axis, from its middle.
     """
     radius = cylinder_of(scene).radius_m
     local = [
@@ -51,17 +51,17 @@ def reach_path(
 
 
 def tilt_path(scene: Scene, theta_deg: float) -> FingerPath:
-    """Hover above the cylinder at that angle: the sheet waits there, inclined by it."""
+    """Make a path to a point above the cylinder, where the sheet waits inclined by that angle."""
     return reach_path(scene, f"tilt {theta_deg:+g} deg", [(float(np.radians(theta_deg)), HOVER_M)])
 
 
 def push_path(
     scene: Scene, depth_mm: float, *, along_mm: float = 0.0, tilt_deg: float = 0.0
 ) -> FingerPath:
-    """Push the cylinder's side by that depth, from above.
+    """Make a path that pushes the cylinder's side by that depth.
 
-    Where: along its axis from the middle, and around it from the front, which inclines the sheet.
-    ExperimentError for a place that is not on the side that can be touched.
+    along_mm: position along the axis, from the middle.  tilt_deg: angle around the axis, from the
+    front.  Raises ExperimentError for a position that cannot be touched.
     """
     cylinder = cylinder_of(scene)
     if abs(along_mm) > 500.0 * cylinder.length_m or abs(tilt_deg) > 60.0:
@@ -76,10 +76,10 @@ def push_path(
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """One of the two experiments: what is varied, how the finger does it, what is measured.
+    """Describe one of the two experiments: the varied value, the finger's path, the measured sizes.
 
-    name: with the value, what a case is called.  sizes: of the cylinder in a picture (m);
-    size_names: their letters in the paper.
+    name: template of a case's name with the value.  sizes: function to the cylinder's sizes in an
+    image (m).  size_names: their letters in the paper.
     """
 
     key: str
@@ -90,7 +90,7 @@ class Series:
     values: tuple[float, ...]
 
     def label(self, value: float, correction: Correction) -> str:
-        """What the picture of that case is called."""
+        """Return the label of a case's image."""
         return f"{self.name.format(value)}, {correction}"
 
 
@@ -106,7 +106,7 @@ PUSH = Series("depth_mm", "pushed {:g} mm", push_path, push_sizes, ("h", "w"), (
 
 
 def pushed_at(along_mm: float, tilt_deg: float) -> Series:
-    """The pushes at another place of the cylinder's side than the middle of its front."""
+    """Return the pushes at a position on the cylinder's side; zeros are the middle of its front."""
     if not along_mm and not tilt_deg:
         return PUSH
     return replace(
@@ -117,17 +117,17 @@ def pushed_at(along_mm: float, tilt_deg: float) -> Series:
 
 
 PLACES: tuple[Pattern, ...] = ("coordinate_ramp_x", "coordinate_ramp_y")
-"""Patterns of which a dense map of the errors is made."""
+"""Patterns from which a dense error map is made."""
 
 
-def places_label(label: str, pattern: Pattern) -> str:
-    """What the picture of a case in such a pattern is called."""
+def pattern_label(label: str, pattern: Pattern) -> str:
+    """Return the label of a case's image of a pattern."""
     return f"{label}, {pattern}"
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """One picture of the twin's eye from the bag."""
+class EyeImage:
+    """Hold one image of the simulated eye from the bag."""
 
     label: str
     correction: Correction
@@ -136,12 +136,12 @@ class Picture:
     expected: NDArray[np.uint8]
 
 
-def read_pictures(bag: Path) -> dict[str, Picture]:
-    """The newest picture of each label."""
+def read_pictures(bag: Path) -> dict[str, EyeImage]:
+    """Return the newest image of each label."""
     pictures = {}
     for _, message, _, _ in BagReader(bag, topics=["twin/eye"]):
         if isinstance(message, TwinEye):
-            pictures[message.label] = Picture(
+            pictures[message.label] = EyeImage(
                 message.label,
                 message.correction,
                 message.metres_per_px,
@@ -152,39 +152,39 @@ def read_pictures(bag: Path) -> dict[str, Picture]:
 
 
 def size_errors_mm(
-    picture: Picture, sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
+    picture: EyeImage, sizes: Callable[[NDArray[np.uint8], float], tuple[float, ...]]
 ) -> list[float]:
-    """Absolute differences (mm) of the sizes seen and the expected ones, as in the paper."""
+    """Return absolute differences (mm) between seen and expected sizes, as in the paper."""
     seen = np.array(sizes(picture.seen, picture.metres_per_px))
     expected = np.array(sizes(picture.expected, picture.metres_per_px))
     return [float(error) for error in np.abs(seen - expected) * 1e3]
 
 
-def picture_of(pictures: dict[str, Picture], label: str) -> Picture:
-    """The picture of that label; ExperimentError when the bag has none."""
+def find_picture(pictures: dict[str, EyeImage], label: str) -> EyeImage:
+    """Return the image with that label; ExperimentError if the bag has none."""
     if label not in pictures:
         have = ", ".join(pictures) or "none"
-        raise ExperimentError(f'the bag has no picture "{label}"; it has: {have}')
+        raise ExperimentError(f'the bag has no image "{label}"; it has: {have}')
     return pictures[label]
 
 
-def error_map_of(pictures: dict[str, Picture], label: str) -> ErrorMap:
-    """The errors at all visible points of a case that was pictured in both patterns."""
-    x, y = (picture_of(pictures, places_label(label, pattern)) for pattern in PLACES)
+def make_error_map(pictures: dict[str, EyeImage], label: str) -> ErrorMap:
+    """Return the errors at all visible points of a case, from its images of both patterns."""
+    x, y = (find_picture(pictures, pattern_label(label, pattern)) for pattern in PLACES)
     return error_map(x.seen, y.seen, x.metres_per_px)
 
 
-def rows(
-    pictures: dict[str, Picture], series: Series, *, with_maps: bool = False
+def make_rows(
+    pictures: dict[str, EyeImage], series: Series, *, with_maps: bool = False
 ) -> list[dict[str, Any]]:
-    """The rows of an experiment from its pictures: one for each value and correction.
+    """Return the rows of an experiment, one for each value and correction.
 
-    with_maps: and mean, 95 % and maximum of the errors at all visible points.
+    with_maps: add mean, 95 % quantile and maximum of the errors at all visible points.
     """
     result = []
     for value in series.values:
         for correction in CORRECTIONS:
-            picture = picture_of(pictures, series.label(value, correction))
+            picture = find_picture(pictures, series.label(value, correction))
             errors = size_errors_mm(picture, series.sizes)
             row: dict[str, Any] = {series.key: value, "method": correction}
             row.update(
@@ -193,13 +193,13 @@ def rows(
             )
             row["mean_mm"] = float(np.mean(errors))
             if with_maps:
-                row |= map_figures(error_map_of(pictures, series.label(value, correction)))
+                row |= map_figures(make_error_map(pictures, series.label(value, correction)))
             result.append(row)
     return result
 
 
 def map_figures(errors: ErrorMap) -> dict[str, float | None]:
-    """Mean, 95 % and maximum (mm) over all visible points; None where none is."""
+    """Return mean, 95 % quantile and maximum (mm) over all visible points; None without points."""
     sizes_mm = 1e3 * errors.sizes_m
     if len(sizes_mm) == 0:
         return dict.fromkeys(("map_mean_mm", "map_p95_mm", "map_max_mm"))

@@ -1,4 +1,4 @@
-"""How far one motion lags behind another, by cross-correlation."""
+"""Estimate the lag between two motions by cross-correlation."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from scipy.interpolate import CubicSpline
 Floats = NDArray[np.float64]
 
 STEP_S = 0.002
-LEAST_CORRELATION = 0.5
-LEAST_MOTION_M = 1e-6
+MIN_CORRELATION = 0.5
+MIN_MOTION_M = 1e-6
 
 
 def lag_s(
@@ -21,24 +21,22 @@ def lag_s(
     leader_times_s: Floats | None = None,
     max_lag_s: float = 0.15,
 ) -> float | None:
-    """By how much `follower` is later than `leader`; negative: it is ahead.
+    """Return the lag of `follower` behind `leader` in s; negative if it is ahead.
 
-    times_s: (n,), increasing, not necessarily even.  follower, leader: (n,) or (n, k), m, at those
-    times; or the leader at `leader_times_s` (m,), which cover them and are dense enough for it to
-    be smooth between them.  The lag is where their normalised cross-correlation, all axes
-    together, is greatest: the leader is shifted (by a cubic spline, so by any time) against the
-    follower's part that all shifts within +-max_lag_s cover, and a parabola through the best shift
-    and its neighbours tells the place between them.  A mean and a straight trend are taken off
-    both: how late something is
-    that goes evenly cannot be told from how far it is off.  A lag that is not the same for slow and
-    quick parts of the motion comes out as that of the larger ones.  Ten seconds at 60 Hz of a hand
-    that wanders by 0.5 mm per axis tell it to 0.6 ms (standard error) under white noise of 0.1 mm,
-    to 1.9 ms under 0.3 mm.
+    times_s: (n,), increasing, not necessarily uniform.  follower, leader: (n,) or (n, k), m, at
+    those times.  leader_times_s: (m,), other times of the leader, which cover the follower's.
 
-    None where there is no lag to be told: the leader hardly moves but evenly, the follower does
-    something else (correlation below one half), or the best shift is at the edge of the range.
-    Raises ValueError for times that do not increase, values that are not finite or of other length,
-    and a motion not longer than four times `max_lag_s`.
+    The lag maximizes the normalized cross-correlation over all axes.  The leader is shifted by a
+    cubic spline against the part of the follower that all shifts within +-max_lag_s cover.  A
+    parabola through the best shift and its neighbours refines it.  Mean and linear trend are
+    removed from both, since a lag of uniform motion equals an offset.  If the lag differs between
+    slow and fast parts, larger motions dominate.  The standard error for ten seconds at 60 Hz of a
+    hand that wanders by 0.5 mm per axis is 0.6 ms with white noise of 0.1 mm, 1.9 ms with 0.3 mm.
+
+    Returns None without a lag: a leader without motion besides its trend, a correlation below
+    MIN_CORRELATION, or a best shift at the end of the range.  Raises ValueError for times that do
+    not increase, values that are not finite or differ in number, and a motion that is not longer
+    than four times `max_lag_s`.
     """
     followed, led = (_rows(values) for values in (follower, leader))
     led_at = times_s if leader_times_s is None else leader_times_s
@@ -50,7 +48,7 @@ def lag_s(
         )
     numbers = (followed, led, times_s, led_at)
     if not all(np.isfinite(values).all() for values in numbers):
-        raise ValueError("a lag needs finite times and values; leave out what is not known")
+        raise ValueError("a lag needs finite times and values; remove unknown samples")
     if not ((np.diff(times_s) > 0.0).all() and (np.diff(led_at) > 0.0).all()):
         raise ValueError("a lag needs times that increase")
     if len(times_s) < 8 or times_s[-1] - times_s[0] <= 4.0 * max_lag_s:
@@ -69,7 +67,7 @@ def lag_s(
         return np.asarray(values - trend @ (trend.T @ values))
 
     ours = moving(followed[inner])
-    if min(_size(moving(shifted(at))), _size(ours)) < LEAST_MOTION_M:
+    if min(_size(moving(shifted(at))), _size(ours)) < MIN_MOTION_M:
         return None
 
     def correlation(shift_s: float) -> float:
@@ -80,7 +78,7 @@ def lag_s(
     shifts = np.linspace(-max_lag_s, max_lag_s, 2 * count + 1)
     fits = np.array([correlation(shift) for shift in shifts])
     best = int(np.argmax(fits))
-    if best in (0, len(fits) - 1) or fits[best] < LEAST_CORRELATION:
+    if best in (0, len(fits) - 1) or fits[best] < MIN_CORRELATION:
         return None
     before, here, after = fits[best - 1 : best + 2]
     bend = before - 2.0 * here + after
@@ -89,11 +87,11 @@ def lag_s(
 
 
 def _rows(values: Floats) -> Floats:
-    """Values (n,) or (n, k) as (n, k)."""
+    """Return values (n,) or (n, k) as (n, k)."""
     array = np.asarray(values, dtype=np.float64)
     return array[:, None] if array.ndim == 1 else array
 
 
 def _size(values: Floats) -> float:
-    """Root mean square (m) of rows (n, k)."""
+    """Return the root mean square (m) of rows (n, k)."""
     return float(np.sqrt((values**2).sum(axis=1).mean()))

@@ -1,4 +1,4 @@
-"""Pictures of the image's error at each visible point, case by case and method by method."""
+"""Draw the image error at each visible point, for each case and correction."""
 
 from __future__ import annotations
 
@@ -10,38 +10,40 @@ from matplotlib.figure import Figure
 
 from flexsheet.launch.experiments.image import (
     CORRECTIONS,
-    Picture,
+    EyeImage,
     Series,
-    error_map_of,
+    make_error_map,
     map_figures,
 )
 from flexsheet.launch.experiments.pictures import CORRECTION_NAMES
 from flexsheet.nodes.twin.error_map import ErrorMap
 
-LEAST_MM, MOST_MM = 0.01, 10.0
-"""Of the colours, which are logarithmic."""
+MIN_MM, MAX_MM = 0.01, 10.0
+"""Limits of the logarithmic colour scale."""
 
 
-def draw_error_maps(pictures: dict[str, Picture], series: Series, path: Path) -> None:
-    """A row for each value of the series, a column for each correction.
+def draw_error_maps(pictures: dict[str, EyeImage], series: Series, path: Path) -> None:
+    """Draw a row for each value of the series, a column for each correction.
 
-    ExperimentError when a case was not pictured in both patterns.
+    Raises ExperimentError if a case lacks an image of a pattern.
     """
     cases = [
         (series.name.format(value), [series.label(value, name) for name in CORRECTIONS])
         for value in series.values
     ]
-    maps = [(title, [error_map_of(pictures, label) for label in labels]) for title, labels in cases]
+    maps = [
+        (title, [make_error_map(pictures, label) for label in labels]) for title, labels in cases
+    ]
     figure = Figure(figsize=(2.9 * len(CORRECTIONS) + 0.9, 2.3 * len(maps)), layout="constrained")
     panels = figure.subplots(len(maps), len(CORRECTIONS), squeeze=False)
     shown = None
     for row, (title, errors) in zip(panels, maps, strict=True):
-        box = _box_of(errors)
+        box = _find_box(errors)
         for panel, correction, of_it in zip(row, CORRECTIONS, errors, strict=True):
             panel.set_xticks([])
             panel.set_yticks([])
             sizes_mm = 1e3 * np.linalg.norm(of_it.errors_m[box], axis=2)
-            shown = panel.imshow(sizes_mm, norm=LogNorm(LEAST_MM, MOST_MM), cmap="viridis")
+            shown = panel.imshow(sizes_mm, norm=LogNorm(MIN_MM, MAX_MM), cmap="viridis")
             figures = [one for one in map_figures(of_it).values() if one is not None]
             said = ", ".join(f"{one:.2f}" for one in figures) + " mm" if figures else "not seen"
             panel.set_title(f"{title}\n{CORRECTION_NAMES[correction]}\n{said}", fontsize=8)
@@ -51,8 +53,8 @@ def draw_error_maps(pictures: dict[str, Picture], series: Series, path: Path) ->
     figure.savefig(path, dpi=90)
 
 
-def _box_of(maps: list[ErrorMap]) -> tuple[slice, slice]:
-    """Rows and columns in which any of the maps shows anything; all of them where none does."""
+def _find_box(maps: list[ErrorMap]) -> tuple[slice, slice]:
+    """Return the rows and columns in which any map has values; all of them if none has."""
     seen = np.any([np.isfinite(each.errors_m).all(axis=2) for each in maps], axis=0)
     if not seen.any():
         return slice(None), slice(None)

@@ -1,4 +1,4 @@
-"""The demo's pictures: what a person should understand at a glance."""
+"""Draw the figures of the demo and of the experiments."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from flexsheet.launch.experiments.image import Picture
-from flexsheet.launch.experiments.stroke import PAPER_TABLE_1, Recording, StrokeErrors
+from flexsheet.launch.experiments.image import EyeImage
+from flexsheet.launch.experiments.stroke import PAPER_TABLE_1, StrokeErrors, StrokeRecording
 
 EVENTS = (
     "fingertip",
@@ -25,7 +25,7 @@ EVENTS = (
 
 BLACK = 8
 SHOWN = (0.18, 0.82)
-"""The part of the eye's picture that is printed; around it is only dark sheet."""
+"""Part of the eye's image that is drawn; around it is only dark sheet."""
 
 CORRECTION_NAMES = {
     "none": "not corrected",
@@ -35,16 +35,16 @@ CORRECTION_NAMES = {
 }
 
 
-def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) -> None:
-    """One row per case: each picture as the eye sees it, and last as it should be."""
+def draw_eye_views(rows: Sequence[tuple[str, Sequence[EyeImage]]], path: Path) -> None:
+    """Draw one row per case: each image as the eye sees it, and last the expected image."""
     columns = max(len(pictures) for _, pictures in rows) + 1
     figure = Figure(figsize=(3.2 * columns, 3.4 * len(rows)), layout="constrained")
     axes = figure.subplots(len(rows), columns, squeeze=False)
     for row, (title, pictures) in zip(axes, rows, strict=True):
-        shown: list[tuple[str, np.ndarray, Picture]] = [
+        shown: list[tuple[str, np.ndarray, EyeImage]] = [
             (CORRECTION_NAMES[picture.correction], picture.seen, picture) for picture in pictures
         ]
-        shown.append(("as it should be", pictures[0].expected, pictures[0]))
+        shown.append(("expected", pictures[0].expected, pictures[0]))
         for axis in row:
             axis.set_axis_off()
         for axis, (name, pixels, picture) in zip(row, shown, strict=False):
@@ -64,7 +64,7 @@ def draw_eye_views(rows: Sequence[tuple[str, Sequence[Picture]]], path: Path) ->
 
 
 def outline_box(picture: np.ndarray) -> tuple[float, float, float, float] | None:
-    """Left, top, width, height of what is not black; None where all is."""
+    """Return left, top, width and height of the non-black part; None if all is black."""
     ys, xs = np.nonzero(picture.max(axis=2) > BLACK)
     if len(xs) == 0:
         return None
@@ -77,7 +77,7 @@ def outline_box(picture: np.ndarray) -> tuple[float, float, float, float] | None
 
 
 def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
-    """Position and angle error over time, one column per stroke, the paper's mean dashed."""
+    """Draw position and angle error over time, one column per stroke, the paper's mean dashed."""
     figure = Figure(figsize=(5.5 * len(errors), 6), layout="constrained")
     axes = figure.subplots(2, len(errors), squeeze=False)
     for column, (seconds, stroke) in enumerate(errors.items()):
@@ -105,12 +105,12 @@ def draw_stroke(errors: dict[float, StrokeErrors], path: Path) -> None:
         for axis in (upper, lower):
             axis.set_ylim(bottom=0)
             axis.grid(visible=True, alpha=0.2)
-    figure.suptitle("How far the sheet is from the finger while it strokes")
+    figure.suptitle("Error of the sheet during strokes")
     figure.savefig(path, dpi=110)
 
 
-def draw_latency(recording: Recording, path: Path) -> None:
-    """Where the milliseconds go: from exposure to each event, median, 1-99 % and all."""
+def draw_latency(recording: StrokeRecording, path: Path) -> None:
+    """Draw the latency from exposure to each event: median and 1-99 %."""
     events = [event for event in EVENTS if len(recording.delays_s.get(event, ()))]
     figure = Figure(figsize=(8, 0.7 * len(events) + 1.6), layout="constrained")
     axes = figure.subplots()
@@ -125,13 +125,13 @@ def draw_latency(recording: Recording, path: Path) -> None:
     longest_ms = max(np.quantile(recording.delays_s[event], 0.99) for event in events) * 1e3
     axes.set_xlim(0, 1.25 * longest_ms)
     axes.set_xlabel("ms since the middle of the exposure: 1-99 % (bar), median (line)")
-    axes.set_title("Where the milliseconds go")
+    axes.set_title("Latency")
     axes.grid(visible=True, axis="x", alpha=0.2)
     figure.savefig(path, dpi=110)
 
 
 def draw_compliance(result: dict[str, Any], path: Path) -> None:
-    """Force over depth, wanted and felt, a panel per place, and what people would notice."""
+    """Draw force over depth, desired and presented, one panel per position, with people's JND."""
     places = list(dict.fromkeys(row["place"] for row in result["rows"]))
     figure = Figure(figsize=(4.2 * len(places), 4.4), layout="constrained")
     panels = figure.subplots(1, len(places), squeeze=False, sharey=True)[0]
@@ -141,17 +141,17 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
         rows = [row for row in result["rows"] if row["place"] == place]
         depths = np.array([0.0, *(row["depth_mm"] for row in rows)])
         wanted = np.array([0.0, *(row["wanted_n"] for row in rows)])
-        for share, strength in ((surer, 0.12), (sure, 0.18)):
+        for ratio, strength in ((surer, 0.12), (sure, 0.18)):
             panel.fill_between(
                 depths,
-                (1.0 - share) * wanted,
-                (1.0 + share) * wanted,
+                (1.0 - ratio) * wanted,
+                (1.0 + ratio) * wanted,
                 color="C0",
                 alpha=strength,
                 linewidth=0,
-                label=f"within {100 * share:.0f} %: not noticed",
+                label=f"within {100 * ratio:.0f} %: below the JND",
             )
-        panel.plot(depths, wanted, color="C0", label="the object's")
+        panel.plot(depths, wanted, color="C0", label="the object")
         if place == places[0]:
             panel.plot(
                 [row["depth_mm"] for row in moving],
@@ -159,14 +159,14 @@ def draw_compliance(result: dict[str, Any], path: Path) -> None:
                 ".",
                 color="0.5",
                 markersize=3,
-                label=f"felt at {result['moving']['speed_mm_per_s']:.0f} mm/s, in and out",
+                label=f"presented at {result['moving']['speed_mm_per_s']:.0f} mm/s, in and out",
             )
         presented = [row["presented_n"] for row in rows]
-        panel.plot(depths[1:], presented, "o", color="C1", label="felt, held still")
+        panel.plot(depths[1:], presented, "o", color="C1", label="presented, at rest")
         panel.set_title(place)
         panel.set_xlabel("depth of the finger, mm")
         panel.grid(visible=True, alpha=0.2)
     panels[0].set_ylabel("force, N")
     panels[0].legend(fontsize=8)
-    figure.suptitle("What a finger feels of the object, by the twin's sheet")
+    figure.suptitle("Presented force of the object, by the simulated sheet")
     figure.savefig(path, dpi=110)

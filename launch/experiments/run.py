@@ -1,4 +1,4 @@
-"""Runs an experiment: starts the graph with a recorder, drives it, stops it, reads the bag."""
+"""Run an experiment: start the graph with a recorder, drive it and stop it."""
 
 from __future__ import annotations
 
@@ -29,39 +29,39 @@ Procedure = Callable[[Driver, Scene], Awaitable[None]]
 
 
 def new_folder(name: str, parent: Path = RUNS) -> Path:
-    """A new folder for an experiment's bag and pictures: runs/20261121-164500-stroke."""
+    """Create a folder for an experiment's bag and images: runs/20261121-164500-stroke."""
     folder = parent / f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{name}"
     folder.mkdir(parents=True)
     return folder
 
 
 async def drive(plan: ResolvedGraph, procedure: Procedure, progress: Progress) -> None:
-    """Start the plan's graph, run the procedure on it, stop it.
+    """Start the plan's graph, run the procedure on it and stop it.
 
-    Raises what the procedure raises, or NodeFailedError as soon as a node has failed for good.
+    Raises the procedure's errors, and NodeFailedError as soon as a node has failed for good.
     """
     scene = plan.scene_message()
     if scene is None:
         raise ExperimentError(
-            f'{plan.launch_file}: key "scene": an experiment needs a scene; name one'
+            f'{plan.launch_file}: key "scene": an experiment needs a scene; add one'
         )
     async with RunningGraph(plan) as graph:
         progress("starting the nodes")
         await graph.wait_ready()
         async with Driver(plan, graph.run) as driver:
-            await _unless_it_ends(graph, _drive(driver, scene, procedure, progress))
+            await _run_while_graph_runs(graph, _drive(driver, scene, procedure, progress))
 
 
 async def _drive(driver: Driver, scene: Scene, procedure: Procedure, progress: Progress) -> None:
     progress("waiting for the soft body and the arms")
     await driver.wait_until_up()
     await procedure(driver, scene)
-    # What the last action caused is on its way through the graph to the recorder.
+    # Messages caused by the last action are still on their way to the recorder.
     await asyncio.sleep(GRACE_S)
 
 
-async def _unless_it_ends(graph: RunningGraph, work: Coroutine[Any, Any, None]) -> None:
-    """Do `work` while the graph runs; when the graph ends first, raise why."""
+async def _run_while_graph_runs(graph: RunningGraph, work: Coroutine[Any, Any, None]) -> None:
+    """Do `work` while the graph runs; raise the reason if the graph ends first."""
     task = asyncio.create_task(work)
     end = asyncio.create_task(graph.wait())
     try:
@@ -91,21 +91,21 @@ def run_experiment(
     except ExperimentError as error:
         if not bag.exists():
             raise
-        raise ExperimentError(f"{error}\nrecorded until then: {bag}") from error
+        raise ExperimentError(f"{error}\nrecorded until the error: {bag}") from error
 
 
 async def _interruptible(work: Coroutine[Any, Any, None]) -> None:
-    """Do `work`; SIGINT and SIGTERM end it in order, as an ExperimentError."""
+    """Do `work`; SIGINT and SIGTERM cancel it and raise ExperimentError."""
     task = asyncio.create_task(work)
     with handle_signals(task.cancel, signal.SIGINT, signal.SIGTERM):
         try:
             await task
         except asyncio.CancelledError:
-            raise ExperimentError("interrupted; all nodes have been ended") from None
+            raise ExperimentError("interrupted; all nodes were stopped") from None
 
 
 def settings_of_type(launch_file: Path, node_type: str, setting: str) -> list[str]:
-    """Name the setting ("parameter=value") of each node whose class is that of a type."""
+    """Return the setting ("parameter=value") for each node whose class is that of a type."""
     wanted = node_class(node_type)
     return [
         f"{node.name}.{setting}"
@@ -117,7 +117,7 @@ def settings_of_type(launch_file: Path, node_type: str, setting: str) -> list[st
 def stroke_procedure(
     seconds: Sequence[float], progress: Progress, *, path: FingerPath | None = None
 ) -> Procedure:
-    """Stroke once for each duration; or follow `path` instead."""
+    """Make a procedure that strokes once for each duration, or follows `path`."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         if path is not None:
@@ -140,9 +140,9 @@ def picture_procedure(
     shading: Shading = "flat",
     with_maps: bool = False,
 ) -> Procedure:
-    """Bring the sheet into each case and photograph it with each correction.
+    """Make a procedure that images each case with each correction.
 
-    with_maps: and in the patterns that tell the error at each point.
+    with_maps: also image the coordinate ramps, from which dense error maps are made.
     """
 
     async def procedure(driver: Driver, scene: Scene) -> None:
@@ -154,14 +154,14 @@ def picture_procedure(
                 progress(label)
                 await driver.take_picture(label, correction, shading)
                 for pattern in image.PLACES if with_maps else ():
-                    of_pattern = image.places_label(label, pattern)
+                    of_pattern = image.pattern_label(label, pattern)
                     await driver.take_picture(of_pattern, correction, pattern=pattern)
 
     return procedure
 
 
-def in_turn(*procedures: Procedure) -> Procedure:
-    """The procedures one after another on the same graph."""
+def run_in_sequence(*procedures: Procedure) -> Procedure:
+    """Join procedures into one that runs them in sequence on the same graph."""
 
     async def procedure(driver: Driver, scene: Scene) -> None:
         for each in procedures:

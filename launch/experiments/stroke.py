@@ -1,4 +1,4 @@
-"""Section V of the paper: stroking the virtual cylinder, and how far off the sheet is (Table I)."""
+"""Section V of the paper: stroke the virtual cylinder and measure the sheet's error (Table I)."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ NOTHING: Floats = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
-class Pictures:
-    """What was drawn, at the middle of its light.
+class DrawnFrames:
+    """Hold the contents of drawn frames at the middle of their display.
 
-    fingertip: (3,) rows, where the finger was drawn.  sheet: (4, 4) poses drawn for, as (6,) rows
-    of centre and normal.  dented: (1,) rows, the light's age over the finger that dents the object.
+    fingertip: rows (3,), the drawn finger.  sheet: rows (6,), centre and normal of the sheet pose.
+    dented: rows (1,), display time minus the time of the finger that deforms the object.
     """
 
     fingertip: list[tuple[int, Floats]]
     sheet: list[tuple[int, Floats]]
     dented: list[tuple[int, Floats]]
 
-    def take(self, frame: Frame) -> None:
+    def add(self, frame: Frame) -> None:
         if not frame.light_ns:
             return
         pose = frame.world_from_sheet
@@ -77,7 +77,7 @@ def stroke_label(seconds: float) -> str:
 
 
 def stroke_path(scene: Scene, seconds: float) -> FingerPath:
-    """Approach from above, touch, dwell, stroke 60 degrees in `seconds` at constant speed, lift."""
+    """Make a path: approach, touch, dwell, stroke 60 degrees at constant speed, lift."""
     radius = cylinder_of(scene).radius_m
     world_from_object = object_pose(scene)
     stroke_times = np.linspace(0.0, seconds, max(int(seconds * 20), 2))
@@ -110,7 +110,7 @@ def stroke_path(scene: Scene, seconds: float) -> FingerPath:
 
 
 def stroke_window_s(seconds: float) -> tuple[float, float]:
-    """The part of the path's time in which the finger strokes."""
+    """Return begin and end of the stroke in the path's time."""
     begin = APPROACH_S + DWELL_S
     return begin, begin + seconds
 
@@ -121,17 +121,16 @@ def object_pose(scene: Scene) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
-    """Samples of a moving thing: times (n,) ns, values (n, k)."""
+class SampledMotion:
+    """Hold samples of a motion: times (n,) ns, values (n, k)."""
 
     times_ns: NDArray[np.int64]
     values: Floats
 
     def at(self, times_ns: NDArray[np.int64]) -> Floats:
-        """Values (m, k) at other times, linear between samples.
+        """Return values (m, k) at other times, linear between samples.
 
-        Times count from the first sample, so that nanoseconds of a machine that has been up for
-        months keep their digits.
+        Times count from the first sample, so that a float keeps the nanoseconds of a long uptime.
         """
         zero = self.times_ns[0]
         x, xp = (times_ns - zero).astype(np.float64), (self.times_ns - zero).astype(np.float64)
@@ -142,8 +141,8 @@ class Track:
         return inside
 
 
-def track(samples: list[tuple[int, Floats]], what: str) -> Track:
-    """A track of (time, value) samples, in the order of time, repeated times dropped."""
+def make_motion(samples: list[tuple[int, Floats]], what: str) -> SampledMotion:
+    """Sort samples (time, value) and drop repeated times; ExperimentError for fewer than two."""
     if len(samples) < 2:
         raise ExperimentError(
             f"the bag has {len(samples)} samples of {what}; the experiment needs more"
@@ -151,37 +150,37 @@ def track(samples: list[tuple[int, Floats]], what: str) -> Track:
     times = np.array([time for time, _ in samples], dtype=np.int64)
     values = np.array([value for _, value in samples])
     times, first = np.unique(times, return_index=True)
-    return Track(times, values[first])
+    return SampledMotion(times, values[first])
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
-    """What an experiment reads from a bag.
+class StrokeRecording:
+    """Hold an experiment's data from a bag.
 
-    Edges are (9,) rows: middle of the clamped edge, its y axis, its z axis, in the world.
-    delays_s: from the middle of an exposure to each later event that came of it, by event.
-    drops: messages lost on the way or refused; what a `latest` reader passed over is not lost.
+    Edges are rows (9,): middle of the clamped edge, its y axis, its z axis, in the world.
+    delays_s: from the middle of an exposure to each event that it caused, by event.
+    drops: lost or refused messages, without those that a `latest` reader skipped.
     """
 
     scene: Scene
-    fingertip: Track
-    measured: Track
-    finger: Track
+    fingertip: SampledMotion
+    measured: SampledMotion
+    finger: SampledMotion
     windows_ns: dict[str, tuple[int, int]]
-    measured_edges: tuple[Track, Track]
-    true_edges: tuple[Track, Track]
+    measured_edges: tuple[SampledMotion, SampledMotion]
+    true_edges: tuple[SampledMotion, SampledMotion]
     delays_s: dict[str, Floats]
     drops: int
-    pictures: Pictures = field(default_factory=lambda: Pictures([], [], []))
+    pictures: DrawnFrames = field(default_factory=lambda: DrawnFrames([], [], []))
 
     def arm_delays_s(self) -> Floats:
-        """From exposure to the command being written, both arms together."""
+        """Return delays (n,) from exposure to the written command, of both arms."""
         both = [self.delays_s.get(f"{side} arm command", NOTHING) for side in ("left", "right")]
         return np.concatenate(both)
 
 
-def by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
-    """Delays (n,) of each event, from (event, exposure) to delay."""
+def group_by_event(delays: dict[tuple[str, int], float]) -> dict[str, Floats]:
+    """Return the delays (n,) of each event, from delays by (event, exposure)."""
     events: dict[str, list[float]] = {}
     for (event, _), delay_s in delays.items():
         events.setdefault(event, []).append(delay_s)
@@ -194,15 +193,15 @@ def edge_row(world_from_flange: Floats, flange_from_edge: Floats) -> Floats:
 
 
 def frame_events(frame: Frame, published_ns: int) -> list[tuple[str, int]]:
-    """What happened to a picture, and when, ns."""
+    """Return the events of a frame and their times, ns."""
     drawn_ns = frame.drawn_ns or published_ns
     begun_ns = drawn_ns - round(frame.draw_s * 1e9)
     events = [("frame begun", begun_ns), ("frame drawn", drawn_ns)]
     return [*events, ("light", frame.light_ns)] if frame.light_ns else events
 
 
-def events_of(message: Message, header: Header) -> list[tuple[str, int, int]]:
-    """What of the way from exposure to light a message tells: (event, exposure ns, when ns)."""
+def list_events(message: Message, header: Header) -> list[tuple[str, int, int]]:
+    """Return the latency events of a message: (event, exposure ns, time ns)."""
     exposure_ns = header.source_ns
     match message:
         case Fingertip() if message.valid:
@@ -221,15 +220,15 @@ def events_of(message: Message, header: Header) -> list[tuple[str, int, int]]:
 
 
 def _windows_ns(times_by_label: dict[str, list[tuple[int, float]]]) -> dict[str, tuple[int, int]]:
-    """When each path began and when it was last heard of, from (stamp, time on the path)."""
+    """Return begin and last stamp of each path, from samples (stamp, time on the path)."""
     return {
         label: (samples[-1][0] - round(samples[-1][1] * 1e9), samples[-1][0])
         for label, samples in times_by_label.items()
     }
 
 
-def read_recording(bag: Path) -> Recording:
-    """Collect from a bag what the stroke's figures are computed from."""
+def read_recording(bag: Path) -> StrokeRecording:
+    """Read the data for the stroke's figures from a bag."""
     scene: Scene | None = None
     fingertip: list[tuple[int, Floats]] = []
     measured: list[tuple[int, Floats]] = []
@@ -239,14 +238,14 @@ def read_recording(bag: Path) -> Recording:
         key: [] for key in ("left", "right", "true_left", "true_right")
     }
     delays: dict[tuple[str, int], float] = {}
-    pictures = Pictures([], [], [])
+    pictures = DrawnFrames([], [], [])
 
     def delay(event: str, source_ns: int, event_ns: int) -> None:
         delays.setdefault((event, source_ns), (event_ns - source_ns) * 1e-9)
 
     losses: dict[tuple[str, int, str], int] = {}
     for _, message, header, _ in BagReader(bag):
-        for event in events_of(message, header):
+        for event in list_events(message, header):
             delay(*event)
         match message:
             case Scene():
@@ -265,40 +264,42 @@ def read_recording(bag: Path) -> Recording:
                 flanges["true_left"].append((header.source_ns, message.world_from_flange_left))
                 flanges["true_right"].append((header.source_ns, message.world_from_flange_right))
             case Frame():
-                pictures.take(message)
+                pictures.add(message)
             case Status():
                 for port in message.inputs:
-                    # Each start of a node counts anew; its last word is what it lost in all.
+                    # Counters restart with the node; the last status of each start has the total.
                     losses[message.node, header.epoch, port.topic] = port.gaps + port.rejected
             case _:
                 pass
     if scene is None:
         raise ExperimentError(f"{bag}: no scene was recorded")
 
-    def edges(key: str, arm: ArmSpec) -> Track:
+    def edges(key: str, arm: ArmSpec) -> SampledMotion:
         pose = arm.flange_from_edge
         flange_from_edge = transform_from_rpy(pose.position_m, pose.rpy_rad)
         rows = [(time, edge_row(flange, flange_from_edge)) for time, flange in flanges[key]]
-        return track(rows, f"arm {key}")
+        return make_motion(rows, f"arm {key}")
 
-    return Recording(
+    return StrokeRecording(
         scene=scene,
-        fingertip=track(fingertip, "fingertip"),
-        measured=track(measured, "fingertip"),
-        finger=track(finger, "twin/finger"),
+        fingertip=make_motion(fingertip, "fingertip"),
+        measured=make_motion(measured, "fingertip"),
+        finger=make_motion(finger, "twin/finger"),
         windows_ns=_windows_ns(times_by_label),
         measured_edges=(edges("left", scene.arms.left), edges("right", scene.arms.right)),
         true_edges=(edges("true_left", scene.arms.left), edges("true_right", scene.arms.right)),
-        delays_s=by_event(delays),
+        delays_s=group_by_event(delays),
         drops=sum(losses.values()),
         pictures=pictures,
     )
 
 
 def sheet_planes(
-    edges: tuple[Track, Track], world_from_object: Floats, times_ns: NDArray[np.int64]
+    edges: tuple[SampledMotion, SampledMotion],
+    world_from_object: Floats,
+    times_ns: NDArray[np.int64],
 ) -> tuple[Floats, Floats]:
-    """The sheet's centres (n, 3) m and unit normals (n, 3), in the object's frame.
+    """Return the sheet's centres (n, 3) m and unit normals (n, 3), in the object's frame.
 
     The sheet is the plane through both edges.
     """
@@ -320,14 +321,16 @@ def sheet_planes(
     return 0.5 * (left[:, :3] + right[:, :3]), normal
 
 
-def presented(
-    edges: tuple[Track, Track], world_from_object: Floats, times_ns: NDArray[np.int64], x_m: Floats
+def find_presented_points(
+    edges: tuple[SampledMotion, SampledMotion],
+    world_from_object: Floats,
+    times_ns: NDArray[np.int64],
+    x_m: Floats,
 ) -> tuple[Floats, Floats]:
-    """What the sheet presents: points D' (n, 3) in the object's frame, and angles (n,).
+    """Return the points D' (n, 3) that the sheet presents, in the object's frame, and angles (n,).
 
-    It presents the cylinder point whose tangent plane it is, so D' is the plane's point nearest to
-    the cylinder's axis (its x there: `x_m` (n,)), and the angle is that of the plane's normal about
-    the axis.
+    D' is the plane's point nearest to the cylinder's axis at x = `x_m` (n,).  The angle is that of
+    the plane's normal about the axis.
     """
     centre, normal = sheet_planes(edges, world_from_object, times_ns)
     axis_point = np.column_stack([x_m, np.zeros_like(x_m), np.zeros_like(x_m)])
@@ -336,14 +339,14 @@ def presented(
 
 
 MIN_CURVATURE_PER_M = 1.0
-"""A surface that bends less counts as flat: a normal does not identify one of its points."""
+"""A surface with less curvature counts as flat: a normal does not identify one of its points."""
 
 
-def presented_on_surface(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
-    """Points D' (n, 3) that planes through `centre` with `normal` (n, 3) present near `foot`.
+def project_presented_point(foot: Nearest, centre: Floats, normal: Floats) -> Floats:
+    """Return points D' (n, 3) presented near `foot` by planes through `centre` with `normal`.
 
-    As on the cylinder: the surface point whose normal is the plane's, projected onto the plane.
-    Along a flat direction it is the foot itself.  Second order in the angle between both normals.
+    D' is the surface point with the plane's normal, projected onto the plane.  Along a flat
+    direction it is the foot itself.  The error is of second order in the angle between the normals.
     """
     curvatures, directions = principal_curvatures(foot.shape_operator, foot.normal)
     slopes = np.einsum("nki,ni->nk", directions, normal)
@@ -358,20 +361,19 @@ def presented_on_surface(foot: Nearest, centre: Floats, normal: Floats) -> Float
 
 def sheet_errors(
     scene: Scene,
-    finger: Track,
-    edges: tuple[Track, Track],
+    finger: SampledMotion,
+    edges: tuple[SampledMotion, SampledMotion],
     times_ns: NDArray[np.int64],
     retreat_m: Floats | float = 0.0,
     *,
     shape: Shape | None = None,
 ) -> tuple[Floats, Floats]:
-    """Delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for an object of any shape.
+    """Return delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for any shape of object.
 
-    D is the object's point nearest to the finger: the sheet presents the undeformed surface, so
-    how deep the finger pushes is not an error of its.  retreat_m (n,): how far below that surface
-    the sheet is meant to be, where it complies as the object would.  On a cylinder, delta theta is
-    the angle about its axis, as in the paper; on others the angle between both normals.  shape:
-    the scene's, where the caller has made it.
+    D is the object's point nearest to the finger.  The sheet presents the undeformed surface, so
+    the push depth is no error.  retreat_m (n,): commanded depth of the sheet below that surface.
+    On a cylinder, delta theta is the angle about its axis, as in the paper; on others, the angle
+    between the normals.  shape: that of the scene, if the caller has it.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.at(times_ns))
@@ -381,26 +383,28 @@ def sheet_errors(
         on_surface = foot.point - np.broadcast_to(retreat_m, len(points))[:, None] * foot.normal
         sine = np.linalg.norm(np.cross(foot.normal, normal), axis=1)
         cosine = np.einsum("ni,ni->n", foot.normal, normal)
-        off = on_surface - presented_on_surface(foot, centre, normal)
+        off = on_surface - project_presented_point(foot, centre, normal)
         return np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)
     angles = np.arctan2(points[:, 1], points[:, 2])
     radius = cylinder_of(scene).radius_m - retreat_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
-    presented_points, presented_angles = presented(edges, world_from_object, times_ns, points[:, 0])
+    presented_points, presented_angles = find_presented_points(
+        edges, world_from_object, times_ns, points[:, 0]
+    )
     delta_theta = (angles - presented_angles + np.pi) % (2 * np.pi) - np.pi
     return np.linalg.norm(on_surface - presented_points, axis=1), np.abs(delta_theta)
 
 
-def smoothed(measured: Track, times_ns: NDArray[np.int64]) -> Track:
-    """An offline smoother of the same measurements: what a method that knows the future reaches.
+def smooth_motion(measured: SampledMotion, times_ns: NDArray[np.int64]) -> SampledMotion:
+    """Smooth the measurements offline, as a bound for causal methods.
 
-    Cubic smoothing spline per coordinate, its penalty by generalised cross-validation.
+    One cubic smoothing spline per coordinate; generalized cross-validation sets the penalty.
     """
     inside = (measured.times_ns >= times_ns[0]) & (measured.times_ns <= times_ns[-1])
     times, values = measured.times_ns[inside], measured.values[inside]
     seconds = (times - times[0]) * 1e-9
     columns = [make_smoothing_spline(seconds, column)(seconds) for column in values.T]
-    return Track(times, np.column_stack(columns))
+    return SampledMotion(times, np.column_stack(columns))
 
 
 def summary(values: Floats, scale: float) -> dict[str, float]:
@@ -442,7 +446,7 @@ class StrokeErrors:
     arcs_m: Floats
 
 
-def stroke_span_ns(recording: Recording, seconds: float) -> tuple[int, int]:
+def stroke_span_ns(recording: StrokeRecording, seconds: float) -> tuple[int, int]:
     """When that stroke began and ended; ExperimentError when the bag does not have it."""
     label = stroke_label(seconds)
     if label not in recording.windows_ns:
@@ -453,7 +457,7 @@ def stroke_span_ns(recording: Recording, seconds: float) -> tuple[int, int]:
     return zero_ns + round(begin_s * 1e9), min(zero_ns + round(finish_s * 1e9), end_ns)
 
 
-def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
+def stroke_errors(recording: StrokeRecording, seconds: float) -> StrokeErrors:
     """Errors at every exposure of that stroke; ExperimentError when the bag does not have it."""
     begin_ns, finish_ns = stroke_span_ns(recording, seconds)
 
@@ -464,7 +468,7 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
         return times[keep]
 
     times, exposures = (
-        in_stroke(track.times_ns) for track in (recording.fingertip, recording.finger)
+        in_stroke(make_motion.times_ns) for make_motion in (recording.fingertip, recording.finger)
     )
     if len(times) < 10:
         label = stroke_label(seconds)
@@ -472,7 +476,7 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
     scene = recording.scene
     delta_d, delta_theta = sheet_errors(scene, recording.fingertip, recording.measured_edges, times)
     true_d, true_theta = sheet_errors(scene, recording.finger, recording.true_edges, exposures)
-    smooth = smoothed(recording.measured, times)
+    smooth = smooth_motion(recording.measured, times)
     world_from_object = object_pose(scene)
     true_points = recording.finger.at(times)
     return StrokeErrors(
@@ -490,14 +494,14 @@ def stroke_errors(recording: Recording, seconds: float) -> StrokeErrors:
 
 def arcs(
     scene: Scene,
-    edges: tuple[Track, Track],
+    edges: tuple[SampledMotion, SampledMotion],
     times_ns: NDArray[np.int64],
     points: Floats,
 ) -> Floats:
     """Ways (n, 2) m around the cylinder: of the line that the sheet presents, of the points."""
     world_from_object = object_pose(scene)
     local = apply(inverse(world_from_object), points)
-    _, angles = presented(edges, world_from_object, times_ns, local[:, 0])
+    _, angles = find_presented_points(edges, world_from_object, times_ns, local[:, 0])
     both = np.stack([angles, np.arctan2(local[:, 1], local[:, 2])], axis=1)
     return np.asarray(cylinder_of(scene).radius_m * both)
 
@@ -516,7 +520,7 @@ def tangential_distance(
     return np.asarray(np.linalg.norm(on_surface[0] - on_surface[1], axis=1))
 
 
-def visible_lag_ms(recording: Recording, seconds: float) -> dict[str, float | None]:
+def visible_lag_ms(recording: StrokeRecording, seconds: float) -> dict[str, float | None]:
     """How late what was drawn is when its light leaves, after all prediction; None: not to tell.
 
     fingertip, sheet: the mark and the sheet's turn about the object, as drawn, against the true
@@ -535,7 +539,7 @@ def visible_lag_ms(recording: Recording, seconds: float) -> dict[str, float | No
     ) -> float | None:
         if len(samples) < 20:
             return None
-        drawn = track(samples, "frame")
+        drawn = make_motion(samples, "frame")
         inside = drawn.times_ns < times_ns[-1]
         found = lag_s(
             np.asarray((drawn.times_ns[inside] - span[0]) * 1e-9, dtype=np.float64),
@@ -551,7 +555,9 @@ def visible_lag_ms(recording: Recording, seconds: float) -> dict[str, float | No
 
     true_ns = recording.true_edges[0].times_ns
     true_ns = true_ns[recording.true_edges[1].covers(true_ns)]
-    _, angles = presented(recording.true_edges, world_from_object, true_ns, np.zeros(len(true_ns)))
+    _, angles = find_presented_points(
+        recording.true_edges, world_from_object, true_ns, np.zeros(len(true_ns))
+    )
     sheet = [(time, turns(row[None, 3:])[0]) for time, row in within(recording.pictures.sheet)]
     finger = recording.finger
     dented = within(recording.pictures.dented)
@@ -563,11 +569,11 @@ def visible_lag_ms(recording: Recording, seconds: float) -> dict[str, float | No
 
 
 def stroke_result(
-    recording: Recording, errors: StrokeErrors, seconds: float, bag: Path
+    recording: StrokeRecording, errors: StrokeErrors, seconds: float, bag: Path
 ) -> dict[str, Any]:
-    """The figures of `experiment stroke --json`; lengths in mm, angles in degrees, times in ms.
+    """Return the figures of `experiment stroke --json` in mm, degrees and ms.
 
-    lag_ms: of the true sheet behind the true finger, by cross-correlation of the hand's wander.
+    lag_ms: lag of the true sheet behind the true finger, by cross-correlation.
     """
     lag = lag_s(errors.true_seconds, errors.arcs_m[:, 0], errors.arcs_m[:, 1])
     return {

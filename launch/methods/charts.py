@@ -1,4 +1,4 @@
-"""Speed against accuracy: measures a method family on this machine and this scene, and draws it."""
+"""Measure speed and accuracy of a method family on this machine and a scene, and draw them."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from flexsheet.launch.methods.finite import finite
-from flexsheet.launch.methods.machine import machine_name
-from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, save_svg
+from flexsheet.launch.methods.results import machine_name, replace_non_finite
+from flexsheet.launch.methods.svg import COLOURS, INK, page_style, save_svg
 from flexsheet.launch.running.code_state import git_state
 from flexsheet.messages.errors import FlexsheetError
 from flexsheet.messages.files import write_file
@@ -28,43 +27,41 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 FAMILIES: dict[str, str] = {
-    "marker": "flexsheet.nodes.triangulator.families:MARKER",
-    "triangulation": "flexsheet.nodes.triangulator.families:TRIANGULATION",
-    "tracking": "flexsheet.launch.methods.families:TRACKING",
+    "marker": "flexsheet.nodes.triangulator.benchmarks:MARKER",
+    "triangulation": "flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",
+    "tracking": "flexsheet.launch.methods.benchmarks:TRACKING",
     "soft-body": "flexsheet.nodes.fem_solver.benchmarks:SOFT_BODY",
-    "correction": "flexsheet.launch.methods.families:CORRECTION",
-    "sheet-force": "flexsheet.launch.methods.families:SHEET_FORCE",
-    "sheet-shape": "flexsheet.launch.methods.families:SHEET_SHAPE",
-    "mesh-normal": "flexsheet.nodes.planner.families:MESH_NORMAL",
-    "rolling": "flexsheet.nodes.planner.families:ROLLING",
+    "correction": "flexsheet.launch.methods.benchmarks:CORRECTION",
+    "sheet-force": "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
+    "sheet-shape": "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
 }
-"""Families by their name on the command line; each node's folder describes its own."""
+"""Families by their name on the command line, as `module:NAME`."""
 
 REPEATS = 30
-TOLD_EVERY_S = 1.0
+PROGRESS_PERIOD_S = 1.0
 ROOT = Path(__file__).resolve().parents[2]
 OVERVIEW = "README.md"
 TITLE_WIDTH = 95
 
 
 class UnknownFamilyError(FlexsheetError, KeyError):
-    """A family name that is not in the table; the message suggests one that is."""
+    """Raised for an unknown family name; the text suggests the nearest one."""
 
     code = "unknown-family"
     remedy = "Choose one of the names in the text (`flexsheet chart --help`)."
 
 
 def family_named(name: str) -> Family:
-    """The family of that name; raises UnknownFamilyError with the nearest name."""
+    """Return the family of that name; raises UnknownFamilyError with the nearest name."""
     if name not in FAMILIES:
         near = get_close_matches(name, FAMILIES, n=1)
         hint = f'; did you mean "{near[0]}"?' if near else f"; there are: {', '.join(FAMILIES)}"
         raise UnknownFamilyError(f'unknown family "{name}"{hint}')
-    return family_at(FAMILIES[name])
+    return load_family(FAMILIES[name])
 
 
-def family_at(place: str) -> Family:
-    """The family that `module:NAME` describes."""
+def load_family(place: str) -> Family:
+    """Import the family at `module:NAME`."""
     module_name, _, attribute = place.partition(":")
     family = getattr(import_module(module_name), attribute)
     assert isinstance(family, Family)
@@ -72,7 +69,7 @@ def family_at(place: str) -> Family:
 
 
 def git_commit() -> str | None:
-    """The commit of this code; None where nobody knows it."""
+    """Return the commit of this code, or None if unknown."""
     commit: str | None = json.loads(git_state(ROOT))["commit"]
     return commit
 
@@ -85,17 +82,15 @@ def measure_family(
     progress: Callable[[str], None] = lambda text: None,
     wanted: Callable[[Trial], bool] = lambda trial: True,
 ) -> list[Point]:
-    """Measure every trial of the family that is wanted; `progress` is told how many are measured,
-    and before, of what has to be worked out, how much is left.
+    """Measure all trials of the family that are wanted; report preparation and trials as progress.
 
-    A family closes what a trial needs when it is asked for a later one, so each is measured at
-    once.
+    Each trial is measured before the next is requested, since a family may then release its data.
     """
-    family.prepare(scene, _with_time_left("working out what it takes to judge:", progress))
+    family.prepare(scene, _with_time_left("computing the reference:", progress))
     points: list[Point] = []
     last_s = -math.inf
     for trial in filter(wanted, family.trials(scene)):
-        if time.monotonic() - last_s >= TOLD_EVERY_S:
+        if time.monotonic() - last_s >= PROGRESS_PERIOD_S:
             last_s = time.monotonic()
             progress(f"measuring {trial.method}, {len(points)} done")
         points.append(measure(trial, repeats=repeats))
@@ -103,14 +98,14 @@ def measure_family(
 
 
 def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int, int], None]:
-    """Return a function that reports (done, total) with the time left, every `TOLD_EVERY_S`."""
+    """Return a function that reports (done, total) with the time left, at intervals."""
     eta, last_s = EtaEstimator(), -math.inf
 
     def report(done: int, total: int) -> None:
         nonlocal last_s
         now_s = time.monotonic()
         left = f": {eta.text(done, total, now_s)}" if total else ""
-        if now_s - last_s >= TOLD_EVERY_S:
+        if now_s - last_s >= PROGRESS_PERIOD_S:
             last_s = now_s
             progress(f"{what} {done} of {total}{left}")
 
@@ -118,7 +113,7 @@ def _with_time_left(what: str, progress: Callable[[str], None]) -> Callable[[int
 
 
 def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[str, Any]:
-    """What `chart FAMILY --json` prints."""
+    """Return the result that `chart FAMILY --json` prints."""
     return {
         "family": family.name,
         "unit": family.unit,
@@ -135,10 +130,10 @@ def chart_result(family: Family, scene: Scene, points: Sequence[Point]) -> dict[
 
 
 def draw_chart(result: dict[str, Any], path: Path) -> None:
-    """Draw the result: log time across, error up; a line is the front of one case.
+    """Draw error over time, logarithmic; a line is the Pareto front of one case.
 
-    A family that says so gets its errors along the case, too, and further figures: with the
-    reference's own doubt, a band below which nothing can be told.
+    A family with a `sweep_key` also gets diagrams of errors and extra metrics over that key, with a
+    band of the reference's uncertainty.
     """
     from matplotlib.figure import Figure
 
@@ -148,7 +143,7 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
         else sorted({k for p in result["points"] for k in p["extra_metrics"]})
     )
     panels = 1 if result["sweep_key"] is None else 2 + len(also)
-    with drawn_for_pages():
+    with page_style():
         columns = min(panels, 2)
         rows = math.ceil(panels / columns)
         figure = Figure(figsize=(8, 5.5) if rows == 1 else (14, 5.5 * rows), layout="constrained")
@@ -157,24 +152,26 @@ def draw_chart(result: dict[str, Any], path: Path) -> None:
             unused.remove()
         _draw_time(first, result)
         for axes, name in zip(others, ["error", *also], strict=False):
-            _draw_along(axes, result, name)
+            _draw_sweep(axes, result, name)
         save_svg(figure, path)
 
 
 def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
-    """Errors below a ten-thousandth of the scene's tolerance (dashed) are drawn there: they are
-    rounding, and would press all the rest into a corner."""
+    """Draw error over time; errors below 1e-4 of the tolerance (dashed) are rounding and drawn
+    there."""
     methods = list(dict.fromkeys(point["method"] for point in result["points"]))
-    least = 1e-4 * result["tolerance"]
+    min_error = 1e-4 * result["tolerance"]
     for index, method in enumerate(methods):
         mine = [point for point in result["points"] if point["method"] == method]
         for in_range, marker in ((True, "o"), (False, "x")):
-            shown = [point for point in mine if point["in_range"] == in_range and _judged(point)]
+            shown = [
+                point for point in mine if point["in_range"] == in_range and _has_reference(point)
+            ]
             if shown:
                 front = "" if method not in result["front"] else ", on the front"
                 axes.plot(
                     [point["median_s"] * 1e6 for point in shown],
-                    [max(point["error"], least) for point in shown],
+                    [max(point["error"], min_error) for point in shown],
                     marker,
                     color=COLOURS[index % len(COLOURS)],
                     alpha=0.7,
@@ -184,9 +181,11 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
         usable = [
             point
             for point in result["points"]
-            if point["in_range"] and point["case"] == case and _judged(point)
+            if point["in_range"] and point["case"] == case and _has_reference(point)
         ]
-        steps = sorted((point["median_s"] * 1e6, max(point["error"], least)) for point in usable)
+        steps = sorted(
+            (point["median_s"] * 1e6, max(point["error"], min_error)) for point in usable
+        )
         best = [
             step
             for i, step in enumerate(steps)
@@ -205,9 +204,9 @@ def _draw_time(axes: Axes, result: dict[str, Any]) -> None:
     axes.legend(fontsize=8)
 
 
-def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
-    """One figure over the case, a line for each method, hollow out of its range; grey: what the
-    reference itself does not know."""
+def _draw_sweep(axes: Axes, result: dict[str, Any], name: str) -> None:
+    """Draw a metric over the sweep key, a line for each method; markers out of range are hollow,
+    the reference's uncertainty is grey."""
     along, points = result["sweep_key"], result["points"]
 
     def value(point: dict[str, Any]) -> float | None:
@@ -226,14 +225,14 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     if doubts:
         at, doubt = zip(*doubts, strict=True)
         low = [0.0 if name == "error" else -each for each in doubt]
-        label = "the reference's own doubt"
+        label = "uncertainty of the reference"
         axes.fill_between(at, low, doubt, color=INK, alpha=0.12, linewidth=0, label=label)
     methods = list(dict.fromkeys(point["method"] for point in points))
     for index, method in enumerate(methods):
         shown = [
             (point["case"][along], value(point), point["in_range"])
             for point in points
-            if point["method"] == method and _number(value(point))
+            if point["method"] == method and _is_finite(value(point))
         ]
         if not shown:
             continue
@@ -255,17 +254,17 @@ def _draw_along(axes: Axes, result: dict[str, Any], name: str) -> None:
     axes.legend(fontsize=8)
 
 
-def _number(value: float | None) -> bool:
+def _is_finite(value: float | None) -> bool:
     return value is not None and math.isfinite(value)
 
 
-def _judged(point: dict[str, Any]) -> bool:
-    """Whether there was a reference to judge a point by."""
-    return _number(point["error"])
+def _has_reference(point: dict[str, Any]) -> bool:
+    """Return whether a reference gave the point's error."""
+    return _is_finite(point["error"])
 
 
 def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The cases of points, each once, in their order."""
+    """Return the distinct cases of points in their order."""
     cases: list[dict[str, Any]] = []
     for point in points:
         if point["case"] not in cases:
@@ -274,22 +273,22 @@ def unique_cases(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_chart(result: dict[str, Any], folder: Path) -> tuple[Path, Path]:
-    """Write the picture and the numbers of a chart; returns both paths."""
+    """Write figure and numbers of a chart; return both paths."""
     folder.mkdir(parents=True, exist_ok=True)
     picture, numbers = folder / f"{result['family']}.svg", folder / f"{result['family']}.json"
     draw_chart(result, picture)
-    write_file(numbers, json.dumps(finite(result), indent=1) + "\n")
+    write_file(numbers, json.dumps(replace_non_finite(result), indent=1) + "\n")
     return picture, numbers
 
 
-def kept_charts(folder: Path) -> list[dict[str, Any]]:
-    """The charts whose numbers lie in the folder, in the order of the table of families."""
+def read_charts(folder: Path) -> list[dict[str, Any]]:
+    """Read the charts of a folder, in the order of the table of families."""
     kept = [folder / f"{name}.json" for name in FAMILIES]
-    return [_as_today(json.loads(path.read_text())) for path in kept if path.exists()]
+    return [_add_missing_keys(json.loads(path.read_text())) for path in kept if path.exists()]
 
 
-def _as_today(result: dict[str, Any]) -> dict[str, Any]:
-    """Numbers of earlier code, with what they did not have yet."""
+def _add_missing_keys(result: dict[str, Any]) -> dict[str, Any]:
+    """Add the keys that results of earlier versions lack."""
     points = [
         {"extra_metrics": {}, "reference_uncertainty": {}, **point} for point in result["points"]
     ]
@@ -297,7 +296,7 @@ def _as_today(result: dict[str, Any]) -> dict[str, Any]:
 
 
 def write_overview(folder: Path) -> Path:
-    """One page of all the charts that lie in the folder; returns its path."""
+    """Write one page of all charts in the folder; return its path."""
     path = folder / OVERVIEW
     write_file(path, "\n".join(_overview_lines(folder)) + "\n")
     return path
@@ -306,12 +305,12 @@ def write_overview(folder: Path) -> Path:
 def _overview_lines(folder: Path) -> Iterator[str]:
     yield "# Speed against accuracy\n"
     yield (
-        "Every method of every family, timed and judged on one machine and one scene by "
-        "`flexsheet chart --output docs/charts`. *In range* are the cases that a method says it is "
-        "good for; the front has those that no other method beats in both. The numbers of each "
-        "picture stand beside it as JSON.\n"
+        "Time and error of every method, measured on one machine and one scene by "
+        "`flexsheet chart --output docs/charts`. *In range* counts the cases in a method's stated "
+        "range. The front has the methods that no other method dominates in time and error. "
+        "The numbers of each figure are beside it as JSON.\n"
     )
-    for result in kept_charts(folder):
+    for result in read_charts(folder):
         name, unit = result["family"], result["unit"]
         commit = (result.get("code") or {}).get("commit") or "unknown"
         yield f"## {name}\n"
@@ -323,7 +322,7 @@ def _overview_lines(folder: Path) -> Iterator[str]:
         yield f"![{name}: time against error of each method]({name}.svg)\n"
         yield f"| method | time, median | largest error in range, {unit} | cases in range | front |"
         yield "|---|---|---|---|---|"
-        yield from map(_overview_row, methods_of(result["points"]))
+        yield from map(_overview_row, summarize_methods(result["points"]))
         yield ""
         # benchmarks of the same methods leave theirs as FAMILY-WHAT
         for more in sorted(folder.glob(f"{name}-*.svg")):
@@ -331,13 +330,13 @@ def _overview_lines(folder: Path) -> Iterator[str]:
                 yield f"![{more.stem}]({more.name})\n\n[Numbers]({more.stem}.json).\n"
 
 
-def methods_of(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Per method: the slowest median, the largest error and the count of its cases in range."""
+def summarize_methods(points: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return each method's maximum median time, maximum error and number of cases in range."""
     rows = []
-    front = pareto_front([Point(**point) for point in points if _judged(point)])
+    front = pareto_front([Point(**point) for point in points if _has_reference(point)])
     for method in dict.fromkeys(point["method"] for point in points):
         mine = [point for point in points if point["method"] == method]
-        inside = [point for point in mine if point["in_range"] and _judged(point)]
+        inside = [point for point in mine if point["in_range"] and _has_reference(point)]
         rows.append(
             {
                 "method": method,
@@ -359,7 +358,7 @@ def _overview_row(row: dict[str, Any]) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A duration for people: 12 µs, 3.4 ms, 1.2 s."""
+    """Format a duration for people: 12 µs, 3.4 ms, 1.2 s."""
     for unit, size in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= size:
             return f"{seconds / size:.3g} {unit}"

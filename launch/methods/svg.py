@@ -1,4 +1,4 @@
-"""Pictures for pages that are light or dark: one SVG that follows what its reader prefers."""
+"""Save figures as SVG that suits light and dark pages."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 INK, INK_IN_THE_DARK = "#1f2328", "#e6edf3"
-"""Of axes and words, on white and on black."""
+"""Colours of axes and text, on white and on black."""
 
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#8c6bb1", "#7f7f7f")
-"""Told apart by people who see colours otherwise (Okabe and Ito), on white and on black."""
+"""Colours for people with any colour vision (Okabe and Ito), on white and on black."""
 
 _STYLE: dict[Any, Any] = {
     "axes.edgecolor": INK,
@@ -33,7 +33,7 @@ _STYLE: dict[Any, Any] = {
     "text.color": INK,
     "xtick.color": INK,
     "ytick.color": INK,
-    # The same picture has the same bytes.
+    # Equal figures have equal bytes.
     "svg.hashsalt": "flexsheet",
 }
 
@@ -47,8 +47,8 @@ _DARK = f"""<style>
 
 
 @contextmanager
-def drawn_for_pages() -> Iterator[None]:
-    """Figures made inside have the colours that `save_svg` can turn for the dark."""
+def page_style() -> Iterator[None]:
+    """Give figures made within the colours that `save_svg` can replace on dark pages."""
     import matplotlib as mpl
     from matplotlib.rcsetup import cycler
 
@@ -57,8 +57,8 @@ def drawn_for_pages() -> Iterator[None]:
         yield
 
 
-def svg_of(figure: Figure) -> str:
-    """The figure as SVG; its ground is transparent, its ink is light where the page is dark."""
+def render_svg(figure: Figure) -> str:
+    """Return the figure as SVG with a transparent background and light ink on dark pages."""
     drawn = StringIO()
     figure.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
     head, tag, rest = drawn.getvalue().partition("<defs>")
@@ -66,5 +66,5 @@ def svg_of(figure: Figure) -> str:
 
 
 def save_svg(figure: Figure, path: Path) -> None:
-    """Write `svg_of` the figure."""
-    write_file(path, svg_of(figure))
+    """Write the figure as SVG; see `render_svg`."""
+    write_file(path, render_svg(figure))

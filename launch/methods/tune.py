@@ -1,9 +1,8 @@
-"""The cheapest methods that are good enough for a scene: measured, chosen, and written into it.
+"""Measure methods for a scene, choose the fastest sufficient ones, and write them into the scene.
 
-Each family that nodes take up is measured on this machine over the scene's working range.  Of the
-methods whose stated range holds all of it and whose largest error keeps a margin to the scene's
-tolerance, the one that takes least time is chosen.  Where there is none, the nearest miss is, and
-that is said.
+Each family is measured on this machine over the scene's working range.  A method is sufficient if
+its stated range contains the working range and its maximum error keeps a margin to the scene's
+tolerance.  Without a sufficient method, the nearest miss is chosen and reported.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap
 
-from flexsheet.launch.methods.charts import duration, family_at, git_commit, measure_family
-from flexsheet.launch.methods.machine import machine_name
+from flexsheet.launch.methods.charts import duration, git_commit, load_family, measure_family
+from flexsheet.launch.methods.results import machine_name
 from flexsheet.launch.plans.documents import BadInputError, Problem, did_you_mean
 from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.errors import FlexsheetError
@@ -34,17 +33,17 @@ from flexsheet.nodes.methods import Family, Point, Trial
 
 REPEATS = 10
 MARGIN = 0.2
-"""Share of a tolerance that must be left over: what no chart has comes on top."""
+"""Fraction of a tolerance that must remain, for errors outside the measurements."""
 TIE_RATIO = 1.1
-"""Methods that take no longer than this times the quickest take the same time, as far as a machine
-with other work can tell; the more exact is taken."""
+"""Methods up to this factor slower than the fastest count as equally fast; the most exact is
+chosen."""
 
 Measure = Callable[[Family, Scene, Callable[[Trial], bool]], Sequence[Point]]
 Setting = str | dict[str, Any]
 
 
 class UnknownTunableError(FlexsheetError, KeyError):
-    """A family that no node takes a choice of; the message says which there are."""
+    """Raised for a family without a choice in scenes; the text lists the others."""
 
     code = "unknown-tunable"
     remedy = "Choose one of the names in the text (docs/tune.md)."
@@ -52,12 +51,11 @@ class UnknownTunableError(FlexsheetError, KeyError):
 
 @dataclass(frozen=True, slots=True)
 class Tunable:
-    """A family that nodes take up.
+    """Describe a family among whose methods a scene can choose.
 
-    key: in a scene's `methods`.  families: where they are described, to be measured in turn; what
-    takes minutes to make comes in a later one, which is asked only where nothing before it is good
-    enough.  settings: for each method that a node offers, by its name in the chart, what the scene
-    then says.
+    key: in a scene's `methods`.  families: as `module:NAME`, measured in order; later ones take
+    minutes to prepare and are measured only if no earlier method is sufficient.  settings: the
+    scene's value for each method, by the method's name in the chart.
     """
 
     name: str
@@ -78,27 +76,27 @@ TUNABLES = (
     Tunable(
         "marker",
         "marker",
-        ("flexsheet.nodes.triangulator.families:MARKER",),
+        ("flexsheet.nodes.triangulator.benchmarks:MARKER",),
         _by_name("moments", "weighted_centroid", "subpixel_fit"),
     ),
     Tunable(
         "triangulation",
         "triangulation",
-        ("flexsheet.nodes.triangulator.families:TRIANGULATION",),
+        ("flexsheet.nodes.triangulator.benchmarks:TRIANGULATION",),
         _by_name("dlt"),
     ),
     Tunable(
         "tracking",
         "tracking",
-        ("flexsheet.launch.methods.families:TRACKING",),
+        ("flexsheet.launch.methods.benchmarks:TRACKING",),
         _by_name("none", "one_euro", "constant_velocity", "constant_acceleration", "singer_tremor"),
     ),
     Tunable(
         "sheet-force",
         "sheet_force",
         (
-            "flexsheet.launch.methods.families:SHEET_LAWS",
-            "flexsheet.launch.methods.families:SHEET_FORCE",
+            "flexsheet.launch.methods.benchmarks:SHEET_LAWS",
+            "flexsheet.launch.methods.benchmarks:SHEET_FORCE",
         ),
         _by_name("linear", "scaled", "table"),
     ),
@@ -106,8 +104,8 @@ TUNABLES = (
         "sheet-shape",
         "sheet_shape",
         (
-            "flexsheet.launch.methods.families:QUICK_SHAPE",
-            "flexsheet.launch.methods.families:SHEET_SHAPE",
+            "flexsheet.launch.methods.benchmarks:QUICK_SHAPE",
+            "flexsheet.launch.methods.benchmarks:SHEET_SHAPE",
         ),
         _by_name("four_triangles", "reduced_order"),
     ),
@@ -115,8 +113,8 @@ TUNABLES = (
         "correction",
         "correction",
         (
-            "flexsheet.launch.methods.families:QUICK_CORRECTION",
-            "flexsheet.launch.methods.families:CORRECTION",
+            "flexsheet.launch.methods.benchmarks:QUICK_CORRECTION",
+            "flexsheet.launch.methods.benchmarks:CORRECTION",
         ),
         _by_name("none", "one_plane", "four_triangles", "two_pass"),
     ),
@@ -135,17 +133,17 @@ TUNABLES = (
         },
     ),
 )
-"""In the order in which they are tuned: the correction asks which shape two passes go onto."""
+"""In the order of tuning: the correction depends on the chosen sheet shape."""
 
 TWO_PASS_ONTO = {
     "four_triangles": "two_pass_triangles",
     "reduced_order": "two_pass",
 }
-"""What the chart calls two passes, by the sheet's shape."""
+"""Name of the two-pass correction in the chart, by the sheet's shape."""
 
 
 def tunables_named(names: Sequence[str]) -> list[Tunable]:
-    """Those of the names, in the order of `TUNABLES`, or all; UnknownTunableError."""
+    """Return the named tunables in the order of `TUNABLES`, or all; raises UnknownTunableError."""
     known = [one.name for one in TUNABLES]
     for name in names:
         if name not in known:
@@ -156,13 +154,13 @@ def tunables_named(names: Sequence[str]) -> list[Tunable]:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """One method over a scene's working range.
+class MethodEvaluation:
+    """Hold the evaluation of one method over a scene's working range.
 
-    median_s: of a call, in the middle of the cases.  slowest_s: of the slowest case.  error: the
-    largest within the method's range, at `worst_case`; infinite where it has none.  outside: the
-    cases that it does not claim.  wrong: those where its error takes more than the tolerance less
-    its margin, or nothing could judge it.
+    median_s: time of a call, median over the cases.  slowest_s: of the slowest case.  error: the
+    maximum within the method's range, at `worst_case`; infinite without one.  outside: cases out of
+    the method's range.  wrong: cases whose error exceeds the tolerance less its margin, or has no
+    reference.
     """
 
     method: str
@@ -186,14 +184,14 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """What a family comes to: the chosen method, whether it meets the tolerance, and all judged."""
+    """Hold the chosen method of a family and the evaluations of all."""
 
     family: str
     key: str
     unit: str
     tolerance: float
-    chosen: Verdict
-    judged: tuple[Verdict, ...]
+    chosen: MethodEvaluation
+    judged: tuple[MethodEvaluation, ...]
 
     @property
     def met(self) -> bool:
@@ -201,11 +199,11 @@ class Choice:
 
     @property
     def spare_ratio(self) -> float:
-        """Share of the tolerance that is left over; negative where it is exceeded."""
+        """Return the remaining fraction of the tolerance; negative if it is exceeded."""
         return 1.0 - self.chosen.error / self.tolerance
 
     def sentence(self) -> str:
-        """Why, in a sentence."""
+        """Return the reason for the choice in one sentence."""
         one, unit = self.chosen, self.unit
         allowed = f"{_figure(self.tolerance)} {unit}"
         took = duration(one.median_s)
@@ -215,24 +213,24 @@ class Choice:
         cheaper = [other for other in self.judged if other.median_s * TIE_RATIO < one.median_s]
         rest = "nothing is cheaper"
         if cheaper:
-            nearest = min(cheaper, key=_miss)
+            nearest = min(cheaper, key=_miss_key)
             rest = f"{nearest.method} is cheaper ({duration(nearest.median_s)}), but "
             rest += self._shortfall(nearest)
         left = f"{one.method} ({took}) leaves {_figure(one.error)} of {allowed} allowed"
         return f"{self.family}: {left}; {rest}"
 
-    def _shortfall(self, one: Verdict) -> str:
-        """Why a method does not do."""
+    def _shortfall(self, one: MethodEvaluation) -> str:
+        """Return why a method is not sufficient."""
         parts = []
         if one.wrong:
             error = f"{_figure(one.error)} {self.unit} at {_case(one.worst_case)}"
-            parts.append(f"leaves {error}" if math.isfinite(one.error) else "nothing can judge it")
+            parts.append(f"leaves {error}" if math.isfinite(one.error) else "has no reference")
         if one.outside:
-            parts.append(f"is not meant for {_case(one.outside[0])}")
+            parts.append(f"is out of its range at {_case(one.outside[0])}")
         return " and ".join(parts)
 
     def report(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the report of `--json`."""
         return {
             "family": self.family,
             "key": self.key,
@@ -261,14 +259,14 @@ def _case(case: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def verdicts(
+def evaluate_methods(
     points: Sequence[Point],
     settings: Mapping[str, Setting],
     *,
     tolerance: float,
     margin: float = MARGIN,
-) -> list[Verdict]:
-    """How each method of `settings` does over the cases that the scene asks for."""
+) -> list[MethodEvaluation]:
+    """Evaluate each method of `settings` over the scene's own cases."""
     allowed, found = (1.0 - margin) * tolerance, []
     for method, setting in settings.items():
         mine = [point for point in points if point.method == method and point.in_scene]
@@ -279,7 +277,7 @@ def verdicts(
         worst = max(sure, key=lambda point: point.error, default=mine[0])
         times = sorted(point.median_s for point in mine)
         found.append(
-            Verdict(
+            MethodEvaluation(
                 method=method,
                 setting=setting,
                 median_s=times[len(times) // 2],
@@ -294,21 +292,18 @@ def verdicts(
     return found
 
 
-def choose(judged: Sequence[Verdict]) -> Verdict:
-    """The cheapest that meets the tolerance everywhere, else the nearest miss."""
+def choose(judged: Sequence[MethodEvaluation]) -> MethodEvaluation:
+    """Return the fastest method that meets the tolerance everywhere, else the nearest miss."""
     enough = [one for one in judged if one.meets]
     if not enough:
-        return min(judged, key=_miss)
+        return min(judged, key=_miss_key)
     quickest = min(one.median_s for one in enough)
     same = [one for one in enough if one.median_s <= TIE_RATIO * quickest]
     return min(same, key=lambda one: (one.error, one.median_s))
 
 
-def _miss(one: Verdict) -> tuple[int, int, float, float]:
-    """By how much a method misses.
-
-    What it is not meant for comes first: there it gives no answer that could be near.
-    """
+def _miss_key(one: MethodEvaluation) -> tuple[int, int, float, float]:
+    """Return a sort key for methods that miss; cases out of range weigh most."""
     return len(one.outside), one.missed, one.error, one.median_s
 
 
@@ -320,30 +315,32 @@ def tune(
     measured: Measure | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Choice]:
-    """Measure and choose, family by family; `measured` stands in for the measuring.
+    """Measure and choose for each family in order; `measured` replaces the measurement in tests.
 
-    Errors of a family whose shape, mesh or sheet cannot be worked with come through.
+    Raises the errors of a family that cannot handle the scene's shape, mesh or sheet.
     """
     choices: list[Choice] = []
     shape: str = scene.methods.sheet_shape or "reduced_order"
     for number, tunable in enumerate(tunables, start=1):
-        told = partial(_told, progress, f"{tunable.name} ({number} of {len(tunables)})")
+        told = partial(_report, progress, f"{tunable.name} ({number} of {len(tunables)})")
         settings = dict(tunable.settings)
         if tunable.name == "correction":
             settings.pop("two_pass")
             settings[TWO_PASS_ONTO[shape]] = "two_pass"
-        choice = _tuned(scene, tunable, settings, margin=margin, measured=measured, progress=told)
+        choice = _tune_family(
+            scene, tunable, settings, margin=margin, measured=measured, progress=told
+        )
         if tunable.name == "sheet-shape":
             shape = choice.chosen.method
         choices.append(choice)
     return choices
 
 
-def _told(progress: Callable[[str], None], where: str, text: str) -> None:
+def _report(progress: Callable[[str], None], where: str, text: str) -> None:
     progress(f"{where}: {text}")
 
 
-def _tuned(
+def _tune_family(
     scene: Scene,
     tunable: Tunable,
     settings: Mapping[str, Setting],
@@ -352,9 +349,9 @@ def _tuned(
     measured: Measure | None,
     progress: Callable[[str], None],
 ) -> Choice:
-    judged: list[Verdict] = []
+    judged: list[MethodEvaluation] = []
     for place in tunable.families:
-        family = family_at(place)
+        family = load_family(place)
         known = {one.method for one in judged}
         left = {
             name: setting
@@ -371,7 +368,7 @@ def _tuned(
             points = measure_family(
                 family, scene, repeats=REPEATS, progress=progress, wanted=wanted
             )
-        judged += verdicts(points, left, tolerance=family.tolerance(scene), margin=margin)
+        judged += evaluate_methods(points, left, tolerance=family.tolerance(scene), margin=margin)
         if any(one.meets for one in judged):
             break
     tolerance = family.tolerance(scene)
@@ -385,11 +382,14 @@ def _is_wanted(methods: Mapping[str, Setting], trial: Trial) -> bool:
 METHODS = "methods"
 
 
-def written(
+def insert_choices(
     text: str, choices: Sequence[Choice], *, today: str, machine: str, commit: str | None
 ) -> str:
-    """A scene file's text with these choices in its `methods`.  All else stays as it is, to the
-    byte, and so do the methods of other families; a `methods` on one line is unfolded."""
+    """Return a scene file's text with these choices in its `methods`.
+
+    All other text keeps its bytes, also the methods of other families.  A `methods` on one line is
+    expanded to several.
+    """
     lines = text.splitlines(keepends=True)
     ending = "\r\n" if lines and lines[0].endswith("\r\n") else "\n"
     block = _block(text, lines)
@@ -414,21 +414,20 @@ def written(
 def _line(choice: Choice, indent: str) -> str:
     setting = choice.chosen.setting
     took, allowed = duration(choice.chosen.median_s), f"{_figure(choice.tolerance)} {choice.unit}"
-    told = f"{took}, leaves {_figure(choice.chosen.error)} of {allowed}"
+    comment = f"{took}, leaves {_figure(choice.chosen.error)} of {allowed}"
     if not choice.met:
         missed = f"{choice.chosen.missed} of {choice.chosen.cases} cases missed"
-        told = f"NOT GOOD ENOUGH, the nearest miss: {told}; {missed}"
-    return f"{indent}{choice.key}: {_flow(setting)}  # {told}"
+        comment = f"NOT GOOD ENOUGH, the nearest miss: {comment}; {missed}"
+    return f"{indent}{choice.key}: {_flow(setting)}  # {comment}"
 
 
 @dataclass(frozen=True, slots=True)
 class _Block:
-    """The `methods` of a scene file's lines.
+    """Locate the `methods` in a scene file's lines.
 
-    start: its first line, with the comment above that was written along.  end: the line after it;
-    both are the file's end where there are none.  header: the line of `methods:`, where it can
-    stay.  parts: what comes after it, in order: a family's key and its lines; and comments, without
-    a key.
+    start: first line, including the generated comment above.  end: line after the block; both are
+    the file's end without a block.  header: the line `methods:`, if it can stay.  parts: in order,
+    each family's key and lines, and comments with an empty key.
     """
 
     start: int
@@ -476,12 +475,14 @@ def _flow(item: Any) -> str:
 
 
 FILES = (("object", "geometry", "file"), ("object", "appearance", "image_file"))
-"""Keys of a scene file that name a file relative to it."""
+"""Keys of a scene file whose values are paths relative to it."""
 
 
-def moved(text: str, source: Path, target: Path) -> str:
-    """A scene file's text as it must read in the target's folder: files that it names relative to
-    itself are named from there.  BadInputError where a name cannot be put in."""
+def relocate_paths(text: str, source: Path, target: Path) -> str:
+    """Return a scene file's text with its relative paths adapted to the target's folder.
+
+    Raises BadInputError for a path that cannot be replaced.
+    """
     here, there = source.absolute().parent.resolve(), target.resolve().parent
     if here == there or source.resolve() == target.resolve():
         return text
@@ -498,8 +499,8 @@ def moved(text: str, source: Path, target: Path) -> str:
         rest = lines[line][column:]
         old = next((one for one in (f'"{name}"', f"'{name}'", name) if rest.startswith(one)), None)
         if old is None:
-            what = f'names "{name}", which is not to be found from {there}'
-            remedy = "give the file's whole path, or --output a file beside the scene"
+            what = f'names "{name}", which cannot be rewritten relative to {there}'
+            remedy = "give the absolute path, or --output a file in the scene's folder"
             raise BadInputError([Problem(f"{source}:{line + 1}", key, what, remedy)])
         new = json.dumps(os.path.relpath(here / name, there), ensure_ascii=False)
         lines[line] = lines[line][:column] + new + rest[len(old) :]
@@ -507,23 +508,25 @@ def moved(text: str, source: Path, target: Path) -> str:
 
 
 def check_target(source: Path, target: Path) -> None:
-    """Before anything is measured: can a scene be written there?  BadInputError where not."""
-    moved(_read(source), source, target)
+    """Check before the measurement that the target can be written; raises BadInputError."""
+    relocate_paths(_read(source), source, target)
     try:
         if target.is_dir():
-            raise IsADirectoryError(errno.EISDIR, "it is a folder")
-        draft = _draft_of(target.resolve())
+            raise IsADirectoryError(errno.EISDIR, "is a folder")
+        draft = _draft_path(target.resolve())
         draft.touch()
         draft.unlink()
     except OSError as error:
-        raise _unwritable(target, error) from error
+        raise _write_problem(target, error) from error
 
 
-def _unwritable(target: Path, error: OSError) -> BadInputError:
+def _write_problem(target: Path, error: OSError) -> BadInputError:
     if error.errno in DISK_ERRORS:
-        return BadInputError([Problem(str(write_error(target, error)), (), "nothing is changed")])
+        return BadInputError(
+            [Problem(str(write_error(target, error)), (), "the file is unchanged")]
+        )
     what = f"cannot be written: {error.strerror or error}"
-    remedy = "give --output FILE, in a folder that is there and may be written to"
+    remedy = "give --output FILE in an existing, writable folder"
     return BadInputError([Problem(str(target), (), what, remedy)])
 
 
@@ -531,44 +534,46 @@ def _read(source: Path) -> str:
     return source.read_bytes().decode("utf-8")  # read_text would change how lines end
 
 
-def _draft_of(target: Path) -> Path:
+def _draft_path(target: Path) -> Path:
     return target.with_name(f".{target.stem}.{os.getpid()}.yaml")
 
 
 def write_choices(source: Path, target: Path, choices: Sequence[Choice]) -> None:
-    """Put the choices into a scene file, or into a copy of it; a reader sees the old or the new.
+    """Write the choices into a scene file or a copy of it, atomically.
 
-    A link stays one: what it leads to is written.  BadInputError where the result would be no
-    scene, or another one, and where the target cannot be written.
+    A symbolic link stays; its target is written.  Raises BadInputError if the result would not be
+    the same scene, or the target cannot be written.
     """
-    text = written(
-        moved(_read(source), source, target),
+    text = insert_choices(
+        relocate_paths(_read(source), source, target),
         choices,
         today=datetime.now(UTC).date().isoformat(),
         machine=machine_name(),
         commit=git_commit(),
     )
     before = load_scene(source)
-    # In the target's folder, as a scene names its mesh from there.
+    # The draft is in the target's folder, since a scene's paths are relative to its own.
     place = target.resolve()
-    draft = _draft_of(place)
+    draft = _draft_path(place)
     try:
         draft.write_bytes(text.encode())
-        after = _loaded(draft, source)
+        after = _load_draft(draft, source)
         same = {"methods": before.methods}
         if after.model_copy(update=same).model_dump_json() != before.model_dump_json():
-            problem = Problem(str(source), (METHODS,), "cannot be put in without a change", "")
+            problem = Problem(
+                str(source), (METHODS,), "would change with the choices", "edit it by hand"
+            )
             raise BadInputError([problem])
         shutil.copymode(place if place.exists() else source, draft)
         draft.replace(place)
     except OSError as error:
-        raise _unwritable(target, error) from error
+        raise _write_problem(target, error) from error
     finally:
         draft.unlink(missing_ok=True)
 
 
-def _loaded(draft: Path, source: Path) -> Scene:
-    """The scene of the draft; what is wrong with it is said of the source."""
+def _load_draft(draft: Path, source: Path) -> Scene:
+    """Load the draft; name the source file in its problems."""
     try:
         return load_scene(draft)
     except BadInputError as error:

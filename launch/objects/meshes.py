@@ -1,10 +1,10 @@
-"""Mesh files that a scene names: read, repaired or refused, and put into the scene.
+"""Read, check and repair the mesh file of a scene.
 
 In a scene file an object may be given as
 
     geometry: {shape: mesh_file, file: liver.obj, metres_per_unit: 0.01}
 
-with a path relative to the scene file.  What the scene message holds is the mesh itself.
+with a path relative to the scene file.  The scene message contains the mesh itself.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from flexsheet.nodes.models.shapes.triangles import (
 GEOMETRY: Key = ("object", "geometry")
 MESH_FILE = "mesh_file"
 SHAPE_NAMES = (*(name for name in SHAPES if name != "mesh"), MESH_FILE)
-"""What a scene file may say; a mesh's arrays are no matter for YAML."""
+"""Shapes of a scene file; a mesh is given as a file, not as arrays."""
 SUFFIXES = (".obj", ".stl")
-MOST_BYTES = 64 << 20
-SMALLEST_M, LARGEST_M = 0.005, 1.0
-"""Objects that a hand can be shown; what is outside has its unit wrong."""
-LARGEST_UNITS = 1e9
-"""Of a coordinate in the file, whatever its unit: beyond it numbers of the mesh run over."""
+MAX_BYTES = 64 << 20
+MIN_EXTENT_M, MAX_EXTENT_M = 0.005, 1.0
+"""Plausible extents of an object; others are probably in another unit."""
+MAX_COORDINATE = 1e9
+"""Maximum coordinate in the file, in its unit; larger ones overflow in later computations."""
 
-MOST_CUTTING = 0.01
-"""Pairs of triangles that cut through one another, over all triangles: more is no flaw of a rim but
-another object.  Fewer are bridged by the smooth surface."""
+MAX_CUTTING_RATIO = 0.01
+"""Maximum number of intersecting triangle pairs over all triangles.  The smooth surface bridges
+fewer; more mean that the mesh is not one solid."""
 
 
 class MeshFile(LimitedModel):
-    """An object's geometry as a scene file gives it."""
+    """Describe an object's geometry by a mesh file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -58,12 +58,12 @@ class MeshFile(LimitedModel):
         Positive, Field(description="the file's unit: 0.001 for millimetres, 0.01 for centimetres")
     ]
     smoothing_m: Positive | None = Field(
-        default=None, description="null: as long as it takes to hide the facets"
+        default=None, description="null: the length that hides the facets"
     )
 
 
-def scene_from_document(document: Document) -> Scene:
-    """The scene of a scene file, with the mesh that it names; raises BadInputError."""
+def make_scene(document: Document) -> Scene:
+    """Make the scene of a scene file, with the mesh that it names; raises BadInputError."""
     name = _shape_name(document)
     if name is not None and name not in SHAPE_NAMES:
         what = f'unknown shape "{name}"'
@@ -83,7 +83,7 @@ def scene_from_document(document: Document) -> Scene:
 
 
 def _shape_name(document: Document) -> Any:
-    """What the document says as the shape's name; None where it says none."""
+    """Return the document's shape name, or None without one."""
     value: Any = document.values
     for key in (*GEOMETRY, "shape"):
         value = value.get(key) if isinstance(value, dict) else None
@@ -91,54 +91,51 @@ def _shape_name(document: Document) -> Any:
 
 
 def read_mesh(path: Path, metres_per_unit: float, smoothing_m: float | None) -> Mesh:
-    """The mesh of a file, in metres, one that can be touched; MeshError says why it is none.
+    """Read a closed mesh from a file, in metres; MeshError gives the reason if it is not one.
 
-    Repaired: vertices stored once per triangle are merged, degenerate and repeated triangles and
-    unused vertices are dropped, winding is unified and turned outwards.  `Mesh.origin` tells what
-    was done.  Refused is what `check_mesh` refuses of the rest, holes among them: a closed surface
-    cannot be guessed.
+    Repairs: merges vertices that are stored once per triangle; removes degenerate and repeated
+    triangles and unused vertices; unifies the winding and orients it outwards.  `Mesh.origin` lists
+    the repairs.  Holes and all else that `check_mesh` rejects raise MeshError.
     """
-    vertices, triangles, repairs = _repaired(_read(path), metres_per_unit)
+    vertices, triangles, repairs = _repair(_read(path), metres_per_unit)
     extent_m = float(np.ptp(vertices, axis=0).max())
-    if not SMALLEST_M <= extent_m <= LARGEST_M:
+    if not MIN_EXTENT_M <= extent_m <= MAX_EXTENT_M:
         raise MeshError(
-            f"the object would be {extent_m:.3g} m wide; is metres_per_unit {metres_per_unit:g} "
-            "right? (0.001 for millimetres, 0.01 for centimetres)"
+            f"the object would be {extent_m:.3g} m wide; check metres_per_unit {metres_per_unit:g} "
+            "(0.001 for millimetres, 0.01 for centimetres)"
         )
     check_mesh(vertices, triangles)
     cutting = count_intersections(vertices, triangles)
-    if cutting > MOST_CUTTING * len(triangles):
-        raise MeshError(
-            f"the surface cuts through itself: {cutting} pairs of triangles; untangle it"
-        )
+    if cutting > MAX_CUTTING_RATIO * len(triangles):
+        raise MeshError(f"the surface intersects itself in {cutting} pairs of triangles; repair it")
     if cutting:
-        repairs.append(f"{cutting} pairs of triangles that cut through one another are bridged")
+        repairs.append(f"{cutting} intersecting pairs of triangles bridged")
     if smoothing_m is None:
         smoothing_m = default_smoothing_m(vertices, triangles)
     deviation_m = SmoothMeshShape(vertices, triangles, smoothing_m).deviation_m()
-    told = [
+    history = [
         f"{path.name} by {metres_per_unit:g}",
         *repairs,
-        f"smoothed over {smoothing_m * 1e3:.3g} mm, at most {deviation_m * 1e3:.2g} mm off",
+        f"smoothed over {smoothing_m * 1e3:.3g} mm, maximum deviation {deviation_m * 1e3:.2g} mm",
     ]
     return Mesh(
         vertices_m=vertices,
         triangles=triangles.astype(np.int32),
         smoothing_m=smoothing_m,
-        origin="; ".join(told),
+        origin="; ".join(history),
     )
 
 
 def _read(path: Path) -> Any:
-    """The file as a `trimesh.Trimesh`, as it stands; MeshError where it holds none."""
+    """Read a file as a `trimesh.Trimesh` without changes; MeshError if it holds none."""
     if path.suffix.lower() not in SUFFIXES:
-        raise MeshError(f"meshes are read from {' and '.join(SUFFIXES)} files")
+        raise MeshError(f"is not a mesh file; convert it to {' or '.join(SUFFIXES)}")
     try:
         size = path.stat().st_size
     except OSError as error:
         raise MeshError(f"cannot be read at {path}: {error.strerror}; check the path") from error
-    if size > MOST_BYTES:
-        raise MeshError(f"has {size >> 20} MiB, at most {MOST_BYTES >> 20} are read; decimate it")
+    if size > MAX_BYTES:
+        raise MeshError(f"has {size >> 20} MiB, at most {MAX_BYTES >> 20} are allowed; decimate it")
     # Late, because only scenes with a mesh need it.
     import trimesh
 
@@ -146,33 +143,33 @@ def _read(path: Path) -> Any:
         mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
     # A file of any content makes it raise errors of many kinds.
     except Exception as error:
-        raise MeshError(f"is no mesh that can be read: {error}") from error
+        raise MeshError(f"cannot be read as a mesh: {error}; export it again") from error
     faces = np.asarray(getattr(mesh, "faces", ()))
     if len(faces):
-        _refuse_odd(np.asarray(mesh.vertices), faces)
+        _check_arrays(np.asarray(mesh.vertices), faces)
     return mesh
 
 
-def _refuse_odd(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
-    """Arrays that are no mesh, which the library lets through; MeshError."""
+def _check_arrays(vertices: NDArray[Any], faces: NDArray[Any]) -> None:
+    """Raise MeshError for arrays that the library accepts though they are no mesh."""
     if faces.shape[1:] != (3,) or vertices.shape[1:] != (3,):
-        raise MeshError("its faces are no triangles of points in space")
-    if not (np.abs(vertices) < LARGEST_UNITS).all():
-        raise MeshError(f"a vertex is NaN or infinite, or further away than {LARGEST_UNITS:g}")
+        raise MeshError("its faces are not triangles of points in space; triangulate it")
+    if not (np.abs(vertices) < MAX_COORDINATE).all():
+        raise MeshError(f"a vertex is not finite or exceeds {MAX_COORDINATE:g}; export it again")
     if faces.min() < 0 or faces.max() >= len(vertices):
-        raise MeshError("a triangle names a vertex that is not there")
+        raise MeshError("a triangle refers to a missing vertex; export it again")
 
 
-def _repaired(
+def _repair(
     mesh: Any, metres_per_unit: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], list[str]]:
-    """Vertices (v, 3) m, triangles (t, 3) and what was repaired; MeshError for nothing at all."""
+    """Return vertices (v, 3) m, triangles (t, 3) and the repairs; MeshError for an empty mesh."""
     repairs = []
     if not len(getattr(mesh, "faces", ())):
         raise MeshError("holds no triangles")
     if len(mesh.faces) > 2 * MAX_TRIANGLES:
         raise MeshError(
-            f"{len(mesh.faces)} triangles, at most {MAX_TRIANGLES} are taken; decimate the mesh"
+            f"{len(mesh.faces)} triangles, at most {MAX_TRIANGLES} are allowed; decimate the mesh"
         )
     mesh.merge_vertices(merge_tex=True, merge_norm=True)
     for what, keep in (
@@ -183,7 +180,7 @@ def _repaired(
         dropped = len(mesh.faces) - int(np.count_nonzero(kept))
         if dropped:
             mesh.update_faces(kept)
-            repairs.append(f"{dropped} {what} triangles dropped")
+            repairs.append(f"{dropped} {what} triangles removed")
     if not len(mesh.faces):
         raise MeshError("all its triangles are degenerate")
     mesh.remove_unreferenced_vertices()
@@ -192,7 +189,7 @@ def _repaired(
     triangles = unify_winding(before)
     if volume_m3(vertices, triangles) < 0.0:
         triangles = triangles[:, ::-1]
-    turned = int((before != triangles).any(axis=1).sum())
-    if turned:
-        repairs.append(f"{turned} triangles turned over")
+    flipped = int((before != triangles).any(axis=1).sum())
+    if flipped:
+        repairs.append(f"{flipped} triangles flipped")
     return vertices, np.ascontiguousarray(triangles), repairs

@@ -1,11 +1,11 @@
-"""Image files that a scene names as its object's texture: read, or refused, and put into the scene.
+"""Read and check the texture image of a scene's object.
 
 In a scene file the object may have
 
     appearance: {texture: image, image_file: marble.png}
 
-with a path relative to the scene file.  What the scene message holds is the picture itself, so that
-the renderer has it on whatever host it runs.
+with a path relative to the scene file.  The scene message contains the image itself, so that the
+renderer has it on any host.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from flexsheet.messages.errors import FlexsheetError
 APPEARANCE: Key = ("object", "appearance")
 IMAGE_FILE = "image_file"
 SUFFIXES = (".png", ".jpg", ".jpeg")
-MOST_PX = 2048
-"""A side's; the projector has fewer."""
+MAX_SIDE_PX = 2048
+"""Maximum width and height; the projector has fewer pixels."""
 
 
 class TextureError(FlexsheetError, ValueError):
-    """A file that is no texture; the text says why, and what helps."""
+    """Raised for a file that cannot be a texture; the text gives the reason and a remedy."""
 
     code = "texture"
     remedy = "Name a PNG or JPEG file, and a mesh with texture coordinates."
 
 
 def put_image(document: Document) -> None:
-    """Replace `image_file` in a scene's document by the picture; raises BadInputError."""
+    """Replace `image_file` in a scene's document by the image; raises BadInputError."""
     value: Any = document.values
     for key in APPEARANCE:
         value = value.get(key) if isinstance(value, dict) else None
@@ -43,18 +43,18 @@ def put_image(document: Document) -> None:
     name, where = value.pop(IMAGE_FILE), (*APPEARANCE, IMAGE_FILE)
     try:
         if value.get("texture") != "image":
-            raise TextureError("is used by texture: image only; say so, or leave the file out")
+            raise TextureError("needs texture: image; set it, or remove image_file")
         if not isinstance(name, str):
-            raise TextureError("is no file's name")
+            raise TextureError("is not a file name")
         value["image"] = read_image(document.path.parent / name)
     except TextureError as error:
         raise BadInputError([document.problem(where, f'"{name}": {error}')]) from error
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
-    """The picture (height, width, 3) of a file, red first; TextureError says why it is none."""
+    """Read an image (height, width, 3), red first; TextureError gives the reason if it fails."""
     if path.suffix.lower() not in SUFFIXES:
-        raise TextureError(f"textures are read from {', '.join(SUFFIXES)} files")
+        raise TextureError(f"is not an image file; convert it to {' or '.join(SUFFIXES)}")
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -62,10 +62,12 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     # Late, because only scenes with an image need it.
     import cv2
 
-    picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
-    if picture is None:
-        raise TextureError("is damaged, or no picture")
-    if max(picture.shape) > MOST_PX:
-        height, width = picture.shape[:2]
-        raise TextureError(f"has {width}x{height} pixels, at most {MOST_PX} to a side; shrink it")
-    return np.ascontiguousarray(picture[..., ::-1], dtype=np.uint8)
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if image is None:
+        raise TextureError("is damaged or not an image; export it again")
+    if max(image.shape) > MAX_SIDE_PX:
+        height, width = image.shape[:2]
+        raise TextureError(
+            f"has {width}x{height} pixels, at most {MAX_SIDE_PX} per side; shrink it"
+        )
+    return np.ascontiguousarray(image[..., ::-1], dtype=np.uint8)

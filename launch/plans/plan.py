@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from flexsheet.launch.objects.meshes import scene_from_document
+from flexsheet.launch.objects.meshes import make_scene
 from flexsheet.launch.plans.documents import (
     BadInputError,
     Document,
@@ -142,7 +142,7 @@ def _load_scene(
         return None, None
     try:
         scene_document = read_document(path)
-        return scene_document, scene_from_document(scene_document)
+        return scene_document, make_scene(scene_document)
     except BadInputError as error:
         problems.extend(error.problems)
         return None, None
@@ -150,7 +150,7 @@ def _load_scene(
 
 def load_scene(path: Path) -> Scene:
     """Read and check a scene file; raises BadInputError."""
-    return scene_from_document(read_document(path))
+    return make_scene(read_document(path))
 
 
 def _make_node(

@@ -322,8 +322,8 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
     inward = (radius - away) * inverse
     edge = np.exp(inward * inward * -0.5)
     edge *= (PEAK_OF_NORMAL / steps) * inverse
-    share = np.add.reduce(ndtr(inward), axis=1)
-    share /= steps
+    coverage = np.add.reduce(ndtr(inward), axis=1)
+    coverage /= steps
     np.add.reduce(edge, axis=1, out=slopes[:, RADIUS])
     np.add.reduce(edge * -inward, axis=1, out=slopes[:, BLUR])
     edge /= away
@@ -337,11 +337,11 @@ def _render_disc(found: Floats, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         np.add.reduce(along * ay, axis=1, out=slopes[:, MOTION_Y])
         slopes[:, MOTION_X:] *= height[:, None]
     slopes[:, :MARKER] *= height[:, None]
-    slopes[:, MARKER] = share
-    left = np.subtract(1.0, share, out=slopes[:, GROUND])
+    slopes[:, MARKER] = coverage
+    left = np.subtract(1.0, coverage, out=slopes[:, GROUND])
     np.multiply(left, dx, out=slopes[:, SLOPE_X])
     np.multiply(left, dy, out=slopes[:, SLOPE_Y])
-    levels = ground + share * height
+    levels = ground + coverage * height
     return levels.reshape(count, side * side), slopes.reshape(count, parameters, side * side)
 
 

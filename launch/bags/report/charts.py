@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flexsheet.launch.bags.report.series import Grid, Spread, States
 from flexsheet.launch.bags.report.session import Session
-from flexsheet.launch.methods.svg import COLOURS, INK, drawn_for_pages, svg_of
+from flexsheet.launch.methods.svg import COLOURS, INK, page_style, render_svg
 from flexsheet.nodes.arm_bridge.kinematics import JOINT_SPEED_RAD_PER_S
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def charts_of(session: Session) -> dict[str, Chart]:
         "force": forces,
     }
     found = {}
-    with drawn_for_pages():
+    with page_style():
         for name, make in makers.items():
             chart = make(session)
             if chart is not None:
@@ -150,7 +150,7 @@ def timeline(session: Session) -> Chart | None:
     ]
     counts = [f"{session.events.counts[kind]} × {kind}" for kind in kinds]
     return Chart(
-        svg_of(figure),
+        render_svg(figure),
         "Timeline. " + "; ".join([*spent, *counts]) + ".",
         "What the sheet, the arms and the finger's tracker did; white: nothing was recorded. Of "
         "states that share a stretch of the picture the gravest is drawn.",
@@ -216,7 +216,7 @@ def latencies(session: Session) -> Chart | None:
     for i in range(len(events), grid.size):
         grid[i // 2][i % 2].set_visible(False)
     return Chart(
-        svg_of(figure),
+        render_svg(figure),
         "From the exposure to each step, over the whole bag, median and 99 %: "
         + "; ".join(told)
         + ".",
@@ -258,7 +258,7 @@ def paths(session: Session) -> Chart | None:
         f"{axis} from {a:.0f} to {b:.0f} mm" for axis, a, b in zip("xyz", low, high, strict=True)
     )
     return Chart(
-        svg_of(figure),
+        render_svg(figure),
         f"Paths of finger and sheet in the world: {spans}.",
         "In the world's frame, its origin in the middle of the imaginary screen.",
     )
@@ -299,7 +299,7 @@ def sheet_errors(session: Session) -> Chart | None:
         if (overall := errors.distance[name].overall())
     ]
     return Chart(
-        svg_of(figure),
+        render_svg(figure),
         "Errors of the sheet in contact, as the paper defines them; greatest: "
         + ", ".join(worst)
         + ".",
@@ -336,7 +336,7 @@ def joint_speeds(session: Session) -> Chart | None:
     grid[0][0].legend(fontsize=8, ncols=7, loc="upper right")
     grid[-1][0].set_xlabel("time in the bag, s")
     return Chart(
-        svg_of(figure),
+        render_svg(figure),
         f"Joint speeds as shares of their limits: {', '.join(told)}.",
         "The greatest of each stretch of time, from the measured joints over 25 ms.",
     )
@@ -370,7 +370,7 @@ def forces(session: Session) -> Chart | None:
         _over_time(axes, session)
     lower.set_xlabel("time in the bag, s")
     return Chart(
-        svg_of(figure),
+        render_svg(figure),
         f"Forces: {', '.join(told)}.",
         "Above, the pull of the sheet at its edges, by the bridges; below, how deep the finger is "
         "in the object, and the object's force on it by the solver.",

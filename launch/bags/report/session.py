@@ -16,7 +16,7 @@ from pydantic import ValidationError
 from flexsheet.launch.bags.report.album import Album
 from flexsheet.launch.bags.report.series import Events, Grid, Moments, Places, Range, Spread, States
 from flexsheet.launch.bags.report.strokes import SheetErrors
-from flexsheet.launch.experiments.stroke import events_of
+from flexsheet.launch.experiments.stroke import list_events
 from flexsheet.launch.plans.plan_model import ResolvedGraph
 from flexsheet.messages.bag import BagError, BagInfo, BagReader
 from flexsheet.messages.base import Header, Message
@@ -253,7 +253,7 @@ class Session:
         # What a message says of durations stands on its own writer's clock alone; only what is
         # brought together with others must be put into the recorder's.
         seconds, index = self.seconds(log_ns), self.grid.index(log_ns)
-        for event, exposure_ns, at_ns in events_of(message, header):
+        for event, exposure_ns, at_ns in list_events(message, header):
             if self._exposures.get(event) != exposure_ns:
                 self._exposures[event] = exposure_ns
                 if event not in self.latencies:

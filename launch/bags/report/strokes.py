@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from flexsheet.launch.bags.report.followed import FollowedFinger
 from flexsheet.launch.bags.report.series import Grid, Moments, Range
 from flexsheet.launch.experiments.stroke import (
-    Track,
+    SampledMotion,
     edge_row,
+    make_motion,
     object_pose,
     sheet_errors,
     stroke_window_s,
-    track,
 )
 from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import ArmSpec, Scene
@@ -84,12 +84,14 @@ class Side:
         self.finger: list[tuple[int, Floats]] = []
         self.edges: tuple[list[tuple[int, Floats]], ...] = ([], [])
 
-    def ripe(self) -> tuple[Track, tuple[Track, Track], NDArray[np.int64]] | None:
+    def ripe(
+        self,
+    ) -> tuple[SampledMotion, tuple[SampledMotion, SampledMotion], NDArray[np.int64]] | None:
         """Tracks, and the times at which everything is known; what is not, stays for later."""
         if len(self.finger) < 2 or min(map(len, self.edges)) < 2:
             return None
-        finger = track(self.finger, "finger")
-        left, right = (track(edge, "edge") for edge in self.edges)
+        finger = make_motion(self.finger, "finger")
+        left, right = (make_motion(edge, "edge") for edge in self.edges)
         until_ns = min(left.times_ns[-1], right.times_ns[-1])
         self.finger = [sample for sample in self.finger if sample[0] > until_ns]
         for edge in self.edges:
@@ -227,7 +229,7 @@ class SheetErrors:
     def _add_followed(
         self, times_ns: NDArray[np.int64], d: Floats, theta: Floats, heights: Floats
     ) -> None:
-        following = track(self._following, "twin/finger").at(times_ns)[:, 0] > 0.5
+        following = make_motion(self._following, "twin/finger").at(times_ns)[:, 0] > 0.5
         for run in self.runs:
             inside = (times_ns >= run.zero_ns) & (times_ns <= run.done_ns)
             if inside.any():
@@ -237,7 +239,7 @@ class SheetErrors:
         """Whether the target was in contact (n,), and the commanded retreat (n,) m, else 0."""
         if len(self._contact) < 2:
             return np.zeros(len(times_ns), np.bool_), np.zeros(len(times_ns))
-        contact = track(self._contact, "sheet_target")
+        contact = make_motion(self._contact, "sheet_target")
         touches, retreat_m = contact.at(times_ns).T
         covered = contact.covers(times_ns)
         return (touches > 0.999) & covered, np.where(covered, retreat_m, 0.0)

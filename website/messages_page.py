@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Sequence
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, get_args, get_origin
 
-import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from flexsheet.messages.arrays import ArraySpec
 from flexsheet.messages.base import Header
+from flexsheet.messages.field_types import field_type
 from flexsheet.messages.topics import TOPICS, Topic
 
 INTRODUCTION = """\
@@ -110,43 +108,12 @@ def type_section(kind: type[BaseModel]) -> str:
     return f"### {kind.__name__}\n\n{text}\n\n{_table(('field', 'type', 'notes'), rows)}"
 
 
-def field_type(field: FieldInfo) -> str:
-    """A field's type as a reader of the page would say it."""
-    for extra in field.metadata:
-        if isinstance(extra, ArraySpec):
-            return _array(extra)
-    return _type(field.annotation)
-
-
-def _type(annotation: Any) -> str:
-    """A type as a reader of the page would say it."""
-    origin, arguments = get_origin(annotation), get_args(annotation)
-    if origin is Annotated:
-        spec = next((extra for extra in arguments[1:] if isinstance(extra, ArraySpec)), None)
-        return _array(spec) if spec else _type(arguments[0])
-    if origin is Literal:
-        return " \\| ".join(f"`{value}`" for value in arguments)
-    if origin in (Union, UnionType):
-        return " or ".join(_type(argument) for argument in arguments)
-    if origin is tuple and arguments[-1] is Ellipsis:
-        return f"any number of {_type(arguments[0])}"
-    if origin is tuple:
-        return f"{len(arguments)} of {_type(arguments[0])}"
-    if annotation is NoneType:
-        return "none"
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
-    return getattr(annotation, "__name__", str(annotation))
-
-
-def _array(spec: ArraySpec) -> str:
-    return f"{np.dtype(spec.dtype).name} {spec.describe_shape()}"
-
-
 def _field_notes(field: FieldInfo) -> str:
     """Bounds, default and description."""
     notes = [note for extra in _constraints(field) if (note := _constraint(extra))]
-    if not field.is_required():
+    if field.default_factory is not None:
+        notes.append("empty by default")
+    elif not field.is_required():
         notes.append(f"default {field.default!r}")
     if field.description:
         notes.append(field.description)

@@ -162,10 +162,10 @@ class DrawnDisc:
             away = np.hypot(x - along * self.motion[0], y - along * self.motion[1])
             lit += np.clip(RAYS * (self.radius_px - away) + 0.5, 0.0, 1.0) / steps
         blurred = np.asarray(cv2.GaussianBlur(lit, (0, 0), RAYS * self.blur_px))
-        share = blurred.reshape(IMAGE_PX, RAYS, IMAGE_PX, RAYS).mean(axis=(1, 3))
+        coverage = blurred.reshape(IMAGE_PX, RAYS, IMAGE_PX, RAYS).mean(axis=(1, 3))
         rows = np.clip(np.arange(IMAGE_PX) - self.centre[1], -GROUND_REACH_PX, GROUND_REACH_PX)
         ground = self.ground + self.slope * rows[:, None]
-        return np.asarray(ground + share * (self.marker - ground))
+        return np.asarray(ground + coverage * (self.marker - ground))
 
 
 def noisy(levels: Floats, noise: PixelNoise, random: np.random.Generator) -> Image:

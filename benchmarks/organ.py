@@ -1,6 +1,6 @@
 """A made-up organ as a mesh: two lobes, a wedge from one to the other, a shallow furrow between.
 
-    python -m flexsheet.launch.objects.organ launch/scenes/organ.obj
+    python -m benchmarks.organ launch/scenes/organ.obj
 
 Lengths in the file are millimetres; its front is towards +z.  Nothing of it is anybody's.
 """
@@ -44,7 +44,7 @@ def organ_mesh() -> tuple[Floats, Indices]:
 
 def obj_text(vertices: Floats, triangles: Indices) -> str:
     """The mesh as a Wavefront OBJ file, to a hundredth of a unit."""
-    lines = ["# made by python -m flexsheet.launch.objects.organ; millimetres"]
+    lines = ["# made by python -m benchmarks.organ; millimetres"]
     lines += [f"v {x:.2f} {y:.2f} {z:.2f}" for x, y, z in vertices]
     lines += [f"f {a} {b} {c}" for a, b, c in triangles + 1]
     return "\n".join(lines) + "\n"
@@ -52,7 +52,7 @@ def obj_text(vertices: Floats, triangles: Indices) -> str:
 
 def main() -> None:
     if len(sys.argv) != 2:
-        sys.exit("usage: python -m flexsheet.launch.objects.organ FILE.obj")
+        sys.exit("usage: python -m benchmarks.organ FILE.obj")
     Path(sys.argv[1]).write_text(obj_text(*organ_mesh()), encoding="utf-8")
 
 

@@ -1,21 +1,27 @@
-"""Method families of the planner: ways to a mesh's normal, and ways to roll.
+"""Compare methods for a mesh's normal and for rolling; a scene cannot choose among them.
 
-Mesh normals: how long a query takes, how far off the normal is.  Judged on an ellipsoid of a
-liver's size whose normals are known, meshed at several densities.  The tolerance is the tilt that
-moves the end of the sheet's usable height by the scene's tolerance of the sheet's position.
+Mesh normals: time of a query and error of the normal.  The reference is an ellipsoid of a liver's
+size with known normals, meshed at several densities.  The tolerance is the tilt that moves the end
+of the sheet's usable height by the scene's tolerance of the sheet's position.
 
-Rolling: how long a step takes, and how far the sheet is from where it should be after a stroke over
-the object: at the corners of its usable part, against rolling in steps a fiftieth as long.
+Rolling: time of a step, and position error at the corners of the sheet's usable part after a stroke
+over the object.  The reference is rolling in steps a fiftieth as long.
+
+python -m benchmarks.planner_methods [--scene SCENE] [--output docs/charts]
 """
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable, Iterator
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flexsheet.launch.methods.charts import chart_result, measure_family, write_chart
+from flexsheet.launch.plans.plan import load_scene
 from flexsheet.messages.scene import Scene
 from flexsheet.nodes.methods import Case, Family, Trial
 from flexsheet.nodes.models.rigid import apply
@@ -290,3 +296,18 @@ ROLLING = Family(
     trials=rolling_trials,
     tolerance=lambda scene: 1e3 * scene.tolerances.sheet_position_m,
 )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--scene", type=Path, default=Path("launch/scenes/cylinder.yaml"))
+    parser.add_argument("--output", type=Path, default=Path("docs/charts"))
+    given = parser.parse_args()
+    scene = load_scene(given.scene)
+    for family in (MESH_NORMAL, ROLLING):
+        result = chart_result(family, scene, measure_family(family, scene, progress=print))
+        print(*write_chart(result, given.output))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""Method families that one node offers and another judges: only here may both be known."""
+"""Make the method families whose reference is the simulator; only launch may import both."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ RESTING = ("hold",)
 
 
 def finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
-    """The paper's stroke, where the object is its cylinder, and some gestures, as the twin's finger
-    makes them."""
+    """Return motions of the simulated finger: gestures, and the paper's stroke on a cylinder."""
     paths: dict[str, FingerPath] = {}
     if isinstance(scene.object.geometry, Cylinder):
         paths["stroke"] = stroke_path(scene, 10.0)
@@ -37,7 +36,7 @@ def finger_motions(scene: Scene) -> Mapping[str, TruePathCase]:
 
 
 def _motion(scene: Scene, path: FingerPath, *, resting: bool) -> TruePathCase:
-    """The path with its unsteadiness, once the reach to its start is over."""
+    """Make the motion on a path with wander and tremor, from the path's first point on."""
     start = np.asarray(path.positions_world_m[0])
     motion = FingerMotion.resting(start, seed=1).followed_by(
         0.0,
@@ -58,6 +57,6 @@ TRACKING = make_tracking_family(finger_motions)
 true_force = lru_cache(maxsize=1024)(twin_force)
 SHEET_FORCE = sheet_force_family(true_force, lambda scene: force_table.load_or_compute(scene, None))
 SHEET_LAWS = sheet_force_family(true_force, None)
-"""Those that are at hand at once."""
+"""The methods without a long computation."""
 SHEET_SHAPE = sheet_shape_family(twin_points)
 QUICK_SHAPE = sheet_shape_family(twin_points, solved=False)

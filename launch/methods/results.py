@@ -1,0 +1,45 @@
+"""Describe the machine that a result was measured on, and make results valid JSON."""
+
+from __future__ import annotations
+
+import math
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+CPU_INFO = Path("/proc/cpuinfo")
+
+MAX_LOAD_PER_CORE = 0.5
+"""Load above which other processes make timings unreliable."""
+
+
+def replace_non_finite(value: Any) -> Any:
+    """Return a value with None for NaN and infinity, which JSON lacks."""
+    if isinstance(value, dict):
+        return {key: replace_non_finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [replace_non_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def machine_name() -> str:
+    """Return processor, cores and Python version in one line."""
+    name = platform.processor() or platform.machine()
+    if CPU_INFO.exists():
+        lines = [line for line in CPU_INFO.read_text().splitlines() if "model name" in line]
+        name = lines[0].partition(":")[2].strip() if lines else name
+    return f"{os.cpu_count()} cores {name}, Python {platform.python_version()}"
+
+
+def describe_load() -> str | None:
+    """Return a warning if other processes load the machine, else None."""
+    load, cores = os.getloadavg()[0], os.cpu_count() or 1
+    if load <= MAX_LOAD_PER_CORE * cores:
+        return None
+    return (
+        f"this machine is busy (load {load:.1f} on {cores} cores): the times are too long, and the "
+        "order of the methods by time may be wrong; measure again on an idle machine"
+    )

@@ -1,0 +1,44 @@
+"""Describe the types of message fields and parameters in words, for pages and commands."""
+
+from __future__ import annotations
+
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import numpy as np
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from flexsheet.messages.arrays import ArraySpec
+
+
+def field_type(field: FieldInfo) -> str:
+    """Return a field's type in words; models are links to their sections."""
+    for extra in field.metadata:
+        if isinstance(extra, ArraySpec):
+            return _array(extra)
+    return _type(field.annotation)
+
+
+def _type(annotation: Any) -> str:
+    origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        spec = next((extra for extra in arguments[1:] if isinstance(extra, ArraySpec)), None)
+        return _array(spec) if spec else _type(arguments[0])
+    if origin is Literal:
+        return " \\| ".join(f"`{value}`" for value in arguments)
+    if origin in (Union, UnionType):
+        return " or ".join(_type(argument) for argument in arguments)
+    if origin is tuple and arguments[-1] is Ellipsis:
+        return f"any number of {_type(arguments[0])}"
+    if origin is tuple:
+        return f"{len(arguments)} of {_type(arguments[0])}"
+    if annotation is NoneType:
+        return "none"
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return f"[{annotation.__name__}](#{annotation.__name__.lower()})"
+    return getattr(annotation, "__name__", str(annotation))
+
+
+def _array(spec: ArraySpec) -> str:
+    return f"{np.dtype(spec.dtype).name} {spec.describe_shape()}"
