@@ -22,7 +22,7 @@ from flexsheet.launch.objects.meshes import read_mesh
 from flexsheet.nodes.models.shapes import Shape, SmoothMeshShape, make_shape
 from flexsheet.nodes.models.shapes.smooth_mesh import default_smoothing_m
 from flexsheet.nodes.models.shapes.triangles import Facets, triangle_normals, vertex_normals
-from flexsheet.nodes.planner.families import ellipsoid_mesh
+from flexsheet.nodes.planner.benchmarks import ellipsoid_mesh
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

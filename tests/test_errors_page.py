@@ -37,7 +37,7 @@ PATH = r"\S*/"
          "camera-and-calibration"),
         ("the window was closed and frames are not shown; restart the node to open it",
          "Note", "renderer-and-projector"),
-        ("object is softer than the sheet presents surely", "Reason", "planner"),
+        ("object is too soft for the position tolerance", "Reason", "planner"),
     ],
 )  # fmt: skip
 def test_what_is_said_while_it_runs_is_explained(message: str, kind: str, page: str) -> None:

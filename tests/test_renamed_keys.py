@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from ruamel.yaml import YAML
@@ -16,7 +16,7 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.base import Message
 from flexsheet.messages.scene import Scene
 from flexsheet.messages.topics import TOPICS
-from flexsheet.messages.types import Display, Frame
+from flexsheet.messages.types import Display, Frame, SheetReason, SheetTarget
 from flexsheet.nodes import node_class
 from flexsheet.nodes.node import parameters_of
 
@@ -42,6 +42,18 @@ def test_an_old_parameter_gets_an_error_that_names_the_new_one(
     nodes = {"one": {"type": node_type, "parameters": {old: 0.1}}}
     YAML().dump({"nodes": nodes}, file)
     with pytest.raises(BadInputError, match=f'unknown key "{old}"; it is now "{new}"'):
+        load_plan(file)
+
+
+@pytest.mark.parametrize("old", renamed_keys.VALUES["compliance_mode"])
+def test_an_old_value_of_a_parameter_gets_an_error_that_names_the_new_one(
+    tmp_path: Path, old: str
+) -> None:
+    file = tmp_path / "old.yaml"
+    nodes = {"one": {"type": "planner", "parameters": {"compliance_mode": old}}}
+    YAML().dump({"nodes": nodes}, file)
+    new = renamed_keys.VALUES["compliance_mode"][old]
+    with pytest.raises(BadInputError, match=f'compliance_mode.*it is now "{new}"'):
         load_plan(file)
 
 
@@ -81,6 +93,22 @@ def test_a_recorded_value_of_an_old_name_is_read() -> None:
     assert migration is not None
     assert migration({"pattern": "places_x"}) == {"pattern": "coordinate_ramp_x"}
     assert migration({"pattern": "grid"}) == {"pattern": "grid"}
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [*migrations.SHEET_REASONS.items(), ("fingertip: two_markers", "fingertip_invalid"),
+     ("fingertip is 150 ms old", "fingertip_too_old"),
+     ("fingertip is -20 ms old", "fingertip_in_future")],
+)  # fmt: skip
+def test_the_recorded_text_of_a_sheet_target_is_read_as_its_reason(text: str, reason: str) -> None:
+    recorded: dict[str, Any] = SheetTarget.model_json_schema()
+    recorded["properties"]["reason"] = {"type": "string"}
+    migration = migrations.migration_for(SheetTarget, "0" * 16, recorded)
+    assert migration is not None
+    assert reason in get_args(SheetReason)
+    assert migration({"reason": text}) == {"reason": reason}
+    assert migration({"reason": reason}) == {"reason": reason}
 
 
 def test_a_recorded_value_within_a_part_is_read() -> None:

@@ -19,7 +19,7 @@ from flexsheet.nodes.models.sheet import (
     stretch_for_edge_force,
 )
 
-PAPER = {"young_modulus_pa": 1e6, "height_m": 0.24, "thickness_m": 0.001}
+PAPER = {"young_modulus_pa": 1e6, "width_m": 0.24, "height_m": 0.24, "thickness_m": 0.001}
 
 angles = st.tuples(st.floats(-0.6, 0.6), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
 places = st.tuples(st.floats(-0.2, 0.2), st.floats(-0.2, 0.2), st.floats(-0.2, 0.2))

@@ -26,7 +26,12 @@ from flexsheet.messages.bag import BagReader
 from flexsheet.messages.scene import Pose, Scene
 from flexsheet.messages.types import FingerPath, SoftBody, TwinArms, TwinFinger
 from flexsheet.nodes.models.rigid import transform_from_rpy
-from flexsheet.nodes.planner.compliance import FELT_N, GOOD_RATIO, WEBER_RATIO, WEBER_RATIO_BARE
+from flexsheet.nodes.planner.compliance import (
+    FORCE_JND_FLOOR_N,
+    TARGET_ERROR_RATIO,
+    WEBER_RATIO,
+    WEBER_RATIO_BARE,
+)
 from flexsheet.nodes.twin.membrane import Rubber, solve
 from flexsheet.nodes.twin.paths import map_to_surface
 
@@ -36,7 +41,7 @@ Times = NDArray[np.int64]
 PLACES_M = ((0.0, 0.0), (0.025, 0.0), (0.0, 0.02))
 """Along the object, and around it from its front."""
 
-DEPTH_SHARES = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
+PRESS_DEPTH_FRACTIONS = (0.04, 0.1, 0.2, 0.4, 0.7, 1.0)
 """Of the scene's push depth, at which the finger is held."""
 
 HOVER_M = 0.03
@@ -60,12 +65,14 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Press:
-    """One path of the finger: at a place, with the depths at which it is held; none: in and out.
+    """Hold one path of the finger: a push at a position with the depths at which it pauses.
 
-    surface, normal: (3,) of the undeformed object at that place, in the world.
+    place: the position's name. surface, normal: (3,) of the undeformed object there, world frame.
+    holds: empty for a path without pauses.
     """
 
     path: FingerPath
+    place: str
     surface: Floats
     normal: Floats
     holds: tuple[Hold, ...]
@@ -73,7 +80,7 @@ class Press:
 
 def presses(scene: Scene) -> list[Press]:
     """All that the finger does."""
-    depths = scene.working_range.push_depth_m * np.array(DEPTH_SHARES)
+    depths = scene.working_range.push_depth_m * np.array(PRESS_DEPTH_FRACTIONS)
     held = [_held(scene, along, around, depths) for along, around in PLACES_M]
     return [*held, _in_and_out(scene, float(depths[-1]))]
 
@@ -87,9 +94,9 @@ def _held(scene: Scene, along_m: float, around_m: float, depths: Floats) -> Pres
         holds.append(Hold(float(depth), begin_s + HOLD_S - JUDGED_S, begin_s + HOLD_S))
     times.append(times[-1] + (HOVER_M - heights[-1]) / PUSH_M_PER_S)
     heights.append(HOVER_M)
-    label = f"press at {1e3 * along_m:g}, {1e3 * around_m:g} mm"
+    place = f"at {1e3 * along_m:g}, {1e3 * around_m:g} mm"
     way = np.column_stack([times, heights])
-    return _press(scene, label, (along_m, around_m), way, tuple(holds))
+    return _press(scene, place, (along_m, around_m), way, tuple(holds))
 
 
 def _in_and_out(scene: Scene, deepest_m: float) -> Press:
@@ -100,19 +107,19 @@ def _in_and_out(scene: Scene, deepest_m: float) -> Press:
 
 
 def _press(
-    scene: Scene, label: str, place_m: tuple[float, float], way: Floats, holds: tuple[Hold, ...]
+    scene: Scene, place: str, place_m: tuple[float, float], way: Floats, holds: tuple[Hold, ...]
 ) -> Press:
-    """way: times (s) and heights over the surface (m), (n, 2)."""
+    """Make a press; way: times (s) and heights over the surface (m), (n, 2)."""
     surface, above = map_to_surface(scene, np.array([[*place_m, 0.0], [*place_m, HOVER_M]]))
     normal = (above - surface) / HOVER_M
     path = FingerPath(
-        label=label,
+        label=f"press {place}" if holds else place,
         times_s=np.ascontiguousarray(way[:, 0]),
         positions_world_m=surface + np.outer(way[:, 1], normal),
         wander_m=0.0,
         tremor_m=0.0,
     )
-    return Press(path, surface, normal, holds)
+    return Press(path, place, surface, normal, holds)
 
 
 def compliance_procedure(progress: Progress) -> Procedure:
@@ -185,12 +192,12 @@ class Felt:
     depth_m: float
     wanted_n: float
     presented_n: float
-    retreat_m: float
+    normal_offset_m: float
 
     @property
     def error_ratio(self) -> float:
-        """Presented over wanted, less one; forces too small to be felt count as the least felt."""
-        return (self.presented_n - self.wanted_n) / max(self.wanted_n, FELT_N)
+        """Rendered over wanted force, minus one; the reference is at least `FORCE_JND_FLOOR_N`."""
+        return (self.presented_n - self.wanted_n) / max(self.wanted_n, FORCE_JND_FLOOR_N)
 
 
 class Judge:
@@ -229,7 +236,7 @@ class Judge:
             depth_m=depth_m,
             wanted_n=self._wanted_n(at_ns, depth_m),
             presented_n=float(pressed.finger_force_n @ press.normal),
-            retreat_m=float((press.surface - middle) @ press.normal),
+            normal_offset_m=float((press.surface - middle) @ press.normal),
         )
 
     def _wanted_n(self, at_ns: int, depth_m: float) -> float:
@@ -258,7 +265,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
         begin_ns, end_ns = recorded.windows_ns[label]
         for hold in press.holds:
             times = begin_ns + (np.linspace(hold.begin_s, hold.end_s, HELD_SAMPLES) * 1e9)
-            held.append(_row(label, hold, [judge.felt(int(at), press) for at in times]))
+            held.append(_row(press, hold, [judge.felt(int(at), press) for at in times]))
         if not press.holds:
             moving = list(_while_moving(judge, press, begin_ns, end_ns))
     errors = np.array([row["error_percent"] for row in held])
@@ -266,7 +273,7 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
     return {
         "rows": held,
         "worst_percent": float(np.abs(errors).max()),
-        "aimed_percent": 100.0 * GOOD_RATIO,
+        "aimed_percent": 100.0 * TARGET_ERROR_RATIO,
         "noticed_percent": [100.0 * WEBER_RATIO, 100.0 * WEBER_RATIO_BARE],
         "moving": {
             "speed_mm_per_s": 1e3 * PUSH_M_PER_S,
@@ -288,16 +295,16 @@ def compliance_result(bag: Path, progress: Progress) -> dict[str, Any]:
 def _while_moving(judge: Judge, press: Press, begin_ns: int, end_ns: int) -> Iterator[Felt]:
     for at_ns in range(begin_ns, end_ns, round(MOVING_STEP_S * 1e9)):
         felt = judge.felt(at_ns, press)
-        if max(felt.wanted_n, felt.presented_n) >= FELT_N:
+        if max(felt.wanted_n, felt.presented_n) >= FORCE_JND_FLOOR_N:
             yield felt
 
 
-def _row(label: str, hold: Hold, felt: Sequence[Felt]) -> dict[str, Any]:
+def _row(press: Press, hold: Hold, felt: Sequence[Felt]) -> dict[str, Any]:
     return {
-        "place": label.removeprefix("press "),
+        "place": press.place,
         "depth_mm": 1e3 * hold.depth_m,
         "wanted_n": float(np.mean([one.wanted_n for one in felt])),
         "presented_n": float(np.mean([one.presented_n for one in felt])),
         "error_percent": 100.0 * float(np.mean([one.error_ratio for one in felt])),
-        "retreat_mm": 1e3 * float(np.mean([one.retreat_m for one in felt])),
+        "retreat_mm": 1e3 * float(np.mean([one.normal_offset_m for one in felt])),
     }

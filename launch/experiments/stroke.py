@@ -360,30 +360,32 @@ def sheet_errors(
     finger: Track,
     edges: tuple[Track, Track],
     times_ns: NDArray[np.int64],
-    retreat_m: Floats | float = 0.0,
+    normal_offset_m: Floats | float = 0.0,
     *,
     shape: Shape | None = None,
 ) -> tuple[Floats, Floats]:
     """Delta d (m) and delta theta (rad) of Fig. 9 at `times_ns`, for an object of any shape.
 
     D is the object's point nearest to the finger: the sheet presents the undeformed surface, so
-    how deep the finger pushes is not an error of its.  retreat_m (n,): how far below that surface
-    the sheet is meant to be, where it complies as the object would.  On a cylinder, delta theta is
-    the angle about its axis, as in the paper; on others the angle between both normals.  shape:
-    the scene's, where the caller has made it.
+    how deep the finger pushes is not an error of its.  normal_offset_m (n,): how far below that
+    surface the sheet is meant to be, where it complies as the object would.  On a cylinder,
+    delta theta is the angle about its axis, as in the paper; on others the angle between both
+    normals.  shape: the scene's, where the caller has made it.
     """
     world_from_object = object_pose(scene)
     points = apply(inverse(world_from_object), finger.at(times_ns))
     if not isinstance(scene.object.geometry, Cylinder):
         foot = (shape or make_shape(dict(scene.object.geometry))).closest(points)
         centre, normal = sheet_planes(edges, world_from_object, times_ns)
-        on_surface = foot.point - np.broadcast_to(retreat_m, len(points))[:, None] * foot.normal
+        on_surface = (
+            foot.point - np.broadcast_to(normal_offset_m, len(points))[:, None] * foot.normal
+        )
         sine = np.linalg.norm(np.cross(foot.normal, normal), axis=1)
         cosine = np.einsum("ni,ni->n", foot.normal, normal)
         off = on_surface - presented_on_surface(foot, centre, normal)
         return np.linalg.norm(off, axis=1), np.arctan2(sine, cosine)
     angles = np.arctan2(points[:, 1], points[:, 2])
-    radius = cylinder_of(scene).radius_m - retreat_m
+    radius = cylinder_of(scene).radius_m - normal_offset_m
     on_surface = np.column_stack([points[:, 0], radius * np.sin(angles), radius * np.cos(angles)])
     presented_points, presented_angles = presented(edges, world_from_object, times_ns, points[:, 0])
     delta_theta = (angles - presented_angles + np.pi) % (2 * np.pi) - np.pi

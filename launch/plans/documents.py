@@ -65,7 +65,7 @@ MAPPING_WANTED = ("model_type", "model_attributes_type", "dict_type", "mapping_t
 """Kinds of pydantic's errors whose texts name a class."""
 
 Key = tuple[str | int, ...]
-"""Where a value sits in a document: ("nodes", "planner", "parameters", "lead_s")."""
+"""Where a value sits in a document: ("nodes", "planner", "parameters", "max_age_s")."""
 
 
 @dataclass(frozen=True, slots=True)

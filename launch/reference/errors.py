@@ -9,7 +9,14 @@ import re
 from collections.abc import Iterable
 from typing import get_args
 
-from flexsheet.launch.reference.remedies import AREAS, FINGERTIP, PARTICULAR, REMEDIES, Area
+from flexsheet.launch.reference.remedies import (
+    AREAS,
+    FINGERTIP,
+    PARTICULAR,
+    REMEDIES,
+    SHEET_TARGET,
+    Area,
+)
 from flexsheet.launch.reference.sentences import FILLED_IN, Said, classes, messages
 
 SHORTEST_MATCH = 8
@@ -44,6 +51,8 @@ def reference() -> str:
         sections.append(f"## {area.title}\n\n{area.about}\n")
         if area.title == "Fingertip":
             sections.append(_table("`reason`", "what to do", FINGERTIP.items()))
+        if area.title == "Planner":
+            sections.append(_table("`reason`", "what to do", SHEET_TARGET.items()))
         sections += [_section(kind, area, mine) for kind in kinds]
     return "\n".join(sections)
 
@@ -108,6 +117,8 @@ def explained(message: str) -> list[dict[str, str]]:
     first."""
     if message in FINGERTIP:
         return [{"message": message, "what to do": FINGERTIP[message], "page": _page("Fingertip")}]
+    if message in SHEET_TARGET:
+        return [{"message": message, "what to do": SHEET_TARGET[message], "page": _page("Planner")}]
     if message in REMEDIES:
         return [_of_kind(message)]
     found: dict[tuple[str, str], dict[str, str]] = {}

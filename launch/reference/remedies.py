@@ -217,6 +217,23 @@ PARTICULAR = {
 }
 """By words of a message that says no remedy itself and needs more than its kind's."""
 
+SHEET_TARGET: dict[str, str] = {
+    "fingertip_invalid": "the fingertip is not valid: see the `reason` of the topic `fingertip`.",
+    "fingertip_not_finite": "the fingertip holds NaN or infinity: check what publishes it.",
+    "fingertip_too_old": f"{BUSY_FIRST}; else camera, triangulator and network are slow.",
+    "fingertip_in_future": "the clocks of two hosts differ: see docs/clocks.md.",
+    "implausible_input": "the finger is 10 m away or moves at 10 m/s: check the calibration.",
+    "ambiguous_side": "the finger is inside the object, on no definite side: move it out.",
+    "through_object": "the finger is deeper than 1.4 times the scene's push depth: move it out.",
+    "past_object_edge": "the finger is past the touchable surface: move it back.",
+    "beyond_tilt": "the arms cannot tilt the sheet further: move the finger to the front.",
+    "beyond_spin": "rolling has rotated the sheet by `max_spin_rad`: lift the finger.",
+    "past_sheet_width": "the contact is near a clamped edge: move the finger back or lift it.",
+    "past_sheet_height": "the contact is past the usable height: move the finger back or lift it.",
+    "concave_contact": "the object is concave there: the flat sheet rests on the rim.",
+}
+"""Remedies by `reason` of the topic `sheet_target`."""
+
 FINGERTIP = {
     "no_marker": "no marker in either image: finger out of view, marker lost, exposure too dark.",
     "marker_in_one_view": "one camera is occluded or sees less far: move the finger or the camera.",

@@ -88,6 +88,7 @@ def max_stretch_ratio(scene: Scene) -> float:
     strongest = stretch_for_edge_force(
         sheet.max_edge_force_n,
         young_modulus_pa=sheet.young_modulus_pa,
+        width_m=sheet.width_m,
         height_m=sheet.height_m,
         thickness_m=sheet.thickness_m,
     )
