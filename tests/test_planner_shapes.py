@@ -587,7 +587,7 @@ def test_an_inverted_mesh_is_refused() -> None:
 
 @pytest.mark.parametrize("turn_rad", [math.pi, 1.5])
 def test_an_object_that_turns_no_side_to_the_user_is_refused(turn_rad: float) -> None:
-    with pytest.raises(UnpresentableError, match=r"leans .* turn it by object.world_from_object"):
+    with pytest.raises(UnpresentableError, match=r"rotate it by object.world_from_object"):
         Desk(scene_with(SOLIDS["plane"], rpy_rad=(turn_rad, 0.0, 0.0)))
 
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from flexsheet.messages.scene import Cylinder, Ellipsoid, Mesh, Plane, RoundedBox, Scene, Sphere
+from flexsheet.messages.scene import Geometry, Scene
 from flexsheet.nodes.models.rigid import rotation_from_rpy
+from flexsheet.nodes.models.shapes import GEOMETRIES
 from flexsheet.nodes.models.sheet import stretch_for_edge_force
 
 Floats = NDArray[np.float64]
-Geometry = Cylinder | Sphere | Ellipsoid | Plane | RoundedBox | Mesh
 
 
 MIN_STRETCH_RATIO, STRETCH_STEP = 1.005, 0.001
@@ -57,7 +57,7 @@ def edited(
     values: dict[str, Any] = {name: getattr(scene, name) for name in type(scene).model_fields}
     solid, sheet = scene.object, scene.sheet
     try:
-        geometry = scaled(solid.geometry, size_ratio)
+        geometry = scale_geometry(solid.geometry, size_ratio)
         pose = solid.world_from_object
         rotation = rotation_from_rpy(pose.rpy_rad)
         back_m = front_m(solid.geometry, rotation) * (size_ratio - 1.0)
@@ -104,50 +104,17 @@ def _with(part: Any, **changes: Any) -> Any:
     return type(part)(**fields | changes)
 
 
-def scaled(geometry: Geometry, ratio: float) -> Geometry:
-    """The same shape, larger by `ratio` about its origin; a plane stays as it is."""
+def scale_geometry(geometry: Geometry, ratio: float) -> Geometry:
+    """Return the geometry scaled by `ratio` about its origin; a plane stays as it is."""
     if not (np.isfinite(ratio) and ratio > 0.0):
-        raise SceneChoiceError(f"size: {ratio} times as large is no size")
-    changes: dict[str, Any]
-    match geometry:
-        case Cylinder():
-            changes = {"radius_m": ratio * geometry.radius_m, "length_m": geometry.length_m}
-        case Sphere():
-            changes = {"radius_m": ratio * geometry.radius_m}
-        case Ellipsoid():
-            changes = {"semi_axes_m": tuple(ratio * side for side in geometry.semi_axes_m)}
-        case RoundedBox():
-            changes = {
-                "size_m": tuple(ratio * side for side in geometry.size_m),
-                "edge_radius_m": ratio * geometry.edge_radius_m,
-            }
-        case Mesh():
-            changes = {
-                "vertices_m": ratio * geometry.vertices_m,
-                "smoothing_m": ratio * geometry.smoothing_m,
-            }
-        case Plane():
-            return geometry
+        raise SceneChoiceError(f"size: {ratio} is not a ratio above 0")
+    changes = GEOMETRIES[geometry.shape].scale(geometry, ratio)
     return _with(geometry, **changes)  # type: ignore[no-any-return]  # of the same type
 
 
 def front_m(geometry: Geometry, world_from_object: Floats) -> float:
-    """How far a shape reaches towards the user (world z) from its origin, turned as (3, 3) says.
+    """Return the extent of the touchable surface towards the user (world z) from its origin.
 
-    Of a cylinder the side counts, not the ends: they are not touched.
+    world_from_object: the object's rotation (3, 3).
     """
-    towards = world_from_object[2]
-    match geometry:
-        case Cylinder():
-            return geometry.radius_m * float(np.hypot(towards[1], towards[2]))
-        case Sphere():
-            return geometry.radius_m
-        case Ellipsoid():
-            return float(np.linalg.norm(np.array(geometry.semi_axes_m) * towards))
-        case RoundedBox():
-            core = 0.5 * np.array(geometry.size_m) - geometry.edge_radius_m
-            return float(core @ np.abs(towards)) + geometry.edge_radius_m
-        case Mesh():
-            return float((geometry.vertices_m @ towards).max())
-        case Plane():
-            return 0.0
+    return GEOMETRIES[geometry.shape].extent_m(geometry, world_from_object[2])
